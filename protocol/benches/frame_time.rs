@@ -13,8 +13,13 @@ use protocol::wire_time::Bits;
 fn replies(format: Format) -> Vec<Frame> {
     let packets = CellId::all().take(253).map(|cell| {
         let word = i16::from(cell.get()).wrapping_mul(-0x3D4D);
-        let words = std::array::from_fn(|at| word.rotate_left(u32::try_from(at).unwrap_or(0)));
-        Packet { id: Id::new(Kind::Torque, Node::Cell(cell)), words, epoch: Epoch(17), count: 1 }
+        let words: [i16; 6] = std::array::from_fn(|at| word.rotate_left(u32::try_from(at).unwrap_or(0)));
+        Packet {
+            id: Id::new(Kind::Torque, Node::Cell(cell)),
+            words: words.into(),
+            epoch: Epoch(17),
+            count: 1,
+        }
     });
     packets.flat_map(|packet| packet.frames(format)).collect()
 }

@@ -9,7 +9,7 @@ use std::hint::black_box;
 use gungraun::{library_benchmark, library_benchmark_group};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id, Kind, Node};
-use protocol::packet::{Epoch, Packet, Reassembly, Segment};
+use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Segment};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
@@ -19,7 +19,7 @@ mod counted;
 fn packet() -> Packet {
     let cell = CellId::all().nth(11).expect("there are 254 cells");
     let words = [0x1234, -0x0102, 0x0055, -1, 0, 0x4000];
-    Packet { id: Id::new(Kind::Torque, Node::Cell(cell)), words, epoch: Epoch(200), count: 1 }
+    Packet { id: Id::new(Kind::Torque, Node::Cell(cell)), words: words.into(), epoch: Epoch(200), count: 1 }
 }
 
 fn fd_frame() -> Frame {
@@ -40,11 +40,13 @@ fn decode(frame: Frame) -> Packet {
     Packet::from_fd(black_box(&frame)).expect("a whole packet")
 }
 
+const SIX: Lengths = Lengths::only(Length::Six);
+
 fn pair(id: Id, frames: [Frame; 2]) -> Packet {
     let mut segment = Segment::NONE;
     let [first, second] = black_box(&frames);
-    let waiting = segment.push(Micros(0), id, first.data());
-    match (waiting, segment.push(Micros(134), id, second.data())) {
+    let waiting = segment.push(Micros(0), id, SIX, first.data());
+    match (waiting, segment.push(Micros(134), id, SIX, second.data())) {
         (Ok(Reassembly::Waiting), Ok(Reassembly::Complete(packet))) => packet,
         paired => unreachable!("two segments of one packet: {paired:?}"),
     }

@@ -26,6 +26,99 @@ pub type Q7_8 = Q<8>;
 /// Temperatures in degrees Celsius: [-512, 512) in steps of 1.6e-2.
 pub type Q9_6 = Q<6>;
 
+/// In which format the cells of a bus send their own torques: a wider range for a coarser step. Sums are Q7.8.
+#[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
+pub enum TorqueFormat {
+    /// [-8, 8) Nm or N in steps of 2.4e-4.
+    #[default]
+    Q3_12,
+    /// [-32, 32) Nm or N in steps of 9.8e-4.
+    Q5_10,
+    /// [-128, 128) Nm or N in steps of 3.9e-3.
+    Q7_8,
+}
+
+impl TorqueFormat {
+    /// Every format, the finest first; a format's place is the number that stands for it.
+    pub const ALL: [Self; 3] = [Self::Q3_12, Self::Q5_10, Self::Q7_8];
+
+    /// Its name.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Q3_12 => "Q3.12",
+            Self::Q5_10 => "Q5.10",
+            Self::Q7_8 => "Q7.8",
+        }
+    }
+
+    /// The number that stands for it in a parameter.
+    #[must_use]
+    pub const fn number(self) -> u8 {
+        self as u8
+    }
+
+    /// The format that a number stands for.
+    #[must_use]
+    pub fn from_number(number: i16) -> Option<Self> {
+        usize::try_from(number).ok().and_then(|number| Self::ALL.get(number)).copied()
+    }
+
+    /// Fraction bits of its words.
+    #[must_use]
+    pub const fn fraction(self) -> u32 {
+        match self {
+            Self::Q3_12 => 12,
+            Self::Q5_10 => 10,
+            Self::Q7_8 => 8,
+        }
+    }
+
+    /// What one step is worth, in Nm or N.
+    #[must_use]
+    pub fn step(self) -> f64 {
+        1.0 / f64::from(1_u32 << self.fraction())
+    }
+
+    /// What a word is worth, in Nm or N.
+    #[must_use]
+    pub fn real(self, word: i16) -> f64 {
+        f64::from(word) * self.step()
+    }
+
+    /// The nearest word, ties away from zero; out of range it saturates, and what is not a number becomes zero.
+    #[must_use]
+    pub fn nearest(self, value: f64) -> i16 {
+        match self {
+            Self::Q3_12 => Q::<12>::nearest(value).0,
+            Self::Q5_10 => Q::<10>::nearest(value).0,
+            Self::Q7_8 => Q::<8>::nearest(value).0,
+        }
+    }
+
+    /// A word in steps of 2^-12 Nm or N, the finest of all formats: exact.
+    #[must_use]
+    pub fn finest_steps(self, word: i16) -> i32 {
+        i32::from(word) << (Self::Q3_12.fraction() - self.fraction())
+    }
+
+    /// The first torque beyond its range, in Nm or N.
+    #[must_use]
+    pub fn bound(self) -> f64 {
+        -self.real(i16::MIN)
+    }
+
+    /// The word of an exact torque, rounded to the nearest step, ties up, and held within the range.
+    #[must_use]
+    pub fn round<const F: u32>(self, exact: Acc<F>) -> i16 {
+        match self {
+            Self::Q3_12 => exact.round::<12>().to_bits(),
+            Self::Q5_10 => exact.round::<10>().to_bits(),
+            Self::Q7_8 => exact.round::<8>().to_bits(),
+        }
+    }
+}
+
 /// A real number that is outside the range of a `Q` format.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 #[error("{got} is not in [{min}, {bound})")]
@@ -111,6 +204,12 @@ impl<const F: u32> Q<F> {
     #[must_use]
     pub const fn saturating_neg(self) -> Self {
         Self(self.0.saturating_neg())
+    }
+
+    /// The sum; held at the ends of the range.
+    #[must_use]
+    pub const fn saturating_add(self, rhs: Self) -> Self {
+        Self(self.0.saturating_add(rhs.0))
     }
 
     /// The sum, wrapped into range: for angles, whose range is one turn.

@@ -90,7 +90,7 @@ fn fields(of: &str, layouts: &[Layout]) -> String {
     for layout in layouts {
         let parameter = Parameter::from_number(layout.number).filter(|_| of == "parameter");
         let note = match parameter {
-            Some(Parameter::Row(0)) => " to 21: row of joint 1 to 6",
+            Some(Parameter::Row(0)) => " to 47: row 1 to 32",
             Some(Parameter::Row(_)) => continue,
             Some(Parameter::Identity) => ", read only",
             Some(Parameter::Commit) => ", write only",
@@ -163,6 +163,7 @@ fn format_of(field: &Field) -> String {
             format!("Q{}.{bits}", 15 - bits)
         }
         Format::Angle | Format::Position => "Q1.14".to_owned(),
+        Format::Torque => "Q3.12, or the bus' torque format".to_owned(),
         Format::Port => "unsigned, 8 bits".to_owned(),
         Format::Ports(..) => "bits".to_owned(),
         Format::State => "state".to_owned(),

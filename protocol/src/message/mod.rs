@@ -2,9 +2,9 @@
 //!
 //! | kind | node field | words | count |
 //! |---|---|---|---|
-//! | 0 command | 0 halt, 1 joints, 2 sync, 3 resume, 4 report | joints: six positions, quarter turns, Q1.14; else 0 | joints: joints in use |
-//! | 1 sum | sender | sum of torques in Nm, Q7.8 | contributing cells |
-//! | 2 torque | sender | own torque in Nm, Q3.12 | 1 |
+//! | 0 command | 0 halt, 1 joints, 2 sync, 3 resume, 4 report | joints: a position for each joint, quarter turns or m, Q1.14; else 0 | joints: joints in use |
+//! | 1 sum | sender | sum of torques in Nm or N, Q7.8 | contributing cells |
+//! | 2 torque | sender | own torque in Nm or N, in the format of the bus, [`crate::fixed::TorqueFormat`] | 1 |
 //! | 3 sensors | sender | a [`SensorPage`] | page |
 //! | 4 network | sender | a [`NetworkPage`] | page |
 //! | 5 configure | destination | what to write | parameter, + 0x80 to write; the epoch byte is a tag |
@@ -21,11 +21,14 @@ pub use network::{Heard, Heartbeat, NetworkPage, PortState, Ports, Refused, Tree
 pub use sensors::{SensorPage, SkinSensors};
 pub use state::State;
 
+use core::ops::RangeInclusive;
+
 use thiserror::Error;
 
-use crate::fixed::{Q1_14, Q3_12, Q5_10, Q7_8};
+use crate::fixed::{Q1_14, Q5_10};
 use crate::id::{CellId, Command, Id, Kind, Node};
-use crate::packet::{self, Epoch, Packet, WORDS};
+use crate::packet::{self, Epoch, Length, Packet, WORDS, Words};
+use crate::parameters::MAX_JOINTS;
 
 /// The version of this protocol, in every heartbeat.
 pub const VERSION: u8 = 1;
@@ -40,8 +43,8 @@ pub(crate) const REFUSED: u8 = 126;
 /// The joint positions of one epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Joints {
-    /// Positions in quarter turns; those beyond the joints in use are zero.
-    pub positions: [Q1_14; WORDS],
+    /// Positions in quarter turns, of prismatic joints in m; those beyond the joints in use are zero.
+    pub positions: [Q1_14; MAX_JOINTS],
     /// Joints in use.
     pub in_use: u8,
 }
@@ -128,8 +131,8 @@ pub enum Message {
         from: CellId,
         /// The joints it answers.
         epoch: Epoch,
-        /// Nm.
-        torque: [Q7_8; WORDS],
+        /// Nm or N, Q7.8, a word for each joint.
+        torque: Words,
         /// Cells in it; 0 ends the sums before.
         count: u8,
     },
@@ -139,8 +142,8 @@ pub enum Message {
         from: CellId,
         /// The joints it answers.
         epoch: Epoch,
-        /// Nm.
-        torque: [Q3_12; WORDS],
+        /// Nm or N in the format of the bus, a word for each joint.
+        torque: Words,
     },
     /// What a cell measures.
     Sensors {
@@ -249,29 +252,30 @@ impl Message {
                 Command::Sync => Self::Sync,
                 Command::Resume => Self::Resume,
                 Command::Report => Self::Report,
-                Command::Joints if (1..=6).contains(&count) => Self::Joints {
-                    epoch,
-                    joints: Joints { positions: words.map(Q1_14::from_bits), in_use: count },
-                },
                 Command::Joints => {
-                    return Err(MessageError::Count { kind, got: count, allowed: "1 to 6" });
+                    let allowed = allowed_joints(words.length());
+                    if !allowed.0.contains(&count) {
+                        return Err(MessageError::Count { kind, got: count, allowed: allowed.1 });
+                    }
+                    let positions = words.padded().map(Q1_14::from_bits);
+                    Self::Joints { epoch, joints: Joints { positions, in_use: count } }
                 }
             },
-            Kind::Sum if count == 0 && words != [0; WORDS] => {
+            Kind::Sum if count == 0 && !words.is_zero() => {
                 return Err(MessageError::Count { kind, got: count, allowed: "1 to 255, or 0 with zeros" });
             }
-            Kind::Sum => Self::Sum { from: sender()?, epoch, torque: words.map(Q7_8::from_bits), count },
+            Kind::Sum => Self::Sum { from: sender()?, epoch, torque: words, count },
             Kind::Torque if count != 1 => {
                 return Err(MessageError::Count { kind, got: count, allowed: "1" });
             }
-            Kind::Torque => Self::Torque { from: sender()?, epoch, torque: words.map(Q3_12::from_bits) },
+            Kind::Torque => Self::Torque { from: sender()?, epoch, torque: words },
             Kind::Sensors => {
-                Self::Sensors { from: sender()?, epoch, page: SensorPage::decode(kind, count, words)? }
+                Self::Sensors { from: sender()?, epoch, page: SensorPage::decode(kind, count, words.six())? }
             }
             Kind::Network => match Node::from_byte(node) {
                 Node::Everyone => return Err(MessageError::Sender { kind, node }),
                 from @ (Node::Gateway | Node::Cell(_)) => {
-                    Self::Network { from, epoch, page: NetworkPage::decode(count, words)? }
+                    Self::Network { from, epoch, page: NetworkPage::decode(count, words.six())? }
                 }
             },
             Kind::Configure => {
@@ -279,12 +283,13 @@ impl Message {
                 let request = if count & WRITE == 0 {
                     Request::Read { number }
                 } else {
-                    Request::Write { number, words }
+                    Request::Write { number, words: words.six() }
                 };
                 Self::Configure { to: addressee(kind, node)?, tag: epoch.0, request }
             }
             Kind::Configured => {
                 let number = count & !WRITE;
+                let words = words.six();
                 let answer = match words {
                     [refused, reason, ..] if number == REFUSED => {
                         Answer::Refused { number: refused.to_le_bytes()[0], reason }
@@ -295,7 +300,7 @@ impl Message {
             }
             Kind::Stimulus => {
                 let from = if count & FROM_THE_NEXT == 0 { From::Epoch(epoch) } else { From::Next };
-                let page = SensorPage::decode(kind, count & !FROM_THE_NEXT, words)?;
+                let page = SensorPage::decode(kind, count & !FROM_THE_NEXT, words.six())?;
                 Self::Stimulus { to: addressee(kind, node)?, from, page }
             }
         })
@@ -304,14 +309,13 @@ impl Message {
     /// Encodes it to a packet.
     #[must_use]
     pub fn encode(&self) -> Packet {
-        let packet = |words, epoch, count| Packet { id: self.id(), words, epoch, count };
+        let with = |words, epoch, count| Packet { id: self.id(), words, epoch, count };
+        let packet = |words: [i16; WORDS], epoch, count| with(words.into(), epoch, count);
         match *self {
             Self::Halt | Self::Sync | Self::Resume | Self::Report => packet([0; WORDS], Epoch(0), 0),
-            Self::Joints { epoch, joints } => {
-                packet(joints.positions.map(Q1_14::to_bits), epoch, joints.in_use)
-            }
-            Self::Sum { epoch, torque, count, .. } => packet(torque.map(Q7_8::to_bits), epoch, count),
-            Self::Torque { epoch, torque, .. } => packet(torque.map(Q3_12::to_bits), epoch, 1),
+            Self::Joints { epoch, joints } => with(joints.words(), epoch, joints.in_use),
+            Self::Sum { epoch, torque, count, .. } => with(torque, epoch, count),
+            Self::Torque { epoch, torque, .. } => with(torque, epoch, 1),
             Self::Sensors { epoch, page, .. } => {
                 let (count, words) = page.encode();
                 packet(words, epoch, count)
@@ -412,8 +416,7 @@ impl Message {
     /// Whether a word of it means *saturated*; `None` of what is neither a torque nor a sum.
     #[must_use]
     pub fn is_saturated(&self) -> Option<bool> {
-        let is_end = |word: &i16| [i16::MIN, i16::MAX].contains(word);
-        self.torque_words().map(|words| words.iter().any(is_end))
+        self.torque_words().map(|words| words.is_saturated())
     }
 
     /// Whether it reports a touch: a torque or a sum that is not all zero, a stimulus or sensors with a contact force
@@ -426,18 +429,29 @@ impl Message {
         if let Some(SensorPage::Skin(skin)) = self.sensor_page() {
             return skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
         }
-        self.torque_words().is_some_and(|words| words != [0; WORDS])
+        self.torque_words().is_some_and(|words| !words.is_zero())
     }
 
     /// The words of a torque or a sum.
-    fn torque_words(&self) -> Option<[i16; WORDS]> {
-        if let Self::Torque { torque, .. } = self {
-            Some(torque.map(Q3_12::to_bits))
-        } else if let Self::Sum { torque, .. } = self {
-            Some(torque.map(Q7_8::to_bits))
-        } else {
-            None
-        }
+    const fn torque_words(&self) -> Option<Words> {
+        if let Self::Torque { torque, .. } | Self::Sum { torque, .. } = *self { Some(torque) } else { None }
+    }
+}
+
+impl Joints {
+    /// The words that travel: as many as the joints in use need.
+    fn words(&self) -> Words {
+        Words::new(Length::for_joints(self.in_use.into()), self.positions.map(Q1_14::to_bits))
+    }
+}
+
+/// The joints that words of this length are for.
+const fn allowed_joints(length: Length) -> (RangeInclusive<u8>, &'static str) {
+    match length {
+        Length::Six => (1..=6, "1 to 6"),
+        Length::Eight => (7..=8, "7 or 8"),
+        Length::Ten => (9..=10, "9 or 10"),
+        Length::Fourteen => (11..=14, "11 to 14"),
     }
 }
 
@@ -449,37 +463,4 @@ fn addressee(kind: Kind, node: u8) -> Result<Node, MessageError> {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    proptest! {
-        /// What is decoded from a packet is encoded to a packet with the same meaning; words
-        /// that a page does not use may differ.
-        #[test]
-        fn a_meaning_comes_back(id in 0_u16..0x800, words: [i16; WORDS], epoch: u8, count: u8) {
-            let packet = Packet { id: Id::from_bits(id), words, epoch: Epoch(epoch), count };
-            if let Ok(message) = Message::decode(&packet) {
-                prop_assert_eq!(Message::decode(&message.encode()), Ok(message));
-                prop_assert_eq!(message.encode().id, packet.id);
-            }
-        }
-    }
-
-    #[test]
-    fn what_cannot_be_is_refused_with_the_value() {
-        let packet = |id, count| Packet { id: Id::from_bits(id), words: [0; WORDS], epoch: Epoch(0), count };
-        let says = |id, count| Message::decode(&packet(id, count)).unwrap_err().to_string();
-        assert_eq!(
-            says(0x005, 0),
-            "command 5 does not exist: 0 halt, 1 joints, 2 sync, 3 resume, 4 report do"
-        );
-        assert_eq!(says(0x001, 7), "command with count 7; 1 to 6 is allowed");
-        assert_eq!(says(0x200, 1), "torque from node 0, which is no cell");
-        assert_eq!(says(0x2FF, 1), "torque from node 255, which is no cell");
-        assert_eq!(says(0x201, 2), "torque with count 2; 1 is allowed");
-        assert_eq!(says(0x301, 2), "sensors page 2 does not exist");
-        assert_eq!(says(0x401, 9), "network page 9 does not exist");
-        assert_eq!(says(0x500, 0), "configure to node 0, which is no cell");
-    }
-}
+mod tests;

@@ -5,9 +5,9 @@
 //!
 //! | number | parameter | words |
 //! |---|---|---|
-//! | 0 | identity, read only | serial low, serial high, protocol version, configuration hash, state, 0 |
-//! | 1 | mount | joint k that moves the cell's link (1..=joints), joints of the robot (1..=6) |
-//! | 2 | pose in the frame of joint k | position x, y, z in m, Q1.14; outward normal x, y, z, Q1.14 |
+//! | 0 | identity, read only | serial low, serial high, protocol version, configuration hash, state, [`Abilities`] |
+//! | 1 | mount | joint k that moves the cell's link (1..=joints), joints of the chain (1..=14), row that carries the cell, rows of the chain (both 0 where each joint has one revolute row and row k carries it), torque format (0 Q3.12, 1 Q5.10, 2 Q7.8) |
+//! | 2 | pose in the frame of the row that carries the cell | position x, y, z in m, Q1.14; outward normal x, y, z, Q1.14 |
 //! | 3 | contact (Algorithm 1) | alpha_c Q3.12, alpha_p in N Q5.10, F_c,th in N Q5.10, F_p,th Q1.14, F_z,th in N Q5.10 |
 //! | 4 | timing | period of the joint broadcast in µs, unsigned |
 //! | 5 | mode, volatile | 1: obey stimuli, 0: measure |
@@ -15,23 +15,36 @@
 //! | 7 | sensing, volatile | 0: off, 1: continuous, 2: event; period in ms |
 //! | 8 | events, volatile | thresholds: contact N Q5.10, proximity Q1.14, temperature °C Q9.6, acceleration g Q3.12; hysteresis, a part of each, Q1.14 |
 //! | 9 | links_down, volatile | bit p: port p receives nothing (only in test mode) |
-//! | 16..=21 | Denavit-Hartenberg row of joint 1..=6 | a, d in m, Q1.14; alpha, theta offset in quarter turns, Q1.14 |
+//! | 16..=47 | Denavit-Hartenberg row 1..=32 | a, d in m, Q1.14; alpha, theta offset in quarter turns, Q1.14; kind (0 revolute, 1 prismatic, 2 fixed) |
 //! | 127 | commit, write only | hash that the written parameters must have |
 //!
 //! Writing changes a staged copy; a commit with the right hash takes the copy into flash and into use,
 //! all of it or nothing.
 
+mod abilities;
+mod error;
+mod rows;
 mod switches;
 
+pub use abilities::{Abilities, Ability};
+pub use error::ParameterError;
+pub use rows::{Row, RowKind};
 pub use switches::{Events, LinksDown, Reply, Sensing, Slots};
 
-use thiserror::Error;
-
-use crate::fixed::{Q1_14, Q3_12, Q5_10};
-use crate::packet::{WORDS, crc16, words};
+use crate::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
+use crate::packet::{MAX_WORDS, WORDS, crc16, words};
 
 /// The longest chain of joints.
-pub const MAX_JOINTS: usize = WORDS;
+pub const MAX_JOINTS: usize = MAX_WORDS;
+/// The most rows of a chain's table.
+pub const MAX_ROWS: usize = 32;
+/// Rows that each image has; a longer chain's rows follow them.
+const IMAGE_ROWS: usize = 6;
+/// The number of row 1.
+const FIRST_ROW: u8 = 16;
+/// The number after that of the last row.
+#[expect(clippy::cast_possible_truncation, reason = "32 rows")]
+const AFTER_ROWS: u8 = FIRST_ROW + MAX_ROWS as u8;
 
 /// The parameters' numbers in `configure` and `configured` packets.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -56,28 +69,17 @@ pub enum Parameter {
     Events,
     /// 9: the ports whose links are down, for tests.
     LinksDown,
-    /// 16 to 21: one row of the robot's table, counted from 0.
+    /// 16 to 47: one row of the chain's table, counted from 0.
     Row(u8),
     /// 127: take what was written into use.
     Commit,
 }
 
-/// The parameters that are kept in flash, in the order in which they are hashed.
-const STORED: [Parameter; 10] = [
-    Parameter::Mount,
-    Parameter::Pose,
-    Parameter::Contact,
-    Parameter::Timing,
-    Parameter::Row(0),
-    Parameter::Row(1),
-    Parameter::Row(2),
-    Parameter::Row(3),
-    Parameter::Row(4),
-    Parameter::Row(5),
-];
+/// The parameters that are kept in flash before the rows, in the order in which they are hashed.
+const STORED: [Parameter; 4] = [Parameter::Mount, Parameter::Pose, Parameter::Contact, Parameter::Timing];
 
-/// Every parameter and its number.
-const NUMBERS: [(Parameter, u8); 17] = [
+/// Every parameter that is no row, and its number.
+const NUMBERS: [(Parameter, u8); 11] = [
     (Parameter::Identity, 0),
     (Parameter::Mount, 1),
     (Parameter::Pose, 2),
@@ -88,28 +90,39 @@ const NUMBERS: [(Parameter, u8); 17] = [
     (Parameter::Sensing, 7),
     (Parameter::Events, 8),
     (Parameter::LinksDown, 9),
-    (Parameter::Row(0), 16),
-    (Parameter::Row(1), 17),
-    (Parameter::Row(2), 18),
-    (Parameter::Row(3), 19),
-    (Parameter::Row(4), 20),
-    (Parameter::Row(5), 21),
     (Parameter::Commit, 127),
 ];
 
 impl Parameter {
-    /// The parameters that are kept in flash, in the order in which they are hashed.
-    pub const STORED: [Self; 10] = STORED;
+    /// The parameters that are kept in flash for a chain of so many rows, in the order in which they are hashed.
+    pub fn stored(rows: usize) -> impl Iterator<Item = Self> {
+        let rows = rows.clamp(IMAGE_ROWS, MAX_ROWS);
+        STORED.into_iter().chain((0..).take(rows).map(Self::Row))
+    }
+
+    /// Whether it is kept in flash.
+    #[must_use]
+    pub fn is_stored(self) -> bool {
+        matches!(self, Self::Row(_)) || STORED.contains(&self)
+    }
 
     /// The parameter with this number, if there is one.
     #[must_use]
     pub fn from_number(number: u8) -> Option<Self> {
+        if (FIRST_ROW..AFTER_ROWS).contains(&number) {
+            return Some(Self::Row(number - FIRST_ROW));
+        }
         NUMBERS.iter().find(|(_, known)| *known == number).map(|(parameter, _)| *parameter)
     }
 
     /// Its number; that of a commit, which no row has, for a row that does not exist.
     #[must_use]
     pub fn number(self) -> u8 {
+        if let Self::Row(row) = self
+            && row < AFTER_ROWS - FIRST_ROW
+        {
+            return FIRST_ROW + row;
+        }
         NUMBERS.iter().find(|(known, _)| *known == self).map_or(127, |(_, number)| *number)
     }
 
@@ -139,20 +152,7 @@ impl Parameter {
     }
 }
 
-/// One row of the robot's table in standard Denavit-Hartenberg form, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Row {
-    /// Length of the link in m.
-    pub a: Q1_14,
-    /// Offset along the joint's axis in m.
-    pub d: Q1_14,
-    /// Twist in quarter turns.
-    pub alpha: Q1_14,
-    /// What is added to the joint's position, in quarter turns.
-    pub theta_offset: Q1_14,
-}
-
-/// Where a cell sits and where it points, in the frame of joint k.
+/// Where a cell sits and where it points, in the frame of the row that carries it.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Pose {
     /// Position in m.
@@ -181,82 +181,41 @@ pub struct Contact {
 pub struct Parameters {
     /// The joint k that moves the cell's link, 1 to `joints`.
     pub joint: u8,
-    /// How many joints the robot has, 1 to 6.
+    /// How many joints the chain has, 1 to 14.
     pub joints: u8,
+    /// The row that carries the cell, 1 to `table_rows`; 0, with `table_rows` 0: row k.
+    pub row: u8,
+    /// How many rows the chain has, `joints` to 32; 0: one for each joint, all of them revolute.
+    pub table_rows: u8,
+    /// How it sends its own torque.
+    pub torque_format: TorqueFormat,
     /// Where the cell sits.
     pub pose: Pose,
     /// How it feels.
     pub contact: Contact,
     /// The period of the joint broadcast in µs; joints older than this are skipped.
     pub period_us: u16,
-    /// The robot; rows beyond `joints` are zero.
-    pub rows: [Row; MAX_JOINTS],
+    /// The chain; rows beyond those in use are zero.
+    pub rows: [Row; MAX_ROWS],
 }
 
-/// Why words cannot be taken for a parameter.
-#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
-#[non_exhaustive]
-pub enum ParameterError {
-    /// No such number, or one that cannot be written this way.
-    #[error("parameter {0} cannot be written")]
-    NotWritable(u8),
-    /// The number of joints.
-    #[error("{got} joints; 1 to 6 are possible")]
-    Joints {
-        /// What was asked for.
-        got: i16,
-    },
-    /// The joint that moves the cell.
-    #[error("joint {got} does not exist; the robot has joints 1 to {joints}")]
-    Joint {
-        /// What was asked for.
-        got: i16,
-        /// How many there are.
-        joints: i16,
-    },
-    /// The normal's length.
-    #[error("the outward normal has length^2 {got} / 2^28; within 1/64 of 2^28 is allowed")]
-    Normal {
-        /// Its square, in steps of 2^-28.
-        got: i64,
-    },
-    /// A threshold below zero, or a gain.
-    #[error("word {word} of the contact parameter is {got}; it must not be negative")]
-    Negative {
-        /// Which word, from 0.
-        word: u8,
-        /// What it is.
-        got: i16,
-    },
-    /// The broadcast period.
-    #[error("a joint broadcast every 0 us is not possible")]
-    Period,
-}
+/// Bytes of the parameters of a chain of up to 6 rows, as they are hashed and kept.
+pub const IMAGE_BYTES: usize = (STORED.len() + IMAGE_ROWS) * WORDS * 2;
+/// Bytes of those of a chain of 32 rows.
+pub const MAX_IMAGE_BYTES: usize = (STORED.len() + MAX_ROWS) * WORDS * 2;
 
-impl ParameterError {
-    /// The number that stands for this error in a refusal.
-    #[must_use]
-    pub const fn code(self) -> i16 {
-        match self {
-            Self::NotWritable(_) => 1,
-            Self::Joints { .. } => 2,
-            Self::Joint { .. } => 3,
-            Self::Normal { .. } => 4,
-            Self::Negative { .. } => 5,
-            Self::Period => 6,
-        }
-    }
-}
-
-/// Bytes of the parameters as they are hashed and kept.
-pub const IMAGE_BYTES: usize = STORED.len() * WORDS * 2;
+/// The parameters as bytes: [`IMAGE_BYTES`], and 12 more for each row after the sixth.
+pub type Image = heapless::Vec<u8, MAX_IMAGE_BYTES>;
 
 impl Parameters {
     /// The words of a stored parameter; zeros for the others.
     #[must_use]
     pub fn words(&self, parameter: Parameter) -> [i16; WORDS] {
         match parameter {
-            Parameter::Mount => words([i16::from(self.joint), i16::from(self.joints)]),
+            Parameter::Mount => {
+                let format = self.torque_format.number();
+                words([self.joint, self.joints, self.row, self.table_rows, format].map(i16::from))
+            }
             Parameter::Pose => {
                 let ([x, y, z], [nx, ny, nz]) = (self.pose.position, self.pose.normal);
                 words([x, y, z, nx, ny, nz].map(Q1_14::to_bits))
@@ -269,10 +228,7 @@ impl Parameters {
                 self.contact.force_threshold.to_bits(),
             ]),
             Parameter::Timing => words([self.period_us.cast_signed()]),
-            Parameter::Row(row) => {
-                let row = self.rows.get(usize::from(row)).copied().unwrap_or_default();
-                words([row.a, row.d, row.alpha, row.theta_offset].map(Q1_14::to_bits))
-            }
+            Parameter::Row(row) => self.rows.get(usize::from(row)).copied().unwrap_or_default().words(),
             Parameter::Identity
             | Parameter::Mode
             | Parameter::Reply
@@ -286,14 +242,20 @@ impl Parameters {
     /// Takes the words of one parameter as they are; [`Parameters::check`] looks at the whole.
     ///
     /// # Errors
-    /// When the parameter is not one that is stored, or a count does not fit its byte; then nothing is changed.
+    /// When the parameter is not one that is stored, a count does not fit its byte, or there is no such kind of row or
+    /// format; then nothing is changed.
     pub fn set(&mut self, parameter: Parameter, words: [i16; WORDS]) -> Result<(), ParameterError> {
         let [w0, w1, w2, w3, w4, w5, ..] = words;
         match parameter {
             Parameter::Mount => {
                 let joints = u8::try_from(w1).map_err(|_| ParameterError::Joints { got: w1 })?;
                 let joint = u8::try_from(w0).map_err(|_| ParameterError::Joint { got: w0, joints: w1 })?;
-                (self.joint, self.joints) = (joint, joints);
+                let table_rows =
+                    u8::try_from(w3).map_err(|_| ParameterError::Rows { got: w3, joints: w1 })?;
+                let row = u8::try_from(w2).map_err(|_| ParameterError::Row { got: w2, rows: w3 })?;
+                let format = TorqueFormat::from_number(w4).ok_or(ParameterError::Format { got: w4 })?;
+                (self.joint, self.joints, self.row, self.table_rows) = (joint, joints, row, table_rows);
+                self.torque_format = format;
             }
             Parameter::Pose => {
                 self.pose = Pose {
@@ -313,12 +275,7 @@ impl Parameters {
             Parameter::Timing => self.period_us = w0.cast_unsigned(),
             Parameter::Row(number) => {
                 let unknown = ParameterError::NotWritable(parameter.number());
-                *self.rows.get_mut(usize::from(number)).ok_or(unknown)? = Row {
-                    a: Q1_14::from_bits(w0),
-                    d: Q1_14::from_bits(w1),
-                    alpha: Q1_14::from_bits(w2),
-                    theta_offset: Q1_14::from_bits(w3),
-                };
+                *self.rows.get_mut(usize::from(number)).ok_or(unknown)? = Row::from_words(number, words)?;
             }
             Parameter::Identity
             | Parameter::Mode
@@ -336,7 +293,7 @@ impl Parameters {
     /// Whether a cell can compute with this.
     ///
     /// # Errors
-    /// The first thing that is wrong: joints, the normal's length, negative gains, no period.
+    /// The first thing that is wrong: joints, the normal's length, negative gains, no period, rows.
     pub fn check(&self) -> Result<(), ParameterError> {
         let (joint, joints) = (i16::from(self.joint), i16::from(self.joints));
         if self.joints == 0 || usize::from(self.joints) > MAX_JOINTS {
@@ -357,37 +314,83 @@ impl Parameters {
         if self.period_us == 0 {
             return Err(ParameterError::Period);
         }
+        self.check_rows(joints)
+    }
+
+    /// Whether the rows have as many joints as the chain, and the row that carries the cell follows joint k.
+    fn check_rows(&self, joints: i16) -> Result<(), ParameterError> {
+        let (row, rows) = (i16::from(self.row), i16::from(self.table_rows));
+        let moving = |rows: &[Row]| rows.iter().filter(|row| row.moves()).count();
+        let table = self.table();
+        let is_short = self.table_rows == 0;
+        let has_joints = moving(table) == usize::from(self.joints);
+        if usize::from(self.table_rows) > MAX_ROWS || !has_joints || is_short && !self.is_plain() {
+            return Err(ParameterError::Rows { got: rows, joints });
+        }
+        if is_short && self.row == 0 {
+            return Ok(());
+        }
+        let below = table.get(..usize::from(self.row)).filter(|_| self.row > 0 && !is_short);
+        if below.is_none_or(|below| moving(below) != usize::from(self.joint)) {
+            return Err(ParameterError::Row { got: row, rows });
+        }
         Ok(())
     }
 
-    /// The rows in use.
-    #[must_use]
-    pub fn chain(&self) -> &[Row] {
-        self.rows.get(..usize::from(self.joint)).unwrap_or_default()
+    /// Whether each row in use is revolute.
+    fn is_plain(&self) -> bool {
+        self.table().iter().all(|row| row.kind == RowKind::Revolute)
     }
 
-    /// All stored parameters as bytes, in the order of [`Parameter::STORED`], words little endian.
+    /// The rows of the whole chain.
     #[must_use]
-    pub fn image(&self) -> [u8; IMAGE_BYTES] {
-        let mut image = [0; IMAGE_BYTES];
-        let words = STORED.iter().flat_map(|&parameter| self.words(parameter));
-        for (bytes, word) in image.as_chunks_mut::<2>().0.iter_mut().zip(words) {
-            *bytes = word.to_le_bytes();
+    pub fn table(&self) -> &[Row] {
+        let rows = if self.table_rows == 0 { self.joints } else { self.table_rows };
+        self.rows.get(..usize::from(rows)).unwrap_or_default()
+    }
+
+    /// The rows from the base to the cell.
+    #[must_use]
+    pub fn chain(&self) -> &[Row] {
+        let row = if self.row == 0 { self.joint } else { self.row };
+        self.rows.get(..usize::from(row)).unwrap_or_default()
+    }
+
+    /// These parameters with the shortest words that mean the same: no rows are named where they follow from the
+    /// joints.
+    #[must_use]
+    pub fn shortest(self) -> Self {
+        let short = Self { row: 0, table_rows: 0, ..self };
+        if self.table_rows == self.joints && self.row == self.joint && short.is_plain() {
+            short
+        } else {
+            self
         }
-        image
+    }
+
+    /// All stored parameters as bytes, in the order of [`Parameter::stored`], words little endian.
+    #[must_use]
+    pub fn image(&self) -> Image {
+        let words = Parameter::stored(self.table().len()).flat_map(|parameter| self.words(parameter));
+        words.flat_map(i16::to_le_bytes).collect()
     }
 
     /// Reads an image and checks it.
     ///
     /// # Errors
-    /// When [`Parameters::set`] or [`Parameters::check`] refuses it.
-    pub fn from_image(image: &[u8; IMAGE_BYTES]) -> Result<Self, ParameterError> {
+    /// When [`Parameters::set`] or [`Parameters::check`] refuses it, or it is longer or shorter than its rows.
+    pub fn from_image(image: &[u8]) -> Result<Self, ParameterError> {
         let mut parameters = Self::default();
-        let (words, _) = image.as_chunks::<2>();
-        for (&parameter, chunk) in STORED.iter().zip(words.as_chunks::<WORDS>().0) {
+        let mut words = image.as_chunks::<2>().0.as_chunks::<WORDS>().0.iter();
+        for parameter in Parameter::stored(MAX_ROWS) {
+            let Some(chunk) = words.next() else { break };
             parameters.set(parameter, chunk.map(i16::from_le_bytes))?;
         }
         parameters.check()?;
+        if parameters.image() != image {
+            let (rows, joints) = (parameters.table_rows.into(), parameters.joints.into());
+            return Err(ParameterError::Rows { got: rows, joints });
+        }
         Ok(parameters)
     }
 
@@ -399,82 +402,4 @@ impl Parameters {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    fn sound() -> Parameters {
-        let mut rows = [Row::default(); MAX_JOINTS];
-        rows[0] = Row { a: Q1_14::nearest(0.5), alpha: Q1_14::nearest(1.0), ..Row::default() };
-        Parameters {
-            joint: 1,
-            joints: 2,
-            pose: Pose {
-                position: [Q1_14::nearest(0.1); 3],
-                normal: [Q1_14::ZERO, Q1_14::ZERO, Q1_14::nearest(1.0)],
-            },
-            contact: Contact { alpha_c: Q3_12::nearest(1.0), ..Contact::default() },
-            period_us: 16_000,
-            rows,
-        }
-    }
-
-    #[test]
-    fn every_parameter_number_comes_back() {
-        for number in 0..=u8::MAX {
-            if let Some(parameter) = Parameter::from_number(number) {
-                assert_eq!(parameter.number(), number);
-            }
-        }
-        assert_eq!(Parameter::from_number(22), None);
-        let volatile =
-            (0..=u8::MAX).filter(|&it| Parameter::from_number(it).is_some_and(Parameter::is_volatile));
-        assert!(volatile.eq(5..=9));
-    }
-
-    #[test]
-    fn what_is_wrong_is_said() {
-        assert_eq!(sound().check(), Ok(()));
-        let wrong = Parameters { joint: 3, ..sound() };
-        assert_eq!(
-            wrong.check().unwrap_err().to_string(),
-            "joint 3 does not exist; the robot has joints 1 to 2"
-        );
-        assert!(Parameters { joints: 7, ..sound() }.check().is_err());
-        assert!(Parameters { period_us: 0, ..sound() }.check().is_err());
-        assert!(Parameters { pose: Pose::default(), ..sound() }.check().is_err());
-        let contact = Contact { force_threshold: Q5_10::from_bits(-1), ..Contact::default() };
-        assert_eq!(
-            Parameters { contact, ..sound() }.check(),
-            Err(ParameterError::Negative { word: 4, got: -1 })
-        );
-    }
-
-    #[test]
-    fn the_hash_sees_every_word() {
-        let hash = sound().hash();
-        for parameter in Parameter::STORED {
-            let mut other = sound();
-            let mut words = other.words(parameter);
-            words[0] ^= 1;
-            other.set(parameter, words).unwrap();
-            assert_ne!(other.hash(), hash, "{parameter:?}");
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn an_image_comes_back(k in 1_u8..=6, words in any::<[[i16; 4]; 6]>(), period_us in 1_u16..) {
-            let mut target = Parameters { joint: k, joints: 6, period_us, ..sound() };
-            for (row, [a, d, alpha, offset]) in target.rows.iter_mut().zip(words) {
-                *row = Row { a: Q1_14::from_bits(a), d: Q1_14::from_bits(d), alpha: Q1_14::from_bits(alpha), theta_offset: Q1_14::from_bits(offset) };
-            }
-            prop_assert_eq!(Parameters::from_image(&target.image()), Ok(target));
-        }
-
-        #[test]
-        fn no_image_panics(bytes in proptest::collection::vec(any::<u8>(), IMAGE_BYTES)) {
-            let _ = Parameters::from_image(bytes.as_slice().try_into().unwrap());
-        }
-    }
-}
+mod tests;

@@ -2,11 +2,13 @@
 
 use serde::Deserialize;
 
-use crate::fixed::Q1_14;
-use crate::packet::WORDS;
+use crate::fixed::{Q1_14, TorqueFormat};
+use crate::packet::{MAX_WORDS, WORDS};
 
+/// Bytes of the words of a packet of six.
+const WORD_BYTES: usize = 2 * WORDS;
 /// The byte that counts the joints in use.
-const COUNT: usize = 2 * WORDS + 1;
+const COUNT: usize = WORD_BYTES + 1;
 
 /// What a field's bits are.
 #[derive(Clone, Debug, Default, Deserialize, PartialEq)]
@@ -31,6 +33,8 @@ pub enum Format {
     Threshold(u32),
     /// The same, where the largest and the smallest word mean *saturated*.
     Saturating(u32),
+    /// The same, with as many fraction bits as the torque format of the bus.
+    Torque,
     /// The sum of three neighbouring words with so many fraction bits; no field of its own.
     Total(u32),
     /// A word in quarter turns, shown in rad.
@@ -105,6 +109,8 @@ pub struct Field {
     when: Option<[u16; 2]>,
     /// What becomes of it otherwise.
     pub absent: Absent,
+    /// Whether it may be left out where it is written: 0 then.
+    pub optional: bool,
     /// What may be written, beyond the format and the range.
     pub allowed: String,
     /// What it means, in one line.
@@ -130,6 +136,7 @@ impl Field {
             Format::Word | Format::Hex | Format::State | Format::Group(_) => (16, 0, false),
             Format::Signed | Format::Choice | Format::Reason => (16, 0, true),
             Format::Angle | Format::Position => (16, 14, true),
+            Format::Torque => (16, TorqueFormat::default().fraction(), true),
             Format::Fixed(fraction)
             | Format::Threshold(fraction)
             | Format::Saturating(fraction)
@@ -161,9 +168,17 @@ impl Field {
         if self.labels.is_empty() { 1 } else { self.labels.len() }
     }
 
-    /// The bits of one element in a packet's bytes, with their sign; 0 of what is not there.
+    /// Whether it has as many elements as its packet has words.
+    #[must_use]
+    pub fn grows(&self) -> bool {
+        self.labels.len() == MAX_WORDS
+    }
+
+    /// The bits of one element in [`crate::packet::Packet::fields`], with their sign; 0 of what is not there.
     #[must_use]
     pub fn raw(&self, bytes: &[u8], element: usize) -> i64 {
+        // Epoch and count stand after the sixth word.
+        let element = element + usize::from(element >= WORDS);
         let (at, width) = (self.at() + element * 16, u32::from(self.width()));
         let there = bytes.get(at / 8..).unwrap_or_default();
         let all = there.iter().take(5).rev().fold(0_u64, |all, &byte| all << 8 | u64::from(byte));
@@ -187,11 +202,14 @@ impl Field {
         (0..3).map(|element| self.real(self.raw(bytes, element))).sum()
     }
 
-    /// The elements that mean something: of positions those of the joints in use, of all others each.
+    /// The elements that mean something: of positions those of the joints in use, of what grows the words of the
+    /// packet, of all others each.
     #[must_use]
     pub fn elements_in(&self, bytes: &[u8]) -> usize {
+        let there = bytes.len().saturating_sub(WORD_BYTES + 2) / 2 + WORDS;
         match bytes.get(COUNT) {
             Some(&in_use) if self.format == Format::Position => self.elements().min(usize::from(in_use)),
+            Some(_) | None if self.grows() => there,
             Some(_) | None => self.elements(),
         }
     }
@@ -211,7 +229,7 @@ impl Field {
     /// Whether its ends mean *saturated*.
     #[must_use]
     pub fn is_saturating(&self) -> bool {
-        matches!(self.format, Format::Saturating(_))
+        matches!(self.format, Format::Saturating(_) | Format::Torque)
     }
 
     /// Whether it is there, in these bytes of a packet whose layout begins with this field.

@@ -64,6 +64,8 @@ struct Schema {
 pub struct Part {
     /// It is there while a number lies within these bounds, which are inclusive.
     pub when: [u16; 2],
+    /// The field whose number that is; by default the one that selects a part.
+    pub of: Option<String>,
     /// What it is made of.
     pub pieces: Vec<Piece>,
 }
@@ -121,12 +123,14 @@ impl<'de> Deserialize<'de> for Part {
         enum Either {
             Always(String),
             Within(u16, u16, String),
+            Of(String, u16, u16, String),
         }
-        let (when, text) = match Either::deserialize(deserializer)? {
-            Either::Always(text) => (ALWAYS, text),
-            Either::Within(min, max, text) => ([min, max], text),
+        let (when, of, text) = match Either::deserialize(deserializer)? {
+            Either::Always(text) => (ALWAYS, None, text),
+            Either::Within(min, max, text) => ([min, max], None, text),
+            Either::Of(field, min, max, text) => ([min, max], Some(field), text),
         };
-        Ok(Self { when, pieces: Piece::all(&text) })
+        Ok(Self { when, of, pieces: Piece::all(&text) })
     }
 }
 

@@ -52,7 +52,7 @@ pub fn layout(message: &Message, packet: &Packet) -> &'static Layout {
     }
     let is_refusal = packet.id.kind == Kind::Configured && number == REFUSED;
     if matches!(packet.id.kind, Kind::Configure | Kind::Configured) && !is_refusal {
-        return value(number, packet.words);
+        return value(number, packet.words.six());
     }
     let layouts = PacketSchema::of(packet.id).map_or(&[][..], |schema| &schema.layouts);
     layouts.iter().find(|layout| layout.number == number).unwrap_or_else(file::empty)

@@ -1,7 +1,7 @@
 //! The file holds together.
 
 use super::*;
-use crate::packet::{BYTES, Epoch};
+use crate::packet::{Epoch, MAX_WORDS};
 
 /// Every layout with what belongs to it in bytes 12 and 13.
 fn all() -> impl Iterator<Item = (&'static [Field], &'static Layout)> {
@@ -14,11 +14,12 @@ fn all() -> impl Iterator<Item = (&'static [Field], &'static Layout)> {
 #[test]
 fn fields_stand_side_by_side_within_the_packet() {
     for (end, layout) in all() {
-        let mut taken = [false; BYTES * 8 - 16];
+        let mut taken = [false; MAX_WORDS * 16 + 16];
         let real = |field: &&Field| !matches!(field.format, Format::Total(_));
         for field in end.iter().chain(&layout.fields).filter(real) {
             for element in 0..field.elements() {
-                let at = field.at() + element * 16;
+                // Epoch and count stand after the sixth word.
+                let at = field.at() + (element + usize::from(element >= 6)) * 16;
                 for bit in &mut taken[at..at + usize::from(field.width())] {
                     assert!(!*bit, "{} {}", layout.name, field.name);
                     *bit = true;
@@ -57,7 +58,7 @@ fn texts_name_fields_that_are_there() {
 #[test]
 fn whatever_is_a_message_has_a_layout() {
     for (bits, count) in (0..0x800).flat_map(|bits| (0..=u8::MAX).map(move |count| (bits, count))) {
-        let packet = Packet { id: Id::from_bits(bits), words: [0; WORDS], epoch: Epoch(0), count };
+        let packet = Packet { id: Id::from_bits(bits), words: Default::default(), epoch: Epoch(0), count };
         let Ok(message) = Message::decode(&packet) else { continue };
         let packet = message.encode();
         let layout = layout(&message, &packet);

@@ -3,15 +3,16 @@
 use std::collections::HashSet;
 
 use super::check::Checked;
-use super::{Bus, Reply, raw, sensing};
+use super::{Bus, JointKind, Reply, Robot, raw, sensing};
 use crate::can::Format;
 use crate::document::Place;
+use crate::fixed::TorqueFormat;
 use crate::wire_time::BitRates;
 
 /// Buses of a skin.
 const BUSES: usize = 64;
 
-pub(super) fn buses(raw: &[raw::Bus]) -> Checked<Vec<Bus>> {
+pub(super) fn buses(raw: &[raw::Bus], robot: &Robot) -> Checked<Vec<Bus>> {
     if raw.is_empty() {
         return Err(Place::named("bus").fault("[]", "at least one bus is needed"));
     }
@@ -34,9 +35,37 @@ pub(super) fn buses(raw: &[raw::Bus]) -> Checked<Vec<Bus>> {
         let format =
             at.key("format").word(&bus.format, &[("fd", Format::Fd), ("classic", Format::Classic)])?;
         let (bitrate, data_bitrate) = bit_rates(&at, bus, format)?;
-        Ok(Bus { name, reply, format, bitrate, data_bitrate, sensing: sensing::of_bus(&at, bus)? })
+        let chain = chain(&at, bus, robot)?;
+        let torque_format = torque_format(&at, bus, robot, chain)?;
+        let sensing = sensing::of_bus(&at, bus)?;
+        Ok(Bus { name, reply, format, chain, torque_format, bitrate, data_bitrate, sensing })
     };
     raw.iter().enumerate().map(bus).collect()
+}
+
+/// The chain that a bus names; it need not name the only one.
+fn chain(at: &Place, bus: &raw::Bus, robot: &Robot) -> Checked<usize> {
+    let names =
+        || robot.chains.iter().map(|chain| format!("{:?}", chain.name)).collect::<Vec<_>>().join(", ");
+    let at = at.key("chain");
+    match &bus.chain {
+        Some(name) => robot.chains.iter().position(|chain| chain.name == *name).ok_or_else(|| {
+            at.fault(format_args!("{name:?}"), format_args!("no such chain; there is {}", names()))
+        }),
+        None if robot.chains.len() == 1 => Ok(0),
+        None => Err(at.fault("", format_args!("which chain? there is {}", names()))),
+    }
+}
+
+/// In which format its cells send their own torques: the finest, but where a joint slides 8 N would be no push.
+fn torque_format(at: &Place, bus: &raw::Bus, robot: &Robot, chain: usize) -> Checked<TorqueFormat> {
+    if let Some(name) = &bus.torque_format {
+        let formats = TorqueFormat::ALL.map(|format| (format.name(), format));
+        return at.key("torque_format").word(name, &formats);
+    }
+    let joints = robot.chains.get(chain).map_or(&[][..], |chain| &chain.joints);
+    let slides = |&joint: &usize| robot.joints.get(joint).is_some_and(|it| it.kind == JointKind::Prismatic);
+    Ok(if joints.iter().any(slides) { TorqueFormat::Q5_10 } else { TorqueFormat::Q3_12 })
 }
 
 /// What the cells of a bus answer with.

@@ -3,6 +3,7 @@
 use std::collections::HashMap;
 
 use super::check::Checked;
+use super::reach::{REACH, reach};
 use super::{Bus, Cell, Robot, raw};
 use crate::document::Place;
 use crate::fixed::Q;
@@ -11,8 +12,6 @@ use crate::parameters::Contact;
 
 /// How far a quaternion's length may be from one.
 const UNIT_TOLERANCE: f64 = 1e-3;
-/// Metres that words in Q1.14 can hold, less some steps for what a chain of roundings adds.
-const REACH: f64 = 2.0 - 1e-3;
 
 pub(super) fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Contact) -> Checked<Vec<Cell>> {
     let mut taken = HashMap::new();
@@ -77,14 +76,13 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Contact
     let node = CellId::new(raw.node);
     let why = "a cell's node is 1 to 254; further cells need another bus";
     let node = node.map_err(|_| at.key("node").fault(raw.node, why))?;
-    let joints = robot.joints.len();
-    let joint = u8::try_from(raw.joint).ok().filter(|&joint| joint > 0 && usize::from(joint) <= joints);
-    let why = format_args!("the robot has joints 1 to {joints}");
-    let joint = joint.ok_or_else(|| at.key("joint").fault(raw.joint, why))?;
+    let (joint, row) = place(at, raw, robot, buses.get(bus).map_or(0, |bus| bus.chain))?;
     for (axis, &value) in raw.position.iter().enumerate() {
         at.key("position").nth(axis).finite(value)?;
     }
-    let reach = reach(robot, joint, raw.position);
+    let chain = buses.get(bus).and_then(|bus| robot.chains.get(bus.chain));
+    let rows = chain.and_then(|chain| chain.rows.get(..usize::from(row))).unwrap_or_default();
+    let reach = reach(rows, raw.position);
     if reach >= REACH {
         let [x, y, z] = raw.position;
         let why = format!(
@@ -106,6 +104,7 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Contact
         node,
         serial: at.key("serial").within(serial, 0..=u32::MAX, "")?,
         joint,
+        row,
         position: raw.position,
         normal: normal(at, raw)?,
         neighbors,
@@ -129,6 +128,32 @@ pub(super) fn contact(at: &Place, raw: raw::Contact, base: Contact) -> Checked<C
 /// A cell that is given no serial number gets one that no other such cell gets.
 fn default_serial(bus: usize, node: CellId) -> i64 {
     i64::try_from(bus).unwrap_or(0) * 1_000 + i64::from(node.get())
+}
+
+/// The joint that moves a cell, and the row that carries it: one of them need be said.
+fn place(at: &Place, raw: &raw::Cell, robot: &Robot, chain: usize) -> Checked<(u8, u8)> {
+    let Some(chain) = robot.chains.get(chain) else { return Ok((0, 0)) };
+    let (joints, rows) = (chain.joints.len(), chain.rows.len());
+    let within = |key, got: i64, max: usize, what: &str| {
+        let number = u8::try_from(got).ok().filter(|&it| it > 0 && usize::from(it) <= max);
+        number.ok_or_else(|| at.key(key).fault(got, format_args!("{what} 1 to {max}")))
+    };
+    let joint = raw.joint.map(|got| within("joint", got, joints, "the robot has joints")).transpose()?;
+    let row = raw.row.map(|got| within("row", got, rows, "its chain has rows")).transpose()?;
+    match (joint, row) {
+        (None, None) => Err(at
+            .key("joint")
+            .fault("", format_args!("which joint moves the cell? there are 1 to {joints}"))),
+        (Some(joint), None) => Ok((joint, chain.row_of(joint).unwrap_or_default())),
+        (given, Some(row)) => match chain.joint_below(row) {
+            0 => Err(at.key("row").fault(row, "no joint moves what this row carries")),
+            joint if given.is_none_or(|given| given == joint) => Ok((joint, row)),
+            joint => {
+                let why = format!("this row is moved by joint {joint}: leave the joint out, or correct it");
+                Err(at.key("row").fault(row, why))
+            }
+        },
+    }
 }
 
 /// The bus that a cell names; it need not name the only one.
@@ -169,16 +194,4 @@ fn unit<const N: usize>(at: &Place, what: &str, parts: [f64; N]) -> Checked<[f64
         return Err(at.fault(format_args!("[{got}]"), why));
     }
     Ok(parts.map(|part| part / length))
-}
-
-/// The farthest that a cell can come from the origin of any frame below it (of the base: from its
-/// axis), whatever the joints do: the lengths of the links, added up. No moment of a unit force that a
-/// kernel meets on its way is greater.
-fn reach(robot: &Robot, joint: u8, position: [f64; 3]) -> f64 {
-    let mut reach = position.iter().map(|x| x * x).sum::<f64>().sqrt();
-    for (index, row) in robot.joints.iter().enumerate().take(usize::from(joint)).rev() {
-        // The first joint's offset lies along its own axis, to which it adds no distance.
-        reach += if index == 0 { row.a.abs() } else { row.a.hypot(row.d) };
-    }
-    reach
 }

@@ -1,12 +1,10 @@
 //! From the file's words to checked types.
 
-use core::f64::consts::TAU;
-
 use super::{Cell, buses, cells};
-use super::{Controller, ControllerKind, LostBus, Reply, Robot, Safety, Skin, Timing, raw, sensing};
+use super::{Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing, raw, robot, sensing};
 use crate::document::{Fault, Place};
-use crate::fixed::{Q, Q1_14};
-use crate::parameters::{Contact, MAX_JOINTS};
+use crate::fixed::Q;
+use crate::parameters::Contact;
 
 pub(super) type Checked<T> = Result<T, Fault>;
 
@@ -14,13 +12,13 @@ pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
     if raw.version != 1 {
         return Err(Place::named("version").fault(raw.version, "this program reads version 1"));
     }
-    let robot = robot(raw.robot)?;
+    let robot = robot::robot(raw.robot)?;
     let timing = timing(&raw.timing)?;
     // The default for a skin without contacts: the force is the sum of the three words.
     let plain = Contact { alpha_c: Q::nearest(1.0), ..Contact::default() };
     let contact = cells::contact(&Place::named("contact"), raw.contact, plain)?;
     let events = sensing::events(raw.events)?;
-    let buses = buses::buses(&raw.bus)?;
+    let buses = buses::buses(&raw.bus, &robot)?;
     let controller = controller(raw.controller, robot.joints.len())?;
     let safety = safety(&raw.safety)?;
     let cells = cells::cells(&raw.cell, &robot, &buses, contact)?;
@@ -77,34 +75,7 @@ fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> 
     Err(at.key("slot_us").fault(slot_us, why))
 }
 
-fn robot(raw: raw::Robot) -> Checked<Robot> {
-    let at = Place::named("robot");
-    let count = raw.joints.len();
-    if count == 0 || count > MAX_JOINTS {
-        return Err(at
-            .key("joints")
-            .fault(format_args!("{count} joints"), "a robot has 1 to 6 revolute joints"));
-    }
-    for (index, joint) in raw.joints.iter().enumerate() {
-        let at = at.key("joints").nth(index);
-        at.key("a").fit(joint.a, Q1_14::try_nearest)?;
-        at.key("d").fit(joint.d, Q1_14::try_nearest)?;
-        at.key("alpha").finite(joint.alpha)?;
-        at.key("theta_offset").finite(joint.theta_offset)?;
-    }
-    let limits_rad = raw.limits_rad.unwrap_or_else(|| vec![[-TAU, TAU]; count]);
-    same_length(&at.key("limits_rad"), limits_rad.len(), count)?;
-    for (index, [min, max]) in limits_rad.iter().enumerate() {
-        // Written so that NaN is refused too.
-        if !(min.is_finite() && max.is_finite() && min < max) {
-            let (got, why) = (format!("[{min}, {max}]"), "the smaller position comes first");
-            return Err(at.key("limits_rad").nth(index).fault(got, why));
-        }
-    }
-    Ok(Robot { name: raw.name, joints: raw.joints, limits_rad })
-}
-
-fn same_length(at: &Place, got: usize, joints: usize) -> Checked<()> {
+pub(super) fn same_length(at: &Place, got: usize, joints: usize) -> Checked<()> {
     if got == joints {
         return Ok(());
     }
@@ -162,7 +133,15 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
         let why = "the path of a Unix socket is needed with kind = \"external\"";
         ControllerKind::External { socket: raw.socket.ok_or_else(|| at.key("socket").fault("", why))? }
     };
-    Ok(Controller { kind, max_speed_rad_s: each_or("max_speed_rad_s", raw.max_speed_rad_s, 2.0)? })
+    let max_speed = match (raw.max_speed, raw.max_speed_rad_s) {
+        (Some(_), Some(_)) => {
+            let why = "the former name of max_speed: give one of them";
+            return Err(at.key("max_speed_rad_s").fault("", why));
+        }
+        (None, Some(former)) => each_positive("max_speed_rad_s", former)?,
+        (given, None) => each_or("max_speed", given, 2.0)?,
+    };
+    Ok(Controller { kind, max_speed })
 }
 
 fn safety(raw: &raw::Safety) -> Checked<Safety> {

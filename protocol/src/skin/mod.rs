@@ -7,19 +7,22 @@ mod buses;
 mod cells;
 mod check;
 mod raw;
+mod reach;
+mod robot;
 pub mod sensing;
 mod wires;
 
 use std::path::Path;
 
-use serde::Deserialize;
-
 use crate::can::Format;
 use crate::document::{self, DocumentError};
-use crate::fixed::Q1_14;
+use crate::fixed::{Q1_14, TorqueFormat};
 use crate::id::CellId;
+use crate::packet::Length;
 use crate::parameters::{Contact, Events, Parameters, Pose, Row, Sensing};
 
+pub use reach::{REACH, reach};
+pub use robot::{Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;
 
 /// The keys by which a skin is known from a scenario, and the other way round.
@@ -46,31 +49,6 @@ pub struct Skin {
     pub safety: Safety,
     /// The cells, in the file's order.
     pub cells: Vec<Cell>,
-}
-
-/// A chain of revolute joints.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Robot {
-    /// Its name.
-    pub name: String,
-    /// Standard Denavit-Hartenberg rows, base to tip; 1 to 6 of them.
-    pub joints: Vec<DenavitHartenberg>,
-    /// Minimum and maximum position of each joint in rad.
-    pub limits_rad: Vec<[f64; 2]>,
-}
-
-/// One row of the robot's table, `Rz(theta + theta_offset) Tz(d) Tx(a) Rx(alpha)`; what is not said is 0.
-#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq)]
-#[serde(deny_unknown_fields, default)]
-pub struct DenavitHartenberg {
-    /// Length of the link in m.
-    pub a: f64,
-    /// Twist in rad.
-    pub alpha: f64,
-    /// Offset along the joint's axis in m.
-    pub d: f64,
-    /// What is added to the joint's position, in rad.
-    pub theta_offset: f64,
 }
 
 /// How often things happen.
@@ -100,7 +78,7 @@ impl Timing {
 /// What a bus' cells answer with.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Reply {
-    /// Each cell its own torque, Q3.12.
+    /// Each cell its own torque, in the bus' [`Bus::torque_format`].
     Torque,
     /// Sums along the tree, Q7.8.
     Sum {
@@ -118,8 +96,12 @@ pub struct Bus {
     pub name: String,
     /// What its cells answer with.
     pub reply: Reply,
-    /// One FD frame a packet, or two classic ones.
+    /// One FD frame a packet, or several classic ones.
     pub format: Format,
+    /// The chain whose skin it carries: an index into [`Robot::chains`].
+    pub chain: usize,
+    /// In which format its cells send their own torques.
+    pub torque_format: TorqueFormat,
     /// Bits in a second, of hardware; of an FD frame's head and tail.
     pub bitrate: Option<u32>,
     /// Bits in a second of an FD frame's data, of hardware.
@@ -133,8 +115,8 @@ pub struct Bus {
 pub struct Controller {
     /// Which one.
     pub kind: ControllerKind,
-    /// The maximum speed of each joint in rad/s.
-    pub max_speed_rad_s: Vec<f64>,
+    /// The maximum speed of each joint in rad/s, of prismatic ones in m/s.
+    pub max_speed: Vec<f64>,
 }
 
 /// Which controller.
@@ -142,9 +124,9 @@ pub struct Controller {
 pub enum ControllerKind {
     /// `M q'' + D q' = tau`, joint by joint: who pushes the skin moves the arm.
     Kinesthetic {
-        /// M in kg m2.
+        /// M in kg m2, of prismatic joints in kg.
         inertia: Vec<f64>,
-        /// D in Nm s/rad.
+        /// D in Nm s/rad, of prismatic joints in N s/m.
         damping: Vec<f64>,
     },
     /// Somebody else's program behind a Unix datagram socket.
@@ -198,11 +180,13 @@ pub struct Cell {
     pub node: CellId,
     /// Its serial number.
     pub serial: u32,
-    /// The joint k that moves the link it sits on, from 1.
+    /// The joint k of its chain that moves the link it sits on, from 1.
     pub joint: u8,
-    /// Position in the frame of joint k, in m.
+    /// The row of its chain in whose frame it sits, from 1: that of joint k, or a fixed one after it.
+    pub row: u8,
+    /// Position in the frame of that row, in m.
     pub position: [f64; 3],
-    /// Outward normal in the frame of joint k: the cell's z axis.
+    /// Outward normal in the same frame: the cell's z axis.
     pub normal: [f64; 3],
     /// What is wired to its ports.
     pub neighbors: [Option<CellId>; 4],
@@ -239,9 +223,13 @@ impl Skin {
     }
 
     fn try_parameters(&self, cell: &Cell) -> Option<Parameters> {
+        let chain = self.chain(cell.bus);
         let mut parameters = Parameters {
             joint: cell.joint,
-            joints: u8::try_from(self.robot.joints.len()).ok()?,
+            joints: u8::try_from(chain.joints.len()).ok()?,
+            row: cell.row,
+            table_rows: u8::try_from(chain.rows.len()).ok()?,
+            torque_format: self.buses.get(cell.bus)?.torque_format,
             pose: Pose {
                 position: cell.position.map(Q1_14::nearest),
                 normal: cell.normal.map(Q1_14::nearest),
@@ -250,15 +238,40 @@ impl Skin {
             period_us: self.period_us()?,
             ..Parameters::default()
         };
-        for (row, joint) in parameters.rows.iter_mut().zip(&self.robot.joints) {
-            *row = Row {
-                a: Q1_14::nearest(joint.a),
-                d: Q1_14::nearest(joint.d),
-                alpha: Q1_14::from_radians(joint.alpha)?,
-                theta_offset: Q1_14::from_radians(joint.theta_offset)?,
+        for (word, &ChainRow { kind, table, .. }) in parameters.rows.iter_mut().zip(&chain.rows) {
+            *word = Row {
+                kind,
+                a: Q1_14::nearest(table.a),
+                d: Q1_14::nearest(table.d),
+                alpha: Q1_14::from_radians(table.alpha)?,
+                theta_offset: Q1_14::from_radians(table.theta_offset)?,
             };
         }
-        Some(parameters)
+        Some(parameters.shortest())
+    }
+
+    /// The chain of a bus, given as an index into [`Skin::buses`].
+    #[must_use]
+    #[expect(clippy::missing_panics_doc, reason = "each bus of a checked skin has a chain")]
+    pub fn chain(&self, bus: usize) -> &Chain {
+        let chain = self.buses.get(bus).map_or(0, |bus| bus.chain);
+        self.robot.chains.get(chain).expect("a checked skin has the chains of its buses")
+    }
+
+    /// The joints of a bus' chain, base to tip, each with its index into [`Robot::joints`].
+    pub fn joints_of(&self, bus: usize) -> impl ExactSizeIterator<Item = (usize, &Joint)> {
+        self.chain(bus).joints.iter().map(|&joint| (joint, self.joint(joint)))
+    }
+
+    #[expect(clippy::expect_used, reason = "each chain of a checked skin has joints of the robot")]
+    fn joint(&self, joint: usize) -> &Joint {
+        self.robot.joints.get(joint).expect("a checked skin has the joints of its chains")
+    }
+
+    /// How long joints, torques and sums on a bus are.
+    #[must_use]
+    pub fn length_of(&self, bus: usize) -> Length {
+        Length::for_joints(self.chain(bus).joints.len())
     }
 
     /// From one broadcast of joints to the next, in µs; `None` for more than a word holds.

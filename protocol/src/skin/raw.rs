@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use super::{DenavitHartenberg, LostBus};
+use super::{DenavitHartenberg, JointKind, LostBus};
 use crate::can::Format;
 
 #[derive(Debug, Deserialize)]
@@ -45,8 +45,44 @@ fn one_bus() -> Vec<Bus> {
 pub(super) struct Robot {
     #[serde(default = "robot")]
     pub(super) name: String,
-    pub(super) joints: Vec<DenavitHartenberg>,
+    pub(super) urdf: Option<String>,
+    pub(super) joints: Option<Vec<DenavitHartenberg>>,
     pub(super) limits_rad: Option<Vec<[f64; 2]>>,
+    #[serde(default)]
+    pub(super) joint: Vec<Joint>,
+    #[serde(default)]
+    pub(super) chain: Vec<Chain>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Joint {
+    pub(super) name: String,
+    #[serde(default = "revolute")]
+    pub(super) kind: String,
+    pub(super) limits: Option<[f64; 2]>,
+}
+
+fn revolute() -> String {
+    JointKind::Revolute.name().to_owned()
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Chain {
+    pub(super) name: String,
+    pub(super) rows: Vec<Row>,
+}
+
+/// A row of a chain; without a joint it is fixed.
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct Row {
+    pub(super) joint: Option<String>,
+    pub(super) a: f64,
+    pub(super) alpha: f64,
+    pub(super) d: f64,
+    pub(super) theta_offset: f64,
 }
 
 fn robot() -> String {
@@ -84,6 +120,8 @@ pub(super) struct Bus {
     pub(super) name: String,
     pub(super) reply: String,
     pub(super) format: String,
+    pub(super) chain: Option<String>,
+    pub(super) torque_format: Option<String>,
     pub(super) slot_us: Option<i64>,
     pub(super) carry: Option<bool>,
     pub(super) bitrate: Option<i64>,
@@ -98,6 +136,8 @@ impl Default for Bus {
             name: "vcan0".to_owned(),
             reply: "torque".to_owned(),
             format: Format::Fd.name().to_owned(),
+            chain: None,
+            torque_format: None,
             slot_us: None,
             carry: None,
             bitrate: None,
@@ -125,6 +165,7 @@ pub(super) struct Controller {
     pub(super) kind: String,
     pub(super) inertia: Option<Vec<f64>>,
     pub(super) damping: Option<Vec<f64>>,
+    pub(super) max_speed: Option<Vec<f64>>,
     pub(super) max_speed_rad_s: Option<Vec<f64>>,
     pub(super) socket: Option<String>,
 }
@@ -132,7 +173,7 @@ pub(super) struct Controller {
 impl Default for Controller {
     fn default() -> Self {
         let kind = "kinesthetic".to_owned();
-        Self { kind, inertia: None, damping: None, max_speed_rad_s: None, socket: None }
+        Self { kind, inertia: None, damping: None, max_speed: None, max_speed_rad_s: None, socket: None }
     }
 }
 
@@ -158,7 +199,8 @@ pub(super) struct Cell {
     pub(super) bus: Option<String>,
     pub(super) node: i64,
     pub(super) serial: Option<i64>,
-    pub(super) joint: i64,
+    pub(super) joint: Option<i64>,
+    pub(super) row: Option<i64>,
     pub(super) position: [f64; 3],
     pub(super) orientation: Option<[f64; 4]>,
     pub(super) normal: Option<[f64; 3]>,

@@ -162,6 +162,16 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
 }
 
 #[test]
+fn a_robot_may_say_where_its_urdf_is() {
+    assert_eq!(Skin::parse("skin.toml", GOOD).unwrap().robot.urdf, None);
+    let with = GOOD.replacen("name = \"elbow\"\n", "name = \"elbow\"\nurdf = \"../elbow.urdf\"\n", 1);
+    let skin = Skin::parse("skin.toml", &with).unwrap();
+    assert_eq!(skin.robot.urdf.as_deref(), Some("../elbow.urdf"));
+    let said = says("name = \"elbow\"", "name = \"elbow\"\nurdf = \"\"");
+    assert_eq!(said, "skin.toml:6: robot.urdf = \"\": the path of a file, from the skin's file");
+}
+
+#[test]
 fn a_wire_has_two_ends() {
     assert_eq!(
         says("neighbors = [2, 0, 0, 0]", "neighbors = [2, 2, 0, 0]"),
@@ -269,7 +279,7 @@ fn a_broken_file_says_where_in_one_line() {
     let error = says("joint = 2", "joint = \"two\"");
     assert_eq!(error, "skin.toml:33: cell[0].joint = \"two\": a whole number is needed");
     for (from, to, said) in [
-        ("joint = 2\n", "", "skin.toml:30: cell[0]: key `joint` is missing"),
+        ("joint = 2\n", "", "skin.toml:30: cell[0].joint: which joint moves the cell? there are 1 to 2"),
         ("joint = 2", "joint = 2.5", "skin.toml:33: cell[0].joint = 2.5: a whole number is needed"),
         ("control_hz = 500.0", "control_hz = \"500\"", "timing.control_hz = \"500\": a number is needed"),
         ("[[bus]]", "[bus]", "bus: it is a list of tables: write [[bus]]"),

@@ -94,16 +94,22 @@ def numbers(words, bits):
     return ",".join(number(word, bits) for word in words)
 
 
+def words_for(joints):
+    """How many words joints, torques and sums of a chain have."""
+    return next(words for words in (6, 8, 10, 14) if words >= joints)
+
+
 class Packet:
-    """Sixteen bytes under an identifier."""
+    """Sixteen bytes under an identifier; 20, 24 or 32 of a longer chain's joints, torques and sums."""
 
     def __init__(self, meaning, kind, node, words=(), epoch=0, count=0):
         self.meaning, self.id = meaning, kind << 8 | node
-        self.words = (list(words) + [0] * 6)[:6]
+        self.words = list(words)
+        self.words += [0] * (words_for(len(self.words)) - len(self.words))
         self.epoch, self.count = epoch, count
 
     def body(self):
-        return struct.pack("<6hBB", *self.words, self.epoch, self.count)
+        return struct.pack(f"<{len(self.words)}hBB", *self.words, self.epoch, self.count)
 
     def crc(self):
         return crc16(struct.pack("<H", self.id) + self.body())
@@ -115,8 +121,8 @@ class Packet:
         return f"{self.id:03X}##{flags:X}{self.bytes().hex().upper()}"
 
     def segments(self):
-        data = self.bytes().hex().upper()
-        return f"{self.id:03X}#{data[:16]}", f"{self.id:03X}#{data[16:]}"
+        data = self.bytes()
+        return [f"{self.id:03X}#{data[at : at + 8].hex().upper()}" for at in range(0, len(data), 8)]
 
 
 # --- Messages ------------------------------------------------------------------------------------
@@ -245,8 +251,11 @@ def identity():
     return 0, "", []
 
 
-def mount(joint, of):
-    return 1, f"joint={joint} joints={of}", [joint, of]
+def mount(joint, of, row=0, rows=0, torque_format=0):
+    text = f"joint={joint} joints={of}"
+    if row or rows or torque_format:
+        text += f" row={row} rows={rows} torque_format={torque_format}"
+    return 1, text, [joint, of, row, rows, torque_format]
 
 
 def pose(position, normal):
@@ -312,13 +321,20 @@ def links_down(*deaf):
     return 9, f"deaf={'+'.join(map(str, deaf)) or 'none'}", [sum(1 << port for port in deaf)]
 
 
-def row(joint, a, d, alpha, theta_offset):
-    words = [nearest(a, LENGTH), nearest(d, LENGTH), angle(alpha), angle(theta_offset)]
+def row(number_of_row, a, d, alpha, theta_offset, kind="revolute"):
+    words = [nearest(a, LENGTH), nearest(d, LENGTH), angle(alpha), angle(theta_offset), KINDS.index(kind)]
     text = (
         f"a={number(words[0], LENGTH)} d={number(words[1], LENGTH)}"
         f" alpha={number(words[2], ANGLE)} theta_offset={number(words[3], ANGLE)}"
     )
-    return 15 + joint, text, words
+    if kind != "revolute":
+        text += f" kind={kind}"
+    return 15 + number_of_row, text, words
+
+
+KINDS = ("revolute", "prismatic", "fixed")
+# What a cell of this version can: joints, rows, prismatic and fixed rows, torques in Q5.10 and Q7.8.
+ABILITIES = 14 | 32 << 4 | 1 << 10 | 1 << 11 | 1 << 12 | 1 << 13
 
 
 def commit(value):
@@ -535,6 +551,15 @@ def fd():
         joints(2, [8192, -8192, 100, 0, 0, 0], in_use=3),
     )
     log.put(*(joints(epoch(), words()) for _ in range(3)))
+    long_words = lambda count: [rng.randint(MIN, MAX) for _ in range(count)]
+    log.title("joints of longer chains: 8, 10 and 14 words")
+    for count in range(7, 15):
+        padding = [0] * (words_for(count) - count)
+        log.put(joints(count, long_words(count) + padding, in_use=count))
+    log.title("sums and torques of longer chains")
+    for count in (8, 10, 14):
+        log.put(total(12, 9, [MAX, MIN] + long_words(count - 2), 2), total(12, 10, [0] * count, 0))
+        log.put(torque(12, 9, [MIN, MAX] + long_words(count - 2)), torque(12, 10, [0] * count))
 
     log.title("sums")
     log.put(
@@ -586,7 +611,7 @@ def fd():
     )
 
     log.title("configure: reading")
-    log.put(*(read(12, parameter, parameter) for parameter in (0, *range(1, 10), 16, 21, 127)))
+    log.put(*(read(12, parameter, parameter) for parameter in (0, *range(1, 10), *range(16, 48), 127)))
     log.put(read(EVERYONE, 255, 0), read(254, 0, 99))
 
     log.title("configure: writing")
@@ -604,6 +629,11 @@ def fd():
         write(12, 16, row(1, -2, Fraction(32767, 16384), -math.pi, 3 * math.pi)),
         write(12, 17, commit(0xBEEF)),
         write(EVERYONE, 255, commit(0)),
+        write(12, 18, mount(8, 8, 11, 12, 1)),
+        write(12, 19, mount(14, 14, 32, 32, 2)),
+        write(12, 20, row(7, Fraction("0.088"), 0, math.pi / 2, 0.0)),
+        write(12, 21, row(2, 0, Fraction("0.3"), 0.0, math.pi / 2, "prismatic")),
+        write(12, 22, row(32, -1, Fraction("0.5"), 0.25, -0.5, "fixed")),
         write(254, 0, raw(99, [1, -1, MAX, MIN, 0, 256])),
     )
 
@@ -634,7 +664,7 @@ def fd():
         value(12, 5, sensing("off"), False),
         value(12, 6, events(Fraction("0.1"), Fraction("0.05"), Fraction("0.5"), Fraction("0.1"), Fraction("0.5")), False),
         value(12, 7, links_down(3), True),
-        *(refusal(12, 200, 1, reason) for reason in (1, 2, 3, 4, 5, 6, 16, 17, 18, 19)),
+        *(refusal(12, 200, 1, reason) for reason in (*range(1, 11), 16, 17, 18, 19)),
         refusal(254, 255, 127, 16),
     )
 
@@ -714,9 +744,13 @@ def bad():
     wrong_crc(good.id, without_identifier)
 
     log.title("length")
-    for length in (0, 8, 12, 15, 20, 24, 64):
+    for length in (0, 8, 12, 48, 64):
         body = (data * 4)[:length].hex().upper()
         log.add(f"bad length expected=16 got={length}", f"20C##5{body}")
+    # What is not about joints does not grow.
+    for length in (20, 24, 32):
+        body = (data * 4)[:length].hex().upper()
+        log.add(f"bad length expected=16 got={length}", f"30C##5{body}")
     first, second = good.segments()
     log.add("bad length expected=16 got=8", first)
     log.add("bad length expected=16 got=8", second)
@@ -735,6 +769,8 @@ def bad():
     log.title("counts that cannot be")
     for count in (0, 7, 255):
         meaningless(f"count kind=command got={count} allowed=1-to-6", 0, 1, count)
+    for words, count, allowed in ((8, 6, "7-or-8"), (8, 9, "7-or-8"), (10, 8, "9-or-10"), (14, 10, "11-to-14"), (14, 15, "11-to-14")):
+        meaningless(f"count kind=command got={count} allowed={allowed}", 0, 1, count, [0] * words)
     meaningless("count kind=sum got=0 allowed=1-to-255-or-0-with-zeros", 1, 12, 0, (0, 256))
     for count in (0, 2, 255):
         meaningless(f"count kind=torque got={count} allowed=1", 2, 12, count)
@@ -832,6 +868,15 @@ def classic():
     half(a[12], 0, first, 1000)
     half(a[12], 1, second, 150)
 
+    log.title("longer packets: segments of 8 bytes, the last as long as what is left")
+    for packet in (
+        joints(1, [100, -200, 300, -400, 500, -600, 700, 0], in_use=7),
+        torque(12, 1, [MAX, MIN, 1, -1, 0, 0, 7, 8]),
+    ):
+        half(packet, 0, first, 500)
+        half(packet, 1, first, 150)
+        half(packet, 2, second, 150)
+
     log.title("a whole pair without a meaning")
     odd = Packet("", 0, 9, [], 0, 0)
     log.add("waiting", odd.segments()[0])
@@ -867,7 +912,7 @@ def answer(contact_words):
     quarter = math.pi / 2
     chain = []
     for joint in range(1, JOINT + 1):
-        a, d, alpha, offset = real(by_number[15 + joint])
+        a, d, alpha, offset, _ = real(by_number[15 + joint])
         chain.append((a, d, alpha * quarter, offset * quarter))
     theta = [angle(q) / 2**14 * quarter for q in ANGLES[:JOINT]]
     placed = real(by_number[2])
@@ -993,7 +1038,8 @@ def exchange():
     x.beat(806_000, epoch=8, rejected=1)
     x.bus(807_000, read(CELL, 3, 0))
     state = 1 << 12
-    x.cell(807_000, value(CELL, 3, raw(0, [signed(SERIAL & 0xFFFF), SERIAL >> 16, 1, 0, state, 0]), False))
+    identity_of = [signed(SERIAL & 0xFFFF), SERIAL >> 16, 1, 0, state, ABILITIES]
+    x.cell(807_000, value(CELL, 3, raw(0, identity_of), False))
     x.bus(808_000, command("report"))
     x.cell(808_000, counters(CELL, 8, 1, [2, 0, 0, 0, 0, 0]), counters(CELL, 8, 2, [0, 0, 0, 0, 0, 1]))
     x.cell(808_000, sensors(CELL, 8, skin([0, 0, 0])), sensors(CELL, 8, acceleration([0, 0, 0])))
@@ -1065,7 +1111,7 @@ def exchange():
     refuses(raw(99, [1] * 6), 18)
     ask(read(CELL, tag, 126), refusal(CELL, tag, 126, 18))
     # The one with the lowest number of several reasons.
-    writes(raw(1, [0, 7]))
+    writes(raw(1, [0, 15]))
     writes(raw(2, [0] * 6))
     writes(raw(4, [0]))
     refuses(commit(0), 2, of=127)
@@ -1270,9 +1316,11 @@ def refusals():
     by_number = {parameter[0] for parameter in PARAMETERS}
     steep = lambda n: pose((0, 0, 0), n)
     at_once = [(raw(1, [1, -1]), 2), (raw(1, [1, 256]), 2), (raw(1, [-1, 6]), 3), (raw(1, [256, 6]), 3)]
+    at_once += [(raw(1, [2, 6, -1, 6]), 8), (raw(1, [2, 6, 2, 256]), 7), (raw(16, [0, 0, 0, 0, 3]), 9)]
+    at_once += [(raw(1, [2, 6, 0, 0, 3]), 10), (raw(1, [2, 6, 0, 0, -1]), 10)]
     at_commit = [
         (mount(1, 0), 2),
-        (mount(1, 7), 2),
+        (mount(1, 15), 2),
         (mount(0, 6), 3),
         (mount(4, 3), 3),
         (steep((0, 0, 0)), 4),
@@ -1280,6 +1328,13 @@ def refusals():
         (steep((0, 0, Fraction("0.99"))), 4),
         *((raw(3, [-1 if i == word else 1 for i in range(5)]), 5) for word in range(5)),
         (timing(0), 6),
+        (mount(2, 6, 2, 33), 7),
+        (mount(2, 6, 2, 5), 7),
+        (mount(2, 6, 2, 7), 7),
+        (row(3, 0, 0, 0.0, 0.0, "prismatic"), 7),
+        (mount(2, 6, 3, 6), 8),
+        (mount(2, 6, 0, 6), 8),
+        (mount(2, 6, 2, 0), 8),
     ]
     tag = 0
 
@@ -1290,7 +1345,7 @@ def refusals():
 
     log.title("numbers that are not written like this, or not at all")
     case(raw(0, [1] * 6), 0, 1)
-    for unknown in (10, 15, 22, 126):
+    for unknown in (10, 15, 48, 126):
         case(raw(unknown, [1] * 6), unknown, 18)
     log.title("words that cannot even be staged")
     for parameter, reason in at_once:

@@ -3,15 +3,15 @@
 use std::collections::BTreeMap;
 use std::str::FromStr;
 
-use protocol::fixed::Q;
+use protocol::fixed::{Q, TorqueFormat};
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{
     Answer, From, Heard, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState, Ports, Refused,
     Request, SensorPage, SkinSensors, State, Tree,
 };
-use protocol::packet::{Epoch, PacketError, WORDS};
+use protocol::packet::{Epoch, Length, MAX_WORDS, PacketError, WORDS, Words};
 use protocol::parameters::{
-    Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, Sensing, Slots,
+    Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, RowKind, Sensing, Slots,
 };
 use protocol::wire::{Hello, LinkId, PortMessage, Rank, Walk};
 
@@ -64,6 +64,16 @@ impl<'a> Meaning<'a> {
         let text = self.take(key);
         let all: Vec<_> = text.split(',').map(|text| self.q(text)).collect();
         all.try_into().unwrap_or_else(|_| panic!("{}: {key} needs {N} numbers", self.text))
+    }
+
+    /// The words of joints, a torque or a sum, as many as there are.
+    fn words_of<const F: u32>(&mut self, key: &str) -> Words {
+        let text = self.take(key);
+        let mut words = [0; MAX_WORDS];
+        let all = text.split(',').map(|text| self.q::<F>(text).to_bits());
+        let count = words.iter_mut().zip(all).map(|(word, value)| *word = value).count();
+        assert_eq!(count, text.split(',').count(), "{}: too many", self.text);
+        Words::new(Length::for_joints(count), words)
     }
 
     fn cell(&mut self, key: &str) -> CellId {
@@ -214,7 +224,13 @@ impl<'a> Meaning<'a> {
         let parameter = Parameter::from_number(number).expect(self.text);
         let mut all = Parameters::default();
         match parameter {
-            Parameter::Mount => (all.joint, all.joints) = (self.number("joint"), self.number("joints")),
+            Parameter::Mount => {
+                (all.joint, all.joints) = (self.number("joint"), self.number("joints"));
+                if self.has("row") {
+                    (all.row, all.table_rows) = (self.number("row"), self.number("rows"));
+                    all.torque_format = TorqueFormat::from_number(self.number("torque_format")).unwrap();
+                }
+            }
             Parameter::Pose => {
                 all.pose = Pose { position: self.several("position"), normal: self.several("normal") };
             }
@@ -229,7 +245,9 @@ impl<'a> Meaning<'a> {
             }
             Parameter::Timing => all.period_us = self.number("period_us"),
             Parameter::Row(row) => {
+                let named = if self.has("kind") { self.take("kind") } else { "revolute" };
                 *all.rows.get_mut(usize::from(row)).unwrap() = Row {
+                    kind: RowKind::ALL.into_iter().find(|kind| kind.name() == named).expect(named),
                     a: self.one("a"),
                     d: self.one("d"),
                     alpha: self.one("alpha"),
@@ -319,18 +337,21 @@ impl<'a> Meaning<'a> {
             "report" => Message::Report,
             "joints" => Message::Joints {
                 epoch: self.epoch(),
-                joints: Joints { positions: self.several("positions"), in_use: self.number("in_use") },
+                joints: Joints {
+                    positions: self.words_of::<14>("positions").padded().map(Q::from_bits),
+                    in_use: self.number("in_use"),
+                },
             },
             "sum" => Message::Sum {
                 from: self.cell("from"),
                 epoch: self.epoch(),
-                torque: self.several("torque"),
+                torque: self.words_of::<8>("torque"),
                 count: self.number("count"),
             },
             "torque" => Message::Torque {
                 from: self.cell("from"),
                 epoch: self.epoch(),
-                torque: self.several("torque"),
+                torque: self.words_of::<12>("torque"),
             },
             "sensors" => {
                 Message::Sensors { from: self.cell("from"), epoch: self.epoch(), page: self.sensors() }
@@ -387,6 +408,9 @@ impl<'a> Meaning<'a> {
                 allowed: match meaning.take("allowed") {
                     "1" => "1",
                     "1-to-6" => "1 to 6",
+                    "7-or-8" => "7 or 8",
+                    "9-or-10" => "9 or 10",
+                    "11-to-14" => "11 to 14",
                     "1-to-255-or-0-with-zeros" => "1 to 255, or 0 with zeros",
                     other => panic!("{text}: {other}"),
                 },

@@ -1,0 +1,164 @@
+//! From classic frames to packets: segments that wait for the others of their packet.
+
+use heapless::Deque;
+
+use super::{Length, Lengths, MAX_BYTES, Packet, PacketError, SEGMENT_BYTES};
+use crate::id::{Command, Id, Kind};
+use crate::time::{Micros, Span};
+
+/// Segments of the longest packet.
+const SEGMENTS: usize = Length::Fourteen.segments();
+
+/// What became of a classic frame.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Reassembly {
+    /// A segment; others are awaited.
+    Waiting,
+    /// All segments arrived and the CRC is right.
+    Complete(Packet),
+    /// A packet is lost: segments that do not belong together, or that came too far apart. The oldest is dropped, and
+    /// the one after it is now the first. Returned once for a packet of which several segments came.
+    Incomplete,
+    /// Packets of several lengths end with this segment, each with a right CRC: none of them is taken.
+    Ambiguous,
+}
+
+/// The segments of a packet in classic frames that came so far, one of these per identifier.
+///
+/// Segments come in order and within [`Segment::within`] of each other. A packet's length follows from its kind and
+/// the chain of its bus; where the chain is not known, each length is tried. When the CRC fails, only the oldest segment
+/// is dropped, so that a lost frame costs one packet and not every later one.
+#[derive(Clone, Debug, Default)]
+pub struct Segment {
+    waiting: Deque<Waiting, SEGMENTS>,
+    /// So many of the oldest may belong to a packet that has been counted as incomplete: they are not counted again.
+    counted: usize,
+    /// A packet was lost before the last complete one, and is not counted yet.
+    owed: bool,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Waiting {
+    data: [u8; SEGMENT_BYTES],
+    len: usize,
+    since: Micros,
+}
+
+impl Segment {
+    /// The longest time between the segments of joints and of the answers to them: less than the 16 ms after which
+    /// the next ones usually come, because one in 65 536 groups of segments of different packets has a right CRC.
+    const WITHIN_A_PERIOD: Span = Span::from_millis(15);
+    /// The longest time between those of everything else, most of which is sent once.
+    const WITHIN: Span = Span::from_millis(100);
+
+    /// Nothing waiting.
+    pub const NONE: Self = Self { waiting: Deque::new(), counted: 0, owed: false };
+
+    /// The longest time between the arrivals of the first and the last segment of a packet.
+    #[must_use]
+    pub fn within(id: Id) -> Span {
+        let is_periodic = matches!(id.kind, Kind::Sum | Kind::Torque) || id == Id::command(Command::Joints);
+        if is_periodic { Self::WITHIN_A_PERIOD } else { Self::WITHIN }
+    }
+
+    /// Whether a segment waits for others.
+    #[must_use]
+    pub fn is_waiting(&self) -> bool {
+        !self.waiting.is_empty()
+    }
+
+    /// How many segments wait for others.
+    #[must_use]
+    pub fn waiting(&self) -> usize {
+        self.waiting.len()
+    }
+
+    /// Takes the next classic frame of this identifier, whose packets have one of these lengths. A kind whose packets
+    /// do not grow needs none: [`Lengths::of`] the identifier is respected.
+    ///
+    /// # Errors
+    /// When it carries so many bytes as no segment of theirs; those that wait keep waiting.
+    pub fn push(
+        &mut self,
+        at: Micros,
+        id: Id,
+        lengths: Lengths,
+        data: &[u8],
+    ) -> Result<Reassembly, PacketError> {
+        let lengths = lengths.of_these(id);
+        if !lengths.iter().any(|length| [SEGMENT_BYTES, length.last_segment()].contains(&data.len())) {
+            return Err(PacketError::Length { expected: SEGMENT_BYTES, got: data.len() });
+        }
+        let mut newest = Waiting { data: [0; SEGMENT_BYTES], len: data.len(), since: at };
+        for (byte, &data) in newest.data.iter_mut().zip(data) {
+            *byte = data;
+        }
+        if self.waiting.is_full() {
+            self.waiting.pop_front();
+        }
+        let _ = self.waiting.push_back(newest);
+
+        let within = Self::within(id);
+        let mut found = None;
+        let mut belong_together = false;
+        for length in lengths.iter() {
+            let Some((packet, since)) = self.ends_with(id, length) else { continue };
+            if at.since(since) > within {
+                belong_together = true;
+            } else if found.replace((packet, length.segments())).is_some() {
+                *self = Self::NONE;
+                return Ok(Reassembly::Ambiguous);
+            }
+        }
+        if let Some((packet, segments)) = found {
+            let lost = self.waiting.len().saturating_sub(segments) > self.counted || self.owed;
+            *self = Self { owed: lost, ..Self::NONE };
+            return Ok(Reassembly::Complete(packet));
+        }
+        Ok(self.drop_oldest(at, within, lengths.longest().segments(), belong_together))
+    }
+
+    /// The packet of this length that ends with the newest segment, if its CRC is right, and when its first one came.
+    fn ends_with(&self, id: Id, length: Length) -> Option<(Packet, Micros)> {
+        let skipped = self.waiting.len().checked_sub(length.segments())?;
+        let mut bytes = [0; MAX_BYTES];
+        let mut rest = bytes.get_mut(..length.bytes())?;
+        let mut since = None;
+        for segment in self.waiting.iter().skip(skipped) {
+            since.get_or_insert(segment.since);
+            let (place, after) = rest.split_at_mut_checked(segment.len)?;
+            place.copy_from_slice(segment.data.get(..segment.len)?);
+            rest = after;
+        }
+        if !rest.is_empty() {
+            return None;
+        }
+        let packet = Packet::decode(id, bytes.get(..length.bytes())?).ok()?;
+        Some((packet, since?))
+    }
+
+    /// No packet ends with the newest segment: what is too old is dropped, and of as many as a packet has the oldest.
+    fn drop_oldest(
+        &mut self,
+        now: Micros,
+        within: Span,
+        segments: usize,
+        belong_together: bool,
+    ) -> Reassembly {
+        let is_late = |waiting: &Waiting| now.since(waiting.since) > within;
+        let late = self.waiting.iter().filter(|waiting| is_late(waiting)).count();
+        let dropped = if late > 0 { late } else { (self.waiting.len() + 1).saturating_sub(segments) };
+        for _ in 0..dropped {
+            self.waiting.pop_front();
+        }
+        let is_new = dropped > self.counted;
+        self.counted = match (is_new, late > 0 && !belong_together) {
+            _ if dropped == 0 => self.counted,
+            (true, false) => segments - 1,
+            (true, true) => 0,
+            (false, _) => self.counted - dropped,
+        };
+        let owed = core::mem::take(&mut self.owed);
+        if is_new || owed { Reassembly::Incomplete } else { Reassembly::Waiting }
+    }
+}

@@ -1,0 +1,161 @@
+//! What a cell can compute, as it says in its identity.
+
+use core::fmt;
+
+use super::{MAX_JOINTS, MAX_ROWS, Parameters, RowKind};
+use crate::fixed::TorqueFormat;
+
+/// What a cell can compute: word 5 of parameter 0.
+///
+/// | bits | meaning |
+/// |---|---|
+/// | 0..=3 | joints of the longest chain; 0: 6 |
+/// | 4..=9 | rows of the longest table; 0: 6 |
+/// | 10 | prismatic rows |
+/// | 11 | fixed rows |
+/// | 12 | torques in Q5.10 |
+/// | 13 | torques in Q7.8 |
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Abilities(u16);
+
+/// Something that parameters ask for and a cell cannot compute.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Ability {
+    /// A chain of so many joints.
+    Joints {
+        /// How many are asked for.
+        needed: usize,
+        /// How many it can have.
+        most: usize,
+    },
+    /// A table of so many rows.
+    Rows {
+        /// How many are asked for.
+        needed: usize,
+        /// How many it can have.
+        most: usize,
+    },
+    /// Rows of this kind.
+    Kind(RowKind),
+    /// Torques in this format.
+    Format(TorqueFormat),
+}
+
+impl fmt::Display for Ability {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Joints { needed, most } => write!(f, "{needed} joints (it can have {most})"),
+            Self::Rows { needed, most } => write!(f, "{needed} rows (it can have {most})"),
+            Self::Kind(kind) => write!(f, "{} rows", kind.name()),
+            Self::Format(format) => write!(f, "torques in {}", format.name()),
+        }
+    }
+}
+
+impl Abilities {
+    const ROWS: u32 = 4;
+    const PRISMATIC: u16 = 1 << 10;
+    const FIXED: u16 = 1 << 11;
+    const Q5_10: u16 = 1 << 12;
+    const Q7_8: u16 = 1 << 13;
+
+    /// Everything that this version of the protocol knows.
+    #[expect(clippy::cast_possible_truncation, reason = "14 joints and 32 rows")]
+    pub const ALL: Self = Self(
+        MAX_JOINTS as u16
+            | (MAX_ROWS as u16) << Self::ROWS
+            | Self::PRISMATIC
+            | Self::FIXED
+            | Self::Q5_10
+            | Self::Q7_8,
+    );
+
+    /// What a word says.
+    #[must_use]
+    pub const fn from_word(word: i16) -> Self {
+        Self(word.cast_unsigned())
+    }
+
+    /// The word.
+    #[must_use]
+    pub const fn word(self) -> i16 {
+        self.0.cast_signed()
+    }
+
+    /// Joints of the longest chain that it can compute.
+    #[must_use]
+    pub fn joints(self) -> usize {
+        Self::or_six(self.0 & 0xF)
+    }
+
+    /// Rows of the longest table that it can compute.
+    #[must_use]
+    pub fn rows(self) -> usize {
+        Self::or_six(self.0 >> Self::ROWS & 0x3F)
+    }
+
+    fn or_six(number: u16) -> usize {
+        if number == 0 { 6 } else { number.into() }
+    }
+
+    const fn has(self, bit: u16) -> bool {
+        self.0 & bit != 0
+    }
+
+    /// The first thing that these parameters ask for and the cell cannot.
+    #[must_use]
+    pub fn lacks(self, parameters: &Parameters) -> Option<Ability> {
+        let (joints, table) = (usize::from(parameters.joints), parameters.table());
+        if joints > self.joints() {
+            return Some(Ability::Joints { needed: joints, most: self.joints() });
+        }
+        if table.len() > self.rows() {
+            return Some(Ability::Rows { needed: table.len(), most: self.rows() });
+        }
+        let can = |kind| match kind {
+            RowKind::Revolute => true,
+            RowKind::Prismatic => self.has(Self::PRISMATIC),
+            RowKind::Fixed => self.has(Self::FIXED),
+        };
+        if let Some(row) = table.iter().find(|row| !can(row.kind)) {
+            return Some(Ability::Kind(row.kind));
+        }
+        let has_format = match parameters.torque_format {
+            TorqueFormat::Q3_12 => true,
+            TorqueFormat::Q5_10 => self.has(Self::Q5_10),
+            TorqueFormat::Q7_8 => self.has(Self::Q7_8),
+        };
+        (!has_format).then_some(Ability::Format(parameters.torque_format))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::parameters::Row;
+
+    #[test]
+    fn a_cell_that_says_nothing_can_what_the_first_cells_could() {
+        let plain = Parameters { joint: 6, joints: 6, ..Parameters::default() };
+        let none = Abilities::from_word(0);
+        assert_eq!(none.lacks(&plain), None);
+        let lacks = |abilities: Abilities, parameters: Parameters| {
+            abilities.lacks(&parameters).map(|ability| ability.to_string())
+        };
+        let seven = Parameters { joint: 7, joints: 7, ..plain };
+        assert_eq!(lacks(none, seven).unwrap(), "7 joints (it can have 6)");
+        let mut helped = Parameters { row: 7, table_rows: 7, ..plain };
+        helped.rows[2].kind = RowKind::Fixed;
+        assert_eq!(lacks(none, helped).unwrap(), "7 rows (it can have 6)");
+        assert_eq!(lacks(Abilities(7 << 4), helped).unwrap(), "fixed rows");
+        let mut sliding = plain;
+        sliding.rows[0] = Row { kind: RowKind::Prismatic, ..Row::default() };
+        assert_eq!(lacks(none, sliding).unwrap(), "prismatic rows");
+        let wide = Parameters { torque_format: TorqueFormat::Q5_10, ..plain };
+        assert_eq!(lacks(none, wide).unwrap(), "torques in Q5.10");
+        for parameters in [plain, seven, helped, sliding, wide] {
+            assert_eq!(Abilities::ALL.lacks(&parameters), None);
+        }
+        assert_eq!(Abilities::ALL.word(), 14 | 32 << 4 | 0b1111 << 10);
+    }
+}

@@ -1,0 +1,154 @@
+//! How far a cell can come from the joints that move it.
+//!
+//! A bound of every moment of a unit force that a kernel meets on its way: the distance of the cell from the origin of
+//! each frame below it. Where the cell can be is followed from its row down to the base as the hull of circles: a
+//! revolute joint spreads it around its axis, a prismatic one along it, and rows that do not move only carry it, so that
+//! long rows that fold back cost nothing.
+
+use super::robot::{ChainRow, DenavitHartenberg};
+use crate::parameters::RowKind;
+
+/// Metres that words in Q1.14 can hold, less some steps for what a chain of roundings adds.
+pub const REACH: f64 = 2.0 - 1e-3;
+
+type Vector = [f64; 3];
+
+/// All points at a distance from a centre, in the plane across an axis of length one.
+#[derive(Clone, Copy, Debug)]
+struct Circle {
+    center: Vector,
+    axis: Vector,
+    radius: f64,
+}
+
+fn dot([a, b, c]: Vector, [x, y, z]: Vector) -> f64 {
+    a * x + b * y + c * z
+}
+
+/// `Tz(d) Tx(a) Rx(alpha)`, and with a given angle `Rz(theta)` before it: from a row's frame to the one below.
+fn carry(row: &DenavitHartenberg, d: f64, theta: f64, [x, y, z]: Vector, is_point: bool) -> Vector {
+    let (sine, cosine) = row.alpha.sin_cos();
+    let (a, d) = if is_point { (row.a, d) } else { (0.0, 0.0) };
+    let [x, y, z] = [x + a, cosine * y - sine * z, sine * y + cosine * z + d];
+    let (sine, cosine) = theta.sin_cos();
+    [cosine * x - sine * y, sine * x + cosine * y, z]
+}
+
+impl Circle {
+    fn carry(self, row: &DenavitHartenberg, d: f64, theta: f64) -> Self {
+        let center = carry(row, d, theta, self.center, true);
+        Self { center, axis: carry(row, d, theta, self.axis, false), radius: self.radius }
+    }
+
+    /// The distance of its farthest point from the origin.
+    fn farthest(&self) -> f64 {
+        let along = dot(self.center, self.axis);
+        let across = (dot(self.center, self.center) - along * along).max(0.0).sqrt();
+        (across + self.radius).hypot(along)
+    }
+
+    /// The distance of its farthest point from the z axis, and what it spans along that.
+    fn around_z(&self) -> (f64, [f64; 2]) {
+        let [x, y, z] = self.center;
+        let [ax, ay, _] = self.axis;
+        let height = self.radius * ax.hypot(ay);
+        (x.hypot(y) + self.radius, [z - height, z + height])
+    }
+}
+
+/// The farthest that a point of a row's frame can come from the origin of any frame below it, down to the first revolute
+/// joint's, of which its axis counts, in m: an upper bound, while revolute joints turn freely and prismatic ones are
+/// within their limits. `rows` are those from the base to that row. No moment of a unit force at that point is greater.
+#[must_use]
+pub fn reach(rows: &[ChainRow], position: [f64; 3]) -> f64 {
+    let mut circles = vec![Circle { center: position, axis: [0.0, 0.0, 1.0], radius: 0.0 }];
+    let farthest = |circles: &[Circle]| circles.iter().map(Circle::farthest).fold(0.0, f64::max);
+    let mut most = farthest(&circles);
+    // A bound that does not know directions: no distance grows by more than a row's length.
+    let mut sphere = most;
+    let first = rows.iter().position(|row| row.kind == RowKind::Revolute).unwrap_or(rows.len());
+    for (index, row) in rows.iter().enumerate().skip(first).rev() {
+        let [min, max] = row.limits;
+        let table = &row.table;
+        let slides: &[f64] = if row.kind == RowKind::Prismatic { &[min, max] } else { &[0.0] };
+        let carried = slides.iter().flat_map(|slide| {
+            circles.iter().map(move |circle| circle.carry(table, table.d + slide, table.theta_offset))
+        });
+        let carried: Vec<_> = carried.collect();
+        // What lies along the first axis has no moment about it.
+        let along = slides.iter().map(|slide| (table.d + slide).abs()).fold(0.0, f64::max);
+        sphere += table.a.hypot(if index == first { 0.0 } else { along });
+        circles = carried;
+        if row.kind == RowKind::Revolute {
+            let spans = circles.iter().map(Circle::around_z);
+            let start = (0.0, [f64::INFINITY, f64::NEG_INFINITY]);
+            let (radius, [low, high]) = spans.fold(start, |(most, [low, high]), (radius, [from, to])| {
+                (f64::max(most, radius), [f64::min(low, from), f64::max(high, to)])
+            });
+            let radius = radius.min(sphere);
+            circles = [low, high]
+                .map(|z| Circle {
+                    center: [0.0, 0.0, z.clamp(-sphere, sphere)],
+                    axis: [0.0, 0.0, 1.0],
+                    radius,
+                })
+                .to_vec();
+        }
+        let from_here = if index == first {
+            circles.iter().map(|circle| circle.around_z().0).fold(0.0, f64::max)
+        } else {
+            farthest(&circles)
+        };
+        let from_here = from_here.min(sphere);
+        if index > first {
+            sphere = from_here;
+        }
+        most = most.max(from_here);
+    }
+    most
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use core::f64::consts::{FRAC_PI_2, TAU};
+
+    fn turning(a: f64, alpha: f64, d: f64) -> ChainRow {
+        let table = DenavitHartenberg { a, alpha, d, theta_offset: 0.0 };
+        ChainRow { kind: RowKind::Revolute, table, limits: [-TAU, TAU] }
+    }
+
+    fn fixed(a: f64, alpha: f64, d: f64) -> ChainRow {
+        ChainRow { kind: RowKind::Fixed, limits: [0.0; 2], ..turning(a, alpha, d) }
+    }
+
+    fn is_near(got: f64, target: f64) {
+        assert!((got - target).abs() < 1e-12, "{got}, not {target}");
+    }
+
+    #[test]
+    fn a_stretched_arm_reaches_as_far_as_its_links_are_long() {
+        let arm = [turning(0.5, 0.0, 0.3), turning(0.4, 0.0, 0.0)];
+        is_near(reach(&arm, [0.1, 0.0, 0.0]), 1.0);
+    }
+
+    #[test]
+    fn rows_that_fold_back_do_not_count() {
+        let arm = [turning(0.0, FRAC_PI_2, 0.0), fixed(0.9, 0.0, 0.0), fixed(-0.9, 0.0, 0.0)];
+        is_near(reach(&arm, [0.1, 0.0, 0.0]), 0.8);
+        let there_and_back = [turning(0.2, 0.0, 0.0), fixed(0.0, 0.0, 0.8), fixed(0.0, 0.0, -0.8)];
+        is_near(reach(&there_and_back, [0.1, 0.0, 0.0]), (0.1_f64).hypot(0.8));
+    }
+
+    #[test]
+    fn a_slide_reaches_from_end_to_end() {
+        let slide =
+            ChainRow { kind: RowKind::Prismatic, limits: [-0.1, 0.7], ..turning(0.0, FRAC_PI_2, 0.2) };
+        let arm = [turning(0.0, 0.0, 0.0), slide];
+        is_near(reach(&arm, [0.3, 0.0, 0.0]), (0.3_f64).hypot(0.9));
+        is_near(reach(&[slide, turning(0.4, 0.0, 0.0)], [0.3, 0.0, 0.0]), 0.7);
+        is_near(reach(&[slide], [0.3, 0.0, 0.0]), 0.3);
+        let arm = [turning(0.0, FRAC_PI_2, 0.0), slide];
+        is_near(reach(&arm, [0.3, 0.0, 0.0]), (0.3_f64).hypot(0.9));
+    }
+}
