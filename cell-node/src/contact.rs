@@ -3,7 +3,7 @@
 //! Integers only, exact up to three roundings that each have a name: [`Force`] (16 fraction bits),
 //! [`Torque::words`] (Q3.12), and whatever a sum does with [`Torque::exact`]. Never panics, bounded work.
 
-use protocol::fixed::{Acc, Q1_14, Q3_12, Q5_10};
+use protocol::fixed::{Acc, Q1_14, Q5_10, TorqueFormat};
 use protocol::parameters::{Contact, MAX_JOINTS};
 
 /// A normal force in N, [0, 32 768) in steps of 2^-16; what pushes on the cell is above zero.
@@ -80,14 +80,8 @@ impl Torque {
     /// becomes the largest or the smallest word, which mean *saturated*. The error of the others is at
     /// most half a step, 1.3e-4 Nm.
     #[must_use]
-    pub fn words(&self) -> [Q3_12; MAX_JOINTS] {
-        self.exact.map(Acc::round)
-    }
-
-    /// Whether a word is saturated.
-    #[must_use]
-    pub fn is_saturated(&self) -> bool {
-        self.words().into_iter().any(Q3_12::is_saturated)
+    pub fn words(&self, format: TorqueFormat) -> [i16; MAX_JOINTS] {
+        self.exact.map(|exact| format.round(exact))
     }
 }
 
@@ -96,6 +90,7 @@ impl Torque {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+    use protocol::fixed::Q3_12;
 
     impl Force {
         /// In N, exactly.
@@ -160,13 +155,13 @@ mod tests {
         jacobian[0] = arm;
         jacobian[1] = arm.saturating_neg();
         let torque = Torque::new(&jacobian, Force::from_steps(10 << 16));
-        assert_eq!(torque.words()[..3], [Q3_12::MAX, Q3_12::MIN, Q3_12::ZERO]);
-        assert!(torque.is_saturated());
+        assert_eq!(torque.words(TorqueFormat::Q3_12)[..3], [i16::MAX, i16::MIN, 0]);
+        let wider = torque.words(TorqueFormat::Q5_10);
+        assert_eq!(wider[..3], [Q5_10::nearest(10.0 * arm.to_f64()).to_bits(), -wider[0], 0]);
         assert_eq!(torque.exact()[1].to_f64(), -10.0 * arm.to_f64());
 
         let less = Torque::new(&jacobian, Force::from_steps(9 << 16));
-        assert!(!less.is_saturated());
-        assert_eq!(less.words()[0], Q3_12::nearest(9.0 * arm.to_f64()));
+        assert_eq!(less.words(TorqueFormat::Q3_12)[0], Q3_12::nearest(9.0 * arm.to_f64()).to_bits());
     }
 
     proptest! {
@@ -213,11 +208,11 @@ mod tests {
             for force in [sensed, Force::from_steps(steps)] {
                 prop_assert!(force.steps() >= 0);
                 let torque = Torque::new(&jacobian, force);
-                for ((row, exact), word) in jacobian.iter().zip(torque.exact()).zip(torque.words()) {
+                for ((row, exact), word) in jacobian.iter().zip(torque.exact()).zip(torque.words(TorqueFormat::Q3_12)) {
                     let real = row.to_f64() * force.to_f64();
                     prop_assert_eq!(exact.to_f64(), real);
                     let held = real.clamp(Q3_12::MIN.to_f64(), Q3_12::MAX.to_f64());
-                    prop_assert!((word.to_f64() - held).abs() <= 0.5 / 4_096.0);
+                    prop_assert!((Q3_12::from_bits(word).to_f64() - held).abs() <= 0.5 / 4_096.0);
                 }
             }
         }

@@ -3,13 +3,13 @@
 //! ```text
 //!   byte 0..3  "SKIN"      4  version, 2      5  the node id, 0 for none
 //!        6..9  serial number, little endian  10  1 when parameters follow, 0 when zeros do
-//!       11..   the parameters' image (see `protocol::parameters`)
+//!       11..   the parameters' image, 120 bytes and 12 more for each row after the sixth (see `protocol::parameters`)
 //!     last 2   CRC-16 over all bytes before it, little endian
 //! ```
 
 use protocol::id::CellId;
 use protocol::packet::crc16;
-use protocol::parameters::{IMAGE_BYTES, Parameters};
+use protocol::parameters::{IMAGE_BYTES, Image, MAX_IMAGE_BYTES, Parameters};
 use thiserror::Error;
 
 use crate::identity::Identity;
@@ -18,8 +18,13 @@ const MAGIC: &[u8; 4] = b"SKIN";
 const VERSION: u8 = 2;
 const HEAD_BYTES: usize = 11;
 
-/// Bytes of a flash image.
+/// Bytes of a flash image: of parameters of up to 6 rows.
 pub const BYTES: usize = HEAD_BYTES + IMAGE_BYTES + 2;
+/// Bytes of the longest one.
+pub const MAX_BYTES: usize = HEAD_BYTES + MAX_IMAGE_BYTES + 2;
+
+/// A flash image.
+pub type Bytes = heapless::Vec<u8, MAX_BYTES>;
 
 /// What flash holds.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -32,6 +37,7 @@ pub struct Kept {
 
 /// What flash held when the cell started.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "a cell has no heap")]
 pub enum Flash {
     /// Nothing yet.
     Empty,
@@ -46,7 +52,7 @@ pub enum Flash {
 #[non_exhaustive]
 pub enum FlashError {
     /// Its size.
-    #[error("{got} bytes, not {BYTES}")]
+    #[error("{got} bytes, not {BYTES} to {MAX_BYTES}")]
     Size {
         /// Bytes that it has.
         got: usize,
@@ -75,18 +81,15 @@ pub enum FlashError {
 
 /// The bytes to keep.
 #[must_use]
-pub fn encode(serial: u32, kept: &Kept) -> [u8; BYTES] {
-    let mut bytes = [0; BYTES];
+pub fn encode(serial: u32, kept: &Kept) -> Bytes {
     let number = kept.number.map_or(0, CellId::get);
-    let image = kept.parameters.map_or([0; IMAGE_BYTES], |parameters| parameters.image());
+    let zeros = || [0; IMAGE_BYTES].into_iter().collect();
+    let image: Image = kept.parameters.map_or_else(zeros, |parameters| parameters.image());
     let serial = serial.to_le_bytes();
     let parts: [&[u8]; 5] = [MAGIC, &[VERSION, number], &serial, &[kept.parameters.is_some().into()], &image];
-    for (byte, &part) in bytes.iter_mut().zip(parts.into_iter().flatten()) {
-        *byte = part;
-    }
-    let [body @ .., low, high] = &mut bytes;
-    [*low, *high] = crc16(body).to_le_bytes();
-    bytes
+    let body: Bytes = parts.into_iter().flatten().copied().collect();
+    let crc = crc16(&body).to_le_bytes();
+    body.into_iter().chain(crc).collect()
 }
 
 /// What was kept. Never panics.
@@ -95,12 +98,18 @@ pub fn encode(serial: u32, kept: &Kept) -> [u8; BYTES] {
 /// When the bytes are not whole, sound, of this version, of this cell (by its serial number, and by its number
 /// if it is given one), or no parameters.
 pub fn decode(identity: Identity, bytes: &[u8]) -> Result<Kept, FlashError> {
-    let bytes: &[u8; BYTES] = bytes.try_into().map_err(|_| FlashError::Size { got: bytes.len() })?;
-    let [body @ .., low, high] = bytes;
-    if crc16(body) != u16::from_le_bytes([*low, *high]) || !body.starts_with(MAGIC) {
+    let size = FlashError::Size { got: bytes.len() };
+    let Some((body, crc)) = bytes.split_last_chunk().filter(|_| (BYTES..=MAX_BYTES).contains(&bytes.len()))
+    else {
+        return Err(size);
+    };
+    if crc16(body) != u16::from_le_bytes(*crc) || !body.starts_with(MAGIC) {
         return Err(FlashError::Damaged);
     }
-    let &[_, _, _, _, version, cell, s0, s1, s2, s3, configured, ref image @ ..] = body;
+    let Some((&[_, _, _, _, version, cell, s0, s1, s2, s3, configured], image)) = body.split_first_chunk()
+    else {
+        return Err(size);
+    };
     if version != VERSION {
         return Err(FlashError::Version { got: version });
     }

@@ -12,7 +12,8 @@
 //! A sum of no cells, count 0, ends the lease: nothing more is to come.
 
 use protocol::fixed::{Acc, Q7_8};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::Slots;
 use protocol::time::{Micros, Span};
 use protocol::wire::PORTS;
@@ -26,14 +27,14 @@ const SHORTENED: u32 = 30 - 8;
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Words {
     /// Nm.
-    pub torque: [Q7_8; WORDS],
+    pub torque: [Q7_8; MAX_JOINTS],
     /// Cells in it.
     pub count: u8,
 }
 
 impl Words {
     /// Nothing is to come any more.
-    const END: Self = Self { torque: [Q7_8::ZERO; WORDS], count: 0 };
+    const END: Self = Self { torque: [Q7_8::ZERO; MAX_JOINTS], count: 0 };
 
     /// Whether it ends the lease: nothing more is to come.
     #[must_use]
@@ -66,11 +67,11 @@ pub struct Sum {
     /// How it began, or the last one that did.
     begin: Begin,
     /// The rounded own torque, in steps of Q7.8, if it belongs into the sum.
-    own: Option<[i32; WORDS]>,
+    own: Option<[i32; MAX_JOINTS]>,
     /// It sent a sum in the epoch before: without anything to add it sends one end.
     ends: bool,
     /// What rounding took away, in steps of 2^-30 Nm.
-    carry: [i64; WORDS],
+    carry: [i64; MAX_JOINTS],
     children: [Child; PORTS],
     /// The sum to be sent waits for a sign of the parent.
     pub(crate) held: bool,
@@ -124,7 +125,7 @@ impl Sum {
     }
 
     /// New joints: `own` is this cell's torque at full width, `None` without contact.
-    pub fn begin(&mut self, begin: &Begin, own: Option<&[Acc<30>; WORDS]>) {
+    pub fn begin(&mut self, begin: &Begin, own: Option<&[Acc<30>; MAX_JOINTS]>) {
         let Some(slots) = self.slots else { return };
         let before = self.epoch.replace(begin.epoch);
         let follows = before.is_some_and(|before| before.next() == begin.epoch);
@@ -137,7 +138,7 @@ impl Sum {
         self.begin = *begin;
         self.held = false;
         if own.is_none() {
-            self.carry = [0; WORDS];
+            self.carry = [0; MAX_JOINTS];
         }
         self.own = own.map(|exact| self.round(exact, slots.carry));
         // The parent must not keep the last sum for ever.
@@ -163,8 +164,8 @@ impl Sum {
     }
 
     /// Q7.8, to the nearest; what that took away goes into the next one.
-    fn round(&mut self, exact: &[Acc<30>; WORDS], carries: bool) -> [i32; WORDS] {
-        let mut words = [0; WORDS];
+    fn round(&mut self, exact: &[Acc<30>; MAX_JOINTS], carries: bool) -> [i32; MAX_JOINTS] {
+        let mut words = [0; MAX_JOINTS];
         for ((word, carry), exact) in words.iter_mut().zip(&mut self.carry).zip(exact) {
             let target = exact.steps() + if carries { *carry } else { 0 };
             let rounded = (target + (1 << (SHORTENED - 1))) >> SHORTENED;

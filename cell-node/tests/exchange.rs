@@ -72,8 +72,7 @@ fn configuration() -> Parameters {
         if let Line::Frame(record) = candump::parse(line).unwrap()
             && let Ok(message) = Message::decode(&Packet::from_fd(&record.frame).unwrap())
             && let Message::Configure { request: Request::Write { number, words }, .. } = message
-            && let Some(parameter) =
-                Parameter::from_number(number).filter(|it| Parameter::STORED.contains(it))
+            && let Some(parameter) = Parameter::from_number(number).filter(|it| it.is_stored())
         {
             parameters.set(parameter, words).unwrap();
         }

@@ -94,7 +94,7 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
     let contact = [Q5_10::nearest(4.0), Q5_10::ZERO, Q5_10::ZERO];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
     tell(&mut node, now, &Message::Stimulus { to: Address::Everyone, from: From::Next, page });
-    let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 };
+    let joints = Joints { in_use: 1, ..Joints::default() };
     let sent = tell(&mut node, now, &Message::Joints { epoch: Epoch(7), joints });
     assert!(sent.iter().any(|message| matches!(message, Message::Sum { count: 1, .. })), "{sent:?}");
     let said: Vec<_> = core::iter::from_fn(|| node.poll_port_transmit()).collect();

@@ -3,7 +3,8 @@
 
 use cell_node::sum::{Begin, Sum, Words};
 use protocol::fixed::Q7_8;
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::Slots;
 use protocol::time::{Micros, Span};
 
@@ -21,7 +22,7 @@ fn begin(sum: &mut Sum, epoch: u8, at: u64) {
 }
 
 fn words(bits: i16) -> Words {
-    Words { torque: [Q7_8::from_bits(bits); WORDS], count: 1 }
+    Words { torque: [Q7_8::from_bits(bits); MAX_JOINTS], count: 1 }
 }
 
 /// What is sent until half a period later.

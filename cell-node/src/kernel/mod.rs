@@ -3,13 +3,14 @@
 //! Both compute the paper's Eq. 8 for a cell on the link that joint k moves,
 //!
 //! ```text
-//! J_l = (z_(l-1) x (t_i - t_(l-1))) . f      for l = 1..k,   0 beyond,
+//! J_l = (z_(l-1) x (t_i - t_(l-1))) . f      for l = 1..k,   0 beyond; of a prismatic joint z_(l-1) . f,
 //! tau_l = J_l F_z
 //! ```
 //!
 //! where z_(l-1) is the axis of joint l, t_i the cell's position and f the direction of the force. A
 //! contact pushes *against* the outward normal, f = -normal: press a cell, and the joint gives way.
-//! J is in m, so a newton on the cell makes J_l newton metres in joint l.
+//! J is in m, so a newton on the cell makes J_l newton metres in joint l; of a prismatic joint it is a number, and
+//! makes newtons.
 //!
 //! - [`Wrench`] carries the contact's force and moment from the cell's link down to the base. It is the
 //!   one to use: fewer than half of the operations, and the smaller error.
@@ -25,10 +26,10 @@
 //! The operations are counted by running the code on numbers that count (`oracle::Counted`). The
 //! errors, of Q3.12 words against Eq. 8 in double precision, are bounds over 300 poses with up to 6 N.
 //! J is at most 2 steps of 2^-14 m from the nearest word on a UR5, and on arms of any shape that reach
-//! less than 2 m within the 8 steps that every cell is allowed. `cargo run -p cell-node --example kernels` prints what was measured.
+//! less than 2 m within the 8 steps that every cell of up to 6 rows is allowed; each further row adds one. `cargo run -p cell-node --example kernels` prints what was measured.
 //!
-//! Any arm of 1 to 6 revolute joints in standard Denavit-Hartenberg form will do. Angles are words that
-//! wrap, `theta_l = q_l + theta_offset_l`. Twists of whole quarter turns cost no multiplication, other
+//! Any chain of 1 to 14 joints in up to 32 rows of standard Denavit-Hartenberg form will do: revolute, prismatic and
+//! fixed ones. Angles are words that wrap, `theta_l = q_l + theta_offset_l`. Twists of whole quarter turns cost no multiplication, other
 //! twists four for each vector; lengths that are zero cost nothing. Parameters that
 //! [`Parameters::check`] refuses are safe: with a joint k that does not exist, every J is zero.
 
@@ -54,7 +55,8 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
     /// Never panics, whatever the words are.
     fn new(parameters: &Parameters) -> Self;
 
-    /// J_l in m, [-2, 2), for joints l = 1..=6 (zero for l > k), from joint positions in quarter turns.
+    /// J_l in m, [-2, 2), for joints l = 1..=14 (zero for l > k), from joint positions in quarter turns; of prismatic
+    /// joints a number, from positions in m.
     ///
     /// Never panics and never wraps: what does not fit is held at the ends of its range. Bounded work.
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS];
@@ -69,6 +71,12 @@ fn length<S: Scalar>(word: Q1_14) -> Option<S> {
 #[inline]
 fn angle<S: Scalar>(position: Q1_14, offset: Q1_14) -> Q1_14 {
     if offset == Q1_14::ZERO { position } else { S::plus_angle(position, offset) }
+}
+
+/// Sine and cosine of a constant angle.
+fn settled_turn<S: Scalar>(angle: Q1_14) -> [S; 2] {
+    let [sine, cosine, _] = S::fine_turn(angle);
+    [S::settle::<FINE>(sine), S::settle::<FINE>(cosine)]
 }
 
 /// How a link's twist alpha turns y and z into each other.
@@ -94,8 +102,8 @@ impl<S: Scalar> Twist<S> {
             i16::MIN => Self::Half,
             -0x4000 => Self::Back,
             _ => {
-                let [sine, cosine, _] = S::fine_turn(alpha);
-                Self::Other { sine: S::settle::<FINE>(sine), cosine: S::settle::<FINE>(cosine) }
+                let [sine, cosine] = settled_turn(alpha);
+                Self::Other { sine, cosine }
             }
         }
     }

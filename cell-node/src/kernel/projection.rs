@@ -18,7 +18,7 @@
 //! multiplied nor added. What no later step reads is not computed.
 
 use protocol::fixed::Q1_14;
-use protocol::parameters::{MAX_JOINTS, Parameters, Row};
+use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
 use super::{Kernel, Scalar, Twist, angle, length};
 
@@ -36,13 +36,17 @@ pub struct Projection<S = Q1_14> {
     position: [S; 3],
     /// Where the contact pushes, in the same frame.
     force: [S; 3],
-    /// From joint 1 up; those up to k are in use.
-    links: [Link<S>; MAX_JOINTS],
+    /// From the first row up; those of `rows` are in use.
+    links: [Link<S>; MAX_ROWS],
+    rows: usize,
 }
 
 /// One row of the robot's table.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Link<S> {
+    kind: RowKind,
+    /// d of a prismatic joint, to which its position is added.
+    slide: Q1_14,
     /// theta_offset.
     offset: Q1_14,
     twist: Twist<S>,
@@ -75,6 +79,8 @@ type Axis<S> = [Component<S>; 3];
 struct Step<S> {
     x: Axis<S>,
     z: Axis<S>,
+    /// The joint's; zero of a fixed row.
+    position: Q1_14,
 }
 
 impl<S: Scalar> Kernel<S> for Projection<S> {
@@ -86,9 +92,11 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
         });
         let (_, below) = chain.split_last().unzip();
         let upright = |row: &Row| matches!(row.alpha.to_bits(), 0 | i16::MIN);
+        let slides = chain.iter().any(|row| row.kind == RowKind::Prismatic);
         Self {
-            joint: chain.len(),
-            upright: below.unwrap_or_default().iter().all(upright),
+            joint: if chain.is_empty() { 0 } else { parameters.joint.into() },
+            rows: chain.len(),
+            upright: !slides && below.unwrap_or_default().iter().all(upright),
             position: parameters.pose.position.map(S::word),
             force: parameters.pose.normal.map(|word| S::word(word).negative()),
             links,
@@ -97,13 +105,18 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
 
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
         let mut jacobian = [S::zero(); MAX_JOINTS];
-        let links = self.links.get(..self.joint).unwrap_or_default();
+        let links = self.links.get(..self.rows).unwrap_or_default();
+        let position_of = |link: &Link<S>, moving: &mut core::slice::Iter<'_, Q1_14>| {
+            if link.kind == RowKind::Fixed { None } else { moving.next() }.copied().unwrap_or_default()
+        };
 
         let [mut x, mut y, mut z] = Component::BASE;
-        let mut steps = [Step { x, z }; MAX_JOINTS];
+        let mut steps = [Step { x, z, position: Q1_14::ZERO }; MAX_ROWS];
         let mut group = None;
-        for ((step, link), &position) in steps.iter_mut().zip(links).zip(joints) {
-            let angle = link.angle(group, position);
+        let mut moving = joints.iter();
+        for (step, link) in steps.iter_mut().zip(links) {
+            step.position = position_of(link, &mut moving);
+            let angle = link.angle(group, step.position);
             group = (!link.ends).then_some(angle);
             step.z = z;
             if !link.x {
@@ -125,9 +138,17 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
         };
         let force = to_base(self.force);
         let mut position = to_base(self.position);
-        for ((row, step), link) in jacobian.iter_mut().zip(&steps).zip(links).rev() {
+        let mut moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
+        for (step, link) in steps.iter().zip(links).rev() {
             position = link.shift(position, step, self.upright);
-            *row = triple_product(step.z, position, force);
+            let entry = match link.kind {
+                RowKind::Revolute => triple_product(step.z, position, force),
+                RowKind::Prismatic => along(step.z, force),
+                RowKind::Fixed => continue,
+            };
+            if let Some(row) = moving.next() {
+                *row = entry;
+            }
         }
         jacobian
     }
@@ -138,6 +159,8 @@ impl<S: Scalar> Link<S> {
         let ends = last || row.alpha != Q1_14::ZERO;
         let a = length(row.a);
         Self {
+            kind: row.kind,
+            slide: row.d,
             offset: row.theta_offset,
             twist: Twist::new(row.alpha),
             a,
@@ -149,16 +172,21 @@ impl<S: Scalar> Link<S> {
 
     /// The angle from the axes before the group of parallel joints to this joint's.
     fn angle(&self, group: Option<Q1_14>, position: Q1_14) -> Q1_14 {
-        let own = angle::<S>(position, self.offset);
+        let own = match self.kind {
+            RowKind::Revolute => angle::<S>(position, self.offset),
+            RowKind::Prismatic | RowKind::Fixed => self.offset,
+        };
         group.map_or(own, |group| S::plus_angle(group, own))
     }
 
     /// p_(l-1) from p_l (Eq. 24).
     fn shift(&self, [p0, p1, p2]: [S; 3], step: &Step<S>, upright: bool) -> [S; 3] {
         let ([x0, x1, x2], [z0, z1, z2]) = (step.x, step.z);
+        let slides = self.kind == RowKind::Prismatic;
+        let d = if slides { Some(S::word(self.slide.saturating_add(step.position))) } else { self.d };
         let shift = |p: S, x, z| {
             let sum = self.a.map_or(Sum::Word(p), |a| Sum::Word(p).plus(a, x));
-            self.d.map_or(sum, |d| sum.plus(d, z)).component().number()
+            d.map_or(sum, |d| sum.plus(d, z)).component().number()
         };
         [shift(p0, x0, z0), shift(p1, x1, z1), if upright { p2 } else { shift(p2, x2, z2) }]
     }
@@ -178,6 +206,11 @@ impl<S: Scalar> Twist<S> {
             ],
         }
     }
+}
+
+/// z . f, of a prismatic joint.
+fn along<S: Scalar>([z0, z1, z2]: Axis<S>, [f0, f1, f2]: [S; 3]) -> S {
+    Sum::Nothing.plus(f0, z0).plus(f1, z1).plus(f2, z2).component().number()
 }
 
 /// (z x p) . f (Eq. 8).

@@ -7,20 +7,21 @@
 //! ```text
 //! twist   f, m by Rx(alpha_l)
 //! shift   m_x -= d f_y     m_y += d f_x - a f_z     m_z += a f_y
-//!         J_l = m_z
+//!         J_l = m_z, of a prismatic joint f_z
 //! turn    f, m by Rz(theta_l)
 //! ```
 //!
-//! The turn leaves m_z alone, so J_l can be read before it, and the base's own angle theta_1 is never
-//! needed. Twist and shift of joint k are constant too and are folded into the six stored words. What
-//! nobody reads further down the chain is not computed: [`Live`] says what is, worked out once.
+//! A prismatic joint adds its position to d, a revolute one to theta; a fixed row has neither. The turn leaves m_z and
+//! f_z alone, so J_l can be read before it, and the base's own angle theta_1 is never needed. Twist and shift of the row
+//! that carries the cell are constant, but for a slide, as are fixed rows right below it: they are folded into the six
+//! stored words. What nobody reads further down the chain is not computed: [`Live`] says what is, worked out once.
 
 use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::Q1_14;
-use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
+use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
-use super::{Kernel, Scalar, Twist, angle, length};
+use super::{Kernel, Scalar, Twist, angle, length, settled_turn};
 
 /// The wrench kernel, of one cell.
 ///
@@ -30,10 +31,11 @@ use super::{Kernel, Scalar, Twist, angle, length};
 pub struct Wrench<S = Q1_14> {
     /// The joint that moves the cell; 0 when there is none.
     joint: usize,
-    /// The contact's wrench, twisted and shifted by joint k's row: what the turn by theta_k takes.
+    /// The contact's wrench, twisted and shifted by the row of joint k.
     contact: Wrenched<S>,
-    /// How to get from the turn of joint l+1 to that of joint l; those below k are in use.
-    links: [Link<S>; MAX_JOINTS - 1],
+    /// From joint k's row down to the base, in the table's order; the first `rows` are in use.
+    links: [Link<S>; MAX_ROWS],
+    rows: usize,
 }
 
 /// A force of one newton and its moment in m (that is, Nm per N); or something that is known of each of their
@@ -49,6 +51,7 @@ type Live = Wrenched<bool>;
 
 impl Live {
     const NOTHING: Self = Self { force: [false; 3], moment: [false; 3] };
+    const ALL: Self = Self { force: [true; 3], moment: [true; 3] };
 
     /// The same of both.
     fn each(self, before: impl Fn([bool; 3]) -> [bool; 3]) -> Self {
@@ -56,78 +59,122 @@ impl Live {
     }
 }
 
-/// The steps from the frame of joint l to that of joint l-1, beginning with the turn by theta_(l+1).
+/// The steps from the frame of a row to the one below.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Link<S> {
-    /// What the turn computes.
-    turned: Live,
-    /// theta_offset of joint l+1.
-    offset: Q1_14,
+    kind: RowKind,
     /// What the twist computes.
     twisted: Live,
     twist: Twist<S>,
     a: Option<S>,
+    /// Without the position of a prismatic joint.
     d: Option<S>,
+    /// d, to which the position of a prismatic joint is added.
+    d_word: Q1_14,
+    /// What the turn computes.
+    turned: Live,
+    /// theta_offset.
+    offset: Q1_14,
+    /// Sine and cosine of theta_offset, where the row does not turn; none of a zero.
+    constant: Option<[S; 2]>,
 }
 
 impl<S: Scalar> Kernel<S> for Wrench<S> {
     fn new(parameters: &Parameters) -> Self {
         let chain = parameters.chain();
-        let nothing = Wrenched { force: [S::zero(); 3], moment: [S::zero(); 3] };
-        let contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
-        let mut read = Live::NOTHING; // by the links further down: nothing below joint 1
+        let mut read = Live::NOTHING; // by the rows further down: nothing below joint 1
         let links = core::array::from_fn(|index| {
-            let [row, above] = [index, index + 1].map(|row| parameters.rows.get(row).copied());
             let link;
-            (link, read) = Link::new(&row.unwrap_or_default(), above.unwrap_or_default().theta_offset, read);
+            (link, read) = Link::new(&chain.get(index).copied().unwrap_or_default(), read);
             link
         });
-        Self { joint: chain.len(), contact, links }
+        let nothing = Wrenched { force: [S::zero(); 3], moment: [S::zero(); 3] };
+        let mut contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
+        // Fixed rows between the cell and the joint that moves it.
+        let mut rows = chain.len();
+        let is_fixed = |row: Option<&Row>| row.is_some_and(|row| row.kind == RowKind::Fixed);
+        while is_fixed(rows.checked_sub(1).and_then(|last| chain.get(last))) {
+            let above: Link<S> = Link::new(&chain.get(rows - 1).copied().unwrap_or_default(), Live::ALL).0;
+            rows -= 1;
+            contact = above.turn(contact, Q1_14::ZERO);
+            if let Some(row) = rows.checked_sub(1).and_then(|last| chain.get(last)) {
+                // Not the slide of a prismatic joint.
+                contact = Link::new(row, Live::ALL).0.twist_and_shift(contact, None);
+            }
+        }
+        Self { joint: if rows == 0 { 0 } else { parameters.joint.into() }, contact, links, rows }
     }
 
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
         let mut jacobian = [S::zero(); MAX_JOINTS];
         let mut wrench = self.contact;
-        let Some((last, rest)) = jacobian.get_mut(..self.joint).and_then(<[S]>::split_last_mut) else {
-            return jacobian;
-        };
-        [_, _, *last] = wrench.moment;
-        let above = joints.get(1..self.joint).unwrap_or_default();
-        for ((row, link), &position) in rest.iter_mut().zip(&self.links).zip(above).rev() {
-            wrench = link.carry(wrench, position);
-            [_, _, *row] = wrench.moment;
+        let links = self.links.get(..self.rows).unwrap_or_default();
+        let moving = jacobian.get_mut(..self.joint).unwrap_or_default();
+        let mut moving = moving.iter_mut().zip(joints).rev();
+        for (index, link) in links.iter().rev().enumerate() {
+            let joint = if link.kind == RowKind::Fixed { None } else { moving.next() };
+            let position = joint.as_ref().map_or(Q1_14::ZERO, |(_, position)| **position);
+            let slide = (link.kind == RowKind::Prismatic).then_some(position);
+            if index > 0 {
+                wrench = link.twist_and_shift(wrench, slide);
+            } else if slide.is_some() {
+                // Its own row is folded, without the slide.
+                let moment = link.shift_along(wrench.force, wrench.moment, slide.map(S::word));
+                wrench = Wrenched { moment, ..wrench };
+            }
+            let Wrenched { force: [.., force], moment: [.., moment] } = wrench;
+            if let Some((row, _)) = joint {
+                *row = if slide.is_some() { force } else { moment };
+            }
+            wrench = link.turn(wrench, position);
         }
         jacobian
     }
 }
 
 impl<S: Scalar> Link<S> {
-    /// The link below the turn of the joint `above`, when the turn after it reads `read`; and what it
-    /// reads itself.
-    fn new(row: &Row, offset: Q1_14, read: Live) -> (Self, Live) {
+    /// The link of a row, when the rows below it read `read` of what it turned; and what it reads itself.
+    fn new(row: &Row, read: Live) -> (Self, Live) {
         let twist = Twist::new(row.alpha);
         let (a, d) = (length(row.a), length(row.d));
+        let turns = row.kind == RowKind::Revolute;
+        let constant = (!turns && row.theta_offset != Q1_14::ZERO).then(|| settled_turn(row.theta_offset));
+        let slides = row.kind == RowKind::Prismatic;
 
-        // Backwards: the shift, whose m_z is J.
-        let ([fx, fy, fz], [mx, my, _]) = (read.force, read.moment);
+        // Backwards: the turn, the shift, whose m_z is J, the twist.
+        let shifted = if turns || constant.is_some() { read.each(before_turn) } else { read };
+        let ([fx, fy, mut fz], [mx, my, mut mz]) = (shifted.force, shifted.moment);
+        (fz, mz) = (fz || slides, mz || turns);
+        let moves = slides || d.is_some();
         let twisted = Live {
             force: [
-                fx || (my && d.is_some()),
-                fy || (mx && d.is_some()) || a.is_some(),
+                fx || (my && moves),
+                fy || (mx && moves) || (mz && a.is_some()),
                 fz || (my && a.is_some()),
             ],
-            moment: [mx, my, true],
+            moment: [mx, my, mz],
         };
-        let turned = twisted.each(|live| before_twist(twist, live));
-        (Self { turned, offset, twisted, twist, a, d }, turned.each(before_turn))
+        let link = Self {
+            kind: row.kind,
+            twisted,
+            twist,
+            a,
+            d,
+            d_word: row.d,
+            turned: read,
+            offset: row.theta_offset,
+            constant,
+        };
+        (link, twisted.each(|live| before_twist(twist, live)))
     }
 
+    /// `Tz(d) Tx(a) Rx(alpha)`, but only what is live.
     #[inline]
-    fn carry(&self, wrench: Wrenched<S>, position: Q1_14) -> Wrenched<S> {
-        let Wrenched { force, moment } = self.turn(wrench, position);
-        let force = self.twist.apply(force, self.twisted.force);
-        let moment = self.twist.apply(moment, self.twisted.moment);
-        Wrenched { force, moment: self.shift(force, moment) }
+    fn twist_and_shift(&self, wrench: Wrenched<S>, slide: Option<Q1_14>) -> Wrenched<S> {
+        let force = self.twist.apply(wrench.force, self.twisted.force);
+        let moment = self.twist.apply(wrench.moment, self.twisted.moment);
+        let d = slide.map_or(self.d, |slide| Some(S::word(self.d_word.saturating_add(slide))));
+        Wrenched { force, moment: self.shift(force, moment, d) }
     }
 
     /// `Rz(theta)`, but only what is live.
@@ -137,8 +184,14 @@ impl<S: Scalar> Link<S> {
         if !(fx || fy || mx || my) {
             return wrench;
         }
-        let angle = angle::<S>(position, self.offset);
-        let (sine, cosine) = (S::sine(angle), S::cosine(angle));
+        let [sine, cosine] = match (self.kind, self.constant) {
+            (RowKind::Revolute, _) => {
+                let angle = angle::<S>(position, self.offset);
+                [S::sine(angle), S::cosine(angle)]
+            }
+            (RowKind::Prismatic | RowKind::Fixed, Some(constant)) => constant,
+            (RowKind::Prismatic | RowKind::Fixed, None) => return wrench,
+        };
         let turn = |[x, y, z]: [S; 3], [live_x, live_y, _]: [bool; 3]| {
             [
                 if live_x { S::round(S::minus(cosine.times(x), sine.times(y))) } else { x },
@@ -154,25 +207,33 @@ impl<S: Scalar> Link<S> {
 
     /// The moment about an origin that lies (a, 0, d) further down, but only what is live.
     #[inline]
-    fn shift(&self, [fx, fy, fz]: [S; 3], [mut mx, mut my, mut mz]: [S; 3]) -> [S; 3] {
-        let [live_x, live_y, _] = self.twisted.moment;
+    fn shift(&self, force: [S; 3], moment: [S; 3], d: Option<S>) -> [S; 3] {
+        let ([fx, fy, fz], [mut mx, mut my, mut mz]) = (force, moment);
+        let [live_x, live_y, live_z] = self.twisted.moment;
         if live_y {
-            my = match (self.d, self.a) {
+            my = match (d, self.a) {
                 (None, None) => my,
                 (Some(d), None) => S::round(S::plus(my.widen(), d.times(fx))),
                 (None, Some(a)) => S::round(S::minus(my.widen(), a.times(fz))),
                 (Some(d), Some(a)) => S::round(S::minus(S::plus(my.widen(), d.times(fx)), a.times(fz))),
             };
         }
-        if let Some(d) = self.d
+        if let Some(d) = d
             && live_x
         {
             mx = S::round(S::minus(mx.widen(), d.times(fy)));
         }
-        if let Some(a) = self.a {
+        if let Some(a) = self.a
+            && live_z
+        {
             mz = S::round(S::plus(mz.widen(), a.times(fy)));
         }
         [mx, my, mz]
+    }
+
+    /// The moment about an origin that lies so far along z.
+    fn shift_along(&self, force: [S; 3], moment: [S; 3], d: Option<S>) -> [S; 3] {
+        Self { a: None, ..*self }.shift(force, moment, d)
     }
 }
 

@@ -4,7 +4,7 @@
 //! into use, as a whole: a cell that is interrupted between two writes keeps computing with what it had.
 
 use protocol::message::Answer;
-use protocol::packet::WORDS;
+use protocol::packet::{Length, WORDS};
 use protocol::parameters::{Parameter, ParameterError, Parameters};
 use protocol::time::Span;
 
@@ -71,6 +71,11 @@ impl Configuration {
 }
 
 impl InUse {
+    /// How long joints, torques and sums are.
+    pub(super) fn length(&self) -> Length {
+        Length::for_joints(self.parameters.joints.into())
+    }
+
     /// From one joint broadcast to the next.
     pub(super) fn period(&self) -> Span {
         Span(self.parameters.period_us.into())

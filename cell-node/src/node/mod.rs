@@ -20,10 +20,10 @@ mod summing;
 
 use heapless::Deque;
 use protocol::can::{Format, Frame};
-use protocol::fixed::Q3_12;
+use protocol::fixed::Q7_8;
 use protocol::id::{Command, Id, Kind, Node as Address};
 use protocol::message::{From, Heard, Joints, Message, NetworkPage, SensorPage, State};
-use protocol::packet::{self, Epoch, Packet, WORDS};
+use protocol::packet::{self, Epoch, Length, Lengths, Packet};
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage};
 
@@ -33,7 +33,7 @@ use crate::identity::{Identity, OWN};
 use crate::kernel::Kernel;
 use crate::sum::Words;
 use claim::AddressClaim;
-use configuration::Configuration;
+use configuration::{Configuration, InUse};
 use parameters::{Storing, Switches};
 use receiver::Receiver;
 use sensing::{Pages, Sensing};
@@ -171,6 +171,11 @@ impl Node {
         self.summing.heard_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
 
+    /// How long joints, torques and sums are, once it is configured.
+    fn length(&self) -> Option<Length> {
+        self.configuration.in_use.as_ref().map(InUse::length)
+    }
+
     /// By slot of the reassembly.
     fn slots(&self) -> [Option<Id>; HEARD] {
         let sums = self.summing.heard.map(|cell| Some(Id::new(Kind::Sum, Address::Cell(cell?))));
@@ -194,7 +199,8 @@ impl Node {
             return;
         };
         let Some(slot) = self.slots().iter().position(|&heard| heard == Some(id)) else { return };
-        let Some(packet) = self.receiver.take(now - age, id, slot, frame) else { return };
+        let lengths = Lengths::of_chain(self.length());
+        let Some(packet) = self.receiver.take(now - age, id, slot, lengths, frame) else { return };
         match Message::decode(&packet) {
             Ok(message) => self.handle_message(now, age, message),
             Err(_) => count(&mut self.receiver.refused.meaning),
@@ -241,7 +247,11 @@ impl Node {
                 // Another mode starts again, and a cell that leaves test mode measures no contact any more.
                 self.sense(now);
             }
+            Message::Sum { torque, .. } if self.length().is_some_and(|length| torque.length() != length) => {
+                count(&mut self.receiver.refused.meaning);
+            }
             Message::Sum { from, epoch, torque, count } => {
+                let torque = torque.padded().map(Q7_8::from_bits);
                 if self.summing.take(now, age, from, epoch, Words { torque, count }) {
                     self.handle_sums(now);
                 }
@@ -289,16 +299,18 @@ impl Node {
 
     /// Answers with its own torque; one answer of zero marks the end of a contact.
     fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque>) {
-        let Some(from) = self.identity.cell else { return };
+        let (Some(from), Some(in_use)) = (self.identity.cell, &self.configuration.in_use) else { return };
+        let (length, format) = (in_use.length(), in_use.parameters.torque_format);
         let torque = match torque {
             Some(torque) => {
                 self.active = true;
-                self.mark_saturated(torque.is_saturated());
-                torque.words()
+                torque.words(format)
             }
-            None if core::mem::take(&mut self.active) => [Q3_12::ZERO; WORDS],
+            None if core::mem::take(&mut self.active) => Default::default(),
             None => return,
         };
+        let torque = packet::Words::new(length, torque);
+        self.mark_saturated(torque.is_saturated());
         count(&mut self.heard.torques);
         self.push(Message::Torque { from, epoch, torque });
     }

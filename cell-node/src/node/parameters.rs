@@ -2,7 +2,7 @@
 
 use protocol::message::{Answer, Message, Request, State, VERSION};
 use protocol::packet::WORDS;
-use protocol::parameters::{Events, LinksDown, Parameter, Parameters, Reply, Sensing};
+use protocol::parameters::{Abilities, Events, LinksDown, Parameter, Parameters, Reply, Sensing};
 use protocol::time::Micros;
 
 use super::Node;
@@ -22,6 +22,7 @@ pub(super) struct Switches {
 
 /// What is being written into flash.
 #[derive(Clone, Copy, Debug)]
+#[expect(clippy::large_enum_variant, reason = "a cell has no heap")]
 pub(super) enum Storing {
     /// Committed parameters, with the request's tag.
     Parameters(Parameters, u8),
@@ -136,6 +137,7 @@ impl Node {
             VERSION.into(),
             self.configuration.hash().cast_signed(),
             self.state().0.cast_signed(),
+            Abilities::ALL.word(),
         ])
     }
 }

@@ -3,7 +3,7 @@
 use protocol::can::{Format, Frame};
 use protocol::id::Id;
 use protocol::message::Refused;
-use protocol::packet::{Packet, PacketError, Reassembly, Segment};
+use protocol::packet::{Lengths, Packet, PacketError, Reassembly, Segment};
 use protocol::time::Micros;
 
 use super::{HEARD, count};
@@ -24,15 +24,23 @@ impl Receiver {
     }
 
     /// The packet that this frame, which arrived then, is or completes.
-    pub(super) fn take(&mut self, arrived: Micros, id: Id, slot: usize, frame: &Frame) -> Option<Packet> {
+    /// Joints, torques and sums have one of these lengths.
+    pub(super) fn take(
+        &mut self,
+        arrived: Micros,
+        id: Id,
+        slot: usize,
+        lengths: Lengths,
+        frame: &Frame,
+    ) -> Option<Packet> {
         let packet = match self.format {
             Format::Fd => Packet::from_fd(frame),
             Format::Classic if frame.format() != Format::Classic => {
                 Err(PacketError::Length { expected: 8, got: frame.data().len() })
             }
-            Format::Classic => match self.segments.get_mut(slot)?.push(arrived, id, frame.data()) {
+            Format::Classic => match self.segments.get_mut(slot)?.push(arrived, id, lengths, frame.data()) {
                 Ok(Reassembly::Waiting) => return None,
-                Ok(Reassembly::Incomplete) => {
+                Ok(Reassembly::Incomplete | Reassembly::Ambiguous) => {
                     count(&mut self.refused.incomplete);
                     return None;
                 }

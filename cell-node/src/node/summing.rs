@@ -1,8 +1,9 @@
 //! The cell in a network: which sums are for which parent, and when they are sent.
 
+use protocol::fixed::Q7_8;
 use protocol::id::CellId;
 use protocol::message::{Message, NetworkPage, Ports, Tree};
-use protocol::packet::Epoch;
+use protocol::packet::{self, Epoch};
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage, UPLINK};
 
@@ -309,6 +310,8 @@ impl Node {
                 summing.network.state(epoch);
             }
             self.mark_saturated(torque.iter().any(|word| word.is_saturated()));
+            let length = self.length().unwrap_or_default();
+            let torque = packet::Words::new(length, torque.map(Q7_8::to_bits));
             self.push(Message::Sum { from, epoch, torque, count });
         }
         let Some(late) = self.summing.sum.check(now) else { return };

@@ -1,10 +1,10 @@
 use super::parameters::padded;
 use super::*;
-use protocol::fixed::{Q1_14, Q5_10};
+use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::CellId;
 use protocol::message::{Answer, Heartbeat, Refused, Request, SkinSensors};
-use protocol::packet::Segment;
-use protocol::parameters::{Contact, Parameter, Parameters, Pose, Row};
+use protocol::packet::{Segment, WORDS, Words};
+use protocol::parameters::{Contact, MAX_JOINTS, Parameter, Parameters, Pose, Row};
 
 /// A wheel: one joint about z, a cell on its rim that looks along the direction of motion.
 fn wheel() -> Parameters {
@@ -68,7 +68,7 @@ fn tell(node: &mut Node, message: &Message) -> Vec<Message> {
 }
 
 fn joints(epoch: u8) -> Message {
-    Message::Joints { epoch: Epoch(epoch), joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 } }
+    Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 1, ..Joints::default() } }
 }
 
 fn press(newtons: f64, from: From) -> Message {
@@ -78,8 +78,7 @@ fn press(newtons: f64, from: From) -> Message {
 }
 
 fn torque(epoch: u8, nm: f64) -> Message {
-    let mut torque = [Q3_12::ZERO; WORDS];
-    torque[0] = Q3_12::nearest(nm);
+    let torque = Words::from(padded([Q3_12::nearest(nm).to_bits()]));
     Message::Torque { from: cell(), epoch: Epoch(epoch), torque }
 }
 
@@ -178,7 +177,7 @@ fn a_heartbeat_that_is_due_before_the_next_joints_is_sent_with_the_answer_and_ke
     let mut epoch = Epoch(0);
     let mut joints_at = |node: &mut Node, at: u64| {
         epoch = epoch.next();
-        let joints = Message::Joints { epoch, joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 } };
+        let joints = Message::Joints { epoch, joints: Joints { in_use: 1, ..Joints::default() } };
         for frame in joints.encode().frames(Format::Fd) {
             node.handle_frame(Micros(at), Span(0), &frame);
         }
@@ -281,7 +280,7 @@ fn a_configuration_is_taken_as_a_whole_or_not_at_all() {
             other => panic!("{other:?}"),
         }
     };
-    for parameter in Parameter::STORED {
+    for parameter in Parameter::stored(1) {
         let (number, words) = (parameter.number(), wheel().words(parameter));
         let answer = request(&mut node, Request::Write { number, words });
         assert_eq!(answer, Some(Answer::Value { number, written: true, words }));
@@ -454,11 +453,13 @@ fn no_frame_makes_a_cell_panic() {
         for (id, data) in frames {
             // With a right CRC, so that what lies behind it is reached.
             let id = Id::from_bits(u16::try_from(id).unwrap() & 0x70F | 12);
-            let mut words = [0_i16; WORDS];
+            let length = Length::ALL[data.len() % 4];
+            let mut words = [0_i16; MAX_JOINTS];
             for (word, chunk) in words.iter_mut().zip(data.as_chunks::<2>().0) {
                 *word = i16::from_le_bytes(*chunk);
             }
             let (epoch, count) = (Epoch(data.first().copied().unwrap_or(0)), data.last().copied().unwrap_or(0));
+            let words = Words::new(length, words);
             for frame in (Packet { id, words, epoch, count }).frames(Format::Fd) {
                 node.handle_frame(NOW, Span(0), &frame);
             }

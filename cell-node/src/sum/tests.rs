@@ -14,12 +14,12 @@ fn begin(epoch: u8, depth: u8) -> Begin {
 }
 
 /// In steps of Q7.8 and thousandths of them.
-fn own(thousandths: i64) -> [Acc<30>; WORDS] {
-    [Acc::from_steps(thousandths * (1 << SHORTENED) / 1_000); WORDS]
+fn own(thousandths: i64) -> [Acc<30>; MAX_JOINTS] {
+    [Acc::from_steps(thousandths * (1 << SHORTENED) / 1_000); MAX_JOINTS]
 }
 
 fn words(word: i16, count: u8) -> Words {
-    Words { torque: [Q7_8::from_bits(word); WORDS], count }
+    Words { torque: [Q7_8::from_bits(word); MAX_JOINTS], count }
 }
 
 fn at(epoch: u8, micros: u64) -> Micros {
@@ -152,13 +152,13 @@ fn saturation_passes_upwards_word_by_word() {
     saturated.torque[2] = Q7_8::MIN;
     sum.take(at(1, 0), 0, Epoch(1), saturated);
     let (_, said, _) = sum.say(at(1, 1_000)).unwrap();
-    let mut target = [-995; WORDS];
+    let mut target = [-995; MAX_JOINTS];
     target[1..3].copy_from_slice(&[i16::MAX, i16::MIN]);
     assert_eq!(said.torque.map(Q7_8::to_bits), target);
     sum.begin(&begin(2, 2), Some(&own(i64::from(i16::MAX) * 1_000)));
     sum.take(at(2, 0), 0, Epoch(2), words(1, 1));
     let (_, said, _) = sum.say(at(2, 1_000)).unwrap();
-    assert_eq!(said.torque, [Q7_8::MAX; WORDS]);
+    assert_eq!(said.torque, [Q7_8::MAX; MAX_JOINTS]);
 }
 
 // NACK-2

@@ -10,8 +10,8 @@
 )]
 
 use cell_node::contact::{Force, Torque};
-use protocol::fixed::{Q1_14, Q3_12};
-use protocol::parameters::{MAX_JOINTS, Parameters, Pose, Row};
+use protocol::fixed::{Q1_14, Q3_12, TorqueFormat};
+use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
 /// One line of `vectors/ur5_torque.csv`: computed from Eq. 8 in double precision, and in agreement with
 /// a rigid-body library on the robot's URDF to 1e-11 Nm.
@@ -107,18 +107,22 @@ impl Errors {
         Self::of(|case| {
             let force = Force::from_steps((case.force * 65_536.0) as i64);
             let torque = Torque::new(&jacobian(&case.parameters(), &case.words()), force);
-            torque.words().map(Q3_12::to_f64)
+            torque.words(TorqueFormat::Q3_12).map(|word| TorqueFormat::Q3_12.real(word))
         })
     }
 }
 
 /// The UR5's table, in words.
-pub(crate) fn ur5() -> [Row; MAX_JOINTS] {
+pub(crate) fn ur5() -> [Row; MAX_ROWS] {
     let d = [0.089_159, 0.0, 0.0, 0.109_15, 0.094_65, 0.082_3];
     let a = [0.0, -0.425, -0.392_25, 0.0, 0.0, 0.0];
     let alpha = [1.0, 0.0, 0.0, 1.0, -1.0, 0.0];
-    let [a, d, alpha] = [a, d, alpha].map(|column: [f64; 6]| per_joint(&column).map(Q1_14::nearest));
-    std::array::from_fn(|row| Row { a: a[row], d: d[row], alpha: alpha[row], theta_offset: Q1_14::ZERO })
+    let [a, d, alpha] = [a, d, alpha].map(|column: [f64; 6]| column.map(Q1_14::nearest));
+    let mut rows = [Row::default(); MAX_ROWS];
+    for row in 0..6 {
+        rows[row] = Row { a: a[row], d: d[row], alpha: alpha[row], ..Row::default() };
+    }
+    rows
 }
 
 /// One value a joint, and nothing for joints that the robot has not.
@@ -138,24 +142,32 @@ fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
 
 /// Rz(theta) Tz(d) Tx(a) Rx(alpha), the four multiplied out one by one.
 fn transform(row: &Row, position: Q1_14) -> Transform {
-    let (st, ct) = position.wrapping_add(row.theta_offset).to_radians().sin_cos();
+    let (theta, d) = match row.kind {
+        RowKind::Revolute => (position.wrapping_add(row.theta_offset), row.d),
+        RowKind::Prismatic => (row.theta_offset, row.d.saturating_add(position)),
+        RowKind::Fixed => (row.theta_offset, row.d),
+    };
+    let (st, ct) = theta.to_radians().sin_cos();
     let (sa, ca) = row.alpha.to_radians().sin_cos();
     let about_z = [[ct, -st, 0.0, 0.0], [st, ct, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
     let along = [
         [1.0, 0.0, 0.0, row.a.to_f64()],
         [0.0, 1.0, 0.0, 0.0],
-        [0.0, 0.0, 1.0, row.d.to_f64()],
+        [0.0, 0.0, 1.0, d.to_f64()],
         [0.0, 0.0, 0.0, 1.0],
     ];
     let about_x = [[1.0, 0.0, 0.0, 0.0], [0.0, ca, -sa, 0.0], [0.0, sa, ca, 0.0], [0.0, 0.0, 0.0, 1.0]];
     product(&product(&about_z, &along), &about_x)
 }
 
-/// Eq. 8 as it stands: frames by multiplying 4x4 matrices, then `(z_(l-1) x (t_i - t_(l-1))) . f`.
+/// Eq. 8 as it stands: frames by multiplying 4x4 matrices, then `(z_(l-1) x (t_i - t_(l-1))) . f`, of a prismatic joint
+/// `z_(l-1) . f`.
 pub(crate) fn equation_8(parameters: &Parameters, positions: &[Q1_14; MAX_JOINTS]) -> [f64; MAX_JOINTS] {
     let mut frames: Vec<Transform> =
         vec![std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))))];
-    for (row, &position) in parameters.chain().iter().zip(positions) {
+    let mut positions = positions.iter();
+    for row in parameters.chain() {
+        let position = if row.moves() { *positions.next().unwrap_or(&Q1_14::ZERO) } else { Q1_14::ZERO };
         frames.push(product(frames.last().unwrap(), &transform(row, position)));
     }
     let axis = |frame: &Transform, column: usize| -> [f64; 3] { std::array::from_fn(|i| frame[i][column]) };
@@ -166,7 +178,12 @@ pub(crate) fn equation_8(parameters: &Parameters, positions: &[Q1_14; MAX_JOINTS
     let cell: [f64; 3] = std::array::from_fn(|i| local[i] + last[i][3]);
 
     let mut jacobian = [0.0; MAX_JOINTS];
-    for (row, frame) in jacobian.iter_mut().zip(&frames[..frames.len() - 1]) {
+    let moving = parameters.chain().iter().zip(&frames).filter(|(row, _)| row.moves());
+    for (row, (of, frame)) in jacobian.iter_mut().zip(moving) {
+        if of.kind == RowKind::Prismatic {
+            *row = axis(frame, 2).iter().zip(force).map(|(z, f)| z * f).sum();
+            continue;
+        }
         let origin = axis(frame, 3);
         let moment = cross(axis(frame, 2), std::array::from_fn(|i| cell[i] - origin[i]));
         *row = moment.iter().zip(force).map(|(m, f)| m * f).sum();

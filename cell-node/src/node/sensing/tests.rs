@@ -87,7 +87,7 @@ impl Cell {
 
     fn joints_aged(&mut self, age: Span) -> Vec<SensorPage> {
         self.epoch = self.epoch.next();
-        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 };
+        let joints = Joints { in_use: 1, ..Joints::default() };
         self.hears(&Message::Joints { epoch: self.epoch, joints }, age)
     }
 
@@ -253,7 +253,7 @@ fn a_heartbeat_with_an_event_does_not_send_it_twice() {
     let to = Address::Everyone;
     cell.hears(&Message::Stimulus { to, from: From::Next, page: pressed(500) }, Span(0));
     cell.epoch = cell.epoch.next();
-    let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 1 };
+    let joints = Joints { in_use: 1, ..Joints::default() };
     for frame in (Message::Joints { epoch: cell.epoch, joints }).encode().frames(Format::Fd) {
         cell.node.handle_frame(cell.now, Span(0), &frame);
     }
