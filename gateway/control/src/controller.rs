@@ -10,12 +10,10 @@
 
 use core::f64::consts::TAU;
 
-use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{ControllerKind, Skin};
+use protocol::packet::padded;
+use protocol::skin::{ControllerKind, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::Micros;
 use thiserror::Error;
-
-use crate::robot::padded;
 
 /// A controller's input in a tick. Joints that the robot does not have are zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -25,11 +23,11 @@ pub struct Input {
     /// When it began, since the run's start.
     pub time: Micros,
     /// Joint positions in rad.
-    pub q: [f64; MAX_JOINTS],
+    pub q: [f64; MAX_ROBOT_JOINTS],
     /// Joint velocities in rad/s.
-    pub qdot: [f64; MAX_JOINTS],
+    pub qdot: [f64; MAX_ROBOT_JOINTS],
     /// The skin's torque in Nm.
-    pub torque: [f64; MAX_JOINTS],
+    pub torque: [f64; MAX_ROBOT_JOINTS],
     /// Epochs since the oldest contribution to the torque.
     pub age: u32,
     /// Cells that contribute to the torque.
@@ -45,9 +43,10 @@ pub struct Input {
 
 /// What a controller answers.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "one at a time, on the stack: the loop allocates nothing")]
 pub enum Step {
     /// Joint velocities in rad/s until the next tick; finite, and within the limits of speed.
-    Move([f64; MAX_JOINTS]),
+    Move([f64; MAX_ROBOT_JOINTS]),
     /// It has no answer: a bad cycle. The caller decides what the robot then does.
     Bad(BadCycle),
 }
@@ -89,7 +88,7 @@ pub trait Controller: Send {
 /// the tick are: `v' = tau/D + (v - tau/D) e^(-D/M T)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Kinesthetic {
-    joints: [Admittance; MAX_JOINTS],
+    joints: [Admittance; MAX_ROBOT_JOINTS],
 }
 
 /// One joint.
@@ -114,8 +113,8 @@ impl Kinesthetic {
 
     pub(crate) fn with(skin: &Skin, inertia: &[f64], damping: &[f64]) -> Self {
         let tick = 1.0 / skin.timing.control_hz;
-        let mut joints = [Admittance::default(); MAX_JOINTS];
-        let given = inertia.iter().zip(damping).zip(&skin.controller.max_speed_rad_s);
+        let mut joints = [Admittance::default(); MAX_ROBOT_JOINTS];
+        let given = inertia.iter().zip(damping).zip(&skin.controller.max_speed);
         for (joint, ((inertia, damping), &max_speed)) in joints.iter_mut().zip(given) {
             *joint =
                 Admittance { mobility: damping.recip(), keep: (-damping / inertia * tick).exp(), max_speed };
@@ -127,7 +126,7 @@ impl Kinesthetic {
 impl Controller for Kinesthetic {
     fn step(&mut self, input: &Input) -> Step {
         if input.halted {
-            return Step::Move([0.0; MAX_JOINTS]);
+            return Step::Move([0.0; MAX_ROBOT_JOINTS]);
         }
         if !input.valid || !input.torque.iter().chain(&input.qdot).all(|value| value.is_finite()) {
             return Step::Bad(BadCycle::Torque);
@@ -146,14 +145,14 @@ impl Controller for Kinesthetic {
 /// Goes to a position, as quickly as the joints may, and stays there.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Hold {
-    at: [f64; MAX_JOINTS],
+    at: [f64; MAX_ROBOT_JOINTS],
     pace: Pace,
 }
 
 impl Hold {
     /// Holds `at`, in rad.
     #[must_use]
-    pub fn new(skin: &Skin, at: [f64; MAX_JOINTS]) -> Self {
+    pub fn new(skin: &Skin, at: [f64; MAX_ROBOT_JOINTS]) -> Self {
         Self { at, pace: Pace::of(skin) }
     }
 }
@@ -167,8 +166,8 @@ impl Controller for Hold {
 /// Swings every joint about a position: `start + amplitude sin(2 pi t / period)`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Sine {
-    start: [f64; MAX_JOINTS],
-    amplitude: [f64; MAX_JOINTS],
+    start: [f64; MAX_ROBOT_JOINTS],
+    amplitude: [f64; MAX_ROBOT_JOINTS],
     period_s: f64,
     pace: Pace,
 }
@@ -176,13 +175,18 @@ pub struct Sine {
 impl Sine {
     /// Swings about `start` by `amplitude`, both in rad, once in `period_s`.
     #[must_use]
-    pub fn new(skin: &Skin, start: [f64; MAX_JOINTS], amplitude: [f64; MAX_JOINTS], period_s: f64) -> Self {
+    pub fn new(
+        skin: &Skin,
+        start: [f64; MAX_ROBOT_JOINTS],
+        amplitude: [f64; MAX_ROBOT_JOINTS],
+        period_s: f64,
+    ) -> Self {
         Self { start, amplitude, period_s, pace: Pace::of(skin) }
     }
 
     /// Where it is `seconds` after the run's start, in rad.
     #[must_use]
-    pub fn at(&self, seconds: f64) -> [f64; MAX_JOINTS] {
+    pub fn at(&self, seconds: f64) -> [f64; MAX_ROBOT_JOINTS] {
         let swing = (TAU * seconds / self.period_s).sin();
         let mut at = self.start;
         for (at, amplitude) in at.iter_mut().zip(self.amplitude) {
@@ -205,17 +209,17 @@ impl Controller for Sine {
 pub(crate) struct Pace {
     /// Length of a tick in s.
     tick: f64,
-    max_speed: [f64; MAX_JOINTS],
+    max_speed: [f64; MAX_ROBOT_JOINTS],
 }
 
 impl Pace {
     pub(crate) fn of(skin: &Skin) -> Self {
-        Self { tick: 1.0 / skin.timing.control_hz, max_speed: padded(&skin.controller.max_speed_rad_s) }
+        Self { tick: 1.0 / skin.timing.control_hz, max_speed: padded(&skin.controller.max_speed) }
     }
 
     /// The velocities that bring the robot to `goal` by the next tick, as far as speed allows; none
     /// while it is halted.
-    pub(crate) fn towards(&self, goal: &[f64; MAX_JOINTS], input: &Input) -> [f64; MAX_JOINTS] {
+    pub(crate) fn towards(&self, goal: &[f64; MAX_ROBOT_JOINTS], input: &Input) -> [f64; MAX_ROBOT_JOINTS] {
         let mut velocity = *goal;
         for (velocity, q) in velocity.iter_mut().zip(input.q) {
             *velocity = (*velocity - q) / self.tick;
@@ -224,7 +228,11 @@ impl Pace {
     }
 
     /// The velocities, held within the limits of speed; none while the robot is halted.
-    pub(crate) fn limited(&self, mut velocity: [f64; MAX_JOINTS], input: &Input) -> [f64; MAX_JOINTS] {
+    pub(crate) fn limited(
+        &self,
+        mut velocity: [f64; MAX_ROBOT_JOINTS],
+        input: &Input,
+    ) -> [f64; MAX_ROBOT_JOINTS] {
         for (velocity, max_speed) in velocity.iter_mut().zip(self.max_speed) {
             *velocity = if input.halted { 0.0 } else { velocity.clamp(-max_speed, max_speed) };
         }
@@ -251,23 +259,23 @@ mod tests {
         Kinesthetic::new(&skin()).unwrap()
     }
 
-    fn moved(step: Step) -> [f64; MAX_JOINTS] {
+    fn moved(step: Step) -> [f64; MAX_ROBOT_JOINTS] {
         match step {
             Step::Move(velocity) => velocity,
             Step::Bad(why) => panic!("{why}"),
         }
     }
 
-    fn pushed(torque: [f64; MAX_JOINTS]) -> Input {
+    fn pushed(torque: [f64; MAX_ROBOT_JOINTS]) -> Input {
         Input { torque, valid: true, ..Input::default() }
     }
 
     /// Runs the controller on a simulated arm and returns where it ends.
     fn run(controller: &mut impl Controller, start: [f64; 6], ticks: u64, torque: [f64; 6]) -> SimulatedArm {
-        let mut arm = SimulatedArm::new(&skin(), start);
+        let mut arm = SimulatedArm::new(&skin(), padded(&start));
         for tick in 0..ticks {
             let (q, qdot) = (arm.positions(), arm.velocities());
-            let input = Input { tick, time: Micros(tick * 2_000), q, qdot, ..pushed(torque) };
+            let input = Input { tick, time: Micros(tick * 2_000), q, qdot, ..pushed(padded(&torque)) };
             arm.step(&moved(controller.step(&input)), TICK);
         }
         arm
@@ -289,8 +297,8 @@ mod tests {
     #[test]
     fn without_torque_the_arm_comes_to_rest() {
         let mut controller = kinesthetic();
-        let input = Input { qdot: [1.0; 6], ..pushed([0.0; 6]) };
-        for velocity in moved(controller.step(&input)) {
+        let input = Input { qdot: padded(&[1.0; 6]), ..pushed(padded(&[0.0; 6])) };
+        for velocity in moved(controller.step(&input)).into_iter().take(6) {
             assert!(velocity > 0.99 && velocity < 1.0);
         }
     }
@@ -299,16 +307,16 @@ mod tests {
     fn a_torque_that_must_not_be_used_is_a_bad_cycle() {
         let mut controller = kinesthetic();
         assert_eq!(controller.step(&Input::default()), Step::Bad(BadCycle::Torque));
-        assert_eq!(controller.step(&pushed([f64::NAN; 6])), Step::Bad(BadCycle::Torque));
-        let halted = Input { halted: true, qdot: [1.0; 6], ..pushed([5.0; 6]) };
-        assert_eq!(controller.step(&halted), Step::Move([0.0; 6]));
+        assert_eq!(controller.step(&pushed(padded(&[f64::NAN; 6]))), Step::Bad(BadCycle::Torque));
+        let halted = Input { halted: true, qdot: padded(&[1.0; 6]), ..pushed(padded(&[5.0; 6])) };
+        assert_eq!(controller.step(&halted), Step::Move(padded(&[0.0; 6])));
     }
 
     #[test]
     fn hold_stays_and_returns_no_quicker_than_it_may() {
         let at = [0.1, -0.2, 0.3, 0.0, 0.0, 0.0];
-        let mut hold = Hold::new(&skin(), at);
-        assert_eq!(moved(hold.step(&Input { q: at, ..Input::default() })), [0.0; 6]);
+        let mut hold = Hold::new(&skin(), padded(&at));
+        assert_eq!(moved(hold.step(&Input { q: padded(&at), ..Input::default() })), [0.0; MAX_ROBOT_JOINTS]);
         assert_eq!(moved(hold.step(&Input::default()))[..3], [2.0, -2.0, 2.0]);
         let arm = run(&mut hold, [0.0; 6], 200, [50.0; 6]);
         for (got, target) in arm.positions().iter().zip(at) {
@@ -319,7 +327,7 @@ mod tests {
     #[test]
     fn sine_is_where_it_should_be_at_every_tick() {
         let start = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
-        let mut sine = Sine::new(&skin(), start, [0.2, 0.1, 0.0, 0.0, 0.0, 0.3], 4.0);
+        let mut sine = Sine::new(&skin(), padded(&start), padded(&[0.2, 0.1, 0.0, 0.0, 0.0, 0.3]), 4.0);
         for ticks in [1_u32, 7, 500, 4_321] {
             let arm = run(&mut sine, start, ticks.into(), [0.0; 6]);
             let target = sine.at(f64::from(ticks) * TICK);
@@ -335,7 +343,7 @@ mod tests {
             torque in any::<[f64; 6]>(), qdot in proptest::array::uniform6(-5.0..5.0),
         ) {
             let mut controller = kinesthetic();
-            let input = Input { qdot, ..pushed(torque) };
+            let input = Input { qdot: padded(&qdot), ..pushed(padded(&torque)) };
             match controller.step(&input) {
                 Step::Bad(why) => {
                     prop_assert_eq!(why, BadCycle::Torque);

@@ -14,19 +14,21 @@
 //! unless it computes centrally beside them ([`Cycle::central`]).
 
 pub mod carried;
+mod chain;
 pub mod turn;
 
-use protocol::fixed::Q1_14;
 use protocol::id::Command;
 use protocol::message::Joints;
-use protocol::packet::{Epoch, WORDS};
-use protocol::skin::{LostBus, Safety, Skin};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::{LostBus, MAX_ROBOT_JOINTS, Safety, Skin};
 use protocol::time::Micros;
 
 use crate::controller::{BadCycle, Controller, Input, Step};
 use crate::robot::{Moved, Robot};
 use carried::{Carried, Heard, bit};
-use model::central::{Central, ReferenceTorque};
+use chain::Chain;
+use model::central::Central;
 use model::table::Snapshot;
 
 /// When a tick is.
@@ -55,17 +57,17 @@ pub struct Record {
     /// Ticks skipped just before it, because the one before took too long or the machine was away.
     pub skipped: u64,
     /// Joint positions in rad.
-    pub q: [f64; WORDS],
+    pub q: [f64; MAX_ROBOT_JOINTS],
     /// Joint velocities in rad/s.
-    pub qdot: [f64; WORDS],
+    pub qdot: [f64; MAX_ROBOT_JOINTS],
     /// The cells' torque in Nm.
-    pub torque: [f64; WORDS],
+    pub torque: [f64; MAX_ROBOT_JOINTS],
     /// Whether the torque could be used.
     pub valid: bool,
     /// The epoch of the last joints.
     pub epoch: Epoch,
     /// The commanded joint velocities in rad/s.
-    pub command: [f64; WORDS],
+    pub command: [f64; MAX_ROBOT_JOINTS],
     /// Cells in the torque.
     pub contributing: u32,
     /// Epochs that the oldest of them has missed.
@@ -84,11 +86,20 @@ pub struct Record {
     pub moved: Moved,
 }
 
+/// The torque of the whole skin, computed centrally.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Reference {
+    /// The sum of all cells' torques in Nm or N, by joint of the robot (paper, Eq. 1).
+    pub torque: [f64; MAX_ROBOT_JOINTS],
+    /// Cells with a force above zero.
+    pub active: u32,
+}
+
 /// What a tick leads to.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outcome {
-    /// Joints to send on every bus, when they are due.
-    pub joints: Option<(Epoch, Joints)>,
+    /// The epoch of new joints for every bus, [`Cycle::joints`].
+    pub broadcast: Option<Epoch>,
     /// Broadcasts that should have been before this one and were skipped with their ticks.
     pub broadcasts_skipped: u64,
     /// A halt or a resume that has to be sent on every bus: because this loop halts itself, or because
@@ -103,7 +114,8 @@ pub struct Cycle {
     controller: Box<dyn Controller>,
     robot: Box<dyn Robot + Send>,
     central: Vec<Central>,
-    joints: Joints,
+    /// By bus.
+    chains: Vec<Chain>,
     tick_seconds: f64,
     ticks_per_broadcast: u64,
     safety: Safety,
@@ -132,12 +144,11 @@ impl Cycle {
     /// A loop that has not begun; the first epoch will be 0.
     #[must_use]
     pub fn new(skin: &Skin, controller: Box<dyn Controller>, robot: Box<dyn Robot + Send>) -> Self {
-        let in_use = u8::try_from(skin.robot.joints.len()).unwrap_or(u8::MAX);
         Self {
             controller,
             robot,
             central: (0..skin.buses.len()).map(|bus| Central::new(&skin.part_on(bus))).collect(),
-            joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use },
+            chains: (0..skin.buses.len()).map(|bus| Chain::new(skin, bus)).collect(),
             tick_seconds: 1.0 / skin.timing.control_hz,
             ticks_per_broadcast: u64::from(skin.timing.ticks_per_broadcast),
             safety: skin.safety,
@@ -159,7 +170,7 @@ impl Cycle {
 
     /// Joint positions in rad.
     #[must_use]
-    pub fn positions(&self) -> [f64; WORDS] {
+    pub fn positions(&self) -> [f64; MAX_ROBOT_JOINTS] {
         self.robot.positions()
     }
 
@@ -192,8 +203,9 @@ impl Cycle {
         };
         let (mut stale, mut dead, mut halts, mut resumes) = (0, 0, 0, 0);
         let mut some_bus_works = false;
-        for (index, (Heard { sums: bus, works }, carried)) in
-            buses.into_iter().zip(&mut self.carried).enumerate()
+        let chains = self.carried.iter_mut().zip(&self.chains);
+        for (index, (Heard { sums: bus, works }, (carried, chain))) in
+            buses.into_iter().zip(chains).enumerate()
         {
             let unanswered = carried.unanswered(bus.read_back, self.epoch, self.broadcasts);
             if works && !carried::is_lost(unanswered, &self.safety) {
@@ -203,9 +215,7 @@ impl Cycle {
             }
             let part = carried::part(unanswered, &self.safety);
             if part > 0.0 {
-                for (sum, torque) in input.torque.iter_mut().zip(bus.torque) {
-                    *sum += part * torque;
-                }
+                chain.add(part, &bus.torque, &mut input.torque);
                 input.contributing += bus.contributing;
                 stale += bus.stale;
                 if bus.contributing > 0 {
@@ -233,10 +243,10 @@ impl Cycle {
             Step::Move(velocity) if self.halted.is_none() => velocity,
             // Without an answer the robot goes on as it was for a while; halted, it stands.
             Step::Bad(_) if self.halted.is_none() => input.qdot,
-            Step::Move(_) | Step::Bad(_) => [0.0; WORDS],
+            Step::Move(_) | Step::Bad(_) => [0.0; MAX_ROBOT_JOINTS],
         };
         let moved = self.robot.step(&velocity, self.tick_seconds);
-        let (joints, broadcasts_skipped) = self.broadcast(tick);
+        let (broadcast, broadcasts_skipped) = self.broadcast(tick);
         let Input { q, qdot, torque, valid, contributing, age, missing, .. } = input;
         let record = Record {
             tick,
@@ -256,22 +266,32 @@ impl Cycle {
             halted: self.halted,
             moved,
         };
-        Outcome { joints, broadcasts_skipped, command, record }
+        Outcome { broadcast, broadcasts_skipped, command, record }
     }
 
     /// The reference torque: computed centrally from the last broadcast's words and the sensor values at it. This is
     /// the work that distributed computation takes out of the tick. It grows with the cells.
     #[must_use]
-    pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> ReferenceTorque {
-        let mut reference_torque = ReferenceTorque::default();
-        for (central, bus) in self.central.iter().zip(buses) {
-            let part = central.total(&central.frames(&self.joints.positions), &bus.sensors);
-            for (sum, torque) in reference_torque.torque.iter_mut().zip(part.torque) {
-                *sum += torque;
-            }
-            reference_torque.active += part.active;
+    pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> Reference {
+        let mut reference = Reference::default();
+        for ((central, chain), bus) in self.central.iter().zip(&self.chains).zip(buses) {
+            let part = central.total(&central.frames(&chain.said().positions), &bus.sensors);
+            chain.add(1.0, &part.torque, &mut reference.torque);
+            reference.active += part.active;
         }
-        reference_torque
+        reference
+    }
+
+    /// The joints of a bus' chain as they were last broadcast.
+    #[must_use]
+    pub fn joints(&self, bus: usize) -> Joints {
+        self.chains.get(bus).map_or_else(Joints::default, Chain::said)
+    }
+
+    /// What the newest broadcast said of a bus' chain, before it was rounded to words.
+    #[must_use]
+    pub fn positions_of(&self, bus: usize) -> [f64; MAX_JOINTS] {
+        self.chains.get(bus).map_or([0.0; MAX_JOINTS], |chain| chain.positions(&self.robot.positions()))
     }
 
     /// Halts and resumes that others sent; a halt takes precedence over a resume. Returns what has to be sent on
@@ -307,21 +327,18 @@ impl Cycle {
     }
 
     /// The joints, when their time has come: every so many ticks, also when ticks were skipped.
-    fn broadcast(&mut self, tick: Tick) -> (Option<(Epoch, Joints)>, u64) {
+    fn broadcast(&mut self, tick: Tick) -> (Option<Epoch>, u64) {
         let slot = tick.number / self.ticks_per_broadcast;
         if self.slot == Some(slot) {
             return (None, 0);
         }
         let skipped = self.slot.map_or(slot, |last| slot.saturating_sub(last + 1));
         self.slot = Some(slot);
-        let in_use = usize::from(self.joints.in_use);
-        for (word, q) in self.joints.positions.iter_mut().zip(self.robot.positions()).take(in_use) {
-            // A position that is no number keeps its last word; a robot refuses such velocities anyway.
-            *word = Q1_14::from_radians(q).unwrap_or(*word);
-        }
+        let q = self.robot.positions();
+        self.chains.iter_mut().for_each(|chain| chain.say(&q));
         self.epoch = self.epoch.next();
         self.broadcasts += 1;
-        (Some((self.epoch, self.joints)), skipped)
+        (Some(self.epoch), skipped)
     }
 }
 

@@ -13,11 +13,11 @@ use model::scenario::{Motion, MotionKind};
 /// # Errors
 /// When the skin's controller is another program, and there is no socket to listen on for it.
 pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
-    let start = motion.start_rad;
+    let start = motion.start;
     Ok(match (motion.kind, &skin.controller.kind) {
         (MotionKind::Hold, _) => Box::new(Hold::new(skin, start)),
-        (MotionKind::Sine { amplitude_rad, period_s }, _) => {
-            Box::new(Sine::new(skin, start, amplitude_rad, period_s))
+        (MotionKind::Sine { amplitude, period_s }, _) => {
+            Box::new(Sine::new(skin, start, amplitude, period_s))
         }
         (MotionKind::Kinesthetic, ControllerKind::Kinesthetic { inertia, damping }) => {
             Box::new(Kinesthetic::with(skin, inertia, damping))
@@ -34,13 +34,19 @@ mod tests {
     use super::*;
     use crate::controller::{Input, Step};
     use model::testing::skin;
+    use protocol::packet::padded;
 
     #[test]
     fn the_scenario_selects_the_controller() {
-        let mut motion = Motion { start_rad: [0.25; 6], kind: MotionKind::Hold };
+        let mut motion = Motion { start: padded(&[0.25; 6]), kind: MotionKind::Hold };
         let mut step = |kind, torque| {
             motion.kind = kind;
-            let input = Input { q: [0.25; 6], torque: [torque; 6], valid: true, ..Input::default() };
+            let input = Input {
+                q: padded(&[0.25; 6]),
+                torque: padded(&[torque; 6]),
+                valid: true,
+                ..Input::default()
+            };
             match controller_of(&skin(), &motion).unwrap().step(&input) {
                 Step::Move(velocities) => velocities[0],
                 Step::Bad(why) => panic!("{why}"),
@@ -49,6 +55,6 @@ mod tests {
         assert_eq!(step(MotionKind::Hold, 1.0), 0.0);
         assert_eq!(step(MotionKind::Kinesthetic, 0.0), 0.0);
         assert!(step(MotionKind::Kinesthetic, 1.0) > 0.0, "moves with the torque");
-        assert!(step(MotionKind::Sine { amplitude_rad: [0.1; 6], period_s: 4.0 }, 0.0) > 0.0);
+        assert!(step(MotionKind::Sine { amplitude: padded(&[0.1; 6]), period_s: 4.0 }, 0.0) > 0.0);
     }
 }

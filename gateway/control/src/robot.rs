@@ -1,31 +1,25 @@
 //! What is moved: a robot that takes joint velocities, and a simulated one.
 
-use protocol::parameters::MAX_JOINTS;
-use protocol::skin::Skin;
-
-/// What is given for each joint; nothing for joints that the robot does not have.
-pub(crate) fn padded<T: Copy + Default>(given: &[T]) -> [T; MAX_JOINTS] {
-    core::array::from_fn(|joint| given.get(joint).copied().unwrap_or_default())
-}
+use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
 /// A robot that takes joint velocities. Joints that it does not have stand at zero.
 pub trait Robot {
     /// Moves for `seconds` with these joint velocities in rad/s. Called once a tick: must not block,
     /// allocate, lock or log.
-    fn step(&mut self, velocity: &[f64; MAX_JOINTS], seconds: f64) -> Moved;
+    fn step(&mut self, velocity: &[f64; MAX_ROBOT_JOINTS], seconds: f64) -> Moved;
 
     /// Joint positions in rad, as far as the joints have turned: they may exceed half a turn.
-    fn positions(&self) -> [f64; MAX_JOINTS];
+    fn positions(&self) -> [f64; MAX_ROBOT_JOINTS];
 
     /// Joint velocities in rad/s.
-    fn velocities(&self) -> [f64; MAX_JOINTS];
+    fn velocities(&self) -> [f64; MAX_ROBOT_JOINTS];
 }
 
 /// The result of a step.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Moved {
     /// Joints that stand at a limit and were commanded beyond it, one bit each, joint 1 lowest.
-    pub at_limit: u8,
+    pub at_limit: u32,
     /// Whether a velocity was not finite and was taken as zero.
     pub refused: bool,
 }
@@ -33,17 +27,20 @@ pub struct Moved {
 /// An arm whose positions follow the commanded velocities exactly, up to its joints' limits.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SimulatedArm {
-    positions: [f64; MAX_JOINTS],
-    velocities: [f64; MAX_JOINTS],
-    limits: [[f64; 2]; MAX_JOINTS],
+    positions: [f64; MAX_ROBOT_JOINTS],
+    velocities: [f64; MAX_ROBOT_JOINTS],
+    limits: [[f64; 2]; MAX_ROBOT_JOINTS],
 }
 
 impl SimulatedArm {
     /// The skin's robot, at rest at `start` (in rad), held within its limits.
     #[must_use]
-    pub fn new(skin: &Skin, start: [f64; MAX_JOINTS]) -> Self {
-        let limits = padded(&skin.robot.limits_rad);
-        let mut arm = Self { positions: start, velocities: [0.0; MAX_JOINTS], limits };
+    pub fn new(skin: &Skin, start: [f64; MAX_ROBOT_JOINTS]) -> Self {
+        let mut limits = [[0.0; 2]; MAX_ROBOT_JOINTS];
+        for (limits, joint) in limits.iter_mut().zip(&skin.robot.joints) {
+            *limits = joint.limits;
+        }
+        let mut arm = Self { positions: start, velocities: [0.0; MAX_ROBOT_JOINTS], limits };
         for (position, [min, max]) in arm.positions.iter_mut().zip(arm.limits) {
             *position = position.clamp(min, max);
         }
@@ -52,7 +49,7 @@ impl SimulatedArm {
 }
 
 impl Robot for SimulatedArm {
-    fn step(&mut self, velocity: &[f64; MAX_JOINTS], seconds: f64) -> Moved {
+    fn step(&mut self, velocity: &[f64; MAX_ROBOT_JOINTS], seconds: f64) -> Moved {
         let mut moved = Moved::default();
         let joints = self.positions.iter_mut().zip(&mut self.velocities).zip(&self.limits);
         for (joint, (((position, velocity), &[min, max]), &target)) in joints.zip(velocity).enumerate() {
@@ -69,11 +66,11 @@ impl Robot for SimulatedArm {
         moved
     }
 
-    fn positions(&self) -> [f64; MAX_JOINTS] {
+    fn positions(&self) -> [f64; MAX_ROBOT_JOINTS] {
         self.positions
     }
 
-    fn velocities(&self) -> [f64; MAX_JOINTS] {
+    fn velocities(&self) -> [f64; MAX_ROBOT_JOINTS] {
         self.velocities
     }
 }
@@ -84,12 +81,13 @@ mod tests {
     use super::*;
     use model::testing::skin;
     use proptest::prelude::*;
+    use protocol::packet::padded;
 
     #[test]
     fn positions_follow_velocities_beyond_half_a_turn() {
-        let mut arm = SimulatedArm::new(&skin(), [0.5; 6]);
+        let mut arm = SimulatedArm::new(&skin(), padded(&[0.5; 6]));
         for _ in 0..2_000 {
-            assert_eq!(arm.step(&[1.0, -1.0, 0.0, 0.0, 0.0, 0.0], 0.002), Moved::default());
+            assert_eq!(arm.step(&padded(&[1.0, -1.0, 0.0, 0.0, 0.0, 0.0]), 0.002), Moved::default());
         }
         let [q1, q2, q3, ..] = arm.positions();
         assert!((q1 - 4.5).abs() < 1e-9 && (q2 + 3.5).abs() < 1e-9 && q3 == 0.5);
@@ -99,30 +97,31 @@ mod tests {
     #[test]
     fn the_arm_stops_at_a_limit_reports_it_and_comes_back() {
         let mut skin = skin();
-        skin.robot.limits_rad[2] = [-1.0, 0.5];
-        let mut arm = SimulatedArm::new(&skin, [0.0, 0.0, 0.499, 0.0, 0.0, 0.0]);
-        let moved = arm.step(&[0.0, 0.0, 1.0, 0.0, 0.0, 0.0], 0.002);
+        skin.robot.joints[2].limits = [-1.0, 0.5];
+        let mut arm = SimulatedArm::new(&skin, padded(&[0.0, 0.0, 0.499, 0.0, 0.0, 0.0]));
+        let moved = arm.step(&padded(&[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), 0.002);
         assert_eq!(moved, Moved { at_limit: 0b100, refused: false });
         assert_eq!((arm.positions()[2], arm.velocities()[2]), (0.5, 0.0));
-        assert_eq!(arm.step(&[0.0, 0.0, -1.0, 0.0, 0.0, 0.0], 0.002), Moved::default());
+        assert_eq!(arm.step(&padded(&[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]), 0.002), Moved::default());
         assert!(arm.positions()[2] < 0.5);
     }
 
     #[test]
     fn a_velocity_that_is_no_number_moves_nothing() {
-        let mut arm = SimulatedArm::new(&skin(), [0.25; 6]);
-        assert!(arm.step(&[f64::NAN, f64::INFINITY, 0.0, 0.0, 0.0, 0.0], 0.002).refused);
-        assert_eq!(arm.positions(), [0.25; 6]);
+        let mut arm = SimulatedArm::new(&skin(), padded(&[0.25; 6]));
+        assert!(arm.step(&padded(&[f64::NAN, f64::INFINITY, 0.0, 0.0, 0.0, 0.0]), 0.002).refused);
+        assert_eq!(arm.positions()[..6], [0.25; 6]);
     }
 
     proptest! {
         #[test]
         fn no_joint_ever_leaves_its_limits(steps in proptest::collection::vec(any::<[f64; 6]>(), 1..50)) {
             let skin = skin();
-            let mut arm = SimulatedArm::new(&skin, [0.0; 6]);
+            let mut arm = SimulatedArm::new(&skin, padded(&[0.0; 6]));
             for step in steps {
-                arm.step(&step, 0.002);
-                for (position, [min, max]) in arm.positions().iter().zip(&skin.robot.limits_rad) {
+                arm.step(&padded(&step), 0.002);
+                for (position, joint) in arm.positions().iter().zip(&skin.robot.joints) {
+                    let [min, max] = &joint.limits;
                     prop_assert!(min <= position && position <= max);
                 }
             }

@@ -17,19 +17,20 @@
 use nalgebra::{IsometryMatrix3, Point3, Rotation3, Translation3, Vector3};
 use protocol::fixed::{Q, Q1_14};
 use protocol::message::SkinSensors;
-use protocol::parameters::{Contact, MAX_JOINTS};
-use protocol::skin::Skin;
+use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, RowKind};
+use protocol::skin::{Cell, Chain, Skin};
 
-/// The reference for one skin. Cells are named by their index in [`Skin::cells`].
+/// The reference for the cells of one chain. Cells are named by their index in [`Skin::cells`].
 #[derive(Clone, Debug)]
 pub struct Central {
     links: Vec<Link>,
     cells: Vec<Place>,
 }
 
-/// One row of the robot's table.
+/// One row of the chain's table.
 #[derive(Clone, Copy, Debug)]
 struct Link {
+    kind: RowKind,
     /// What does not move: `Tz(d) Tx(a) Rx(alpha)`.
     fixed: IsometryMatrix3<f64>,
     /// Added to the joint's word, as the cells do it.
@@ -38,82 +39,116 @@ struct Link {
     offset: f64,
 }
 
-/// The pose of a cell in the frame of joint k, and its contact thresholds.
+/// The pose of a cell in the frame of the row that carries it, and its contact thresholds.
 #[derive(Clone, Copy, Debug)]
 struct Place {
-    joint: usize,
+    row: usize,
     position: Point3<f64>,
     normal: Vector3<f64>,
     contact: Contact,
 }
 
-/// Where all links are, for one set of joint positions: frames 0 (the base) to 6 seen from the base.
-/// Those beyond the robot's last joint are the base's.
-#[derive(Clone, Copy, Debug)]
-pub struct Frames([IsometryMatrix3<f64>; MAX_JOINTS + 1]);
+/// Where all links are, for one set of joint positions: frame 0 (the base) and those of the rows, seen from the base.
+#[derive(Clone, Debug)]
+pub struct Frames {
+    frames: [IsometryMatrix3<f64>; MAX_ROWS + 1],
+    kinds: [RowKind; MAX_ROWS],
+}
 
 /// The torque of the whole skin.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ReferenceTorque {
-    /// The sum of all cells' torques in Nm (paper, Eq. 1).
+    /// The sum of all cells' torques in Nm or N, by joint of the chain (paper, Eq. 1).
     pub torque: [f64; MAX_JOINTS],
     /// Cells with a force above zero.
     pub active: u32,
 }
 
 impl Central {
-    /// The reference on the words that the cells compute with.
+    /// The reference on the words that the cells compute with. All cells of the skin sit on one chain: take
+    /// [`Skin::part_on`] a bus, where there are several.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
-        let mut links = Vec::with_capacity(MAX_JOINTS);
+        let mut links = Vec::new();
         let cells = skin.cells.iter().map(|cell| {
             let parameters = skin.parameters(cell);
             if links.is_empty() {
-                let rows = parameters.rows.iter().take(skin.robot.joints.len());
-                links.extend(rows.map(|row| {
+                links.extend(parameters.table().iter().map(|row| {
                     let (a, d, alpha) = (row.a.to_f64(), row.d.to_f64(), row.alpha.to_radians());
-                    Link::new(a, d, alpha, row.theta_offset, row.theta_offset.to_radians())
+                    Link::new(row.kind, a, d, alpha, row.theta_offset, row.theta_offset.to_radians())
                 }));
             }
             let pose = parameters.pose;
-            Place::new(cell.joint, pose.position.map(Q::to_f64), pose.normal.map(Q::to_f64), cell.contact)
+            Place::new(cell, pose.position.map(Q::to_f64), pose.normal.map(Q::to_f64))
         });
         let cells = cells.collect();
         Self { links, cells }
     }
 
-    /// The reference on the numbers of the skin's file.
+    /// The reference on the numbers of the skin's file; of one chain, as above.
     #[must_use]
     pub fn unquantised(skin: &Skin) -> Self {
-        let links = skin.robot.joints.iter().map(|row| {
-            let word = Q1_14::from_radians(row.theta_offset).unwrap_or_default();
-            Link::new(row.a, row.d, row.alpha, word, row.theta_offset)
-        });
-        let cells =
-            skin.cells.iter().map(|cell| Place::new(cell.joint, cell.position, cell.normal, cell.contact));
-        Self { links: links.collect(), cells: cells.collect() }
+        let rows = |chain: &Chain| {
+            let link = |row: &protocol::skin::ChainRow| {
+                let table = row.table;
+                let word = Q1_14::from_radians(table.theta_offset).unwrap_or_default();
+                Link::new(row.kind, table.a, table.d, table.alpha, word, table.theta_offset)
+            };
+            chain.rows.iter().map(link).collect()
+        };
+        let cells = skin.cells.iter().map(|cell| Place::new(cell, cell.position, cell.normal));
+        let links = skin.cells.first().map_or_else(Vec::new, |cell| rows(skin.chain(cell.bus)));
+        Self { links, cells: cells.collect() }
     }
 
-    /// Where all links are when the joints stand as these words say. Bounded work, no allocation.
+    /// Where all links are when the joints of the chain stand as these words say. Bounded work, no allocation.
     #[must_use]
-    pub fn frames(&self, joints: &[Q1_14; MAX_JOINTS]) -> Frames {
-        self.chain(joints, |link, &word| word.wrapping_add(link.offset_word).to_radians())
+    pub fn frames(&self, joints: &[Q1_14]) -> Frames {
+        self.chain(joints, |link, word| match (link.kind, word) {
+            (RowKind::Revolute, Some(word)) => (word.wrapping_add(link.offset_word).to_radians(), 0.0),
+            (RowKind::Prismatic, Some(word)) => (link.offset_word.to_radians(), word.to_f64()),
+            (RowKind::Fixed, _) | (_, None) => (link.offset_word.to_radians(), 0.0),
+        })
     }
 
-    /// Where all links are when the joints stand at these angles in rad. Bounded work, no allocation.
+    /// Where all links are when the joints of the chain stand at these positions, in rad or m. Bounded work, no
+    /// allocation.
     #[must_use]
-    pub fn frames_at(&self, q: &[f64; MAX_JOINTS]) -> Frames {
-        self.chain(q, |link, angle| angle + link.offset)
+    pub fn frames_at(&self, q: &[f64]) -> Frames {
+        self.chain(q, |link, q| match (link.kind, q) {
+            (RowKind::Revolute, Some(angle)) => (angle + link.offset, 0.0),
+            (RowKind::Prismatic, Some(slide)) => (link.offset, *slide),
+            (RowKind::Fixed, _) | (_, None) => (link.offset, 0.0),
+        })
     }
 
-    fn chain<T>(&self, joints: &[T; MAX_JOINTS], theta: impl Fn(&Link, &T) -> f64) -> Frames {
-        let mut frames = [IsometryMatrix3::identity(); MAX_JOINTS + 1];
-        let mut tip = IsometryMatrix3::identity();
-        for ((frame, link), joint) in frames.iter_mut().skip(1).zip(&self.links).zip(joints) {
-            tip = tip * Rotation3::from_axis_angle(&Vector3::z_axis(), theta(link, joint)) * link.fixed;
-            *frame = tip;
+    /// The positions of the chain's joints, in rad or m, that words stand for.
+    #[must_use]
+    pub fn positions(&self, joints: &[Q1_14]) -> [f64; MAX_JOINTS] {
+        let mut positions = [0.0; MAX_JOINTS];
+        let moving = self.links.iter().filter(|link| link.kind != RowKind::Fixed);
+        for ((position, link), word) in positions.iter_mut().zip(moving).zip(joints) {
+            *position = if link.kind == RowKind::Prismatic { word.to_f64() } else { word.to_radians() };
         }
-        Frames(frames)
+        positions
+    }
+
+    /// `place` gives the angle of a row and how far it slides.
+    fn chain<T>(&self, joints: &[T], place: impl Fn(&Link, Option<&T>) -> (f64, f64)) -> Frames {
+        let mut tip = IsometryMatrix3::identity();
+        let mut frames = Frames { frames: [tip; MAX_ROWS + 1], kinds: [RowKind::Fixed; MAX_ROWS] };
+        let mut joints = joints.iter();
+        let each = frames.frames.iter_mut().skip(1).zip(&mut frames.kinds);
+        for ((frame, kind), link) in each.zip(&self.links) {
+            let joint = if link.kind == RowKind::Fixed { None } else { joints.next() };
+            let (theta, slide) = place(link, joint);
+            if link.kind == RowKind::Prismatic {
+                tip *= Translation3::new(0.0, 0.0, slide);
+            }
+            tip = tip * Rotation3::from_axis_angle(&Vector3::z_axis(), theta) * link.fixed;
+            (*frame, *kind) = (tip, link.kind);
+        }
+        frames
     }
 
     /// The force F_z in N that a cell computes from its sensor words: Algorithm 1, exactly. Zero means not in
@@ -126,11 +161,12 @@ impl Central {
     /// Where a cell is, seen from the base, in m; the base itself for a cell that does not exist.
     #[must_use]
     pub fn position(&self, cell: usize, frames: &Frames) -> [f64; 3] {
-        let place = self.cells.get(cell).and_then(|place| Some(frames.0.get(place.joint)? * place.position));
+        let place =
+            self.cells.get(cell).and_then(|place| Some(frames.frames.get(place.row)? * place.position));
         place.map_or([0.0; 3], |position| position.coords.into())
     }
 
-    /// The joint torques in Nm of one cell with the force `f_z` on it (paper, Eq. 8); zero in joints that do not
+    /// The joint torques in Nm, of prismatic joints the forces in N, of one cell with the force `f_z` on it (paper, Eq. 8); zero in joints that do not
     /// move it, and for a cell that does not exist. Bounded work, no allocation.
     #[must_use]
     pub fn torque(&self, cell: usize, frames: &Frames, f_z: f64) -> [f64; MAX_JOINTS] {
@@ -160,29 +196,35 @@ impl Central {
 
 impl Frames {
     /// Adds the torques of a cell at `place` with the force `f_z` on it about joints 1 to k:
-    /// `z_(l-1) x (t - t_(l-1)) . force`.
+    /// `z_(l-1) x (t - t_(l-1)) . force`, of prismatic joints `z_(l-1) . force`.
     fn add_torque(&self, place: &Place, f_z: f64, torque: &mut [f64; MAX_JOINTS]) {
-        let Some(limb) = self.0.get(place.joint) else { return };
+        let Some(limb) = self.frames.get(place.row) else { return };
         let position = limb * place.position;
         let force = limb.rotation * place.normal * -f_z;
-        for (torque, below) in torque.iter_mut().zip(&self.0).take(place.joint) {
+        let rows = self.kinds.iter().zip(&self.frames).take(place.row);
+        let moving = rows.filter(|(kind, _)| **kind != RowKind::Fixed);
+        for (torque, (kind, below)) in torque.iter_mut().zip(moving) {
             let axis = below.rotation.matrix().column(2);
-            let arm = position.coords - below.translation.vector;
-            *torque += axis.cross(&arm).dot(&force);
+            *torque += if *kind == RowKind::Prismatic {
+                axis.dot(&force)
+            } else {
+                axis.cross(&(position.coords - below.translation.vector)).dot(&force)
+            };
         }
     }
 }
 
 impl Link {
-    fn new(a: f64, d: f64, alpha: f64, offset_word: Q1_14, offset: f64) -> Self {
+    fn new(kind: RowKind, a: f64, d: f64, alpha: f64, offset_word: Q1_14, offset: f64) -> Self {
         let twist = Rotation3::from_axis_angle(&Vector3::x_axis(), alpha);
-        Self { fixed: Translation3::new(a, 0.0, d) * twist, offset_word, offset }
+        Self { kind, fixed: Translation3::new(a, 0.0, d) * twist, offset_word, offset }
     }
 }
 
 impl Place {
-    fn new(joint: u8, position: [f64; 3], normal: [f64; 3], contact: Contact) -> Self {
-        Self { joint: joint.into(), position: position.into(), normal: normal.into(), contact }
+    fn new(cell: &Cell, position: [f64; 3], normal: [f64; 3]) -> Self {
+        let Cell { row, contact, .. } = *cell;
+        Self { row: row.into(), position: position.into(), normal: normal.into(), contact }
     }
 }
 

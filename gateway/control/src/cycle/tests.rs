@@ -22,7 +22,7 @@ fn tick(number: u64) -> Tick {
 
 fn cycle(controller: Box<dyn Controller>) -> (Cycle, Sums) {
     let skin = testing::skin();
-    let robot = SimulatedArm::new(&skin, [0.0; WORDS]);
+    let robot = SimulatedArm::new(&skin, [0.0; MAX_ROBOT_JOINTS]);
     (Cycle::new(&skin, controller, Box::new(robot)), Sums::default())
 }
 
@@ -32,7 +32,7 @@ fn joints_go_out_every_eighth_tick_also_after_skipped_ones() {
     let mut sent = vec![];
     for number in [0, 1, 7, 8, 9, 17, 18, 40, 41] {
         let outcome = cycle.tick(tick(number), 0, [works(&bus)]);
-        if let Some((epoch, _)) = outcome.joints {
+        if let Some(epoch) = outcome.broadcast {
             sent.push((number, epoch.0, outcome.broadcasts_skipped));
         }
     }
@@ -82,9 +82,9 @@ impl Two {
     fn new(lost_bus: LostBus) -> Self {
         let mut skin = testing::two_buses();
         skin.safety.lost_bus = lost_bus;
-        let robot = SimulatedArm::new(&skin, [0.0; WORDS]);
+        let robot = SimulatedArm::new(&skin, [0.0; MAX_ROBOT_JOINTS]);
         let controller = Box::new(Kinesthetic::new(&skin).unwrap());
-        let reference_torque = Sums { torque: [1.0; WORDS], contributing: 1, ..Sums::default() };
+        let reference_torque = Sums { torque: [1.0; MAX_JOINTS], contributing: 1, ..Sums::default() };
         let cycle = Cycle::new(&skin, controller, Box::new(robot));
         Self { cycle, buses: [reference_torque; 2], works: [true; 2], number: 0 }
     }
@@ -96,7 +96,7 @@ impl Two {
             let heard = self.buses.iter().zip(self.works).map(|(sums, works)| Heard { sums, works });
             let outcome = self.cycle.tick(tick(self.number), 0, heard);
             self.number += 1;
-            if let Some((epoch, _)) = outcome.joints {
+            if let Some(epoch) = outcome.broadcast {
                 for (bus, _) in self.buses.iter_mut().zip(carries).filter(|(_, carries)| *carries) {
                     bus.read_back = Some(epoch);
                 }
@@ -170,7 +170,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted() {
 #[test]
 fn a_halted_robot_stands_whatever_is_commanded() {
     let (mut cycle, mut bus) = cycle(Box::new(Kinesthetic::new(&testing::skin()).unwrap()));
-    bus.torque = [5.0; WORDS];
+    bus.torque = [5.0; MAX_JOINTS];
     for number in 0..50 {
         cycle.tick(tick(number), 0, [works(&bus)]);
     }

@@ -7,16 +7,18 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use protocol::can::{Format, Frame};
 use protocol::id::Command;
 use protocol::message::Message;
-use protocol::packet::{Epoch, Packet, WORDS};
+use protocol::packet::{Epoch, Length, Packet};
+use protocol::parameters::MAX_JOINTS;
 
 use crate::cycle::carried::Heard;
-use crate::cycle::{Cycle, Record, Tick};
-use model::central::ReferenceTorque;
+use crate::cycle::{Cycle, Record, Reference, Tick};
 use model::scenario::{Mode, Scenario};
 use model::table::Snapshot;
 
 /// While the robot is halted, the halt is resent before every so many joints.
 const HALT_AGAIN: u8 = 8;
+/// Classic frames of the longest packet.
+const SEGMENTS: usize = Length::Fourteen.segments();
 
 /// What all threads of a run share.
 #[derive(Debug, Default)]
@@ -53,7 +55,7 @@ pub struct Timed {
     /// How long it took, in ns.
     pub took_ns: u64,
     /// How long the central computation took of that, in ns, and its result.
-    pub central: Option<(u64, ReferenceTorque)>,
+    pub central: Option<(u64, Reference)>,
 }
 
 /// The state of a bus, for all threads.
@@ -89,7 +91,7 @@ pub struct Line {
     /// The receiver's snapshot.
     pub snapshot: triple_buffer::Output<Snapshot>,
     /// Positions in rad of each broadcast, for the receiver to compare with.
-    pub positions: rtrb::Producer<(Epoch, [f64; WORDS])>,
+    pub positions: rtrb::Producer<(Epoch, [f64; MAX_JOINTS])>,
     /// Its state.
     pub state: Arc<BusState>,
 }
@@ -166,17 +168,22 @@ impl Turn {
             (now().saturating_sub(before), std::hint::black_box(reference_torque))
         });
         self.owe_to_returned_buses(outcome.record.halted.is_some());
-        if let Some((epoch, joints)) = outcome.joints {
+        if let Some(epoch) = outcome.broadcast {
             // A cell that restarted, or did not receive it, would go on answering.
             if outcome.record.halted.is_some() && epoch.0.is_multiple_of(HALT_AGAIN) {
                 self.owed.fill(Some(Message::Halt));
             }
             self.say_what_is_owed(&mut send);
-            for line in &mut self.lines {
+            for (bus, line) in self.lines.iter_mut().enumerate() {
                 // A full queue costs the receiver the unrounded positions, and nothing else.
-                let _ = line.positions.push((epoch, outcome.record.q));
+                let _ = line.positions.push((epoch, self.cycle.positions_of(bus)));
+                line.say(
+                    bus,
+                    &Message::Joints { epoch, joints: self.cycle.joints(bus) },
+                    &self.shared,
+                    &mut send,
+                );
             }
-            self.say(&Message::Joints { epoch, joints }, &mut send);
             self.shared.broadcasts.fetch_add(1, Ordering::Release);
             self.shared.broadcasts_skipped.fetch_add(outcome.broadcasts_skipped, Ordering::Relaxed);
         }
@@ -226,13 +233,6 @@ impl Turn {
             owed.take_if(|message| line.say(bus, message, &self.shared, send));
         }
     }
-
-    /// Sends joints on every bus.
-    fn say(&self, message: &Message, send: &mut impl FnMut(usize, &[Frame]) -> bool) {
-        for (bus, line) in self.lines.iter().enumerate() {
-            line.say(bus, message, &self.shared, send);
-        }
-    }
 }
 
 impl Line {
@@ -257,8 +257,8 @@ impl Line {
 }
 
 /// A packet's frames in place: an array, and how many of it are used.
-fn frames(packet: &Packet, format: Format) -> ([Frame; 2], usize) {
-    let mut frames = [Frame::EMPTY; 2];
+fn frames(packet: &Packet, format: Format) -> ([Frame; SEGMENTS], usize) {
+    let mut frames = [Frame::EMPTY; SEGMENTS];
     let mut count = 0;
     for (place, frame) in frames.iter_mut().zip(packet.frames(format)) {
         *place = frame;

@@ -3,12 +3,14 @@
 //! ```text
 //!   all      0 magic "SKBC" | 4 version u16 | 6 kind u16: 1 state, 2 answer, 3 hello
 //!   state    8 tick u64 | 16 time in us u64 | 24 age in epochs u32 | 28 contributing cells u32
-//!           32 flags u32, from bit 16 on a mask of lost buses | 36 joints u32 | 40 q 6 f64 | 88 qdot 6 f64 | 136 torque 6 f64   184 bytes
-//!   answer   8 tick u64 | 16 command u32 | 20 zero u32 | 24 six f64                         72 bytes
+//!           32 flags u32, from bit 16 on a mask of lost buses | 36 joints u32 | 40 q n f64 | qdot n f64 | torque n f64   40 + 24 n bytes
+//!   answer   8 tick u64 | 16 command u32 | 20 zero u32 | 24 n f64                           24 + 8 n bytes
 //!   hello                                                                                    8 bytes
 //! ```
+//!
+//! n is the robot's joints, but 6 at least: values of joints that it has not are 0 in a state, and ignored in an answer.
 
-use protocol::parameters::MAX_JOINTS;
+use protocol::skin::MAX_ROBOT_JOINTS;
 use thiserror::Error;
 
 use crate::controller::Input;
@@ -20,10 +22,23 @@ const ANSWER: u16 = 2;
 const HELLO: u16 = 3;
 
 const HEAD_BYTES: usize = 8;
+/// Bytes of the longest answer.
+pub(super) const MAX_ANSWER_BYTES: usize = answer_bytes(MAX_ROBOT_JOINTS);
+
+/// Values of each kind in a datagram.
+const fn values(joints: usize) -> usize {
+    if joints < 6 { 6 } else { joints }
+}
+
 /// Bytes of a state.
-pub(super) const STATE_BYTES: usize = 184;
-/// Bytes of an answer, the longest that the gateway takes.
-pub(super) const ANSWER_BYTES: usize = 72;
+const fn state_bytes(joints: usize) -> usize {
+    40 + 24 * values(joints)
+}
+
+/// Bytes of an answer.
+const fn answer_bytes(joints: usize) -> usize {
+    24 + 8 * values(joints)
+}
 
 /// What the gateway sends in every tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -47,13 +62,14 @@ pub struct Answer {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Command {
     /// 1: joint velocities in rad/s.
-    Velocity([f64; MAX_JOINTS]),
+    Velocity([f64; MAX_ROBOT_JOINTS]),
     /// 2: joint positions in rad, to be reached by the next tick as far as the limits of speed allow.
-    Position([f64; MAX_JOINTS]),
+    Position([f64; MAX_ROBOT_JOINTS]),
 }
 
 /// What the gateway takes.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "one at a time, on the stack: the loop allocates nothing")]
 pub(super) enum Heard {
     Hello,
     Answer(Answer),
@@ -109,8 +125,8 @@ impl Writer<'_> {
         self.put(kind.to_le_bytes());
     }
 
-    fn joints(&mut self, values: [f64; MAX_JOINTS]) {
-        for value in values {
+    fn joints(&mut self, all: [f64; MAX_ROBOT_JOINTS], joints: usize) {
+        for value in all.into_iter().take(values(joints)) {
             self.put(value.to_le_bytes());
         }
     }
@@ -126,8 +142,13 @@ impl Reader<'_> {
         *head
     }
 
-    fn joints(&mut self) -> [f64; MAX_JOINTS] {
-        [(); MAX_JOINTS].map(|()| f64::from_le_bytes(self.take()))
+    /// Values that are not there are 0.
+    fn joints(&mut self, joints: usize) -> [f64; MAX_ROBOT_JOINTS] {
+        let mut all = [0.0; MAX_ROBOT_JOINTS];
+        for value in all.iter_mut().take(values(joints)) {
+            *value = f64::from_le_bytes(self.take());
+        }
+        all
     }
 
     /// The kind, if the head is sound.
@@ -153,8 +174,9 @@ impl State {
 
     /// The bytes.
     #[must_use]
-    pub fn encode(&self) -> [u8; STATE_BYTES] {
-        let mut bytes = [0; STATE_BYTES];
+    pub fn encode(&self) -> heapless::Vec<u8, { state_bytes(MAX_ROBOT_JOINTS) }> {
+        let joints = usize::try_from(self.joints).unwrap_or(usize::MAX).min(MAX_ROBOT_JOINTS);
+        let mut bytes = [0; state_bytes(MAX_ROBOT_JOINTS)];
         let mut out = Writer(&mut bytes);
         let input = &self.input;
         out.head(STATE);
@@ -167,10 +189,10 @@ impl State {
         let flags = flag(Self::VALID, input.valid) | flag(Self::HALTED, input.halted);
         out.put((flags | missing << Self::MISSING).to_le_bytes());
         out.put(self.joints.to_le_bytes());
-        out.joints(input.q);
-        out.joints(input.qdot);
-        out.joints(input.torque);
-        bytes
+        out.joints(input.q, joints);
+        out.joints(input.qdot, joints);
+        out.joints(input.torque, joints);
+        bytes.into_iter().take(state_bytes(joints)).collect()
     }
 }
 
@@ -180,15 +202,15 @@ impl Answer {
 }
 
 impl Heard {
-    /// Reads what came. Never panics.
+    /// Reads what came, for a robot of so many joints. Never panics.
     ///
     /// # Errors
     /// When it is neither an answer nor a hello.
-    pub(super) fn decode(bytes: &[u8]) -> Result<Self, Nonsense> {
+    pub(super) fn decode(bytes: &[u8], joints: usize) -> Result<Self, Nonsense> {
         let mut from = Reader(bytes);
         let expected = match from.head()? {
             HELLO => HEAD_BYTES,
-            ANSWER => ANSWER_BYTES,
+            ANSWER => answer_bytes(joints),
             _ => return Err(Nonsense::Kind),
         };
         if bytes.len() != expected {
@@ -200,7 +222,7 @@ impl Heard {
         let tick = u64::from_le_bytes(from.take());
         let command = u32::from_le_bytes(from.take());
         let _zero: [u8; 4] = from.take();
-        let values = from.joints();
+        let values = from.joints(joints);
         if !values.iter().all(|value| value.is_finite()) {
             return Err(Nonsense::NotFinite);
         }
@@ -225,9 +247,6 @@ mod peer {
             if from.head()? != STATE {
                 return Err(Nonsense::Kind);
             }
-            if bytes.len() != STATE_BYTES {
-                return Err(Nonsense::Length);
-            }
             let mut input = Input {
                 tick: u64::from_le_bytes(from.take()),
                 time: protocol::time::Micros(u64::from_le_bytes(from.take())),
@@ -240,17 +259,21 @@ mod peer {
             input.halted = flags & Self::HALTED != 0;
             input.missing = flags >> Self::MISSING;
             let joints = u32::from_le_bytes(from.take());
-            input.q = from.joints();
-            input.qdot = from.joints();
-            input.torque = from.joints();
+            let count = usize::try_from(joints).unwrap();
+            if bytes.len() != state_bytes(count) {
+                return Err(Nonsense::Length);
+            }
+            input.q = from.joints(count);
+            input.qdot = from.joints(count);
+            input.torque = from.joints(count);
             Ok(Self { input, joints })
         }
     }
 
     impl Answer {
         /// The bytes.
-        pub(crate) fn encode(&self) -> [u8; ANSWER_BYTES] {
-            let mut bytes = [0; ANSWER_BYTES];
+        pub(crate) fn encode(&self, joints: usize) -> Vec<u8> {
+            let mut bytes = vec![0; answer_bytes(joints)];
             let mut out = Writer(&mut bytes);
             out.head(ANSWER);
             out.put(self.tick.to_le_bytes());
@@ -260,7 +283,7 @@ mod peer {
             };
             out.put(command.to_le_bytes());
             out.put([0; 4]);
-            out.joints(values);
+            out.joints(values, joints);
             bytes
         }
     }

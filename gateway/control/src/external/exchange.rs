@@ -80,17 +80,24 @@ pub(super) struct Exchange {
     answer: Option<Command>,
     nonsense: bool,
     pub(super) counts: Counts,
+    /// Joints of the robot.
+    joints: usize,
 }
 
 impl Exchange {
+    /// With a robot of so many joints.
+    pub(super) fn new(joints: usize) -> Self {
+        Self { joints, ..Self::default() }
+    }
+
     /// Takes in a datagram. Whether its sender is the peer from now on.
     pub(super) fn handle(&mut self, bytes: &[u8], sender: Sender) -> bool {
-        let answer = match (Heard::decode(bytes), sender) {
+        let answer = match (Heard::decode(bytes, self.joints), sender) {
             (Ok(Heard::Hello), _) => {
                 let counts = Counts { hellos: self.counts.hellos + 1, ..core::mem::take(&mut self.counts) };
                 // A second hello of the peer leaves its pending answer.
                 if sender == Sender::Other || !self.connected {
-                    *self = Self::default();
+                    *self = Self::new(self.joints);
                 }
                 (self.connected, self.counts) = (true, counts);
                 return true;

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use protocol::skin::Skin;
 use thiserror::Error;
 
-use super::datagram::{ANSWER_BYTES, State};
+use super::datagram::{MAX_ANSWER_BYTES, State};
 use super::exchange::{Exchange, Sender, Sent};
 use crate::controller::{Controller, Input, Pace, Step};
 
@@ -66,7 +66,7 @@ impl External {
             file: file(path),
             path: path.to_owned(),
             peer: None,
-            exchange: Exchange::default(),
+            exchange: Exchange::new(skin.robot.joints.len()),
             pace: Pace::of(skin),
             joints: u32::try_from(skin.robot.joints.len()).unwrap_or_default(),
         })
@@ -74,7 +74,7 @@ impl External {
 
     fn receive(&mut self) {
         // One byte more than the longest datagram, so that a longer one is seen to be longer.
-        let mut bytes = [0; ANSWER_BYTES + 1];
+        let mut bytes = [0; MAX_ANSWER_BYTES + 1];
         for _ in 0..PER_TICK {
             let (length, from) = match self.socket.recv_from(&mut bytes) {
                 Ok(received) => received,

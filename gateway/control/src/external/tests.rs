@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 use proptest::prelude::*;
 use tempfile::TempDir;
 
-use super::datagram::{ANSWER_BYTES, Heard, STATE_BYTES};
+use super::datagram::Heard;
 use super::*;
 use crate::controller::{BadCycle, Controller, Input, Step};
 use model::testing::skin;
+use protocol::packet::padded;
 
 const HELLO: &[u8] = b"SKBC\x01\x00\x03\x00";
 
@@ -35,13 +36,13 @@ fn input(tick: u64) -> Input {
     Input { tick, valid: true, ..Input::default() }
 }
 
-fn velocity(tick: u64, first: f64) -> [u8; ANSWER_BYTES] {
-    let command = Command::Velocity([first, 0.0, 0.0, 0.0, 0.0, 0.0]);
-    Answer { tick, command }.encode()
+fn velocity(tick: u64, first: f64) -> Vec<u8> {
+    let command = Command::Velocity(padded(&[first, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    Answer { tick, command }.encode(6)
 }
 
 fn state(socket: &UnixDatagram) -> State {
-    let mut bytes = [0; STATE_BYTES + 1];
+    let mut bytes = [0; 1_000];
     let length = socket.recv(&mut bytes).unwrap();
     State::decode(&bytes[..length]).unwrap()
 }
@@ -55,9 +56,9 @@ fn a_state_is_the_bytes_of_the_documented_table() {
     let input = Input {
         tick: 0x0102,
         time: protocol::time::Micros(516_000),
-        q: [1.0, 0.0, 0.0, 0.0, 0.0, -2.0],
-        qdot: [0.5, 0.0, 0.0, 0.0, 0.0, 0.0],
-        torque: [0.0, 0.0, 0.0, 0.0, 0.0, 0.25],
+        q: padded(&[1.0, 0.0, 0.0, 0.0, 0.0, -2.0]),
+        qdot: padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        torque: padded(&[0.0, 0.0, 0.0, 0.0, 0.0, 0.25]),
         age: 3,
         contributing: 20,
         valid: true,
@@ -74,6 +75,21 @@ fn a_state_is_the_bytes_of_the_documented_table() {
 }
 
 #[test]
+fn a_robot_of_more_joints_has_longer_datagrams() {
+    let mut input = Input::default();
+    (input.q[0], input.qdot[0], input.torque[12]) = (1.0, 0.5, 0.25);
+    let bytes = State { input, joints: 13 }.encode();
+    assert_eq!(bytes.len(), 40 + 3 * 13 * 8);
+    assert_eq!(bytes[40 + 13 * 8..][..8], *b"\0\0\0\0\0\0\xe0\x3f");
+    assert_eq!(bytes[40 + 39 * 8 - 8..], *b"\0\0\0\0\0\0\xd0\x3f");
+    assert_eq!(State::decode(&bytes), Ok(State { input, joints: 13 }));
+    let answer = Answer { tick: 7, command: Command::Velocity(padded(&[1.0; 13])) };
+    assert_eq!(answer.encode(13).len(), 24 + 13 * 8);
+    assert_eq!(Heard::decode(&answer.encode(13), 13), Ok(Heard::Answer(answer)));
+    assert_eq!(Heard::decode(&answer.encode(13), 7), Err(Nonsense::Length));
+}
+
+#[test]
 fn buses_beyond_the_16th_share_its_bit() {
     let said = |missing| {
         let bytes = State { input: Input { missing, ..Input::default() }, joints: 6 }.encode();
@@ -84,12 +100,12 @@ fn buses_beyond_the_16th_share_its_bit() {
 
 #[test]
 fn an_answer_is_the_bytes_of_the_documented_table() {
-    let command = Command::Position([-2.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
-    let bytes = Answer { tick: 7, command }.encode();
+    let command = Command::Position(padded(&[-2.0, 0.0, 0.0, 0.0, 0.0, 1.0]));
+    let bytes = Answer { tick: 7, command }.encode(6);
     assert_eq!(bytes[..24], *b"SKBC\x01\x00\x02\x00\x07\0\0\0\0\0\0\0\x02\0\0\0\0\0\0\0");
     assert_eq!(bytes[24..32], *b"\0\0\0\0\0\0\0\xc0");
     assert_eq!(bytes[64..], *b"\0\0\0\0\0\0\xf0\x3f");
-    assert_eq!(Heard::decode(&bytes), Ok(Heard::Answer(Answer { tick: 7, command })));
+    assert_eq!(Heard::decode(&bytes, 6), Ok(Heard::Answer(Answer { tick: 7, command })));
 }
 
 #[test]
@@ -101,17 +117,19 @@ fn an_answer_is_executed_in_the_next_tick() {
     assert_eq!(gateway.step(&input(1)), Step::Bad(BadCycle::NoPeer), "it has not got a state yet");
     assert_eq!(state(&program), State { input: input(1), joints: 6 });
     program.send(&velocity(1, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(2)), Step::Move([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]));
-    let command = Command::Position([0.001, 0.0, 0.0, 0.0, 0.0, -9.0]);
-    program.send(&Answer { tick: 2, command }.encode()).unwrap();
-    let Step::Move([first, .., last]) = gateway.step(&input(3)) else { panic!("an answer was there") };
+    assert_eq!(gateway.step(&input(2)), Step::Move(padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0])));
+    let command = Command::Position(padded(&[0.001, 0.0, 0.0, 0.0, 0.0, -9.0]));
+    program.send(&Answer { tick: 2, command }.encode(6)).unwrap();
+    let Step::Move([first, _, _, _, _, last, ..]) = gateway.step(&input(3)) else {
+        panic!("an answer was there")
+    };
     assert!((first - 0.5).abs() < 1e-12, "a thousandth of a radian in 2 ms");
     assert!((last + 3.0).abs() < 1e-12, "no quicker than it may");
     program.send(&velocity(3, 99.0)).unwrap();
-    assert_eq!(gateway.step(&input(4)), Step::Move([2.0, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    assert_eq!(gateway.step(&input(4)), Step::Move(padded(&[2.0, 0.0, 0.0, 0.0, 0.0, 0.0])));
     program.send(&velocity(4, 1.0)).unwrap();
     let halted = Input { halted: true, ..input(5) };
-    assert_eq!(gateway.step(&halted), Step::Move([0.0; 6]), "a halted robot stays");
+    assert_eq!(gateway.step(&halted), Step::Move(padded(&[0.0; 6])), "a halted robot stays");
     assert_eq!((count(&gateway, "answers"), count(&gateway, "missing")), (4, 0));
 }
 
@@ -128,7 +146,11 @@ fn a_missing_answer_is_a_bad_cycle_and_a_late_one_is_none() {
     program.send(&velocity(3, 0.25)).unwrap();
     program.send(&velocity(3, 0.75)).unwrap();
     let step = gateway.step(&input(7));
-    assert_eq!(step, Step::Move([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]), "the first answer to the last tick");
+    assert_eq!(
+        step,
+        Step::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])),
+        "the first answer to the last tick"
+    );
     assert_eq!((count(&gateway, "missing"), count(&gateway, "late")), (2, 2));
     assert_eq!(count(&gateway, "repeated"), 1);
 }
@@ -176,7 +198,7 @@ fn the_sender_of_the_last_hello_is_the_peer_and_others_are_ignored() {
     second.send(b"nonsense").unwrap();
     second.send(&velocity(1, 1.0)).unwrap();
     first.send(&velocity(1, 0.5)).unwrap();
-    assert_eq!(gateway.step(&input(2)), Step::Move([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]));
+    assert_eq!(gateway.step(&input(2)), Step::Move(padded(&[0.5, 0.0, 0.0, 0.0, 0.0, 0.0])));
     assert_eq!(count(&gateway, "other senders"), 2);
     second.send(HELLO).unwrap();
     first.send(&velocity(2, 0.5)).unwrap();
@@ -184,7 +206,7 @@ fn the_sender_of_the_last_hello_is_the_peer_and_others_are_ignored() {
     second.send(HELLO).unwrap();
     second.send(&velocity(3, 0.25)).unwrap();
     let step = gateway.step(&input(4));
-    assert_eq!(step, Step::Move([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]), "a second hello changes nothing");
+    assert_eq!(step, Step::Move(padded(&[0.25, 0.0, 0.0, 0.0, 0.0, 0.0])), "a second hello changes nothing");
 }
 
 #[test]
@@ -264,14 +286,14 @@ fn another_socket_under_the_same_name_is_not_removed() {
 proptest! {
     #[test]
     fn no_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
-        let _ = Heard::decode(&bytes);
+        let _ = Heard::decode(&bytes, 6);
         let _ = State::decode(&bytes);
     }
 
     #[test]
     fn an_answer_comes_back(tick: u64, values in proptest::array::uniform6(-1e9..1e9), which: bool) {
-        let command = if which { Command::Velocity(values) } else { Command::Position(values) };
+        let command = if which { Command::Velocity(padded(&values)) } else { Command::Position(padded(&values)) };
         let answer = Answer { tick, command };
-        prop_assert_eq!(Heard::decode(&answer.encode()), Ok(Heard::Answer(answer)));
+        prop_assert_eq!(Heard::decode(&answer.encode(6), 6), Ok(Heard::Answer(answer)));
     }
 }

@@ -22,9 +22,14 @@ fn torques_agree_with_the_table_of_another_program() {
         let row: Vec<f64> = line.split(',').map(|field| field.parse().unwrap()).collect();
         let [joint, q @ .., f_z, _, _, _, _, _, _] = row.as_slice() else { panic!("{line}") };
         let [q1, q2, q3, q4, q5, q6, tx, ty, tz, nx, ny, nz] = *q else { panic!("{line}") };
-        let joint = (1..=6).find(|&k| f64::from(k) == *joint).unwrap();
+        let joint = (1..=6_u8).find(|&k| f64::from(k) == *joint).unwrap().into();
         // The table's n is the direction of the force: inwards.
-        central.cells = vec![Place::new(joint, [tx, ty, tz], [-nx, -ny, -nz], Contact::default())];
+        central.cells = vec![Place {
+            row: joint,
+            position: [tx, ty, tz].into(),
+            normal: [-nx, -ny, -nz].into(),
+            contact: Contact::default(),
+        }];
         let torque = central.torque(0, &central.frames_at(&[q1, q2, q3, q4, q5, q6]), *f_z);
         for (got, target) in torque.iter().zip(&row[14..]) {
             worst = worst.max((got - target).abs());
@@ -46,7 +51,7 @@ fn words_and_numbers_agree_within_what_words_can_hold() {
         assert!((coarse - fine).abs() < 5.0 * 5e-4, "{coarse} is not near {fine}");
     }
     assert_ne!(coarse, fine);
-    assert_eq!(coarse[3..], [0.0; 3], "no torque about joints above the cell's");
+    assert!(coarse[3..].iter().all(|&torque| torque == 0.0), "no torque about joints above the cell's");
 }
 
 #[test]
@@ -103,12 +108,12 @@ proptest! {
     #[test]
     fn the_torque_is_the_work_of_the_force_per_angle(q in any::<[i16; 6]>(), k in 1_u8..=6) {
         let mut skin = skin();
-        skin.cells[0].joint = k;
+        (skin.cells[0].joint, skin.cells[0].row) = (k, k);
         let central = Central::unquantised(&skin);
         let q = q.map(|bits| Q1_14::from_bits(bits).to_radians());
         let place = central.cells[0];
-        let at = |q: &[f64; 6]| central.frames_at(q).0[usize::from(k)] * place.position;
-        let force = central.frames_at(&q).0[usize::from(k)].rotation * place.normal * -2.0;
+        let at = |q: &[f64; 6]| central.frames_at(q).frames[usize::from(k)] * place.position;
+        let force = central.frames_at(&q).frames[usize::from(k)].rotation * place.normal * -2.0;
         let torque = central.torque(0, &central.frames_at(&q), 2.0);
         for joint in 0..6 {
             let (mut less, mut more) = (q, q);

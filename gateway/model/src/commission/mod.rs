@@ -26,7 +26,7 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 use protocol::id::{CellId, Node};
 use protocol::message::{Heartbeat, Message, NetworkPage, Request, State};
 use protocol::packet::Epoch;
-use protocol::parameters::Parameter;
+use protocol::parameters::{MAX_ROWS, Parameter};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
@@ -280,14 +280,14 @@ impl Commission {
                 Some(Phase::Write)
             }
             Phase::Write => {
-                if self.works(now, |stage| stage == Stage::Write) {
+                if self.works(now, |stage| matches!(stage, Stage::Ask | Stage::Write)) {
                     return None;
                 }
-                self.calls = Parameter::STORED.into_iter().map(Step::Read).collect();
+                self.calls = self.all_stored().map(Step::Read).collect();
                 Some(Phase::Read)
             }
             Phase::Read => {
-                if self.works(now, |stage| matches!(stage, Stage::Write | Stage::Read)) {
+                if self.works(now, |stage| matches!(stage, Stage::Ask | Stage::Write | Stage::Read)) {
                     return None;
                 }
                 if self.any(|stage| matches!(stage, Stage::Beat(_))) {
@@ -383,12 +383,18 @@ impl Commission {
             let mut words = self
                 .tasks
                 .iter()
-                .filter(|task| task.stage == Stage::Write)
+                .filter(|task| matches!(task.stage, Stage::Ask | Stage::Write))
                 .map(|task| task.words(*parameter));
             let first = words.next();
             words.all(|other| Some(other) == first)
         };
-        Parameter::STORED.into_iter().filter(common).map(Step::Write).collect()
+        self.all_stored().filter(common).map(Step::Write).collect()
+    }
+
+    /// The parameters of the longest table.
+    fn all_stored(&self) -> impl Iterator<Item = Parameter> + use<> {
+        let longest = self.tasks.iter().map(|task| task.stored().count()).max().unwrap_or_default();
+        Parameter::stored(MAX_ROWS).take(longest)
     }
 
     fn request(&mut self, place: usize, to: Node, step: Step, tag: u8) {
@@ -432,5 +438,5 @@ const fn is_failed(stage: Stage) -> bool {
 /// Whether a write of this parameter changes stored or staged parameters.
 fn is_stored(number: u8) -> bool {
     let parameter = Parameter::from_number(number);
-    parameter.is_some_and(|it| it == Parameter::Commit || Parameter::STORED.contains(&it))
+    parameter.is_some_and(|it| it == Parameter::Commit || it.is_stored())
 }

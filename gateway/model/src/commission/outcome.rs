@@ -5,7 +5,7 @@ use core::fmt;
 use protocol::id::CellId;
 use protocol::message::VERSION;
 use protocol::packet::WORDS;
-use protocol::parameters::Parameter;
+use protocol::parameters::{Ability, Parameter};
 use protocol::schema::reason;
 use serde::{Serialize, Serializer};
 use thiserror::Error;
@@ -104,6 +104,9 @@ pub enum Reason {
         /// Its reason.
         code: i16,
     },
+    /// It cannot compute what the skin asks for.
+    #[error("cannot have {0}: give it newer firmware, or leave it out of the skin")]
+    Cannot(Ability),
     /// Its answer differs from what was written.
     #[error(
         "answers {step} with {}, not {}",

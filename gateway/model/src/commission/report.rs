@@ -96,7 +96,7 @@ impl Commission {
             number: task.number,
             outcome: match task.stage {
                 Stage::Done(outcome) => outcome,
-                Stage::Missing | Stage::Write | Stage::Read | Stage::Beat(_) => {
+                Stage::Missing | Stage::Ask | Stage::Write | Stage::Read | Stage::Beat(_) => {
                     Outcome::Failed(Reason::Stopped)
                 }
             },

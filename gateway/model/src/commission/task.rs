@@ -3,7 +3,7 @@
 use protocol::id::CellId;
 use protocol::message::{Answer, Heartbeat, State, VERSION};
 use protocol::packet::WORDS;
-use protocol::parameters::{Parameter, Parameters};
+use protocol::parameters::{Abilities, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
 use super::outcome::{Outcome, Reason, Step};
@@ -25,6 +25,8 @@ const BEAT: Span = Span::from_millis(2_000);
 pub(super) enum Stage {
     /// It has sent no heartbeat yet.
     Missing,
+    /// It is asked what it can compute.
+    Ask,
     /// It needs some parameters, then a commit.
     Write,
     /// It has committed, or had the right hash; its parameters are to be compared.
@@ -59,8 +61,8 @@ pub(super) struct Task {
     /// Whether this commissioning has changed, or would change, what it computes with.
     touched: bool,
     /// Bit i: the stored parameter i is staged, or reads back right.
-    written: u16,
-    read: u16,
+    written: u64,
+    read: u64,
     pending: Option<Pending>,
     tag: u8,
     rounds: u8,
@@ -80,19 +82,8 @@ pub struct Wish {
     pub verify: bool,
 }
 
-const fn bit(place: usize) -> u16 {
+const fn bit(place: usize) -> u64 {
     1 << place
-}
-
-const ALL: u16 = (1 << Parameter::STORED.len()) - 1;
-
-fn place(parameter: Parameter) -> Option<usize> {
-    Parameter::STORED.iter().position(|&stored| stored == parameter)
-}
-
-fn first_missing(mask: u16) -> Option<Parameter> {
-    let mut stored = Parameter::STORED.iter().enumerate();
-    stored.find(|(place, _)| mask & bit(*place) == 0).map(|(_, &parameter)| parameter)
 }
 
 impl Task {
@@ -124,6 +115,20 @@ impl Task {
         self.target.words(parameter)
     }
 
+    /// The parameters that the target has.
+    pub(super) fn stored(&self) -> impl Iterator<Item = Parameter> + use<> {
+        Parameter::stored(self.target.table().len())
+    }
+
+    /// The bit of a parameter; none of one that the target has not.
+    fn bit(&self, parameter: Parameter) -> u64 {
+        self.stored().position(|stored| stored == parameter).map_or(0, bit)
+    }
+
+    fn first_missing(&self, mask: u64) -> Option<Parameter> {
+        self.stored().enumerate().find(|(place, _)| mask & bit(*place) == 0).map(|(_, parameter)| parameter)
+    }
+
     pub(super) const fn is_done(&self) -> bool {
         matches!(self.stage, Stage::Done(_))
     }
@@ -134,7 +139,8 @@ impl Task {
 
     /// Whether it still needs this step of a request to everyone.
     pub(super) fn needs(&self, step: Step) -> bool {
-        let missing = |mask| place(step.parameter()).is_some_and(|place| mask & bit(place) == 0);
+        let of_step = self.bit(step.parameter());
+        let missing = |mask| of_step != 0 && mask & of_step == 0;
         let can = self.number.is_some() && self.unsettled.is_none() && self.pending.is_none();
         can && match step {
             Step::Write(_) => self.stage == Stage::Write && missing(self.written),
@@ -167,7 +173,7 @@ impl Task {
         match self.stage {
             Stage::Missing => self.place(wish),
             Stage::Beat(_) if self.said_hash == self.hash => self.finish(),
-            Stage::Write | Stage::Read | Stage::Beat(_) | Stage::Done(_) => {}
+            Stage::Ask | Stage::Write | Stage::Read | Stage::Beat(_) | Stage::Done(_) => {}
         }
     }
 
@@ -176,7 +182,7 @@ impl Task {
     fn restart(&mut self) {
         self.pending = None;
         (self.written, self.read) = (0, 0);
-        if matches!(self.stage, Stage::Write | Stage::Read | Stage::Beat(_)) {
+        if matches!(self.stage, Stage::Ask | Stage::Write | Stage::Read | Stage::Beat(_)) {
             self.stage = Stage::Missing;
         }
     }
@@ -187,6 +193,8 @@ impl Task {
         self.stage = match (has_it, wish.dry_run, wish.verify || self.touched) {
             (true, _, true) => Stage::Read,
             (true, _, false) => Stage::Done(Outcome::AlreadySo),
+            // What each cell can need not be asked.
+            (false, ..) if Abilities::default().lacks(&self.target).is_some() => Stage::Ask,
             (false, true, _) => Stage::Done(Outcome::WouldWrite),
             (false, false, _) => Stage::Write,
         };
@@ -216,8 +224,9 @@ impl Task {
             return None;
         }
         let step = match self.stage {
-            Stage::Write => first_missing(self.written).map_or(Step::Commit, Step::Write),
-            Stage::Read => Step::Read(first_missing(self.read)?),
+            Stage::Ask => Step::Read(Parameter::Identity),
+            Stage::Write => self.first_missing(self.written).map_or(Step::Commit, Step::Write),
+            Stage::Read => Step::Read(self.first_missing(self.read)?),
             Stage::Missing | Stage::Beat(_) | Stage::Done(_) => return None,
         };
         // The upper half of the tags is that of requests to everyone.
@@ -278,6 +287,14 @@ impl Task {
                 if number == parameter.number() && written == is_write =>
             {
                 self.pending = None;
+                if self.stage == Stage::Ask {
+                    let [.., abilities] = words;
+                    return match (Abilities::from_word(abilities).lacks(&self.target), wish.dry_run) {
+                        (Some(ability), _) => self.fail(Reason::Cannot(ability)),
+                        (None, true) => self.stage = Stage::Done(Outcome::WouldWrite),
+                        (None, false) => self.stage = Stage::Write,
+                    };
+                }
                 let target = self.words(parameter);
                 if words == target {
                     return self.is_right(now, step);
@@ -297,13 +314,13 @@ impl Task {
     }
 
     fn is_right(&mut self, now: Micros, step: Step) {
-        let bit = place(step.parameter()).map_or(0, bit);
+        let bit = self.bit(step.parameter());
         match step {
             Step::Write(_) => self.written |= bit,
             Step::Commit => (self.stage, self.read) = (Stage::Read, 0),
             Step::Read(_) => {
                 self.read |= bit;
-                if self.read == ALL {
+                if self.first_missing(self.read).is_none() {
                     self.stage = Stage::Beat(now);
                     // A heartbeat may have had the hash meanwhile.
                     if self.said_hash == self.hash {

@@ -2,11 +2,10 @@
 
 use std::io::{self, Write};
 
-use protocol::can::Format as Bus;
 use protocol::candump::{Direction, Record};
 use protocol::id::{Id, Kind};
 use protocol::message::{Message, State};
-use protocol::packet::{BYTES, PacketError};
+use protocol::packet::{Bytes, PacketError};
 use protocol::schema::{self, Absent, Field, Format, Layout, PacketSchema};
 use protocol::wire::LinkId;
 use serde::ser::{Error, Serialize, SerializeMap, Serializer};
@@ -52,7 +51,7 @@ struct Values {
     link_id: Option<LinkId>,
     end: &'static [Field],
     layout: &'static Layout,
-    bytes: [u8; BYTES],
+    bytes: Bytes,
 }
 
 impl Serialize for Values {
@@ -129,6 +128,7 @@ impl Serialize for Shown<'_> {
             Format::Fixed(_)
             | Format::Threshold(_)
             | Format::Saturating(_)
+            | Format::Torque
             | Format::Angle
             | Format::Position => {
                 if field.labels.is_empty() {
@@ -217,16 +217,9 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io
     out.write_all(b"\n")
 }
 
-/// The CRC of a packet: the last two bytes of its only frame, or of its second one.
+/// The CRC of a packet: the last two bytes of its only frame, or of its last one.
 fn last_word(record: &Record<'_>) -> u16 {
-    let end = match record.frame.format() {
-        Bus::Fd => BYTES,
-        Bus::Classic => BYTES / 2,
-    };
-    match record.frame.data().get(end - 2..end) {
-        Some(&[low, high]) => u16::from_le_bytes([low, high]),
-        Some(_) | None => 0,
-    }
+    record.frame.data().last_chunk().map_or(0, |last| u16::from_le_bytes(*last))
 }
 
 fn word(word: u16) -> String {
@@ -253,7 +246,7 @@ impl Line<'_> {
         let layout = schema::layout(message, &packet);
         let end = PacketSchema::of(packet.id).map_or(&[][..], |schema| schema.end(layout));
         let is_bare = end.is_empty() && layout.fields.is_empty();
-        self.values = (!is_bare).then(|| Values { link_id: None, end, layout, bytes: packet.without_crc() });
+        self.values = (!is_bare).then(|| Values { link_id: None, end, layout, bytes: packet.fields() });
     }
 }
 
@@ -339,7 +332,7 @@ mod tests {
         });
         assert_eq!(heard, expected);
         let refusal = values("refusal from=12 tag=200 parameter=1 reason=3");
-        let because = "joint k is not 1 to the robot's joints";
+        let because = "joint k is not 1 to the chain's joints";
         assert_eq!(refusal, json!({ "parameter": "mount", "refusal": 3, "because": because }));
         let write = values("write to=254 tag=0 parameter=99 words=1,-1,32767,-32768,0,256");
         let words = [1, -1, 32_767, -32_768, 0, 256];

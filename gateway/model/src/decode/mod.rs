@@ -5,9 +5,9 @@
 //!                          └ for each identifier of each bus: a waiting segment, and whether packets use it
 //! ```
 //!
-//! A frame is ours as a whole packet with the right CRC, or as one of the two segments of a classic packet. Every other
+//! A frame is ours as a whole packet with the right CRC, or as a segment of a classic packet. Every other
 //! frame is foreign; with an identifier that carries packets it is damaged. Each line begins with a verdict of one word:
-//! `ok`, `segment` (the first frame of two; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`; a packet
+//! `ok`, `segment` (a frame before the last of a packet; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`, `ambiguous`; a packet
 //! without a known meaning: `meaning`.
 
 pub mod json;
@@ -18,11 +18,12 @@ mod text;
 mod wires;
 
 use protocol::can::{Format, Frame};
-use protocol::id::Id;
+use protocol::id::{Command, Id};
 use protocol::message::{Message, MessageError};
-use protocol::packet::{Packet, PacketError, Reassembly, Segment, data_id};
+use protocol::packet::{Length, Lengths, Packet, PacketError, Reassembly, Segment, data_id};
 use protocol::time::Micros;
 use protocol::wire::{self, PortMessage};
+use std::collections::VecDeque;
 use thiserror::Error;
 
 /// Buses that are distinguished at the same time: of more, the oldest is forgotten, or they are taken together.
@@ -37,7 +38,7 @@ pub enum Decoded {
     Foreign(Foreign),
     /// A message of a cell, or of the gateway, over a simulated wire. It is on no real bus.
     Wire(wire::LinkId, PortMessage),
-    /// The first segment of a packet in two classic frames; from [`Decoder::decode`], a frame that may be one.
+    /// A segment of a packet in classic frames, but the last one; from [`Decoder::decode`], a frame that may be one.
     Segment {
         /// Its identifier.
         id: Id,
@@ -175,18 +176,29 @@ struct Bus {
     /// Another one than that of any bus before it.
     number: u64,
     ids: Vec<Slot>,
+    /// How long joints, torques and sums are, as the joints said whose number of joints has that length.
+    length: Option<Length>,
 }
 
 /// An identifier of a bus.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Debug, Default)]
 struct Slot {
     segment: Segment,
-    /// The number of the frame that waits.
-    waiting: Option<u64>,
+    /// The numbers of the frames that wait.
+    waiting: VecDeque<u64>,
     traffic: Traffic,
 }
 
 impl Slot {
+    /// Frames that waited are given up, but for so many of the newest.
+    fn drop_beyond(&mut self, kept: usize, id: Id, older: &mut Vec<(u64, Decoded)>) {
+        for _ in kept..self.waiting.len() {
+            if let Some(number) = self.waiting.pop_front() {
+                older.push((number, self.refuse(id, PacketError::Incomplete)));
+            }
+        }
+    }
+
     /// A frame that is no packet and no segment.
     const fn refuse(&mut self, id: Id, fault: PacketError) -> Decoded {
         self.traffic.other();
@@ -203,13 +215,13 @@ struct Taken {
     decoded: Decoded,
     /// On which bus it waits for its second segment.
     waits: Option<u64>,
-    /// The number of a frame that waited, and what it was.
-    older: Option<(u64, Decoded)>,
+    /// The numbers of frames that waited, and what they were.
+    older: Vec<(u64, Decoded)>,
 }
 
 impl From<Decoded> for Taken {
     fn from(decoded: Decoded) -> Self {
-        Self { decoded, waits: None, older: None }
+        Self { decoded, waits: None, older: Vec::new() }
     }
 }
 
@@ -235,29 +247,44 @@ impl Decoder {
         let format = self.format.unwrap_or_else(|| frame.format());
         let bus = self.bus(bus);
         let on = bus.number;
+        // Joints say themselves how long they are.
+        let is_joints = id == Id::command(Command::Joints);
+        let lengths = Lengths::of_chain(bus.length.filter(|_| !is_joints));
         let slot = bus.ids.get_mut(usize::from(id.to_bits())).expect("11 bits");
-        let (packet, older) = match format {
-            Format::Fd => (Packet::from_fd(frame), None),
+        let mut older = Vec::new();
+        let packet = match format {
+            Format::Fd => Packet::from_fd(frame),
             Format::Classic if frame.format() == Format::Fd => {
-                (Err(PacketError::Length { expected: 8, got: frame.data().len() }), None)
+                Err(PacketError::Length { expected: 8, got: frame.data().len() })
             }
-            Format::Classic => match slot.segment.push(at, id, frame.data()) {
+            Format::Classic => match slot.segment.push(at, id, lengths, frame.data()) {
                 Ok(Reassembly::Waiting | Reassembly::Incomplete) => {
-                    let older = slot.waiting.replace(number);
-                    let older = older.map(|older| (older, slot.refuse(id, PacketError::Incomplete)));
+                    slot.waiting.push_back(number);
+                    slot.drop_beyond(slot.segment.waiting(), id, &mut older);
                     return Taken { decoded: Decoded::Segment { id }, waits: Some(on), older };
                 }
                 Ok(Reassembly::Complete(packet)) => {
-                    (Ok(packet), slot.waiting.take().map(|older| (older, Decoded::Segment { id })))
+                    slot.drop_beyond(packet.words.length().segments() - 1, id, &mut older);
+                    older.extend(slot.waiting.drain(..).map(|older| (older, Decoded::Segment { id })));
+                    Ok(packet)
                 }
-                Err(error) => (Err(error), None),
+                Ok(Reassembly::Ambiguous) => {
+                    slot.drop_beyond(0, id, &mut older);
+                    Err(PacketError::Ambiguous)
+                }
+                Err(error) => Err(error),
             },
         };
         let decoded = match packet {
             Ok(packet) => {
                 slot.traffic.packet();
                 match Message::decode(&packet) {
-                    Ok(message) => Decoded::Message(message),
+                    Ok(message) => {
+                        if let Message::Joints { joints, .. } = message {
+                            bus.length = Some(Length::for_joints(joints.in_use.into()));
+                        }
+                        Decoded::Message(message)
+                    }
                     Err(error) => Decoded::Meaningless { packet, error },
                 }
             }
@@ -270,10 +297,13 @@ impl Decoder {
     fn give_up(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
         let slots = self.buses.iter_mut().find(|it| it.number == bus).map(|bus| &mut bus.ids);
         let slot = slots.and_then(|slots| slots.get_mut(usize::from(id.to_bits())));
-        let Some(slot) = slot.filter(|slot| slot.waiting == Some(number)) else {
+        let Some(slot) = slot.filter(|slot| slot.waiting.front() == Some(&number)) else {
             return Decoded::Foreign(Foreign::Data(PacketError::Incomplete));
         };
-        (slot.segment, slot.waiting) = (Segment::NONE, None);
+        slot.waiting.pop_front();
+        if slot.waiting.is_empty() {
+            slot.segment = Segment::NONE;
+        }
         slot.refuse(id, PacketError::Incomplete)
     }
 
@@ -284,7 +314,7 @@ impl Decoder {
             }
             self.seen += 1;
             let ids = vec![Slot::default(); IDS];
-            self.buses.push(Bus { name: name.to_owned(), number: self.seen, ids });
+            self.buses.push(Bus { name: name.to_owned(), number: self.seen, ids, length: None });
             self.buses.len() - 1
         });
         self.buses.get_mut(at).expect("found, or just made")

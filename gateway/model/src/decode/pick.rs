@@ -133,7 +133,7 @@ mod tests {
     /// A packet of this identifier, or a foreign frame.
     fn frame(id: u32) -> Frame {
         let Ok(bits) = u16::try_from(id) else { return Frame::classic(id, &[]).unwrap() };
-        let packet = Packet { id: Id::from_bits(bits), words: [0; 6], epoch: Epoch(0), count: 1 };
+        let packet = Packet { id: Id::from_bits(bits), words: [0; 6].into(), epoch: Epoch(0), count: 1 };
         packet.frames(Format::Fd).next().unwrap()
     }
 

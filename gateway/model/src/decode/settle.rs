@@ -2,11 +2,11 @@
 //!
 //! ```text
 //!   frames ──> Settler ──> the same frames in the same order, each with what it is
-//!                └ those since the oldest whose second segment may still come
+//!                └ those since the oldest of whose packet segments may still come
 //! ```
 //!
 //! A classic frame is a segment of a packet or foreign. Which of them is known with the next frame of its identifier,
-//! or when the second segment times out. Until then it waits, and so do all frames that came after it.
+//! or when its packet's other segments time out. Until then it waits, and so do all frames that came after it.
 
 use std::collections::VecDeque;
 
@@ -17,9 +17,9 @@ use protocol::time::{Micros, Span};
 
 use super::{Decoded, Decoder};
 
-/// Frames that wait at most; beyond them the oldest is given out without its second segment.
+/// Frames that wait at most; beyond them the oldest is given out without the others of its packet.
 const FRAMES: usize = 1 << 16;
-/// Added to the timeout of the second segment: frames of several buses may be out of order by that much.
+/// Added to the timeout of segments: frames of several buses may be out of order by that much.
 const SLACK: Span = Span::from_millis(100);
 
 /// Classifies frames in the order in which they came; `T` is given out with each.
@@ -65,7 +65,7 @@ impl<T> Settler<T> {
     pub fn push(&mut self, at: Micros, bus: &str, frame: &Frame, item: T) {
         let number = self.oldest + self.waiting.len() as u64;
         let taken = self.decoder.take(number, at, bus, frame);
-        if let Some((older, decoded)) = taken.older {
+        for (older, decoded) in taken.older {
             let older = older.checked_sub(self.oldest).and_then(|index| usize::try_from(index).ok());
             if let Some(entry) = older.and_then(|index| self.waiting.get_mut(index)) {
                 entry.state = State::Settled(decoded);

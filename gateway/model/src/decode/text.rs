@@ -52,7 +52,7 @@ impl Display for Meaning<'_> {
         let Some(schema) = PacketSchema::of(packet.id).filter(|schema| !schema.text.is_empty()) else {
             return Ok(());
         };
-        let (layout, bytes) = (schema::layout(self.0, &packet), packet.without_crc());
+        let (layout, bytes) = (schema::layout(self.0, &packet), packet.fields());
         f.write_str(" ")?;
         fill(f, &schema.text, u16::from(packet.count), &bytes, &|f, name| match name {
             "" => say(f, layout, &bytes).map(|()| None),
@@ -111,8 +111,19 @@ type Find<'a> = dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a Field>, fm
 
 /// Writes the parts of a text that belong to a number.
 fn fill<'a>(f: &mut Formatter<'_>, text: &[Part], number: u16, bytes: &[u8], find: &Find<'a>) -> fmt::Result {
-    let parts = text.iter().filter(|part| (part.when[0]..=part.when[1]).contains(&number));
-    for piece in parts.flat_map(|part| &part.pieces) {
+    for part in text {
+        let of = part.of.as_deref().map(|name| find(f, name)).transpose()?.flatten();
+        let number = of.map_or_else(|| i64::from(number), |field| field.raw(bytes, 0));
+        if !(part.when[0].into()..=part.when[1].into()).contains(&number) {
+            continue;
+        }
+        pieces(f, &part.pieces, bytes, find)?;
+    }
+    Ok(())
+}
+
+fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[Piece], bytes: &[u8], find: &Find<'a>) -> fmt::Result {
+    for piece in pieces {
         match piece {
             Piece::Words(words) => f.write_str(words)?,
             Piece::Field { name, decimals } => {
@@ -145,6 +156,7 @@ fn show(f: &mut Formatter<'_>, field: &Field, bytes: &[u8], decimals: usize) -> 
         Format::Fixed(_)
         | Format::Threshold(_)
         | Format::Saturating(_)
+        | Format::Torque
         | Format::Angle
         | Format::Position
         | Format::Word

@@ -3,19 +3,16 @@
 use core::fmt::{self, Display, Formatter};
 
 use protocol::message::VERSION;
-use protocol::packet::BYTES;
+use protocol::packet::{BYTES, Bytes};
 use protocol::schema::{self, Field, Layout};
 use protocol::wire::{Hello, LinkId, PortMessage, Rank, UPLINK, Walk};
 
 use super::text;
 
 /// The bytes of a message over a wire, and their layout.
-pub(super) fn said(message: PortMessage) -> ([u8; BYTES], &'static Layout) {
-    let mut bytes = [0; BYTES];
+pub(super) fn said(message: PortMessage) -> (Bytes, &'static Layout) {
     let body = message.encode();
-    for (byte, said) in bytes.iter_mut().zip(body) {
-        *byte = said;
-    }
+    let bytes = body.into_iter().chain([0; BYTES]).take(BYTES).collect();
     (
         bytes,
         schema::wires().iter().find(|layout| layout.number == body[0]).expect("every message has a layout"),

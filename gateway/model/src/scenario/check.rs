@@ -5,8 +5,7 @@ use std::collections::HashMap;
 
 use protocol::document::{Fault as Wrong, Place};
 use protocol::fixed::{Q, Q1_14};
-use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{Reply, Skin};
+use protocol::skin::{MAX_ROBOT_JOINTS, Reply, Skin};
 use protocol::time::{Micros, Span};
 use protocol::wire::PORTS;
 
@@ -72,44 +71,67 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
         }
         Ok(core::array::from_fn(|joint| values.get(joint).copied().unwrap_or(0.0)))
     };
-    let start_rad = raw.start_rad.as_ref().map_or(Ok([0.0; MAX_JOINTS]), |it| joints("start_rad", it))?;
+    let (start_key, start) = either(&at, ("start", &raw.start), ("start_rad", &raw.start_rad))?;
+    // What is nearest to zero.
+    let mut nearest = [0.0; MAX_ROBOT_JOINTS];
+    for (start, joint) in nearest.iter_mut().zip(&robot.joints) {
+        *start = f64::clamp(0.0, joint.limits[0], joint.limits[1]);
+    }
+    let start = start.map_or(Ok(nearest), |it| joints(start_key, it))?;
+    let (key, amplitude) = either(&at, ("amplitude", &raw.amplitude), ("amplitude_rad", &raw.amplitude_rad))?;
     let kinds =
         [("hold", Some(MotionKind::Hold)), ("sine", None), ("kinesthetic", Some(MotionKind::Kinesthetic))];
     let needed = "needed with kind = \"sine\"";
     let only = "only with kind = \"sine\"";
-    let (kind, reach) = match (at.key("kind").word(&raw.kind, &kinds)?, &raw.amplitude_rad, raw.period_s) {
-        (Some(kind), None, None) => (kind, [0.0; MAX_JOINTS]),
-        (Some(_), Some(_), _) => return Err(at.key("amplitude_rad").fault("", only)),
+    let (kind, reach) = match (at.key("kind").word(&raw.kind, &kinds)?, amplitude, raw.period_s) {
+        (Some(kind), None, None) => (kind, [0.0; MAX_ROBOT_JOINTS]),
+        (Some(_), Some(_), _) => return Err(at.key(key).fault("", only)),
         (Some(_), None, Some(got)) => return Err(at.key("period_s").fault(got, only)),
-        (None, None, _) => return Err(at.key("amplitude_rad").fault("", needed)),
+        (None, None, _) => return Err(at.key(key).fault("", needed)),
         (None, Some(_), None) => return Err(at.key("period_s").fault("", needed)),
         (None, Some(amplitude), Some(period_s)) => {
-            let amplitude_rad = joints("amplitude_rad", amplitude)?;
+            let amplitude = joints(key, amplitude)?;
             length(&at.key("period_s"), period_s)?;
-            speeds(&at.key("amplitude_rad"), skin, &amplitude_rad, period_s)?;
-            (MotionKind::Sine { amplitude_rad, period_s }, amplitude_rad.map(f64::abs))
+            speeds(&at.key(key), skin, &amplitude, period_s)?;
+            (MotionKind::Sine { amplitude, period_s }, amplitude.map(f64::abs))
         }
     };
-    for (index, ((start, reach), [min, max])) in
-        start_rad.iter().zip(reach).zip(&robot.limits_rad).enumerate()
-    {
+    for (index, ((start, reach), joint)) in start.iter().zip(reach).zip(&robot.joints).enumerate() {
+        let ([min, max], unit) = (joint.limits, joint.kind.unit());
         // Written so that NaN is refused too.
-        if !(start - reach >= *min && start + reach <= *max) {
-            let swings = if reach > 0.0 { format!(", and it swings by {reach} rad") } else { String::new() };
-            let why = format!("joint {} may go from {min:.4} to {max:.4} rad{swings}", index + 1);
-            return Err(at.key("start_rad").nth(index).fault(format_args!("{start} rad"), why));
+        if !(start - reach >= min && start + reach <= max) {
+            let swings =
+                if reach > 0.0 { format!(", and it swings by {reach} {unit}") } else { String::new() };
+            let why = format!("joint {} may go from {min:.4} to {max:.4} {unit}{swings}", index + 1);
+            return Err(at.key(start_key).nth(index).fault(format_args!("{start} {unit}"), why));
         }
     }
-    Ok(Motion { start_rad, kind })
+    Ok(Motion { start, kind })
+}
+
+/// A value under its key or under the former one, and the key.
+fn either<'a, T>(
+    at: &Place,
+    (key, value): (&'static str, &'a Option<T>),
+    (former, given): (&'static str, &'a Option<T>),
+) -> Checked<(&'static str, Option<&'a T>)> {
+    match (value, given) {
+        (Some(_), Some(_)) => {
+            Err(at.key(former).fault("", format_args!("the former name of {key}: give one of them")))
+        }
+        (None, Some(given)) => Ok((former, Some(given))),
+        (value, None) => Ok((key, value.as_ref())),
+    }
 }
 
 /// Whether every joint may be as quick as its swing is at the start.
-fn speeds(at: &Place, skin: &Skin, amplitude: &[f64; MAX_JOINTS], period_s: f64) -> Checked<()> {
-    for (index, (amplitude, &max)) in amplitude.iter().zip(&skin.controller.max_speed_rad_s).enumerate() {
-        let speed = TAU * amplitude.abs() / period_s;
+fn speeds(at: &Place, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period_s: f64) -> Checked<()> {
+    let limits = skin.controller.max_speed.iter().zip(&skin.robot.joints);
+    for (index, (amplitude, (&max, joint))) in amplitude.iter().zip(limits).enumerate() {
+        let (speed, unit) = (TAU * amplitude.abs() / period_s, joint.kind.unit());
         if speed.is_nan() || speed > max {
             let why = format!(
-                "in {period_s} s this takes {speed:.3} rad/s, and joint {} may make {max}",
+                "in {period_s} s this takes {speed:.3} {unit}/s, and joint {} may make {max}",
                 index + 1
             );
             return Err(at.nth(index).fault(amplitude, why));

@@ -14,8 +14,7 @@ use std::path::Path;
 
 use protocol::document::{self, DocumentError};
 use protocol::fixed::{Q1_14, Q9_6};
-use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{KEYS, Skin};
+use protocol::skin::{KEYS, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::{Micros, Span};
 
 pub use touches::{Stimulus, Touches, contact_words};
@@ -44,20 +43,21 @@ pub struct Scenario {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
     /// Where it begins, in rad.
-    pub start_rad: [f64; MAX_JOINTS],
+    pub start: [f64; MAX_ROBOT_JOINTS],
     /// How it moves from there.
     pub kind: MotionKind,
 }
 
 /// How the robot moves.
 #[derive(Clone, Copy, Debug, PartialEq)]
+#[expect(clippy::large_enum_variant, reason = "a run has one")]
 pub enum MotionKind {
     /// `hold`: it stays where it is.
     Hold,
     /// `sine`: every joint swings about its start.
     Sine {
         /// How far, in rad.
-        amplitude_rad: [f64; MAX_JOINTS],
+        amplitude: [f64; MAX_ROBOT_JOINTS],
         /// How slowly, in s.
         period_s: f64,
     },
@@ -310,7 +310,7 @@ impl Scenario {
     /// No touches, no faults, and the skin's controller moves the robot from zero.
     #[must_use]
     pub const fn idle(duration: Span) -> Self {
-        let motion = Motion { start_rad: [0.0; MAX_JOINTS], kind: MotionKind::Kinesthetic };
+        let motion = Motion { start: [0.0; MAX_ROBOT_JOINTS], kind: MotionKind::Kinesthetic };
         Self { duration, seed: 1, motion, modes: Vec::new(), touches: Vec::new(), faults: Vec::new() }
     }
 

@@ -48,7 +48,9 @@ impl Scenario {
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Motion {
     pub(super) kind: String,
+    pub(super) start: Option<Vec<f64>>,
     pub(super) start_rad: Option<Vec<f64>>,
+    pub(super) amplitude: Option<Vec<f64>>,
     pub(super) amplitude_rad: Option<Vec<f64>>,
     pub(super) period_s: Option<f64>,
 }
@@ -57,7 +59,9 @@ impl Default for Motion {
     fn default() -> Self {
         Self {
             kind: MotionKind::Kinesthetic.name().to_owned(),
+            start: None,
             start_rad: None,
+            amplitude: None,
             amplitude_rad: None,
             period_s: None,
         }

@@ -1,9 +1,10 @@
 //! The errors of distributed torques against central ones.
 
-use protocol::packet::WORDS;
+use protocol::fixed::TorqueFormat;
+use protocol::packet::Words;
+use protocol::parameters::MAX_JOINTS;
 use serde::ser::{Serialize, SerializeStruct, Serializer};
 
-use super::held::word_to_nm;
 use super::replies::Expected;
 use super::root_totals;
 
@@ -79,10 +80,10 @@ pub struct Accuracy {
     pub saturated: u64,
     /// `single` joint by joint.
     #[serde(skip)]
-    pub single_by_joint: [Errors; WORDS],
+    pub single_by_joint: [Errors; MAX_JOINTS],
     /// `whole` joint by joint.
     #[serde(skip)]
-    pub whole_by_joint: [Errors; WORDS],
+    pub whole_by_joint: [Errors; MAX_JOINTS],
 }
 
 impl Accuracy {
@@ -91,29 +92,32 @@ impl Accuracy {
     pub(super) fn compare(
         &mut self,
         joint: usize,
-        words: &[i32; WORDS],
+        format: TorqueFormat,
+        words: &Words,
         expected: &Expected,
         of_cell: &mut Errors,
-    ) -> [f64; WORDS] {
-        let mut errors = [0.0; WORDS];
+    ) -> [f64; MAX_JOINTS] {
+        let mut errors = [0.0; MAX_JOINTS];
         let both = expected.quantised.iter().zip(&expected.unquantised);
         let joints = errors.iter_mut().zip(&mut self.single_by_joint);
-        for (((error, of_joint), &word), (quantised, unquantised)) in joints.zip(words).zip(both).take(joint)
+        for (((error, of_joint), &word), (quantised, unquantised)) in
+            joints.zip(words.as_slice()).zip(both).take(joint)
         {
-            if word == i32::from(i16::MAX) || word == i32::from(i16::MIN) {
+            if [i16::MIN, i16::MAX].contains(&word) {
                 self.saturated += 1;
                 continue;
             }
-            *error = word_to_nm(word) - quantised;
+            let torque = format.real(word);
+            *error = torque - quantised;
             self.single.add(*error);
             of_cell.add(*error);
             of_joint.add(*error);
-            self.unquantised.add(word_to_nm(word) - unquantised);
+            self.unquantised.add(torque - unquantised);
         }
         errors
     }
 
-    pub(super) fn whole_skin(&mut self, errors: &[f64; WORDS]) {
+    pub(super) fn whole_skin(&mut self, errors: &[f64]) {
         for (&error, of_joint) in errors.iter().zip(&mut self.whole_by_joint) {
             self.whole.add(error);
             of_joint.add(error);
@@ -123,7 +127,7 @@ impl Accuracy {
     /// The accuracy of several buses together.
     #[must_use]
     pub fn with(self, other: Self) -> Self {
-        let joint_by_joint = |mut sum: [Errors; WORDS], other: [Errors; WORDS]| {
+        let joint_by_joint = |mut sum: [Errors; MAX_JOINTS], other: [Errors; MAX_JOINTS]| {
             for (sum, other) in sum.iter_mut().zip(other) {
                 *sum = sum.with(other);
             }
@@ -151,12 +155,17 @@ pub(super) struct SumError {
     pub(super) saturated: u64,
     /// Epochs in a row, and their errors together.
     epochs: u32,
-    sum: [f64; WORDS],
+    sum: [f64; MAX_JOINTS],
 }
 
 impl SumError {
     /// Compares the sum of a complete epoch, in steps of Q7.8.
-    pub(super) fn take(&mut self, words: &[i32; WORDS], saturated: bool, expected: &root_totals::Expected) {
+    pub(super) fn take(
+        &mut self,
+        words: &[i32; MAX_JOINTS],
+        saturated: bool,
+        expected: &root_totals::Expected,
+    ) {
         if !expected.constant {
             self.interrupt();
         }
@@ -182,6 +191,6 @@ impl SumError {
 
     /// The next epoch begins a new average.
     pub(super) const fn interrupt(&mut self) {
-        (self.epochs, self.sum) = (0, [0.0; WORDS]);
+        (self.epochs, self.sum) = (0, [0.0; MAX_JOINTS]);
     }
 }

@@ -3,6 +3,7 @@
 use protocol::id::CellId;
 use protocol::message::{Answer, From, Heard, Heartbeat, SensorPage, SkinSensors, State};
 use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
 use protocol::skin::{self, Safety};
 use protocol::time::Micros;
@@ -329,7 +330,7 @@ impl Cell {
 
     /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next one. One of an older broadcast
     /// than what is held changes nothing.
-    pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; WORDS]) -> Change {
+    pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; MAX_JOINTS]) -> Change {
         if self.answered.is_some_and(|last| number < last) {
             return Change::default();
         }
@@ -348,7 +349,7 @@ impl Cell {
     }
 
     /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact.
-    pub(super) fn hold(&mut self, words: [i32; WORDS]) -> Change {
+    pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> Change {
         self.held.hold(words)
     }
 

@@ -1,8 +1,8 @@
 //! The epoch that cells are answering: which replies are due, and how it ends when the next one begins.
 
-use protocol::fixed::Q1_14;
 use protocol::message::Joints;
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
 use super::Table;
@@ -12,7 +12,7 @@ use super::root_totals::Expected;
 use crate::tracker::LATEST;
 
 /// The positions in rad that the words of a broadcast were rounded from.
-pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; WORDS]> + 'a;
+pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; MAX_JOINTS]> + 'a;
 
 /// The broadcast that cells are answering.
 #[derive(Clone, Copy, Debug)]
@@ -26,7 +26,7 @@ pub(super) struct Broadcast {
     due: u32,
     pub(super) in_time: u32,
     pub(super) last_reply: Option<Micros>,
-    pub(super) error: [f64; WORDS],
+    pub(super) error: [f64; MAX_JOINTS],
 }
 
 impl Broadcast {
@@ -57,7 +57,13 @@ impl Broadcast {
 
 impl Table {
     /// New joints are on the bus: closes the epoch before, and computes which cells have to answer this one.
-    pub(super) fn open_epoch(&mut self, at: Micros, epoch: Epoch, joints: &Joints, q: Option<[f64; WORDS]>) {
+    pub(super) fn open_epoch(
+        &mut self,
+        at: Micros,
+        epoch: Epoch,
+        joints: &Joints,
+        q: Option<[f64; MAX_JOINTS]>,
+    ) {
         if self.broadcast.is_some_and(|newest| newest.epoch == epoch) {
             // Repeated on the way: cells drop it.
             return self.cells.iter_mut().for_each(Cell::hear_again);
@@ -71,7 +77,7 @@ impl Table {
         self.close_epoch();
         self.release_decayed(epoch);
         let frames = self.comparing.then(|| {
-            let q = q.unwrap_or_else(|| joints.positions.map(Q1_14::to_radians));
+            let q = q.unwrap_or_else(|| self.central.positions(&joints.positions));
             (self.central.frames(&joints.positions), self.unquantised.frames_at(&q))
         });
         let (mut due, mut stale, mut age, mut known) = (0, 0, 0, true);
@@ -105,7 +111,7 @@ impl Table {
         }
         let sums = &mut self.snapshot.sums;
         (sums.stale, sums.age, sums.read_back) = (stale, age, Some(epoch));
-        let error = [0.0; WORDS];
+        let error = [0.0; MAX_JOINTS];
         self.broadcast =
             Some(Broadcast { epoch, recent, number, at, due, in_time: 0, last_reply: None, error });
     }
@@ -122,7 +128,7 @@ impl Table {
         }
         self.counters.epoch(before.due > 0, before.in_time == before.due);
         if self.comparing && before.due > 0 && before.in_time == before.due {
-            self.accuracy.whole_skin(&before.error);
+            self.accuracy.whole_skin(before.error.get(..self.carried.joints).unwrap_or_default());
         }
     }
 

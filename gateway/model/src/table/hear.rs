@@ -1,9 +1,8 @@
 //! Frames on the bus, and their effects on the table.
 
-use protocol::fixed::Q;
 use protocol::id::{Id, Node};
 use protocol::message::{From, Heartbeat, Message, NetworkPage, SensorPage, State};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::{Epoch, Words};
 use protocol::time::Micros;
 
 use super::cell::Cell;
@@ -93,9 +92,9 @@ impl Table {
         } else if let Message::Configured { answer, .. } = *message {
             cell.answers(&answer);
         } else if let Message::Torque { epoch, torque, .. } = *message {
-            self.take_torque(at, place, epoch, torque.map(i32_of));
+            self.take_torque(at, place, epoch, &torque);
         } else if let Message::Sum { epoch, count, torque, .. } = *message {
-            self.take_sum(at, place, epoch, Sum { count, words: torque.map(i32_of) });
+            self.take_sum(at, place, epoch, Sum { count, words: torque.padded().map(i32::from) });
         }
     }
 
@@ -115,7 +114,7 @@ impl Table {
         self.apply(change);
     }
 
-    fn take_torque(&mut self, at: Micros, place: usize, epoch: Epoch, words: [i32; WORDS]) {
+    fn take_torque(&mut self, at: Micros, place: usize, epoch: Epoch, torque: &Words) {
         if self.root_totals.is_some() {
             return self.counters.count(Event::UnknownNode);
         }
@@ -135,23 +134,25 @@ impl Table {
             cell.replies.too_late += 1;
             return self.counters.count(Event::StaleTorque);
         }
-        if words.iter().any(|&word| word == i32::from(i16::MAX) || word == i32::from(i16::MIN)) {
+        if torque.is_saturated() {
             self.counters.count(Event::Saturated);
         }
+        let format = self.carried.torque_format;
         let was_due = cell.answer(number, lag);
         if lag == 0 {
             broadcast.last_reply = Some(at);
             broadcast.in_time += u32::from(was_due);
         }
         if let Some(expected) = cell.outstanding.expected(number) {
-            let error = self.accuracy.compare(cell.joint, &words, &expected, &mut cell.outstanding.errors);
+            let error =
+                self.accuracy.compare(cell.joint, format, torque, &expected, &mut cell.outstanding.errors);
             if lag == 0 {
                 for (sum, error) in broadcast.error.iter_mut().zip(error) {
                     *sum += error;
                 }
             }
         }
-        let change = cell.hold(words);
+        let change = cell.hold(torque.padded().map(|word| format.finest_steps(word)));
         self.apply(change);
     }
 
@@ -182,8 +183,8 @@ impl Table {
         if sum.is_saturated() {
             self.counters.count(Event::Saturated);
         }
-        // Q7.8 in steps of Q3.12, of which the running sum is made.
-        let change = cell.hold_sum(number, sum.count, sum.words.map(|word| word << 4));
+        // In the steps of which the running sum is made.
+        let change = cell.hold_sum(number, sum.count, sum.in_steps());
         self.apply(change);
         self.release_moved(number);
     }
@@ -195,9 +196,4 @@ impl Table {
             self.each_cell(|cell| if cell.is_behind(number) { cell.release() } else { Change::default() });
         }
     }
-}
-
-/// A word as a whole number of steps.
-fn i32_of<const F: u32>(word: Q<F>) -> i32 {
-    i32::from(word.to_bits())
 }

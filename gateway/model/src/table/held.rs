@@ -1,12 +1,12 @@
 //! A cell's last torque, which holds until its next one, decays when that does not come, and is summed.
 
-use protocol::packet::WORDS;
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Safety;
 
 /// What changed in the running sum.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct Change {
-    pub(super) torque: [i32; WORDS],
+    pub(super) torque: [i32; MAX_JOINTS],
     pub(super) contributing: i32,
 }
 
@@ -14,22 +14,22 @@ pub(super) struct Change {
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Held {
     /// The last torque, in steps of Q3.12, and its number of cells: of a root, those in its sum.
-    torque: Option<([i32; WORDS], u8)>,
+    torque: Option<([i32; MAX_JOINTS], u8)>,
     /// What of it is in the running sum.
-    contribution: [i32; WORDS],
+    contribution: [i32; MAX_JOINTS],
     /// Of its cells, those that are counted there.
     contributing: u8,
 }
 
 impl Held {
     /// Holds a torque, in steps of Q3.12, until the next one; zeros end a contact.
-    pub(super) fn hold(&mut self, words: [i32; WORDS]) -> Change {
-        self.torque = (words != [0; WORDS]).then_some((words, 1));
+    pub(super) fn hold(&mut self, words: [i32; MAX_JOINTS]) -> Change {
+        self.torque = (words != [0; MAX_JOINTS]).then_some((words, 1));
         self.contribute(words, u8::from(self.torque.is_some()))
     }
 
     /// The same of a sum of so many cells; one of no cell ends all contacts.
-    pub(super) fn hold_sum(&mut self, words: [i32; WORDS], count: u8) -> Change {
+    pub(super) fn hold_sum(&mut self, words: [i32; MAX_JOINTS], count: u8) -> Change {
         // Even with cells in contact all words may be rounded to 0.
         self.torque = (count > 0).then_some((words, count));
         self.contribute(words, count)
@@ -38,7 +38,7 @@ impl Held {
     /// Releases it.
     pub(super) fn release(&mut self) -> Change {
         self.torque = None;
-        self.contribute([0; WORDS], 0)
+        self.contribute([0; MAX_JOINTS], 0)
     }
 
     /// Holds or decays it after so many unanswered epochs.
@@ -47,17 +47,17 @@ impl Held {
         let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(unanswered);
         if left == 0 && unanswered > 0 {
             // Its contribution has decayed to zero; yet the cell has not reported the end of its contact.
-            return self.contribute([0; WORDS], 0);
+            return self.contribute([0; MAX_JOINTS], 0);
         }
         let decay = safety.decay_epochs.max(1);
         let keep = i32::try_from(left.min(decay)).unwrap_or(i32::MAX);
         let whole = i32::try_from(decay).unwrap_or(i32::MAX);
         let rest = held.map(|word| word * keep / whole);
-        let counts = is_sum || rest != [0; WORDS];
+        let counts = is_sum || rest != [0; MAX_JOINTS];
         self.contribute(rest, if counts { cells } else { 0 })
     }
 
-    fn contribute(&mut self, words: [i32; WORDS], cells: u8) -> Change {
+    fn contribute(&mut self, words: [i32; MAX_JOINTS], cells: u8) -> Change {
         let counted = core::mem::replace(&mut self.contributing, cells);
         let before = core::mem::replace(&mut self.contribution, words);
         let mut torque = words;
@@ -87,9 +87,4 @@ impl Held {
 #[expect(clippy::cast_precision_loss, reason = "sums of 254 words of 16 bits are exact")]
 pub(super) fn to_nm(steps: i64) -> f64 {
     steps as f64 / 4_096.0
-}
-
-/// A word of Q3.12 in Nm.
-pub(super) fn word_to_nm(word: i32) -> f64 {
-    f64::from(word) / 4_096.0
 }

@@ -24,10 +24,11 @@ use std::collections::{BTreeMap, VecDeque};
 
 use hdrhistogram::Histogram;
 use protocol::can::{Format, Frame};
+use protocol::fixed::TorqueFormat;
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::message::{Heartbeat, Message, SkinSensors};
-use protocol::packet::{self, Epoch, Packet, PacketError, Reassembly, Segment, WORDS};
-use protocol::parameters::{Events, Sensing};
+use protocol::packet::{self, Epoch, Length, Lengths, Packet, PacketError, Reassembly, Segment};
+use protocol::parameters::{Events, MAX_JOINTS, Sensing};
 use protocol::skin::{Reply, Safety, Skin};
 use protocol::time::Micros;
 
@@ -55,7 +56,7 @@ pub use crate::tracker::Uplink;
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sums {
     /// The sum of all held torques in Nm.
-    pub torque: [f64; WORDS],
+    pub torque: [f64; MAX_JOINTS],
     /// Cells in it.
     pub contributing: u32,
     /// Unanswered epochs of the oldest of them.
@@ -113,7 +114,7 @@ pub enum Notice {
 /// The state of one bus.
 #[derive(Debug)]
 pub struct Table {
-    format: Format,
+    carried: Carried,
     safety: Safety,
     events: Events,
     central: Central,
@@ -131,12 +132,23 @@ pub struct Table {
     /// The bus was lost since the last broadcast.
     interrupted: bool,
     /// In whole steps, so that the sum never drifts.
-    sum: [i64; WORDS],
+    sum: [i64; MAX_JOINTS],
     snapshot: Snapshot,
     counters: Counters,
     accuracy: Accuracy,
     last_reply: Histogram<u64>,
     notices: VecDeque<Notice>,
+}
+
+/// What the bus carries.
+#[derive(Debug)]
+struct Carried {
+    format: Format,
+    /// How long joints, torques and sums are.
+    length: Length,
+    torque_format: TorqueFormat,
+    /// Joints of the chain.
+    joints: usize,
 }
 
 impl Table {
@@ -157,7 +169,12 @@ impl Table {
         }
         let snapshot = Snapshot { sums: Sums::default(), sensors: vec![SkinSensors::default(); cells.len()] };
         Self {
-            format: skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format),
+            carried: Carried {
+                format: skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format),
+                length: skin.length_of(bus),
+                torque_format: skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default(),
+                joints: skin.joints_of(bus).len(),
+            },
             safety: skin.safety,
             events: skin.events,
             central: Central::new(&part),
@@ -170,7 +187,7 @@ impl Table {
             root_totals: summed.then(RootTotals::default),
             unknown_nodes: BTreeMap::new(),
             interrupted: false,
-            sum: [0; WORDS],
+            sum: [0; MAX_JOINTS],
             snapshot,
             counters: Counters::default(),
             accuracy: Accuracy::default(),
@@ -295,11 +312,13 @@ impl Table {
         let event = |error| match error {
             PacketError::Length { .. } => Event::Length,
             PacketError::Crc { .. } => Event::Crc,
-            PacketError::Incomplete => Event::Incomplete,
+            PacketError::Incomplete | PacketError::Ambiguous => Event::Incomplete,
             PacketError::Foreign => Event::Foreign,
         };
-        if self.format == Format::Fd {
-            return Packet::from_fd(frame).map(Some).map_err(event);
+        if self.carried.format == Format::Fd {
+            let packet = Packet::from_fd(frame).map_err(event)?;
+            let has_length = packet.words.length() == self.carried.length || Lengths::of(id) != Lengths::ALL;
+            return if has_length { Ok(Some(packet)) } else { Err(Event::Length) };
         }
         if frame.format() != Format::Classic {
             return Err(Event::Length);
@@ -307,12 +326,14 @@ impl Table {
         let is_used = self.is_used(id);
         let segment = self.segments.get_mut(usize::from(id.to_bits())).ok_or(Event::Foreign)?;
         let waited = segment.is_waiting();
-        match segment.push(at, id, frame.data()).map_err(event)? {
+        match segment.push(at, id, Lengths::only(self.carried.length), frame.data()).map_err(event)? {
             Reassembly::Complete(packet) => Ok(Some(packet)),
             // Foreign frames are counted each, and not as incomplete packets.
-            Reassembly::Waiting | Reassembly::Incomplete if waited && !is_used => Err(Event::Foreign),
+            Reassembly::Waiting | Reassembly::Incomplete | Reassembly::Ambiguous if waited && !is_used => {
+                Err(Event::Foreign)
+            }
             Reassembly::Waiting => Ok(None),
-            Reassembly::Incomplete => Err(Event::Incomplete),
+            Reassembly::Incomplete | Reassembly::Ambiguous => Err(Event::Incomplete),
         }
     }
 

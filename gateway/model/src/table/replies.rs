@@ -1,7 +1,7 @@
 //! Replies due, compared with replies that came.
 
 use derive_more::{Add, Sum};
-use protocol::packet::WORDS;
+use protocol::parameters::MAX_JOINTS;
 
 use super::accuracy::Errors;
 use crate::tracker::LATEST;
@@ -44,8 +44,8 @@ impl Replies {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Expected {
     pub(super) number: u64,
-    pub(super) quantised: [f64; WORDS],
-    pub(super) unquantised: [f64; WORDS],
+    pub(super) quantised: [f64; MAX_JOINTS],
+    pub(super) unquantised: [f64; MAX_JOINTS],
 }
 
 /// The outstanding replies of a cell for the newest epochs.

@@ -1,6 +1,7 @@
 //! Sums along the cells' tree: the roots' sums of each epoch, compared with what is expected.
 
-use protocol::packet::WORDS;
+use protocol::fixed::TorqueFormat;
+use protocol::parameters::MAX_JOINTS;
 use serde::Serialize;
 
 use super::accuracy::SumError;
@@ -45,10 +46,15 @@ pub(super) struct Sum {
     /// Cells in it.
     pub(super) count: u8,
     /// In steps of Q7.8.
-    pub(super) words: [i32; WORDS],
+    pub(super) words: [i32; MAX_JOINTS],
 }
 
 impl Sum {
+    /// In steps of 2^-12 Nm.
+    pub(super) fn in_steps(&self) -> [i32; MAX_JOINTS] {
+        self.words.map(|word| word << (TorqueFormat::Q3_12.fraction() - TorqueFormat::Q7_8.fraction()))
+    }
+
     pub(super) fn is_saturated(&self) -> bool {
         self.words.iter().any(|&word| word == i32::from(i16::MAX) || word == i32::from(i16::MIN))
     }
@@ -87,7 +93,7 @@ struct Open {
     /// What had come before the next joints.
     in_time: Option<u32>,
     /// Steps of Q7.8.
-    sum: [i32; WORDS],
+    sum: [i32; MAX_JOINTS],
     saturated: bool,
     expected: Option<Expected>,
 }
@@ -96,7 +102,7 @@ struct Open {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Expected {
     /// The whole bus' torque.
-    pub(super) torque: [f64; WORDS],
+    pub(super) torque: [f64; MAX_JOINTS],
     /// Joints that some cell of it loads, from the first.
     pub(super) joints: usize,
     /// Every cell has the same sensors as in the epoch before.
@@ -105,7 +111,7 @@ pub(super) struct Expected {
 
 impl Expected {
     /// Adds the torque of a cell on this joint.
-    pub(super) fn add(&mut self, torque: [f64; WORDS], joint: usize) {
+    pub(super) fn add(&mut self, torque: [f64; MAX_JOINTS], joint: usize) {
         for (sum, torque) in self.torque.iter_mut().zip(torque) {
             *sum += torque;
         }
@@ -145,7 +151,7 @@ impl RootTotals {
         }
         *best = Some(sum);
         if let Some(Some(open)) = self.epochs.get_mut(lag) {
-            let (count, words) = before.map_or((0, [0; WORDS]), |before| (before.count, before.words));
+            let (count, words) = before.map_or((0, [0; MAX_JOINTS]), |before| (before.count, before.words));
             open.came += u32::from(sum.count) - u32::from(count);
             for ((total, word), before) in open.sum.iter_mut().zip(sum.words).zip(words) {
                 *total += word - before;
@@ -169,7 +175,7 @@ impl RootTotals {
                 known,
                 came: 0,
                 in_time: None,
-                sum: [0; WORDS],
+                sum: [0; MAX_JOINTS],
                 saturated: false,
                 expected,
             });

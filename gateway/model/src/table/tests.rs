@@ -1,7 +1,6 @@
 //! A table of a bus whose cells answer with torques.
 
 use super::*;
-use protocol::fixed::{Q1_14, Q3_12};
 use protocol::message::{Heard, Joints, NetworkPage, SensorPage, State};
 
 /// A table that received these, in the frames of the bus, the gateway's own or a cell's.
@@ -44,11 +43,9 @@ fn what_is_no_packet_is_rejected_with_a_cells_identifier_and_foreign_with_an_unu
 #[test]
 fn a_torque_from_before_an_outage_does_not_come_back_with_the_bus() {
     let cell = CellId::new(1).unwrap();
-    let joints = |epoch| Message::Joints {
-        epoch: Epoch(epoch),
-        joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 },
-    };
-    let torque = |epoch| Message::Torque { from: cell, epoch: Epoch(epoch), torque: [Q3_12::MAX; WORDS] };
+    let joints =
+        |epoch| Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } };
+    let torque = |epoch| Message::Torque { from: cell, epoch: Epoch(epoch), torque: [i16::MAX; 6].into() };
     let hear = |table: &mut Table, own, message: Message| {
         for frame in message.encode().frames(Format::Fd) {
             table.handle_frame(Micros(0), own, &frame, &mut |_| None);
@@ -71,9 +68,9 @@ fn a_torque_from_before_an_outage_does_not_come_back_with_the_bus() {
 #[test]
 fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_stimulus() {
     let cell = CellId::new(1).unwrap();
-    let positions = [Q1_14::ZERO; WORDS];
-    let joints =
-        |epoch| (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { positions, in_use: 6 } });
+    let joints = |epoch| {
+        (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } })
+    };
     let heartbeat = |sent| {
         let state = State::CONFIGURED.with(State::TEST_MODE, true);
         let page = NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() });
@@ -108,13 +105,7 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_stimulus() {
 #[test]
 fn lost_joints_that_passed_a_report_on_its_way_are_counted() {
     let joints = |epoch| {
-        (
-            true,
-            Message::Joints {
-                epoch: Epoch(epoch),
-                joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 },
-            },
-        )
+        (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } })
     };
     let report = |epoch, joints| {
         let page = NetworkPage::Heard(Heard { joints, ..Heard::default() });
@@ -141,7 +132,7 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
     let press = Message::Stimulus { to: Node::Cell(cell), from: protocol::message::From::Next, page };
     let joints = |epoch| {
-        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        let joints = Joints { in_use: 6, ..Joints::default() };
         (true, Message::Joints { epoch: Epoch(epoch), joints })
     };
     let result = |intruded| {

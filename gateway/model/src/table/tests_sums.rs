@@ -1,11 +1,12 @@
 //! A table of a bus whose cells answer with sums.
 
-use protocol::fixed::{Q1_14, Q5_10, Q7_8};
+use protocol::fixed::{Q1_14, Q5_10};
 use protocol::message::{From, Joints, NetworkPage, SensorPage, State, Tree};
 use protocol::time::Span;
 
 use super::*;
 use crate::tracker::DEAD_AFTER;
+use protocol::packet::Words;
 
 /// Four cells on one bus, 1 and 2 of them roots.
 fn skin() -> Skin {
@@ -65,15 +66,14 @@ impl Bench {
     }
 
     fn joints(&mut self, epoch: u8) -> Sums {
-        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        let joints = Joints { in_use: 6, ..Joints::default() };
         self.say(true, Message::Joints { epoch: Epoch(epoch), joints });
         self.table.snapshot().sums
     }
 
     /// A sum of `count` cells with so many steps in its first word.
     fn sum(&mut self, node: i64, epoch: u8, count: u8, steps: i16) -> Sums {
-        let mut torque = [Q7_8::ZERO; WORDS];
-        torque[0] = Q7_8::from_bits(steps);
+        let torque = packet::words([steps]).into();
         self.say(false, Message::Sum { from: cell(node), epoch: Epoch(epoch), torque, count });
         self.table.snapshot().sums
     }
@@ -232,11 +232,13 @@ fn the_error_of_whole_sums_is_taken_of_complete_epochs_only_and_averaged_over_32
     let skin = skin();
     let central = Central::new(&skin);
     let page = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
-    let frames = central.frames(&[Q1_14::ZERO; WORDS]);
+    let frames = central.frames(&[Q1_14::ZERO; 6]);
     let one = central.torque(0, &frames, central.force(0, &page));
     // Alternately half a step too high and too low: the average is nearer than any of them.
-    let off =
-        |up| one.map(|nm| Q7_8::from_bits(((nm * 2.0 * 256.0) + if up { 0.6 } else { -0.4 }).floor() as i16));
+    let off = |up| {
+        let word = |nm: f64| ((nm * 2.0 * 256.0) + if up { 0.6 } else { -0.4 }).floor() as i16;
+        Words::new(Length::Six, one.map(word))
+    };
     for epoch in 0..33 {
         bench.joints(epoch);
         let count = if epoch == 0 { 1 } else { 2 };

@@ -1,0 +1,56 @@
+//! The chain of a bus among the joints of the robot.
+
+use protocol::fixed::Q1_14;
+use protocol::message::Joints;
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::{JointKind, MAX_ROBOT_JOINTS, Skin};
+
+/// The joints of a bus' chain, and what was last said of them.
+#[derive(Clone, Debug)]
+pub(super) struct Chain {
+    /// Each joint by its place among those of the robot.
+    joints: Vec<(usize, JointKind)>,
+    /// The last words.
+    said: Joints,
+}
+
+impl Chain {
+    pub(super) fn new(skin: &Skin, bus: usize) -> Self {
+        let joints: Vec<_> = skin.joints_of(bus).map(|(index, joint)| (index, joint.kind)).collect();
+        let in_use = u8::try_from(joints.len()).unwrap_or(u8::MAX);
+        Self { joints, said: Joints { positions: [Q1_14::ZERO; MAX_JOINTS], in_use } }
+    }
+
+    /// What was last said.
+    pub(super) const fn said(&self) -> Joints {
+        self.said
+    }
+
+    /// The positions of the robot as words. A position that is no number keeps its last word; a robot refuses such
+    /// velocities anyway.
+    pub(super) fn say(&mut self, q: &[f64; MAX_ROBOT_JOINTS]) {
+        for (word, &(joint, kind)) in self.said.positions.iter_mut().zip(&self.joints) {
+            if let Some(said) = q.get(joint).and_then(|&q| kind.word(q)) {
+                *word = said;
+            }
+        }
+    }
+
+    /// The positions of the chain's joints, in rad or m.
+    pub(super) fn positions(&self, q: &[f64; MAX_ROBOT_JOINTS]) -> [f64; MAX_JOINTS] {
+        let mut positions = [0.0; MAX_JOINTS];
+        for (position, (joint, _)) in positions.iter_mut().zip(&self.joints) {
+            *position = q.get(*joint).copied().unwrap_or_default();
+        }
+        positions
+    }
+
+    /// Adds a part of the chain's torques to those of the robot: joints that chains share get both.
+    pub(super) fn add(&self, part: f64, torque: &[f64; MAX_JOINTS], sum: &mut [f64; MAX_ROBOT_JOINTS]) {
+        for ((joint, _), torque) in self.joints.iter().zip(torque) {
+            if let Some(sum) = sum.get_mut(*joint) {
+                *sum += part * torque;
+            }
+        }
+    }
+}
