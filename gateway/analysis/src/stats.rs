@@ -10,7 +10,6 @@
 use model::decode::{BUSES, Decoded};
 use model::tracker::{Tracked, Word};
 use protocol::candump::Record;
-use protocol::fixed::Q;
 use protocol::id::CellId;
 use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::{Epoch, PacketError};
@@ -336,7 +335,7 @@ impl LinkId {
             Decoded::Damaged { fault, .. } => match fault {
                 PacketError::Length { .. } => refused.length += 1,
                 PacketError::Crc { .. } => refused.crc += 1,
-                PacketError::Incomplete => refused.incomplete += 1,
+                PacketError::Incomplete | PacketError::Ambiguous => refused.incomplete += 1,
                 PacketError::Foreign => {}
             },
         }
@@ -401,11 +400,11 @@ impl Cell {
         self.counts.packets += 1;
         let word = self.tracked.hear(Micros(nanos / 1_000), message, None).word;
         if let Message::Torque { epoch, torque, .. } = message {
-            let still = torque.iter().any(|word| *word != Q::ZERO);
-            self.counts.saturated += u64::from(torque.iter().copied().any(Q::is_saturated));
+            let still = !torque.is_zero();
+            self.counts.saturated += u64::from(torque.is_saturated());
             self.torque(nanos, *epoch, still, joints);
         } else if let Message::Sum { epoch, torque, .. } = message {
-            self.counts.saturated += u64::from(torque.iter().copied().any(Q::is_saturated));
+            self.counts.saturated += u64::from(torque.is_saturated());
             self.counts.sums += 1;
             self.counts.resent += u64::from(self.summed.replace(*epoch) == Some(*epoch));
         } else if let Message::Network { epoch, page: NetworkPage::Heartbeat(heartbeat), .. } = message {

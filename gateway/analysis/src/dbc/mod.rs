@@ -11,7 +11,7 @@
 //! Frames of simulated wires are left out: no real bus has them, and their identifiers number wires and not cells.
 //! `gateway dump` shows them.
 //!
-//! A DBC knows nothing of the CRC beyond its place, nor that a packet on a classic bus travels in two frames
+//! A DBC knows nothing of the CRC beyond its place, nor that a packet on a classic bus travels in several frames
 //! under one identifier. For a classic bus the text describes packets, for programs that join the frames first.
 
 mod signal;
@@ -21,6 +21,7 @@ use core::iter;
 
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind, Node};
+use protocol::packet::{Length, Lengths};
 use protocol::schema::{PacketSchema, packets};
 use protocol::skin::{Bus, Skin};
 
@@ -74,6 +75,8 @@ struct Message {
     to: Party,
     rhythm: Rhythm,
     comment: &'static str,
+    /// How long it is.
+    length: Length,
     signals: Vec<Signal>,
 }
 
@@ -81,8 +84,12 @@ struct Message {
 fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
     let mut nodes: Vec<_> = skin.cells_of(bus).map(|cell| Node::Cell(cell.node)).collect();
     nodes.sort_unstable_by_key(|node| node.to_byte());
+    let bus_format = skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default();
+    let kinds: Vec<_> = skin.joints_of(bus).map(|(_, joint)| joint.kind).collect();
+    let rows = skin.chain(bus).rows.len();
+    let chain = signal::Chain { length: skin.length_of(bus), format: bus_format, kinds, rows };
     let of = |schema: &'static PacketSchema| {
-        let said = |node| message(schema, node, period_ms(skin));
+        let said = |node| message(schema, node, period_ms(skin), &chain);
         let each = nodes.iter().map(|node| said(*node));
         match schema.kind {
             Kind::Command => vec![said(Node::Everyone)],
@@ -102,7 +109,7 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
 }
 
 /// What a cell sends of this kind, or what is sent to it; a command.
-fn message(schema: &'static PacketSchema, node: Node, period_ms: u32) -> Message {
+fn message(schema: &'static PacketSchema, node: Node, period_ms: u32, chain: &signal::Chain) -> Message {
     let PacketSchema { kind, command, meaning, .. } = schema;
     let cell = if command.is_some() { Party::Cells } else { Party::Cell(node.to_byte()) };
     let (from, to) = if kind.is_from_cells() { (cell, Party::Gateway) } else { (Party::Gateway, cell) };
@@ -118,7 +125,18 @@ fn message(schema: &'static PacketSchema, node: Node, period_ms: u32) -> Message
         Some(command) => (Id::command(*command), command.name().to_owned()),
         None => (Id::new(*kind, node), format!("{}_{node}", kind.name())),
     };
-    Message { id, name, from, to, rhythm, comment: meaning, signals: signal::all(schema) }
+    let grows = Lengths::of(id) == Lengths::ALL;
+    let length = if grows { chain.length } else { Length::Six };
+    Message {
+        id,
+        name,
+        from,
+        to,
+        rhythm,
+        comment: meaning,
+        length,
+        signals: signal::all(schema, length, chain),
+    }
 }
 
 /// The period of the joint broadcast in whole ms, as a DBC has it.

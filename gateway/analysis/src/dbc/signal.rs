@@ -3,12 +3,61 @@
 use core::f64::consts::FRAC_PI_2;
 use core::slice;
 
+use protocol::fixed::TorqueFormat;
+use protocol::id::Kind;
 use protocol::message::State;
-use protocol::packet::{BYTES, WORDS};
+use protocol::packet::{Length, WORDS};
+use protocol::parameters::Parameter;
 use protocol::schema::{Field, Format, Layout, PacketSchema, Range, parameters, reasons};
+use protocol::skin::JointKind;
 
-/// Where the words end.
+/// Where the words of a packet of six end.
 const END: usize = WORDS * 16;
+
+/// What a bus' joints, torques and sums are.
+#[derive(Debug)]
+pub(super) struct Chain {
+    /// How long they are.
+    pub(super) length: Length,
+    /// In which format its cells send torques.
+    pub(super) format: TorqueFormat,
+    /// By joint.
+    pub(super) kinds: Vec<JointKind>,
+    /// Rows of its table.
+    pub(super) rows: usize,
+}
+
+impl Chain {
+    /// Whether the packets of a kind have this page on the bus: no cell has more rows than the chain, or than an image
+    /// has at least.
+    fn has(&self, kind: Kind, layout: &Layout) -> bool {
+        let is_parameter = matches!(kind, Kind::Configure | Kind::Configured);
+        match Parameter::from_number(layout.number) {
+            Some(parameter @ Parameter::Row(_)) if is_parameter => {
+                Parameter::stored(self.rows).any(|stored| stored == parameter)
+            }
+            Some(_) | None => true,
+        }
+    }
+
+    /// A field's element as the joint makes it.
+    fn adapt(&self, field: &Field, element: usize, signal: Signal) -> Signal {
+        let mut signal = signal;
+        if field.format == Format::Torque {
+            let ratio = self.format.step() / TorqueFormat::default().step();
+            signal.factor *= ratio;
+            signal.range = signal.range.map(|bound| bound * ratio);
+        }
+        if field.grows() && self.kinds.get(element) == Some(&JointKind::Prismatic) {
+            if field.format == Format::Position {
+                signal.factor /= FRAC_PI_2;
+                signal.range = signal.range.map(|bound| bound / FRAC_PI_2);
+            }
+            signal.unit = if field.unit == "rad" { "m" } else { "N" };
+        }
+        signal
+    }
+}
 
 /// When a signal is present.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -40,31 +89,46 @@ pub(super) struct Signal {
 }
 
 /// The signals of a kind of packet: those of its pages, of bytes 12 and 13, and the CRC.
-pub(super) fn all(schema: &'static PacketSchema) -> Vec<Signal> {
+pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) -> Vec<Signal> {
     let one_page = schema.layouts.len() == 1;
+    // What follows the words stands further back in a longer packet.
+    let further = length.words() * 16 - END;
     let of_layout = |layout: &'static Layout| {
         let page = if one_page { Page::Every } else { Page::Only(layout.number) };
         layout
             .fields
             .iter()
-            .flat_map(move |field| of(field, &layout.prefix))
+            .flat_map(move |field| {
+                let count = if field.grows() { length.words() } else { usize::MAX };
+                let signals = of(field, &layout.prefix).into_iter().take(count).enumerate();
+                let further = if field.at() < END { 0 } else { further };
+                signals.map(move |(element, signal)| {
+                    let signal = chain.adapt(field, element, signal);
+                    Signal { start: signal.start + further, ..signal }
+                })
+            })
             .map(move |it| Signal { page, ..it })
     };
-    let mut signals: Vec<_> = schema.layouts.iter().flat_map(of_layout).collect();
+    let layouts: Vec<_> = schema.layouts.iter().filter(|layout| chain.has(schema.kind, layout)).collect();
+    let mut signals: Vec<_> = layouts.iter().copied().flat_map(of_layout).collect();
     for field in &schema.end {
         let is_number = matches!(field.format, Format::Page(_) | Format::Parameter(_));
-        let numbered = |signal| Signal { page: Page::Number, names: numbers(&schema.layouts), ..signal };
+        let numbered =
+            |signal| Signal { page: Page::Number, names: numbers(layouts.iter().copied()), ..signal };
         let signals_of = of(field, "").into_iter();
-        signals.extend(signals_of.map(|signal| if is_number { numbered(signal) } else { signal }));
+        let placed = |signal: Signal| Signal { start: signal.start + further, ..signal };
+        signals
+            .extend(signals_of.map(placed).map(|signal| if is_number { numbered(signal) } else { signal }));
     }
-    signals.push(bits("crc".to_owned(), BYTES * 8 - 16, 16));
-    signals.sort_by_key(|signal| if signal.start < END { 0 } else { signal.start });
+    signals.push(bits("crc".to_owned(), length.bytes() * 8 - 16, 16));
+    let words = length.words() * 16;
+    signals.sort_by_key(|signal| if signal.start < words { 0 } else { signal.start });
     signals
 }
 
 /// What the numbers of pages or parameters mean.
-fn numbers(layouts: &'static [Layout]) -> Vec<(i64, &'static str)> {
-    layouts.iter().map(|layout| (i64::from(layout.number), layout.name.as_str())).collect()
+fn numbers(layouts: impl IntoIterator<Item = &'static Layout>) -> Vec<(i64, &'static str)> {
+    layouts.into_iter().map(|layout| (i64::from(layout.number), layout.name.as_str())).collect()
 }
 
 /// Some bits as they are, unsigned.

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use can_dbc::{AttributeValue, ByteOrder, Dbc, MessageId, MultiplexIndicator, ValueDescription, ValueType};
 use proptest::prelude::*;
 use protocol::message::Message;
-use protocol::packet::{BYTES, Epoch, Packet, WORDS};
+use protocol::packet::{Epoch, Packet, WORDS, Words};
 
 mod said;
 
@@ -23,12 +23,13 @@ fn parsed(skin: &Skin, bus: usize) -> Dbc {
 }
 
 /// A frame decoded by the DBC alone: the message's name, and each signal that is present with its value.
-fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8; BYTES]) -> (String, BTreeMap<String, f64>) {
-    let whole = u128::from_le_bytes(*bytes);
+fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8]) -> (String, BTreeMap<String, f64>) {
     let raw = |signal: &can_dbc::Signal| {
         assert_eq!(signal.byte_order, ByteOrder::LittleEndian);
-        let bits = (whole >> signal.start_bit) & ((1 << signal.size) - 1);
-        let bits = i64::try_from(bits).unwrap();
+        let start = usize::try_from(signal.start_bit).unwrap();
+        let there = bytes[start / 8..].iter().take(5).rev();
+        let whole = there.fold(0_i64, |whole, &byte| whole << 8 | i64::from(byte));
+        let bits = (whole >> (start % 8)) & ((1 << signal.size) - 1);
         let negative = signal.value_type == ValueType::Signed && bits >> (signal.size - 1) == 1;
         if negative { bits - (1 << signal.size) } else { bits }
     };
@@ -73,14 +74,15 @@ fn every_message_says_through_the_dbc_what_the_protocol_says() {
     let node = prop_oneof![1 => Just(1_u16), 1 => Just(0xFF), 6 => 0_u16..0x100];
     let cases = (
         (0_u16..8, node).prop_map(|(kind, node)| kind << 8 | node),
-        any::<[i16; WORDS]>(),
+        // Kinds of rows are small.
+        proptest::array::uniform::<_, WORDS>(prop_oneof![any::<i16>(), 0_i16..4]),
         any::<u8>(),
         proptest::sample::select(counts.collect::<Vec<_>>()),
     );
     let config = ProptestConfig { cases: 40_000, failure_persistence: None, ..ProptestConfig::default() };
     let met = std::cell::RefCell::new(&mut met);
     proptest!(config, |((id, words, epoch, count) in cases)| {
-        let packet = Packet { id: Id::from_bits(id), words, epoch: Epoch(epoch), count };
+        let packet = Packet { id: Id::from_bits(id), words: words.into(), epoch: Epoch(epoch), count };
         let Ok(message) = Message::decode(&packet) else { return Ok(()) };
         let packet = message.encode();
         let (name, expected) = said::by_protocol(&message, &packet);
@@ -106,7 +108,8 @@ fn every_identifier_of_the_bus_is_there_and_no_other() {
     let dbc = parsed(&full(), 0);
     let messages = by_id(&dbc);
     for id in 0..0x800 {
-        let packet = |count| Packet { id: Id::from_bits(id), words: [0; WORDS], epoch: Epoch(0), count };
+        let packet =
+            |count| Packet { id: Id::from_bits(id), words: Words::default(), epoch: Epoch(0), count };
         let said = (0..=1).any(|count| Message::decode(&packet(count)).is_ok());
         assert_eq!(messages.contains_key(&id), said, "{id:03X}");
     }
@@ -184,7 +187,7 @@ fn words_have_names_units_and_ranges() {
     assert_eq!(signal(0x101, "sum_1"), ("-128 to 127.99609375 Nm".to_owned(), saturated));
     let angle = "-3.141592653589793 to 3.1414967797905504 rad";
     assert_eq!(signal(0x001, "position_1"), (angle.to_owned(), vec![]));
-    assert_eq!(signal(0x001, "count"), ("1 to 6 ".to_owned(), vec![]));
+    assert_eq!(signal(0x001, "count"), ("1 to 14 ".to_owned(), vec![]));
     assert_eq!(signal(0x301, "proximity"), ("0 to 1 ".to_owned(), vec![]));
     assert_eq!(signal(0x301, "temperature_2"), ("-512 to 511.984375 degC".to_owned(), vec![]));
     assert_eq!(signal(0x301, "page").1, [(0, "skin"), (1, "acceleration")]);
@@ -194,7 +197,7 @@ fn words_have_names_units_and_ranges() {
     assert_eq!(signal(0x501, "events_temperature"), ("0 to 511.984375 degC".to_owned(), vec![]));
     let refusal = signal(0x601, "parameter").1;
     assert_eq!(refusal.last(), Some(&(126, "refusal")));
-    assert_eq!(signal(0x601, "refused_reason").1[6], (16, "the hash is not that of the staged copy"));
+    assert!(signal(0x601, "refused_reason").1.contains(&(16, "the hash is not that of the staged copy")));
 }
 
 #[test]

@@ -3,7 +3,6 @@
 use core::fmt::{self, Write};
 
 use protocol::message::VERSION;
-use protocol::packet::BYTES;
 use protocol::skin::{Bus, Skin};
 
 use super::signal::{Page, Signal};
@@ -83,7 +82,7 @@ pub(super) fn write(
 /// A message and its signals.
 fn frame(out: &mut impl Write, message: &Message, everyone: &[u8]) -> fmt::Result {
     let Message { id, name, from, .. } = message;
-    write!(out, "BO_ {} {name}: {BYTES} ", id.to_bits())?;
+    write!(out, "BO_ {} {name}: {} ", id.to_bits(), message.length.bytes())?;
     parties(out, *from, everyone)?;
     writeln!(out)?;
     for signal in &message.signals {
@@ -123,15 +122,15 @@ fn about(out: &mut impl Write, skin: &Skin, bus: &Bus) -> fmt::Result {
     // A quotation mark would end the comment.
     let [skin, bus_name] = [&skin.name, &bus.name].map(|name| name.replace('"', "'"));
     let travels = if are_packets(bus) {
-        "Classic: a packet travels in two frames of 8 bytes under one identifier; this describes the 16 bytes of the \
-         two joined, which no frame of the bus has."
+        "Classic: a packet travels in frames of up to 8 bytes under one identifier; this describes their bytes joined, \
+         which no frame of the bus has."
     } else {
         "A packet is one CAN FD frame with bit-rate switch."
     };
     writeln!(
         out,
         "CM_ \"Skin {skin}, bus {bus_name}, protocol version {VERSION}. {travels} The crc is CRC-16/CCITT-FALSE over \
-         the identifier (2 bytes, little-endian) and bytes 0 to 13. Epochs and counters wrap.\";"
+         the identifier (2 bytes, little-endian) and all bytes before it. Epochs and counters wrap.\";"
     )
 }
 

@@ -17,16 +17,17 @@ mod watch;
 pub use read::{Found, find};
 pub use watch::{CellMoment, Moment, NotFound, Origin, Requested, Watch};
 
-use protocol::fixed::{Q, Q3_12};
+use protocol::fixed::{Acc, Q, TorqueFormat};
 use protocol::message::{SkinSensors, State};
-use protocol::packet::WORDS;
-use protocol::skin::{Cell, Reply, Skin};
+use protocol::packet::Words;
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::{Cell, Joint, MAX_ROBOT_JOINTS, Reply, Skin};
 use serde::Serialize;
 
 use model::central::Central;
 
 /// The most by which the J of a cell that computes in 16 bits may err, in steps of 2^-14 m: the 5e-4 m that the
-/// kernels promise for arms of any shape.
+/// kernels promise for arms of any shape. Each row of the chain after the sixth, up to the cell's, allows one more.
 pub const JACOBIAN_STEPS: i64 = 8;
 
 /// One epoch, explained.
@@ -51,8 +52,12 @@ pub struct BusExplained {
     pub at_ns: u64,
     /// The words of the joints in use.
     pub position_words: Vec<i16>,
-    /// The same in rad.
+    /// The same in rad, of prismatic joints in m.
     pub position_rad: Vec<f64>,
+    /// The unit of each.
+    pub units: Vec<&'static str>,
+    /// How its cells' torque words are to be read.
+    pub torque_format: &'static str,
     /// Whether it was halted.
     pub halted: bool,
 }
@@ -108,6 +113,8 @@ pub struct Force {
 pub struct Row {
     /// The joint, from 1.
     pub joint: u8,
+    /// The unit of its torques: that of a prismatic joint is N.
+    pub unit: &'static str,
     /// The exact J of the quantised parameters in m; absent when they are not known.
     pub jacobian_m: Option<f64>,
     /// J F_z in f64, in Nm.
@@ -150,6 +157,8 @@ pub enum Verdict {
 pub struct Total {
     /// The joint, from 1.
     pub joint: u8,
+    /// The unit of its torques: that of a prismatic joint is N.
+    pub unit: &'static str,
     /// The sum of the frames' words: steps of 2^-12 Nm.
     pub word_steps: i64,
     /// The same in Nm.
@@ -171,11 +180,9 @@ pub struct Total {
 /// Explains what was found, by the skin's bus.
 #[must_use]
 pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
-    let (central, unquantised) = (Central::new(skin), Central::unquantised(skin));
-    let joints = skin.robot.joints.len();
     let mut explanation =
         Explanation { buses: Vec::new(), cells: Vec::new(), total: Vec::new(), missing: Vec::new() };
-    let mut sums = [Sum::default(); WORDS];
+    let mut sums = [Sum::default(); MAX_ROBOT_JOINTS];
     for (index, (bus, moment)) in skin.buses.iter().zip(moments).enumerate() {
         let name = &bus.name;
         let Some(moment) = moment else {
@@ -192,16 +199,22 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
                 .push(format!("{name} answers with sums, which do not contain the torques of single cells"));
         }
         let positions = moment.joints.positions;
-        let frames = [&central, &unquantised].map(|central| central.frames(&positions));
+        let part = skin.part_on(index);
+        let both = [Central::new(&part), Central::unquantised(&part)];
+        let [central, _] = &both;
+        let frames = both.each_ref().map(|central| central.frames(&positions));
+        let chain: Vec<_> = skin.joints_of(index).collect();
         explanation.buses.push(BusExplained {
             bus: name.clone(),
             at_ns: moment.at_ns,
-            position_words: positions.iter().take(joints).map(|word| word.to_bits()).collect(),
-            position_rad: positions.iter().take(joints).map(|word| word.to_radians()).collect(),
+            position_words: positions.iter().take(chain.len()).map(|word| word.to_bits()).collect(),
+            position_rad: central.positions(&positions).into_iter().take(chain.len()).collect(),
+            units: chain.iter().map(|(_, joint)| joint.kind.unit()).collect(),
+            torque_format: bus.torque_format.name(),
             halted: moment.halted,
         });
         let mut silent = 0;
-        let mut here: Vec<_> = skin.cells.iter().enumerate().filter(|(_, cell)| cell.bus == index).collect();
+        let mut here: Vec<_> = part.cells.iter().enumerate().collect();
         here.sort_unstable_by_key(|(_, cell)| cell.node);
         for (place, cell) in here {
             let Some(said) = moment.cells.get(cell.node.index()) else { continue };
@@ -224,25 +237,30 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
                     "{name} {node}: no torque of this epoch in time: {why}; the words are without it"
                 ));
             }
-            let [[exact, unit], [unrounded, _]] =
-                [(&central, &frames[0]), (&unquantised, &frames[1])].map(|(central, frames)| {
-                    let newtons = force.map_or(0.0, |force| force.fused_or_none());
-                    [newtons, 1.0].map(|newtons| central.torque(place, frames, newtons))
-                });
+            let newtons = force.map_or(0.0, |force| force.fused_or_none());
+            let ([in_words, in_numbers], [rounded, real]) = (&both, &frames);
+            let exact = in_words.torque(place, rounded, newtons);
+            let unit = in_words.torque(place, rounded, 1.0);
+            let unrounded = in_numbers.torque(place, real, newtons);
             let words = said.answer.map(|(_, words)| words);
-            let rows = (0..joints).map(|at| {
-                row(at, at < usize::from(cell.joint), force.as_ref(), &exact, &unit, words.as_ref())
+            let format = bus.torque_format;
+            let steps = jacobian_steps(part.parameters(cell).chain().len());
+            let rows = chain.iter().enumerate().map(|(at, joint)| {
+                let moves = at < usize::from(cell.joint);
+                let steps = moves.then_some(steps);
+                row(joint, at, steps, force.as_ref(), &exact, &unit, format, words.as_ref())
             });
             let rows: Vec<_> = rows.collect();
-            for (at, sum) in sums.iter_mut().enumerate().take(joints) {
+            for (at, (joint, _)) in chain.iter().enumerate() {
+                let Some(sum) = sums.get_mut(*joint) else { continue };
                 sum.open += u32::from(force.is_none() || words.is_none());
-                let of = |values: &[f64; WORDS]| values.get(at).copied().unwrap_or_default();
+                let of = |values: &[f64; MAX_JOINTS]| values.get(at).copied().unwrap_or_default();
                 sum.central += of(&exact);
                 sum.unrounded += of(&unrounded);
-                if let Some(word) = words.and_then(|words| words.get(at).copied()) {
-                    sum.words += i64::from(word.to_bits());
+                if let Some(word) = words.and_then(|words| words.as_slice().get(at).copied()) {
+                    sum.words += i64::from(format.finest_steps(word));
                     sum.products += of(&exact);
-                    sum.saturated += u32::from(word.is_saturated());
+                    sum.saturated += u32::from(is_saturated(word));
                 }
             }
             explanation.cells.push(CellExplained {
@@ -261,7 +279,10 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
             ));
         }
     }
-    explanation.total = (1..).zip(sums).take(joints).map(|(joint, sum)| sum.total(joint)).collect();
+    explanation.total = (1..)
+        .zip(sums.into_iter().zip(&skin.robot.joints))
+        .map(|(joint, (sum, described))| sum.total(joint, described.kind.torque_unit()))
+        .collect();
     explanation
 }
 
@@ -277,10 +298,11 @@ struct Sum {
 
 impl Sum {
     #[expect(clippy::cast_precision_loss, reason = "254 words a bus: exact")]
-    fn total(self, joint: u8) -> Total {
+    fn total(self, joint: u8, unit: &'static str) -> Total {
         let words_nm = self.words as f64 / 4_096.0;
         Total {
             joint,
+            unit,
             word_steps: self.words,
             words_nm,
             products_nm: self.products,
@@ -397,61 +419,78 @@ fn to_newtons(steps: i64) -> f64 {
     steps as f64 / 65_536.0
 }
 
+#[expect(clippy::too_many_arguments, reason = "what a row shows")]
 fn row(
+    &(joint, described): &(usize, &Joint),
     at: usize,
-    moves: bool,
+    steps: Option<i64>,
     force: Option<&Force>,
-    exact: &[f64; WORDS],
-    unit: &[f64; WORDS],
-    words: Option<&[Q3_12; WORDS]>,
+    exact: &[f64; MAX_JOINTS],
+    unit: &[f64; MAX_JOINTS],
+    format: TorqueFormat,
+    words: Option<&Words>,
 ) -> Row {
-    let joint = u8::try_from(at + 1).unwrap_or(u8::MAX);
-    let of = |values: &[f64; WORDS]| force.and_then(|_| values.get(at).copied());
+    let joint = u8::try_from(joint + 1).unwrap_or(u8::MAX);
+    let of = |values: &[f64; MAX_JOINTS]| force.and_then(|_| values.get(at).copied());
     let (jacobian_m, product_nm) = (of(unit), of(exact));
-    let nearest = product_nm.map(Q3_12::nearest);
-    let word = words.and_then(|words| words.get(at).copied());
-    let difference =
-        nearest.zip(word).map(|(nearest, word)| i32::from(word.to_bits()) - i32::from(nearest.to_bits()));
+    let nearest = product_nm.map(|product| format.nearest(product));
+    let word = words.and_then(|words| words.as_slice().get(at).copied());
+    let difference = nearest.zip(word).map(|(nearest, word)| i32::from(word) - i32::from(nearest));
     let verdict = match (force, jacobian_m, nearest, word) {
         (Some(force), Some(jacobian), Some(nearest), Some(word)) => {
-            comparator(force.force_steps, jacobian, moves, nearest, word)
+            comparator(force.force_steps, jacobian, steps, format, nearest, word)
         }
         (_, _, _, _) => Verdict::Open,
     };
     Row {
         joint,
+        unit: described.kind.torque_unit(),
         jacobian_m,
         product_nm,
-        nearest_word: nearest.map(Q::to_bits),
-        word: word.map(Q::to_bits),
-        word_nm: word.map(Q::to_f64),
+        nearest_word: nearest,
+        word,
+        word_nm: word.map(|word| format.real(word)),
         difference_steps: difference,
         verdict,
     }
 }
 
-/// Where a word that should be `nearest` comes from.
+/// Whether a word of a torque means *saturated*.
+fn is_saturated(word: i16) -> bool {
+    [i16::MIN, i16::MAX].contains(&word)
+}
+
+/// How many steps a cell's J may err that so many rows carry.
+fn jacobian_steps(rows: usize) -> i64 {
+    JACOBIAN_STEPS + i64::try_from(rows.saturating_sub(6)).unwrap_or(i64::MAX - JACOBIAN_STEPS)
+}
+
+/// Where a word that should be `nearest` comes from. A joint that does not move the cell has no J that could err.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_precision_loss,
     reason = "J is within +-2 m: 2^15 steps"
 )]
-fn comparator(force_steps: i64, jacobian_m: f64, moves: bool, nearest: Q3_12, word: Q3_12) -> Verdict {
+fn comparator(
+    force_steps: i64,
+    jacobian_m: f64,
+    steps: Option<i64>,
+    format: TorqueFormat,
+    nearest: i16,
+    word: i16,
+) -> Verdict {
     if word == nearest {
-        return if word.is_saturated() { Verdict::Saturated } else { Verdict::Nearest };
+        return if is_saturated(word) { Verdict::Saturated } else { Verdict::Nearest };
     }
+    let Some(within) = steps else { return Verdict::Unexplained };
     let exact = jacobian_m * 16_384.0;
     let middle = exact.round() as i64;
-    let mut near: Vec<i64> = (middle - JACOBIAN_STEPS - 1..=middle + JACOBIAN_STEPS + 1).collect();
+    let mut near: Vec<i64> = (middle - within - 1..=middle + within + 1).collect();
     let off = |steps: i64| steps as f64 - exact;
     near.sort_by(|one, other| off(*one).abs().total_cmp(&off(*other).abs()));
-    let gives = |steps: i64| {
-        let held = ((steps * force_steps + (1 << 17)) >> 18).clamp(i64::from(i16::MIN), i64::from(i16::MAX));
-        held == i64::from(word.to_bits())
-    };
-    let found = near.into_iter().find(|&steps| off(steps).abs() <= JACOBIAN_STEPS as f64 && gives(steps));
-    // A joint that does not move the cell has no J that could err.
-    found.filter(|_| moves).map_or(Verdict::Unexplained, |steps| Verdict::Rounded {
+    let gives = |steps: i64| format.round(Acc::<30>::from_steps(steps * force_steps)) == word;
+    let found = near.into_iter().find(|&steps| off(steps).abs() <= within as f64 && gives(steps));
+    found.map_or(Verdict::Unexplained, |steps| Verdict::Rounded {
         jacobian_m: steps as f64 / 16_384.0,
         jacobian_steps: off(steps),
     })

@@ -4,7 +4,8 @@ use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node};
 use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, State};
-use protocol::packet::Epoch;
+use protocol::packet::padded;
+use protocol::packet::{self, Epoch};
 use protocol::parameters::Parameter;
 
 /// The document's cell 12 on the second link of a UR5: its configuration, its joints, its touch, its torque.
@@ -28,7 +29,7 @@ fn cell() -> CellId {
 fn joints(epoch: u8) -> Message {
     let words: [u16; 6] = [0, 0xCF1C, 0x28BE, 0xC6F5, 0xC008, 0];
     let positions = words.map(|word| Q1_14::from_bits(word.cast_signed()));
-    Message::Joints { epoch: Epoch(epoch), joints: Joints { positions, in_use: 6 } }
+    Message::Joints { epoch: Epoch(epoch), joints: Joints { positions: padded(&positions), in_use: 6 } }
 }
 
 fn press(from: From, newtons: f64) -> Message {
@@ -38,9 +39,7 @@ fn press(from: From, newtons: f64) -> Message {
 }
 
 fn torque(epoch: u8, words: [i16; 2]) -> Message {
-    let [one, two] = words.map(Q3_12::from_bits);
-    let zero = Q3_12::ZERO;
-    Message::Torque { from: cell(), epoch: Epoch(epoch), torque: [one, two, zero, zero, zero, zero] }
+    Message::Torque { from: cell(), epoch: Epoch(epoch), torque: packet::words(words).into() }
 }
 
 fn heartbeat(configuration: u16) -> Message {
@@ -106,7 +105,7 @@ fn a_torque_in_a_joint_that_does_not_move_the_cell_is_not_explained() {
     let skin = skin();
     let mut wrong = torque(7, [-1075, 3195]);
     if let Message::Torque { torque, .. } = &mut wrong {
-        torque[2] = Q3_12::from_bits(1);
+        *torque = [-1075, 3195, 1, 0, 0, 0].into();
     }
     let said = [heartbeat(0x266D), press(From::Next, 1.0), joints(7), wrong];
     let explanation = explained(&skin, &said, first(7)).unwrap();

@@ -1,12 +1,11 @@
 //! Finds the requested joints, and the contact state and answer of each cell at them.
 
 use model::tracker::{Claim, Contact, LATEST, PerCell, Word, is_late};
-use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
 use protocol::message::{
     Answer, From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
 };
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::{Epoch, Words};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use serde::Serialize;
@@ -111,7 +110,7 @@ pub struct CellMoment {
     /// Hash of its configuration; `None` when not reported.
     pub hash: Option<u16>,
     /// The torque that it answered, and when.
-    pub answer: Option<(u64, [Q3_12; WORDS])>,
+    pub answer: Option<(u64, Words)>,
     /// When its torque came, if that was too late to be used.
     pub too_late: Option<u64>,
     /// Further torques of this epoch, which are not used.
@@ -175,8 +174,9 @@ impl<'a> Watch<'a> {
 
     /// Takes in a frame from before the capture that is latched when it begins.
     pub fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
-        let joints = self.skin.robot.joints.len();
-        if let Some(bus_watch) = self.skin.bus_named(bus).and_then(|at| self.bus_watches.get_mut(at)) {
+        let at = self.skin.bus_named(bus);
+        let joints = at.map_or(0, |at| self.skin.joints_of(at).len());
+        if let Some(bus_watch) = at.and_then(|at| self.bus_watches.get_mut(at)) {
             if let Message::Joints { epoch, joints: Joints { in_use, .. } } = *message {
                 if usize::from(in_use) == joints && bus_watch.last != Some(epoch) {
                     bus_watch.latch(epoch);
@@ -190,7 +190,8 @@ impl<'a> Watch<'a> {
     /// Takes in the next frame; `message` is its meaning, if it has one. Whether all is known now.
     pub fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         let first = *self.first.get_or_insert(nanos);
-        let Some(bus_watch) = self.skin.bus_named(bus).and_then(|at| self.bus_watches.get_mut(at)) else {
+        let at = self.skin.bus_named(bus);
+        let Some(bus_watch) = at.and_then(|at| self.bus_watches.get_mut(at)) else {
             if self.others.len() < RUNS && !self.others.iter().any(|other| other == bus) {
                 self.others.push(bus.to_owned());
             }
@@ -203,7 +204,7 @@ impl<'a> Watch<'a> {
                 nanos.saturating_sub(first),
                 message,
                 self.requested,
-                self.skin.robot.joints.len(),
+                at.map_or(0, |at| self.skin.joints_of(at).len()),
             );
         }
         self.is_complete()

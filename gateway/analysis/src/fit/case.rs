@@ -1,6 +1,7 @@
 //! One bus, what its cells send on it, and how long that takes at most.
 
 use protocol::can::Format;
+use protocol::packet::Length;
 use protocol::parameters::Sensing;
 use protocol::skin::{Reply, Skin};
 use protocol::wire_time::{BitRates, Coding, Shape};
@@ -69,6 +70,8 @@ impl Answers {
 pub struct Case {
     /// One FD frame a packet, or two classic ones.
     pub format: Format,
+    /// How long joints and answers are.
+    pub length: Length,
     /// Its bit rates.
     pub rates: BitRates,
     /// From joints to joints in ns.
@@ -134,31 +137,44 @@ impl Case {
             Reply::Torque => torques(skin, bus),
             Reply::Sum { slot_us, .. } => sums(skin, bus, period_ns, Some(slot_us), true)?,
         };
-        Some(Self { format, rates, period_ns, computation_ns, sensing: described.sensing, answers })
+        Some(Self {
+            format,
+            length: skin.length_of(bus),
+            rates,
+            period_ns,
+            computation_ns,
+            sensing: described.sensing,
+            answers,
+        })
     }
 
-    /// The longest frame of 16 bytes (classic: of 8), in ns.
+    /// The longest time of a frame of joints or of an answer; on a classic bus of any frame.
     #[must_use]
     pub fn frame_ns(&self) -> u64 {
+        self.frame_of_ns(self.length)
+    }
+
+    fn frame_of_ns(&self, length: Length) -> u64 {
         let (coding, len) = match self.format {
-            Format::Fd => (Coding::FdSwitched, 16),
+            Format::Fd => (Coding::FdSwitched, u8::try_from(length.bytes()).unwrap_or(u8::MAX)),
             Format::Classic => (Coding::Classic, 8),
         };
         Shape { coding, extended: false, len }.worst().nanoseconds(self.rates)
     }
 
-    /// Frames that a packet takes.
-    const fn frames(&self) -> u32 {
+    /// Frames of a packet.
+    fn frames_of(&self, length: Length) -> u32 {
         match self.format {
             Format::Fd => 1,
-            Format::Classic => 2,
+            Format::Classic => u32::try_from(length.segments()).unwrap_or(u32::MAX),
         }
     }
 
-    /// The longest packet in ns.
+    /// The longest time of the frames of joints or of an answer. Of a classic packet of three frames the last one has 4
+    /// bytes, and is taken for one of 8.
     #[must_use]
     pub fn packet_ns(&self) -> u64 {
-        u64::from(self.frames()) * self.frame_ns()
+        u64::from(self.frames_of(self.length)) * self.frame_ns()
     }
 
     /// The time of the answers of so many cells in ns.
@@ -175,11 +191,12 @@ impl Case {
     ///
     /// Heartbeats and what goes with them may be sent up to a period of the joints early.
     fn streams(&self, answers_jitter_ns: u64) -> [Stream; 5] {
-        let (cells, early_ns, frame_ns) = (self.answers.cells(), self.period_ns, self.frame_ns());
-        let stream = |senders: u32, period_ns, jitter_ns| {
-            let count = senders.saturating_mul(self.frames());
-            Stream { count, period_ns, jitter_ns, frame_ns }
+        let (cells, early_ns) = (self.answers.cells(), self.period_ns);
+        let of = |length, senders: u32, period_ns, jitter_ns| {
+            let count = senders.saturating_mul(self.frames_of(length));
+            Stream { count, period_ns, jitter_ns, frame_ns: self.frame_of_ns(length) }
         };
+        let stream = |senders, period_ns, jitter_ns| of(Length::Six, senders, period_ns, jitter_ns);
         let none = stream(0, ACCELERATION_NS, early_ns);
         let acceleration = stream(cells, ACCELERATION_NS, early_ns);
         let [page_0, page_1] = match self.sensing {
@@ -192,8 +209,8 @@ impl Case {
             Sensing::Event => [stream(cells, HEARTBEAT_NS, early_ns), acceleration],
         };
         [
-            stream(1, self.period_ns, 0),
-            stream(cells, self.period_ns, answers_jitter_ns),
+            of(self.length, 1, self.period_ns, 0),
+            of(self.length, cells, self.period_ns, answers_jitter_ns),
             page_0,
             page_1,
             stream(cells, HEARTBEAT_NS, early_ns),

@@ -4,9 +4,9 @@
 //! sends stimuli, sync and report with their answers, and what stands for wires between cells.
 
 use protocol::can::{Format, Frame};
-use protocol::id::{CellId, Id, Node};
+use protocol::id::{CellId, Command, Id, Node};
 use protocol::message::{Message, NetworkPage, SensorPage, State};
-use protocol::packet::{Epoch, Packet, Reassembly, Segment, data_id};
+use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Segment, data_id};
 use protocol::time::Micros;
 use serde::Serialize;
 
@@ -101,6 +101,8 @@ pub struct Traffic {
     others: u64,
     /// By identifier.
     segments: Vec<Segment>,
+    /// How long joints, torques and sums are, as the last joints were.
+    length: Option<Length>,
     /// By cell: replies to the bench that are outstanding.
     owed: Vec<Owed>,
 }
@@ -143,13 +145,19 @@ impl Traffic {
             self.segments.resize(IDS, Segment::NONE);
         }
         let segment = self.segments.get_mut(usize::from(id.to_bits()))?;
-        match segment.push(Micros(nanos / 1_000), id, frame.data()) {
+        let is_joints = id == Id::command(Command::Joints);
+        let lengths = Lengths::of_chain(self.length.filter(|_| !is_joints));
+        match segment.push(Micros(nanos / 1_000), id, lengths, frame.data()) {
             Ok(Reassembly::Complete(packet)) => {
-                self.ours += 2;
+                let length = packet.words.length();
+                self.ours += length.segments() as u64;
+                if is_joints {
+                    self.length = Some(length);
+                }
                 Some((packet, true))
             }
             Ok(Reassembly::Waiting) => None,
-            Ok(Reassembly::Incomplete) | Err(_) => {
+            Ok(Reassembly::Incomplete | Reassembly::Ambiguous) | Err(_) => {
                 self.others += 1;
                 None
             }

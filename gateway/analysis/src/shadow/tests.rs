@@ -4,7 +4,6 @@ mod run;
 
 use super::*;
 use protocol::can::{BIT_RATE_SWITCH, ERROR, EXTENDED, FD_FORMAT, Format};
-use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::CellId;
 use protocol::message::{Joints, Message};
 use protocol::packet::{Epoch, WORDS};
@@ -35,12 +34,12 @@ fn took(frame: &Frame) -> u64 {
 }
 
 fn joints(epoch: u8) -> Message {
-    Message::Joints { epoch: Epoch(epoch), joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 } }
+    Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } }
 }
 
 fn torque(cell: i64, epoch: u8) -> Message {
     let from = CellId::new(cell).unwrap();
-    Message::Torque { from, epoch: Epoch(epoch), torque: [Q3_12::from_bits(3); WORDS] }
+    Message::Torque { from, epoch: Epoch(epoch), torque: [3; WORDS].into() }
 }
 
 fn say(shadow: &mut Shadow, format: Format, nanos: u64, message: &Message) {

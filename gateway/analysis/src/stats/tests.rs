@@ -2,7 +2,6 @@ use super::*;
 use model::decode::settle::Settler;
 use protocol::can::{Format, Frame};
 use protocol::candump::Timestamp;
-use protocol::fixed::{Q3_12, Q7_8};
 use protocol::id::Node;
 use protocol::message::{self, Heartbeat, Tree};
 use protocol::wire;
@@ -41,7 +40,7 @@ impl Tape {
     }
 
     fn torque(&mut self, epoch: u8, word: i16) {
-        self.say(&Message::Torque { from: cell(), epoch: Epoch(epoch), torque: [Q3_12::from_bits(word); 6] });
+        self.say(&Message::Torque { from: cell(), epoch: Epoch(epoch), torque: [word; 6].into() });
     }
 
     fn heartbeat(&mut self, epoch: u8, sent: u16, state: State) {
@@ -194,8 +193,8 @@ fn wires_are_counted_apart_and_are_no_frames_of_the_bus() {
 fn resent_sums_and_the_place_in_the_tree_are_counted() {
     let mut tape = Tape::default();
     let sum = |epoch, word, count| {
-        let torque = [Q7_8::from_bits(word); 6];
-        Message::Sum { from: cell(), epoch: Epoch(epoch), torque, count }
+        let torque = [word; 6];
+        Message::Sum { from: cell(), epoch: Epoch(epoch), torque: torque.into(), count }
     };
     for message in [sum(1, 5, 1), sum(1, 6, 2), sum(2, i16::MAX, 2)] {
         tape.say(&message);

@@ -1,7 +1,7 @@
 //! The topics of a recording, by the skin: what each is called and what is in it.
 
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::Skin;
+use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
 use model::central::Central;
 
@@ -32,6 +32,8 @@ pub struct Layout {
     pub joints: Vec<String>,
     /// The patches.
     pub patches: Vec<Patch>,
+    /// By bus: each joint of its chain by its place among those of the robot.
+    chains: Vec<Vec<usize>>,
     /// By bus: what its cells make of their sensors, and where they are.
     pub central: Vec<Central>,
     /// From one of a patch's clouds of points to the next, in epochs.
@@ -42,26 +44,28 @@ impl Layout {
     /// A skin's.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
-        let joints = skin.robot.joints.len().min(MAX_JOINTS);
         let buses: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
+        let several_chains = skin.robot.chains.len() > 1;
         let mut patches = Vec::new();
-        for joint in 1..=joints {
-            let on_bus = |bus: usize| {
-                let cells =
-                    skin.cells_of(bus).enumerate().filter(move |(_, cell)| usize::from(cell.joint) == joint);
-                cells.map(|(place, cell)| (place, u16::from(cell.node.get()))).collect::<Vec<_>>()
-            };
-            let parts: Vec<_> = (0..buses.len())
-                .map(|bus| (bus, on_bus(bus)))
-                .filter(|(_, cells)| !cells.is_empty())
-                .collect();
-            let several = parts.len() > 1;
-            let link = format!("link{joint}");
-            patches.extend(parts.into_iter().map(|(bus, cells)| {
-                let name = buses.get(bus).filter(|_| several).map(|bus| format!("_{}", word(bus)));
-                let topic = format!("/skin/{link}{}", name.unwrap_or_default());
-                Patch { topic, link: link.clone(), bus, cells }
-            }));
+        for (index, chain) in skin.robot.chains.iter().enumerate() {
+            let on_chain = |bus: &usize| skin.buses.get(*bus).is_some_and(|bus| bus.chain == index);
+            for joint in 1..=chain.joints.len() {
+                let on_bus = |bus: usize| {
+                    let on_joint = move |cell: &protocol::skin::Cell| usize::from(cell.joint) == joint;
+                    let cells = skin.cells_of(bus).enumerate().filter(move |(_, cell)| on_joint(cell));
+                    cells.map(|(place, cell)| (place, u16::from(cell.node.get()))).collect::<Vec<_>>()
+                };
+                let parts = (0..buses.len()).filter(on_chain).map(|bus| (bus, on_bus(bus)));
+                let parts: Vec<_> = parts.filter(|(_, cells)| !cells.is_empty()).collect();
+                let several = parts.len() > 1;
+                let of_chain = if several_chains { format!("{}_", word(&chain.name)) } else { String::new() };
+                let link = format!("{of_chain}link{joint}");
+                patches.extend(parts.into_iter().map(|(bus, cells)| {
+                    let name = buses.get(bus).filter(|_| several).map(|bus| format!("_{}", word(bus)));
+                    let topic = format!("/skin/{link}{}", name.unwrap_or_default());
+                    Patch { topic, link: link.clone(), bus, cells }
+                }));
+            }
         }
         #[expect(
             clippy::cast_possible_truncation,
@@ -73,10 +77,21 @@ impl Layout {
             central: (0..buses.len()).map(|bus| Central::new(&skin.part_on(bus))).collect(),
             buses,
             arm: word(&skin.robot.name),
-            joints: (1..=joints).map(|joint| format!("joint{joint}")).collect(),
+            joints: skin.robot.joints.iter().map(|joint| joint.name.clone()).collect(),
+            chains: (0..skin.buses.len()).map(|bus| skin.chain(bus).joints.clone()).collect(),
             patches,
             epochs_per_cloud,
         }
+    }
+
+    /// Of positions of the robot those of a bus' chain.
+    #[must_use]
+    pub fn chain_positions(&self, bus: usize, q: &[f64; MAX_ROBOT_JOINTS]) -> [f64; MAX_JOINTS] {
+        let mut positions = [0.0; MAX_JOINTS];
+        for (position, joint) in positions.iter_mut().zip(self.chains.get(bus).into_iter().flatten()) {
+            *position = q.get(*joint).copied().unwrap_or_default();
+        }
+        positions
     }
 }
 

@@ -30,7 +30,7 @@ pub struct LoopTiming {
     pub bad: u8,
     /// Why the robot is halted, one of the definition's constants.
     pub halted: u8,
-    /// Joints that stand at a limit and were told to go on, one bit each, joint 1 lowest.
+    /// Of joints 1 to 8 those that stand at a limit and were told to go on, one bit each, joint 1 lowest.
     pub at_limit: u8,
     /// Whether a velocity was not finite and was taken as zero.
     pub refused: bool,

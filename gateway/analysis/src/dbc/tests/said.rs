@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::fixed::{Q, Q1_14};
+use protocol::fixed::{Q, Q1_14, Q3_12, Q7_8};
 use protocol::message::{Answer, From, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::{Packet, WORDS};
 use protocol::parameters::Parameter;
@@ -62,10 +62,19 @@ impl Said {
                 self.put("version", unsigned[2]);
                 self.put("configuration", unsigned[3]);
                 self.state(State(unsigned[4]));
+                let abilities = unsigned[5];
+                self.put("max_joints", abilities & 0xF);
+                self.put("max_rows", abilities >> 4 & 0x3F);
+                for (bit, name) in (10..).zip(["prismatic", "fixed", "q5_10", "q7_8"]) {
+                    self.put(name, abilities >> bit & 1);
+                }
             }
             Some(Parameter::Mount) => {
                 self.put("mount_joint", words[0]);
                 self.put("mount_joints", words[1]);
+                self.put("mount_row", words[2]);
+                self.put("mount_rows", words[3]);
+                self.put("mount_torque_format", words[4]);
             }
             Some(Parameter::Pose) => {
                 let names = ["pose_x", "pose_y", "pose_z", "normal_x", "normal_y", "normal_z"];
@@ -108,6 +117,7 @@ impl Said {
                 self.put(format!("row{row}_d"), q14(1).to_f64());
                 self.put(format!("row{row}_alpha"), q14(2).to_radians());
                 self.put(format!("row{row}_theta_offset"), q14(3).to_radians());
+                self.put(format!("row{row}_kind"), words[4]);
             }
             Some(Parameter::Commit) => self.put("commit_hash", unsigned[0]),
         }
@@ -117,9 +127,14 @@ impl Said {
 /// The name of a message and its values; `None` for values that no encoding has.
 pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeMap<String, f64>) {
     let mut said = Said::default();
-    let crc = u16::from_le_bytes(packet.encode()[14..].try_into().unwrap());
+    let crc = u16::from_le_bytes(*packet.encode().last_chunk().unwrap());
     said.put("crc", crc);
-    let numbered = |name: &str| std::array::from_fn::<_, WORDS, _>(|index| format!("{name}_{}", index + 1));
+    let words = packet.words.as_slice();
+    let each = |said: &mut Said, name: &str, real: &dyn Fn(i16) -> f64| {
+        for (index, &word) in words.iter().enumerate() {
+            said.put(format!("{name}_{}", index + 1), real(word));
+        }
+    };
     let name = match *message {
         Message::Halt => "halt".to_owned(),
         Message::Sync => "sync".to_owned(),
@@ -128,23 +143,19 @@ pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeM
         Message::Joints { epoch, joints } => {
             said.put("epoch", epoch.0);
             said.put("count", joints.in_use);
-            said.each(
-                numbered("position").each_ref().map(String::as_str),
-                joints.positions,
-                Q1_14::to_radians,
-            );
+            each(&mut said, "position", &|word| Q1_14::from_bits(word).to_radians());
             "joints".to_owned()
         }
-        Message::Sum { from, epoch, torque, count } => {
+        Message::Sum { from, epoch, count, .. } => {
             said.put("epoch", epoch.0);
             said.put("count", count);
-            said.each(numbered("sum").each_ref().map(String::as_str), torque, Q::to_f64);
+            each(&mut said, "sum", &|word| Q7_8::from_bits(word).to_f64());
             format!("sum_{from}")
         }
-        Message::Torque { from, epoch, torque } => {
+        Message::Torque { from, epoch, .. } => {
             said.put("epoch", epoch.0);
             said.put("count", 1);
-            said.each(numbered("torque").each_ref().map(String::as_str), torque, Q::to_f64);
+            each(&mut said, "torque", &|word| Q3_12::from_bits(word).to_f64());
             format!("torque_{from}")
         }
         Message::Sensors { from, epoch, page } => {

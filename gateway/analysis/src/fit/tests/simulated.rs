@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame};
+use protocol::packet::Length;
 use protocol::parameters::Sensing;
 use protocol::wire_time::{Bits, Coding, Shape};
 use rand::{RngExt, SeedableRng};
@@ -218,6 +219,7 @@ fn case(rates: &str, cells: u32) -> Case {
         None => (Format::Fd, rates),
     };
     Case {
+        length: Length::Six,
         format,
         rates: rates.parse().unwrap(),
         period_ns: 16_000_000,

@@ -5,7 +5,7 @@ use crate::fit::traffic::BenchFrames;
 use crate::fit::verdict::Verdict;
 use model::generate::{Target, generate};
 use protocol::can::{BIT_RATE_SWITCH, FD_FORMAT, Format};
-use protocol::fixed::{Q1_14, Q3_12};
+use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
 use protocol::message::{
     From, Heard, Heartbeat, Joints, Message, NetworkPage, Refused, Request, SensorPage, SkinSensors, State,
@@ -88,12 +88,12 @@ impl Run {
 
     /// Joints and what answers them.
     fn epoch(&mut self, answering: i64) {
-        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        let joints = Joints { in_use: 6, ..Joints::default() };
         self.say(&Message::Joints { epoch: self.epoch, joints });
         self.now += MS;
         for node in 1..=answering {
-            let (from, torque) = (cell(node), [Q3_12::from_bits(3); WORDS]);
-            self.say(&Message::Torque { from, epoch: self.epoch, torque });
+            let (from, torque) = (cell(node), [3; WORDS]);
+            self.say(&Message::Torque { from, epoch: self.epoch, torque: torque.into() });
         }
         self.epoch = self.epoch.next();
         self.now += 15 * MS;
@@ -277,9 +277,9 @@ fn an_answer_that_was_ready_too_late_for_any_bus_does_not_count_for_the_verdict(
         run.epoch(0);
         let (next, epoch) = (run.now, Epoch(run.epoch.0 - 1));
         run.now = next - 16 * MS + after;
-        let torque = [Q3_12::from_bits(3); WORDS];
+        let torque = [3; WORDS];
         for node in 1..=60 {
-            run.say(&Message::Torque { from: cell(node), epoch, torque });
+            run.say(&Message::Torque { from: cell(node), epoch, torque: torque.into() });
         }
         run.now = next;
         run.operate(20, 4);

@@ -1,7 +1,6 @@
 //! What the ticks and the cells' torques come to.
 
 use hdrhistogram::Histogram;
-use protocol::packet::WORDS;
 
 use super::Draft;
 use crate::paper;
@@ -47,14 +46,20 @@ impl Draft<'_> {
 
     /// Errors joint by joint.
     fn errors(&self) -> Option<Table> {
-        let accuracy = self
-            .run
-            .bus_figures
-            .iter()
-            .map(|bus_figures| bus_figures.table.accuracy())
-            .reduce(Accuracy::with)?;
-        let joints = self.run.skin.robot.joints.len().min(WORDS);
-        let single = accuracy.single_by_joint.iter().zip(&accuracy.whole_by_joint).take(joints);
+        let skin = &self.run.skin;
+        let mut by_joint = vec![[Errors::default(); 2]; skin.robot.joints.len()];
+        let mut accuracy = Accuracy::default();
+        for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
+            let here = bus_figures.table.accuracy();
+            let both = here.single_by_joint.iter().zip(&here.whole_by_joint);
+            for ((joint, _), (single, whole)) in skin.joints_of(bus).zip(both) {
+                if let Some([sum, of_whole]) = by_joint.get_mut(joint) {
+                    (*sum, *of_whole) = (sum.with(*single), of_whole.with(*whole));
+                }
+            }
+            accuracy = accuracy.with(here);
+        }
+        let single = by_joint.iter().map(|[single, whole]| (single, whole));
         let text = |errors: &Errors| {
             let mean = number(errors.mean().unwrap_or(f64::NAN));
             [mean, number(errors.max()), errors.count().to_string()]
