@@ -4,6 +4,7 @@ use cell_node::kernel::oracle::Counted;
 use cell_node::kernel::{Kernel, Operations, Projection, Wrench};
 use cell_node::sine::{paper_sine, sine};
 use protocol::fixed::Q1_14;
+use protocol::packet::padded;
 use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::skin::Skin;
 
@@ -111,9 +112,10 @@ impl Costs {
         let joints = u8::try_from(skin.robot.joints.len()).unwrap_or(u8::MAX);
         let on = |joint| {
             let cell = skin.cells.first().map(|cell| skin.parameters(cell)).unwrap_or_default();
-            Parameters { joint, ..cell }
+            Parameters { joint, row: 0, table_rows: 0, ..cell }
         };
-        let words: [Q1_14; MAX_JOINTS] = POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default());
+        let words: [Q1_14; MAX_JOINTS] =
+            padded(&POSE.map(|angle| Q1_14::from_radians(angle).unwrap_or_default()));
         Self {
             wrench: (1..=joints).map(|joint| jacobian::<Wrench<Counted>>(&on(joint), &words)).collect(),
             projection: (1..=joints)

@@ -8,7 +8,6 @@
 use std::hint::black_box;
 
 use protocol::can::{Format, Frame};
-use protocol::fixed::{Q1_14, Q3_12};
 use protocol::message::{Joints, Message};
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
@@ -134,12 +133,12 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
     for round in 0..rounds {
         epoch = epoch.next();
         let at = Micros(16_000 * round as u64);
-        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        let joints = Joints { in_use: 6, ..Joints::default() };
         let frames = |message: Message| message.encode().frames(Format::Fd).collect::<Vec<Frame>>();
         for frame in frames(Message::Joints { epoch, joints }) {
             table.handle_frame(at, true, &frame, &mut |_| None);
         }
-        let torque = [Q3_12::from_bits(if round % 2 == 0 { 409 } else { -77 }); WORDS];
+        let torque = [if round % 2 == 0 { 409 } else { -77 }; WORDS].into();
         let replies =
             skin.cells.iter().flat_map(|cell| frames(Message::Torque { from: cell.node, epoch, torque }));
         let replies: Vec<Frame> = replies.collect();

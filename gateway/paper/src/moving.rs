@@ -270,6 +270,7 @@ fn over_active<'a>(rows: impl Iterator<Item = &'a Row>) -> Option<Line> {
 mod tests {
     use super::*;
     use analysis::report::figure::Verdict;
+    use protocol::packet::padded;
     use serde_json::json;
 
     /// A second of ticks: the central computation takes 3 µs and is off from 0.5 s on.
@@ -279,9 +280,9 @@ mod tests {
             let central_us = if central.is_some() { 3.0 } else { 0.0 };
             Row {
                 time_s: f64::from(tick) * 0.002,
-                velocity: [0.1, -0.4, 0.0, 0.0, 0.0, 0.0],
-                distributed: [1.001; 6],
-                central,
+                velocity: padded(&[0.1, -0.4, 0.0, 0.0, 0.0, 0.0]),
+                distributed: padded(&[1.001; 6]),
+                central: central.map(|central: [f64; 6]| padded(&central)),
                 contributing: u32::from(tick % 20),
                 took_us: 1.0 + central_us,
                 central_us,

@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use protocol::packet::WORDS;
+use protocol::packet::padded;
+use protocol::skin::MAX_ROBOT_JOINTS;
 
 use trace::capture::{CaptureError, Item, Reader};
 use trace::ros2::Message;
@@ -18,11 +19,11 @@ pub struct Row {
     /// When it should have begun, in s since the first one.
     pub time_s: f64,
     /// Joint velocities in rad/s.
-    pub velocity: [f64; WORDS],
+    pub velocity: [f64; MAX_ROBOT_JOINTS],
     /// The sum of the cells' torques, in Nm.
-    pub distributed: [f64; WORDS],
+    pub distributed: [f64; MAX_ROBOT_JOINTS],
     /// The central torque in Nm, in ticks that compared.
-    pub central: Option<[f64; WORDS]>,
+    pub central: Option<[f64; MAX_ROBOT_JOINTS]>,
     /// Cells in the cells' torque.
     pub contributing: u32,
     /// How long the tick took, in µs.
@@ -80,8 +81,8 @@ fn take(
 }
 
 /// A number for each joint; 0 for those that the robot has not.
-fn by_joint(numbers: &[f64]) -> [f64; WORDS] {
-    core::array::from_fn(|joint| numbers.get(joint).copied().unwrap_or_default())
+fn by_joint(numbers: &[f64]) -> [f64; MAX_ROBOT_JOINTS] {
+    padded(numbers)
 }
 
 #[cfg(test)]

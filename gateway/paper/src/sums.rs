@@ -3,7 +3,7 @@
 
 use protocol::fixed::Q5_10;
 use protocol::message::SkinSensors;
-use protocol::packet::WORDS;
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
@@ -69,7 +69,7 @@ struct Mean {
 
 impl Mean {
     /// Adds the errors of loaded joints.
-    fn add(&mut self, loaded: usize, got: &[f64; WORDS], target: &[f64; WORDS]) {
+    fn add(&mut self, loaded: usize, got: &[f64; MAX_JOINTS], target: &[f64; MAX_JOINTS]) {
         for (got, target) in got.iter().zip(target).take(loaded).filter(|(_, target)| target.abs() < MOST_NM)
         {
             self.sum += (got - target).abs();
@@ -97,7 +97,7 @@ pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
     let [mut rounded_average, mut carried_average] = [Mean::default(); 2];
     for _ in 0..extent.touches {
         let touch = touched(&mut dice, skin.cells.len(), active);
-        let phase: [f64; WORDS] = core::array::from_fn(|_| dice.random_range(0.0..6.0));
+        let phase: [f64; MAX_JOINTS] = core::array::from_fn(|_| dice.random_range(0.0..6.0));
         for epoch in 0..extent.epochs {
             let q = phase.map(|phase| (phase + f64::from(epoch) * 0.016).sin());
             let (round, carry) = (rounding.turn(&q, &touch), carrying.turn(&q, &touch));
@@ -124,8 +124,12 @@ pub fn errors(skin: &Skin, active: usize, extent: Extent) -> Errors {
 }
 
 /// The average of the sums of a constant touch on an arm that stands.
-fn averaged(tree: &mut Tree, q: &[f64; WORDS], touch: &[(usize, SkinSensors)]) -> ([f64; WORDS], Came) {
-    let (mut mean, mut last) = ([0.0; WORDS], Came::default());
+fn averaged(
+    tree: &mut Tree,
+    q: &[f64; MAX_JOINTS],
+    touch: &[(usize, SkinSensors)],
+) -> ([f64; MAX_JOINTS], Came) {
+    let (mut mean, mut last) = ([0.0; MAX_JOINTS], Came::default());
     for _ in 0..AVERAGED {
         last = tree.turn(q, touch);
         for (mean, sum) in mean.iter_mut().zip(last.sum) {

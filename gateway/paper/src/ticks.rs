@@ -4,9 +4,9 @@
 use std::sync::Arc;
 
 use protocol::can::{Format, Frame};
-use protocol::fixed::{Q1_14, Q3_12};
 use protocol::message::{Joints, Message, SkinSensors};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::{Epoch, WORDS, padded};
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 use protocol::time::{Micros, Span};
 
@@ -71,10 +71,10 @@ fn snapshot(skin: &Skin, bus: usize, active: usize) -> Snapshot {
             table.handle_frame(Micros(100), own, &frame, &mut |_| None);
         }
     };
-    hear(true, Message::Joints { epoch, joints: Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 } });
+    hear(true, Message::Joints { epoch, joints: Joints { in_use: 6, ..Joints::default() } });
     for cell in cells.iter().take(active) {
         // Some torque: what it is costs the same.
-        hear(false, Message::Torque { from: cell.node, epoch, torque: [Q3_12::from_bits(409); WORDS] });
+        hear(false, Message::Torque { from: cell.node, epoch, torque: [409; WORDS].into() });
     }
     Snapshot { sums: table.snapshot().sums, sensors: sensors(cells.len(), active) }
 }
@@ -107,7 +107,7 @@ pub struct Ticks {
 struct Inlet {
     snapshot: Snapshot,
     to_loop: triple_buffer::Input<Snapshot>,
-    positions: rtrb::Consumer<(Epoch, [f64; WORDS])>,
+    positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
 }
 
 /// What the ticks of an epoch took, on average, in ns.
@@ -146,7 +146,7 @@ impl Ticks {
         let modes = vec![ModeChange { at: Micros(0), mode }];
         let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
         let controller = Held(Kinesthetic::new(skin).expect("a generated skin moves by itself"));
-        let cycle = Cycle::new(skin, Box::new(controller), Box::new(SimulatedArm::new(skin, POSE)));
+        let cycle = Cycle::new(skin, Box::new(controller), Box::new(SimulatedArm::new(skin, padded(&POSE))));
         let turn = Turn::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), records_in);
         Self { turn, buses: inlets, records, mode, number: 0 }
     }

@@ -9,7 +9,8 @@ use cell_node::sum::{Begin, Sum};
 use protocol::fixed::{Acc, Q1_14};
 use protocol::id::CellId;
 use protocol::message::SkinSensors;
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::Slots;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -45,11 +46,11 @@ pub struct Tree {
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Came {
     /// Computed centrally in double precision.
-    pub central: [f64; WORDS],
+    pub central: [f64; MAX_JOINTS],
     /// Summed along the tree, Q7.8.
-    pub sum: [f64; WORDS],
+    pub sum: [f64; MAX_JOINTS],
     /// Each active cell's torque cut off to Q7.8, then summed.
-    pub truncated: [f64; WORDS],
+    pub truncated: [f64; MAX_JOINTS],
     /// Joints that some active cell loads.
     pub loaded: usize,
     /// Cells in the sum.
@@ -99,7 +100,7 @@ impl Tree {
     }
 
     /// One epoch in which cells, by their places in the skin, are in contact while the joints are at `q` (rad).
-    pub fn turn(&mut self, q: &[f64; WORDS], touch: &[(usize, SkinSensors)]) -> Came {
+    pub fn turn(&mut self, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> Came {
         let words = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
         let frames = self.central.frames(&words);
         let mut came = Came::default();
@@ -156,7 +157,7 @@ impl Tree {
     }
 }
 
-fn add(sum: &mut [f64; WORDS], more: [f64; WORDS]) {
+fn add(sum: &mut [f64; MAX_JOINTS], more: [f64; MAX_JOINTS]) {
     for (sum, more) in sum.iter_mut().zip(more) {
         *sum += more;
     }

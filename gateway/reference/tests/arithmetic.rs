@@ -3,7 +3,8 @@
 
 use cell_node::contact::{Force, Torque};
 use cell_node::sum::{Begin, Sum, Words};
-use protocol::fixed::{Q, Q1_14};
+use protocol::fixed::{Q, Q1_14, TorqueFormat};
+use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Parameters, Slots};
 use protocol::time::{Micros, Span};
@@ -26,7 +27,7 @@ fn words<const N: usize>(value: &Value) -> [i16; N] {
 
 fn torque(of: &Value) -> Torque {
     let jacobian = words::<WORDS>(&of["jacobian"]).map(Q1_14::from_bits);
-    Torque::new(&jacobian, Force::from_steps(of["force"].as_i64().unwrap()))
+    Torque::new(&padded(&jacobian), Force::from_steps(of["force"].as_i64().unwrap()))
 }
 
 // FORCE-1, TORQUE-1
@@ -40,7 +41,7 @@ fn forces_and_torques_are_those_of_the_other_program() {
         let force =
             Force::fuse([c1, c2, c3].map(Q::from_bits), Q1_14::from_bits(proximity), &rule.contact).steps();
         assert_eq!(Some(i64::from(force)), row["force"].as_i64(), "{row}");
-        assert_eq!(torque(&row).words().map(Q::to_bits), words(&row["torque"]), "{row}");
+        assert_eq!(torque(&row).words(TorqueFormat::Q3_12)[..6], words::<6>(&row["torque"]), "{row}");
     }
 }
 
@@ -69,12 +70,20 @@ fn sums_and_what_rounding_carries_are_those_of_the_other_program() {
             for (port, child) in children.iter().enumerate() {
                 let count = u8::try_from(child["count"].as_u64().unwrap()).unwrap();
                 sum.state(at, port, epoch);
-                sum.take(at, port, epoch, Words { torque: words(&child["words"]).map(Q::from_bits), count });
+                sum.take(
+                    at,
+                    port,
+                    epoch,
+                    Words { torque: padded(&words::<WORDS>(&child["words"])).map(Q::from_bits), count },
+                );
             }
             let sent = sum.say(at + Span(PERIOD / 2));
             let sent = sent.map(|(_, Words { torque, count }, _)| (torque.map(Q::to_bits), count));
             let expected = step["sends"].as_object().map(|sends| {
-                (words(&sends["words"]), u8::try_from(sends["count"].as_u64().unwrap()).unwrap())
+                (
+                    padded(&words::<WORDS>(&sends["words"])),
+                    u8::try_from(sends["count"].as_u64().unwrap()).unwrap(),
+                )
             });
             assert_eq!(sent, expected, "{step}");
         }

@@ -17,7 +17,7 @@ use model::tracker::{Claim, Contact, PerCell, Word};
 use protocol::can::{Format, Frame};
 use protocol::id::{Id, Kind};
 use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
-use protocol::packet::{self, Epoch, Packet, Reassembly, Segment};
+use protocol::packet::{self, Epoch, Lengths, Packet, Reassembly, Segment};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
@@ -36,7 +36,7 @@ pub struct Seen {
 #[derive(Debug)]
 struct PlacedPacket {
     place: u64,
-    frames: [Option<Seen>; 2],
+    frames: Vec<Seen>,
 }
 
 type Kept = Option<Arc<PlacedPacket>>;
@@ -79,9 +79,9 @@ pub struct Latched {
     joints: Option<(Epoch, Arc<PlacedPacket>)>,
     /// The last halt or resume.
     halt: Kept,
-    /// By identifier: a first segment whose second one is still to come.
-    segments: Vec<(Segment, Option<Seen>)>,
-    /// Identifiers of the gateway's side of which the last segment was a first one, and when, in ns since 1970.
+    /// By identifier: segments whose packet is still to come.
+    segments: Vec<(Segment, Vec<Seen>)>,
+    /// Identifiers of the gateway's side of which segments wait, and when the newest came, in ns since 1970.
     open: BTreeMap<u16, u64>,
 }
 
@@ -92,7 +92,7 @@ impl Default for Latched {
             cells: PerCell::default(),
             joints: None,
             halt: None,
-            segments: vec![(Segment::NONE, None); 1 << 11],
+            segments: vec![(Segment::NONE, Vec::new()); 1 << 11],
             open: BTreeMap::new(),
         }
     }
@@ -191,30 +191,35 @@ impl Latched {
         self.hear(&message, &Arc::new(PlacedPacket { place: self.places, frames }));
     }
 
-    /// The packet that a frame is or completes.
-    fn packet(&mut self, id: Id, seen: Seen) -> Option<([Option<Seen>; 2], Packet)> {
+    /// The packet that a frame is or completes, with its frames.
+    fn packet(&mut self, id: Id, seen: Seen) -> Option<(Vec<Seen>, Packet)> {
         if seen.frame.format() == Format::Fd {
-            return Some(([Some(seen), None], Packet::from_fd(&seen.frame).ok()?));
+            return Some((vec![seen], Packet::from_fd(&seen.frame).ok()?));
         }
-        let (segment, first) = self.segments.get_mut(usize::from(id.to_bits()))?;
-        match segment.push(Micros(seen.at_nanos / 1_000), id, seen.frame.data()) {
-            Ok(Reassembly::Complete(packet)) => {
+        let (segment, waiting) = self.segments.get_mut(usize::from(id.to_bits()))?;
+        // Of those that are kept only joints grow, which say themselves how long they are.
+        let reassembly =
+            segment.push(Micros(seen.at_nanos / 1_000), id, Lengths::ALL, seen.frame.data()).ok()?;
+        waiting.push(seen);
+        match reassembly {
+            Reassembly::Complete(packet) => {
                 self.open.remove(&id.to_bits());
-                Some(([first.take(), Some(seen)], packet))
+                let first = waiting.len().saturating_sub(packet.words.length().segments());
+                let frames = waiting.split_off(first);
+                waiting.clear();
+                Some((frames, packet))
             }
-            Ok(Reassembly::Waiting | Reassembly::Incomplete) => {
-                *first = Some(seen);
+            Reassembly::Waiting | Reassembly::Incomplete | Reassembly::Ambiguous => {
+                waiting.drain(..waiting.len().saturating_sub(segment.waiting()));
                 if !id.kind.is_from_cells() {
                     self.open.insert(id.to_bits(), seen.at_nanos);
                 }
                 None
             }
-            Err(_) => None,
         }
     }
 
-    /// Whether the second segment of a packet of the gateway's side may still come: no file should begin between
-    /// the two.
+    /// Whether segments of a packet of the gateway's side may still come: no file should begin between them.
     #[must_use]
     pub fn is_within_a_packet(&self, now_nanos: u64) -> bool {
         let within = |bits: u16| Segment::within(Id::from_bits(bits)).0 * 1_000;
@@ -277,14 +282,14 @@ impl Latched {
         let packets = self.cells.iter().flat_map(|(_, cell)| cell.packets()).chain(joints).chain(&self.halt);
         let ordered: BTreeMap<_, _> =
             packets.map(|placed_packet| (placed_packet.place, placed_packet)).collect();
-        ordered.values().flat_map(|placed_packet| placed_packet.frames.iter().flatten().copied()).collect()
+        ordered.values().flat_map(|placed_packet| placed_packet.frames.iter().copied()).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::fixed::{Q1_14, Q5_10};
+    use protocol::fixed::Q5_10;
     use protocol::id::{CellId, Node};
     use protocol::message::{From, Joints, SkinSensors, Tree};
     use protocol::packet::WORDS;
@@ -310,7 +315,7 @@ mod tests {
     }
 
     fn joints(epoch: u8) -> Message {
-        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        let joints = Joints { in_use: 6, ..Joints::default() };
         Message::Joints { epoch: Epoch(epoch), joints }
     }
 

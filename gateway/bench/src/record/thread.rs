@@ -8,7 +8,7 @@ use std::sync::mpsc::Sender;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::parameters::MAX_JOINTS;
+use protocol::skin::MAX_ROBOT_JOINTS;
 use rustix::time::{ClockId, clock_gettime};
 
 use super::backlog;
@@ -69,7 +69,7 @@ pub(super) struct Work {
     reported: usize,
     buses: Vec<Seen>,
     /// Joint positions at the last tick.
-    q: Option<[f64; MAX_JOINTS]>,
+    q: Option<[f64; MAX_ROBOT_JOINTS]>,
     backlog: Option<u64>,
     ticks: u64,
     ticks_skipped: u64,

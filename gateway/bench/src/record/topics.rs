@@ -3,7 +3,7 @@
 use std::io;
 
 use protocol::candump::{Direction, Record, Timestamp};
-use protocol::parameters::MAX_JOINTS;
+use protocol::skin::MAX_ROBOT_JOINTS;
 
 use super::feed::Touched;
 use super::force::Seen;
@@ -113,7 +113,7 @@ impl Topics {
         timed: &Timed,
     ) -> io::Result<()> {
         let names = &layout.joints;
-        fn of(joints: usize, values: &[f64; MAX_JOINTS]) -> &[f64] {
+        fn of(joints: usize, values: &[f64; MAX_ROBOT_JOINTS]) -> &[f64] {
             values.get(..joints).unwrap_or_default()
         }
         let record = &timed.record;
@@ -144,7 +144,7 @@ impl Topics {
         layout: &Layout,
         place: usize,
         touched: &Touched,
-        q: Option<&[f64; MAX_JOINTS]>,
+        q: Option<&[f64; MAX_ROBOT_JOINTS]>,
         scratch: &mut (Vec<ContactState>, Vec<Point>),
     ) -> io::Result<()> {
         let (Some(patch), Some([state, points])) = (layout.patches.get(place), self.patches.get_mut(place))
@@ -166,7 +166,7 @@ impl Topics {
         let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells };
         writer.write(state, nanos, &message)?;
         let Some(q) = q else { return Ok(()) };
-        let frames = central.frames_at(q);
+        let frames = central.frames_at(&layout.chain_positions(patch.bus, q));
         cloud.clear();
         cloud.extend(cells.iter().zip(&patch.cells).map(|(state, &(cell, _))| {
             #[expect(clippy::cast_possible_truncation, reason = "metres with 7 digits")]
@@ -228,7 +228,7 @@ fn timing(nanos: u64, timed: &Timed) -> LoopTiming {
             Some(Halt::BadCycles(_)) => 1,
             Some(Halt::Frame) => 2,
         },
-        at_limit: record.moved.at_limit,
+        at_limit: record.moved.at_limit.to_le_bytes()[0],
         refused: record.moved.refused,
     }
 }

@@ -2,10 +2,11 @@
 
 use core::fmt::{self, Display, Formatter};
 
-use protocol::fixed::{Q3_12, Q7_8};
+use protocol::fixed::TorqueFormat;
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::message::{Answer, Message};
-use protocol::packet::{Epoch, Packet, WORDS};
+use protocol::packet::{Epoch, Packet, Words};
+use protocol::parameters::MAX_JOINTS;
 use serde::Serialize;
 
 use super::comparator::Own;
@@ -38,7 +39,7 @@ pub enum How {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Said {
     /// The words of a reply to joints.
-    Words(What, [i16; WORDS]),
+    Words(What, Words, TorqueFormat),
     /// A sum, and the remainder without those of the children.
     Sum(Own),
     /// An answer to `configure`, with its tag.
@@ -112,7 +113,7 @@ impl Said {
     /// As the text of a message.
     fn text(&self, cell: CellId, epoch: Epoch) -> String {
         match self {
-            &Self::Words(what, words) => {
+            &Self::Words(what, words, _) => {
                 let (kind, count) = match what {
                     What::Torque => (Kind::Torque, 1),
                     What::Skin => (Kind::Sensors, 0),
@@ -127,13 +128,13 @@ impl Said {
     }
 
     /// Its torques in steps, none where one is saturated, and a step in Nm.
-    fn steps(&self) -> Option<([Option<i32>; WORDS], f64)> {
+    fn steps(&self) -> Option<([Option<i32>; MAX_JOINTS], f64)> {
         match self {
-            Self::Words(What::Torque, words) => {
-                Some((words.map(|word| Some(word.into())), Q3_12::from_bits(1).to_f64()))
+            Self::Words(What::Torque, words, format) => {
+                Some((words.padded().map(|word| Some(word.into())), format.step()))
             }
-            Self::Sum(own) => Some((own.steps, Q7_8::from_bits(1).to_f64())),
-            Self::Words(What::Skin | What::Acceleration, _) | Self::Answer(..) => None,
+            Self::Sum(own) => Some((own.steps, TorqueFormat::Q7_8.step())),
+            Self::Words(What::Skin | What::Acceleration, ..) | Self::Answer(..) => None,
         }
     }
 }
@@ -148,10 +149,10 @@ fn summed(cell: CellId, epoch: Epoch, own: &Own) -> String {
         several => format!("less its children {}", several.join(", ")),
     };
     let word = |step: &Option<i32>| match step {
-        Some(step) => format!(" {:.3}", f64::from(*step) * Q7_8::from_bits(1).to_f64()),
+        Some(step) => format!(" {:.3}", f64::from(*step) * TorqueFormat::Q7_8.step()),
         None => " saturated".to_owned(),
     };
-    let words: String = own.steps.iter().map(word).collect();
+    let words: String = own.steps.iter().take(own.sum.length().words()).map(word).collect();
     format!("{}; {less}:{words} Nm", meaning(sum))
 }
 
@@ -162,7 +163,7 @@ fn meaning(message: Message) -> String {
 }
 
 /// By how much torques differ: `joint 1: 2 steps more (0.0005 Nm), joint 3: ...`.
-struct Steps([Option<i32>; WORDS], [Option<i32>; WORDS], f64);
+struct Steps([Option<i32>; MAX_JOINTS], [Option<i32>; MAX_JOINTS], f64);
 
 impl Display for Steps {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
@@ -192,7 +193,7 @@ mod tests {
 
     #[test]
     fn a_different_torque_is_shown_word_by_word() {
-        let torque = |words| Said::Words(What::Torque, words);
+        let torque = |words: [i16; 6]| Said::Words(What::Torque, words.into(), TorqueFormat::Q3_12);
         let (recorded, now) = (torque([-1075, 3195, 0, 0, 0, 0]), torque([-1074, 3193, 0, 0, 0, 0]));
         let when = Some(When { joints: 37, epoch: 7, at_s: 2.3842 });
         let cell = CellId::new(12).unwrap();

@@ -40,6 +40,7 @@ impl Session {
         let target = match skin_override {
             None => checks.recorded(),
             Some(skin_override) => {
+                shared_state.comparator().describe(&skin_override.skin);
                 checks.bus_links().map(|(name, _)| spawned_skin(&skin_override.skin, name)).collect()
             }
         };

@@ -131,13 +131,14 @@ mod tests {
     use control::robot::SimulatedArm;
     use model::table::Sums;
     use model::testing;
+    use protocol::packet::padded;
 
     /// Moves up to a tick, then has no answer.
     struct Until(u64);
 
     impl Controller for Until {
         fn step(&mut self, input: &Input) -> Step {
-            if input.tick < self.0 { Step::Move([0.25; 6]) } else { Step::Bad(BadCycle::NoAnswer) }
+            if input.tick < self.0 { Step::Move(padded(&[0.25; 6])) } else { Step::Bad(BadCycle::NoAnswer) }
         }
     }
 
@@ -152,7 +153,7 @@ mod tests {
     impl Bench {
         fn new(answers: u64) -> Self {
             let skin = testing::skin();
-            let robot = SimulatedArm::new(&skin, [0.0; 6]);
+            let robot = SimulatedArm::new(&skin, padded(&[0.0; 6]));
             let cycle = Cycle::new(&skin, Box::new(Until(answers)), Box::new(robot));
             Self { cycle, sums: Sums::default(), halts: Halts::default(), tick: 0 }
         }
@@ -162,7 +163,7 @@ mod tests {
                 let tick = Tick { number: self.tick, time: Micros(self.tick * 2_000) };
                 let heard = Heard { sums: &self.sums, works: true };
                 let outcome = self.cycle.tick(tick, 0, [heard]);
-                if let Some((epoch, _)) = outcome.joints {
+                if let Some(epoch) = outcome.broadcast {
                     self.sums.read_back = Some(epoch);
                 }
                 let record = outcome.record;

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
+use protocol::skin::Skin;
 use protocol::time::Span;
 
 use super::halts::Halts;
@@ -73,16 +74,18 @@ impl Measured {
     pub(super) fn line(
         &self,
         elapsed: Duration,
-        (duration, cells): (Span, usize),
+        (duration, skin): (Span, &Skin),
         comparing: bool,
         lost: &[&str],
     ) -> String {
         let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
         let (seconds, of) = (elapsed.as_secs_f64(), duration.seconds());
         let mode = if comparing { Mode::Compare } else { Mode::Distributed }.name();
-        let torque: Vec<_> = record.torque.iter().map(|nm| format!("{nm:6.2}")).collect();
+        let torque: Vec<_> =
+            record.torque.iter().take(skin.robot.joints.len()).map(|nm| format!("{nm:6.2}")).collect();
         let lost = if lost.is_empty() { String::new() } else { format!("  LOST: {}", lost.join(", ")) };
         let halted = self.halts.why().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
+        let cells = skin.cells.len();
         format!(
             "{seconds:5.1} of {of:.1} s{lost}{halted}  {:3} of {cells} in contact, {} stale, {} dead  \
              late p99 {:.0} us  {mode:11}  torque {} Nm",

@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 use protocol::bus::batch::BATCH;
 use protocol::bus::{BusError, Inbox, Received};
 use protocol::id::Kind;
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
 use super::link::{Outages, ReceiveEnd};
@@ -58,7 +59,7 @@ pub struct Receiver {
     /// Where snapshots go.
     pub snapshots: triple_buffer::Input<Snapshot>,
     /// Unrounded positions of the broadcasts.
-    pub positions: rtrb::Consumer<(Epoch, [f64; WORDS])>,
+    pub positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
     /// Where everything to be recorded goes, if it is recorded.
     pub outlet: Option<Outlet>,
     /// What all threads share.
@@ -305,7 +306,10 @@ fn last_words(outlet: &mut Outlet) -> Unrecorded {
 }
 
 /// The positions of an epoch; those of earlier ones, whose broadcast was not read back, are dropped.
-fn positions_of(queue: &mut rtrb::Consumer<(Epoch, [f64; WORDS])>, epoch: Epoch) -> Option<[f64; WORDS]> {
+fn positions_of(
+    queue: &mut rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
+    epoch: Epoch,
+) -> Option<[f64; MAX_JOINTS]> {
     while let Ok((of, q)) = queue.pop() {
         if of == epoch {
             return Some(q);

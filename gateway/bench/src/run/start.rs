@@ -8,7 +8,8 @@ use std::time::{Duration, Instant};
 use hdrhistogram::Histogram;
 use protocol::bus::{BusKind, Filter, Options as BusOptions};
 use protocol::can::Format;
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{self, Reply};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
@@ -59,7 +60,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     }
     // From now on an external controller can connect, so that it is ready when the loop begins.
     let controller = controller_of(skin, &options.scenario.motion)?;
-    let arm = SimulatedArm::new(skin, options.scenario.motion.start_rad);
+    let arm = SimulatedArm::new(skin, options.scenario.motion.start);
     let cycle = Some(Cycle::new(skin, controller, Box::new(arm)));
     let idle = realtime::idle_lateness(skin.timing.tick_nanos());
     let backlog_dropped = backlog::dropped();
@@ -204,7 +205,7 @@ fn listen(
         table.hear_sums_of_roots_only();
     }
     let (snapshots, snapshot) = triple_buffer::triple_buffer(table.snapshot());
-    let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; WORDS])>::new(64);
+    let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; MAX_JOINTS])>::new(64);
     let format = skin.buses.get(index).map_or(Format::Fd, |bus| bus.format);
     let line = Line { format, snapshot, positions, state: Arc::clone(&link.state) };
     let receiver = Receiver {

@@ -173,7 +173,7 @@ impl Bench<'_> {
         progress.show(|| {
             let lost: Vec<_> = lost.map(|bus_link| bus_link.link.name.as_str()).collect();
             let comparing = self.shared.comparing.load(Ordering::Relaxed);
-            let of = (self.options.scenario.duration, self.options.skin.cells.len());
+            let of = (self.options.scenario.duration, &self.options.skin);
             measured.line(script.started.elapsed(), of, comparing, &lost)
         });
         Ok(())

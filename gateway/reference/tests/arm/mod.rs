@@ -3,8 +3,8 @@
 use nalgebra::{IsometryMatrix3, Point3, Rotation3, Translation3, Unit, Vector3};
 use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10};
 use protocol::message::SkinSensors;
-use protocol::packet::{self, WORDS};
-use protocol::parameters::{Contact, MAX_JOINTS, Parameter, Parameters, Pose, Row};
+use protocol::packet::{self, Length, WORDS};
+use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameter, Parameters, Pose, Row};
 use reference::Reference;
 
 /// A configuration, joint positions and a touch.
@@ -34,10 +34,10 @@ pub(crate) fn cases() -> impl Iterator<Item = Case> {
     let mut dice = Dice(1);
     let sizes = (1..=6_u8).flat_map(|joints| (1..=joints).map(move |joint| (joint, joints)));
     sizes.map(move |(joint, joints)| {
-        let mut rows = [Row::default(); MAX_JOINTS];
+        let mut rows = [Row::default(); MAX_ROWS];
         for row in rows.iter_mut().take(usize::from(joints)) {
             let (a, d) = (dice.within(0.15), dice.within(0.15));
-            *row = Row { a, d, alpha: dice.within(2.0), theta_offset: dice.within(2.0) };
+            *row = Row { a, d, alpha: dice.within(2.0), theta_offset: dice.within(2.0), ..Row::default() };
         }
         let normal = Vector3::from_fn(|_, _| dice.real()).normalize();
         let pose = Pose {
@@ -49,7 +49,15 @@ pub(crate) fn cases() -> impl Iterator<Item = Case> {
         q.iter_mut().take(usize::from(joints)).for_each(|q| *q = dice.within(2.0));
         let contact = core::array::from_fn(|_| Q5_10::nearest(1.0 + dice.real()));
         Case {
-            parameters: Parameters { joint, joints, pose, contact: rule, period_us: 16_000, rows },
+            parameters: Parameters {
+                joint,
+                joints,
+                pose,
+                contact: rule,
+                period_us: 16_000,
+                rows,
+                ..Parameters::default()
+            },
             q,
             contact,
         }
@@ -62,13 +70,18 @@ impl Case {
         (0..self.parameters.joints).map(|row| self.parameters.words(Parameter::Row(row))).collect()
     }
 
+    /// Of a value for each joint those that a packet of this chain has.
+    pub(crate) fn of_chain(&self, all: [i16; MAX_JOINTS]) -> Vec<i16> {
+        all[..Length::for_joints(self.parameters.joints.into()).words()].to_vec()
+    }
+
     /// The words of sensors page 0.
     pub(crate) fn sensors(&self) -> [i16; WORDS] {
         packet::words(self.contact.map(Q::to_bits))
     }
 
     /// J and the torques, as the cell computes them.
-    pub(crate) fn answer(&self) -> ([Q1_14; MAX_JOINTS], [Q3_12; MAX_JOINTS]) {
+    pub(crate) fn answer(&self) -> ([Q1_14; MAX_JOINTS], [i16; MAX_JOINTS]) {
         let sensors = SkinSensors { contact: self.contact, ..SkinSensors::default() };
         let cell = Reference::new(&self.parameters);
         (cell.jacobian(&self.q), cell.torque(&self.q, &sensors))

@@ -3,9 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use model::tracker::{Claim, Word};
+use protocol::fixed::TorqueFormat;
 use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Heard, Joints, Message, NetworkPage};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::{Epoch, Words};
 
 use super::WINDOW;
 use super::sums::{Sums, Trees};
@@ -59,7 +60,7 @@ pub(super) struct Round {
     /// Whether a bus did not take them.
     pub(super) is_unsent: bool,
     /// The words of each reply, recorded and now.
-    pub(super) replies: BTreeMap<(CellId, What), Both<Option<[i16; WORDS]>>>,
+    pub(super) replies: BTreeMap<(CellId, What), Both<Option<Words>>>,
     /// Sums, recorded and now.
     pub(super) sums: Both<Sums>,
     /// The epoch under which these joints were sent last.
@@ -130,6 +131,8 @@ struct Pass {
 #[derive(Debug, Default)]
 pub(super) struct BusComparator {
     pub(super) name: String,
+    /// In which format its cells send torques, as far as a skin tells.
+    pub(super) torque_format: TorqueFormat,
     pub(super) present: BTreeMap<CellId, Present>,
     pub(super) known: BTreeMap<CellId, KnownCell>,
     pub(super) announcements: u64,
@@ -431,7 +434,7 @@ pub(super) fn explain_extra(
     known_cell: Option<&mut KnownCell>,
     (cell, round): (CellId, &Round),
     is_last: bool,
-    now: [i16; WORDS],
+    is_end: bool,
 ) -> bool {
     let may_answer = round.may_answer(cell);
     let Some(known_cell) = known_cell else {
@@ -462,6 +465,6 @@ pub(super) fn explain_extra(
         return false;
     }
     // Counters tell how many are missing, and not which: the end may have been sent later then.
-    known_cell.ended_earlier = now == [0; WORDS];
+    known_cell.ended_earlier = is_end;
     true
 }

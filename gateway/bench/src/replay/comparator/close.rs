@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use protocol::id::CellId;
-use protocol::packet::WORDS;
+use protocol::packet::Words;
 
 use super::bus_comparator::{Both, BusComparator, KnownCell, Round, explain_extra};
 use super::sums::{Outcome, ROUNDING, Side, Why, compare};
@@ -27,7 +27,8 @@ impl Comparator {
                 bus_comparator.compare_reply(number, &round, (cell, what), pair, (tally, tolerance))
             {
                 tally.count(how, round.is_unsent);
-                let said = [pair.recorded, pair.now].map(|words| Some(Said::Words(what, words?)));
+                let said = [pair.recorded, pair.now]
+                    .map(|words| Some(Said::Words(what, words?, bus_comparator.torque_format)));
                 first.note(how, &bus_comparator.name, cell, at, said);
             }
         }
@@ -46,7 +47,7 @@ impl BusComparator {
         number: u64,
         round: &Round,
         (cell, what): (CellId, What),
-        Both { recorded, now }: Both<Option<[i16; WORDS]>>,
+        Both { recorded, now }: Both<Option<Words>>,
         (tally, tolerance): (&mut Tally, u16),
     ) -> Option<How> {
         let (is_last, begins_later) = (self.last_round == Some(number), self.begins_later());
@@ -54,7 +55,7 @@ impl BusComparator {
         let mut known_cell = self.known.get_mut(&cell);
         let spoke = known_cell.as_ref().and_then(|known_cell| known_cell.speaks);
         if let (Some(known_cell), Some(recorded), true) = (&mut known_cell, recorded, is_torque) {
-            known_cell.speaks = Some(recorded != [0; WORDS]);
+            known_cell.speaks = Some(!recorded.is_zero());
         }
         match (recorded, now) {
             (None, None) => None,
@@ -75,7 +76,7 @@ impl BusComparator {
             }
             (Some(_), None) if round.is_unsent => Some(How::Missing),
             (Some(recorded), None) => {
-                let is_end = is_torque && recorded == [0; WORDS];
+                let is_end = is_torque && recorded.is_zero();
                 // The contact had ended before, by the recorded stimuli, or began before the part: the cell had not taken
                 // the joints at which it ended.
                 let was_over = spoke.map_or(begins_later, |spoke| spoke && !round.may_answer(cell));
@@ -90,8 +91,8 @@ impl BusComparator {
             }
             // Reports may be requested by this replay.
             (None, Some(now)) => {
-                let counts =
-                    is_torque && !explain_extra(&mut tally.lacking, known_cell, (cell, round), is_last, now);
+                let counts = is_torque
+                    && !explain_extra(&mut tally.lacking, known_cell, (cell, round), is_last, now.is_zero());
                 counts.then_some(How::Extra)
             }
         }
@@ -116,7 +117,7 @@ impl BusComparator {
                 lacking.measured += u64::from(round.sums.recorded.has(cell));
                 continue;
             }
-            let mut outcome = compare(&then, &now, cell, tolerance);
+            let mut outcome = compare(&then, &now, cell, tolerance, self.torque_format);
             let is_touched = round.is_touched(cell);
             let is_doubtful = || {
                 then.is_doubtful(cell, is_touched, false)
@@ -154,7 +155,7 @@ impl BusComparator {
                     continue;
                 }
                 // The words only tell whether a contact has ended, which a sum does not show.
-                Outcome::Extra if explain_extra(lacking, known_cell, (cell, round), is_last, [1; WORDS]) => {
+                Outcome::Extra if explain_extra(lacking, known_cell, (cell, round), is_last, false) => {
                     continue;
                 }
                 Outcome::Extra => How::Extra,

@@ -19,8 +19,9 @@ use std::collections::BTreeMap;
 
 use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::{Epoch, Words};
 use protocol::parameters::{Parameter, Sensing};
+use protocol::skin::Skin;
 
 pub use bus_comparator::Present;
 use bus_comparator::{Announced, Both, BusComparator, take_first_joints};
@@ -94,6 +95,15 @@ impl Comparator {
             tally: Tally::default(),
             first: First { nanos: first_nanos, difference: None },
             other_gateway: None,
+        }
+    }
+
+    /// The skin's buses of these names send torques in their formats.
+    pub fn describe(&mut self, skin: &Skin) {
+        for bus in &mut self.bus_comparators {
+            if let Some(described) = skin.bus_named(&bus.name).and_then(|index| skin.buses.get(index)) {
+                bus.torque_format = described.torque_format;
+            }
         }
     }
 
@@ -257,7 +267,7 @@ impl Comparator {
             Some(_) if what != What::Torque => pair.now = Some(words),
             Some(_) => {
                 self.tally.extra += 1;
-                let said = [None, Some(Said::Words(what, words))];
+                let said = [None, Some(Said::Words(what, words, bus_comparator.torque_format))];
                 self.first.note(How::Extra, &bus_comparator.name, cell, Some((number, epoch, nanos)), said);
             }
         }
@@ -401,7 +411,7 @@ fn is_compared(answer: Answer) -> bool {
 }
 
 /// A reply that has the epoch of the joints that it answers, or came after.
-fn reply(message: &Message) -> Option<(CellId, Epoch, What, [i16; WORDS])> {
+fn reply(message: &Message) -> Option<(CellId, Epoch, What, Words)> {
     let (from, epoch, what) = if let Message::Torque { from, epoch, .. } = *message {
         (from, epoch, What::Torque)
     } else if let Message::Sensors { from, epoch, page } = *message {

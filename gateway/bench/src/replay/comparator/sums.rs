@@ -12,9 +12,10 @@
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use protocol::fixed::{Q, Q7_8};
+use protocol::fixed::{Q7_8, TorqueFormat};
 use protocol::id::CellId;
-use protocol::packet::WORDS;
+use protocol::packet::Words;
+use protocol::parameters::MAX_JOINTS;
 
 /// Where each cell's sums go, from round to round.
 #[derive(Debug, Default)]
@@ -83,7 +84,7 @@ impl Trees {
 /// One cell's sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) struct Sum {
-    pub(super) torque: [Q7_8; WORDS],
+    pub(super) torque: Words,
     /// Cells in it.
     pub(super) count: u8,
 }
@@ -124,20 +125,18 @@ impl Sums {
 
 /// Two cells that feel the same may differ by so many steps in a sum's word: rounding carries what it took away.
 pub(super) const ROUNDING: u32 = 1;
-/// Steps of a torque's word (Q3.12) in one of a sum's (Q7.8).
-const FINER: u16 = 16;
 
 /// What one cell put into its sum.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Own {
     /// The sum as it was sent.
-    pub sum: [Q7_8; WORDS],
+    pub sum: Words,
     /// Cells in it.
     pub count: u8,
     /// The children whose sums are in it.
     pub children: Vec<CellId>,
     /// The sum minus theirs, in steps of Q7.8; none where a word is saturated.
-    pub steps: [Option<i32>; WORDS],
+    pub steps: [Option<i32>; MAX_JOINTS],
     /// The count minus theirs: 1 of a cell in contact, 0 of one that only forwards its children's sums.
     pub cells: i32,
 }
@@ -212,11 +211,11 @@ impl<'a> Side<'a> {
         let Sum { torque: sum, count } = *self.sums.0.get(&cell)?;
         let below = self.children(cell).iter().filter_map(|child| Some((*child, self.sums.0.get(child)?)));
         let (mut children, mut cells) = (Vec::new(), i32::from(count));
-        let mut steps = sum.map(exact);
+        let mut steps = sum.padded().map(exact);
         for (child, its) in below {
             children.push(child);
             cells -= i32::from(its.count);
-            for (own, word) in steps.iter_mut().zip(its.torque) {
+            for (own, &word) in steps.iter_mut().zip(its.torque.as_slice()) {
                 *own = own.zip(exact(word)).map(|(own, word)| own - word);
             }
         }
@@ -258,7 +257,7 @@ impl<'a> Side<'a> {
         let own_of = |cell| Some((self.own(cell)?, other.own(cell)?));
         let Some((own, its)) = own_of(cell) else { return false };
         let adds = |sum: &Sum| {
-            let words = own.steps.iter().zip(&its.steps).zip(sum.torque);
+            let words = own.steps.iter().zip(&its.steps).zip(sum.torque.padded());
             let mut words =
                 words.filter_map(|((own, its), word)| Some(own.as_ref()? - its.as_ref()? - exact(word)?));
             own.cells - its.cells == i32::from(sum.count) && words.all(|left| left.unsigned_abs() <= allowed)
@@ -288,13 +287,19 @@ impl<'a> Side<'a> {
     }
 }
 
-fn exact(word: Q7_8) -> Option<i32> {
-    (!Q::is_saturated(word)).then(|| i32::from(word.to_bits()))
+fn exact(word: i16) -> Option<i32> {
+    (!Q7_8::from_bits(word).is_saturated()).then(|| i32::from(word))
 }
 
 /// Compares what a cell put into its sums, where a torque may be so many of its steps off: that may take the rounded
 /// one over one more bound. Children's differences are not in it, so however many cells are in the sum, this is enough.
-pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId, tolerance: u16) -> Outcome {
+pub(super) fn compare(
+    recorded: &Side<'_>,
+    now: &Side<'_>,
+    cell: CellId,
+    tolerance: u16,
+    format: TorqueFormat,
+) -> Outcome {
     if recorded.affected.contains(&cell) || now.affected.contains(&cell) {
         return Outcome::Omitted(Why::Changing);
     }
@@ -308,17 +313,22 @@ pub(super) fn compare(recorded: &Side<'_>, now: &Side<'_>, cell: CellId, toleran
     match (then, today) {
         (Some(then), Some(today)) => {
             // A word is saturated by the whole subtree: in another tree, by other cells.
-            let alike = |then: Q7_8, today: Q7_8| {
-                then.is_saturated() == today.is_saturated() || recorded.below(cell) != now.below(cell)
+            let alike = |then: i16, today: i16| {
+                exact(then).is_none() == exact(today).is_none() || recorded.below(cell) != now.below(cell)
             };
             // Who only passes on what others feel has no torque that could be off.
-            let tolerance = if then.cells > 0 { tolerance.div_ceil(FINER) } else { 0 };
+            let finer = 1 << (format.fraction() - TorqueFormat::Q7_8.fraction());
+            let tolerance = if then.cells > 0 { tolerance.div_ceil(finer) } else { 0 };
             let allowed = ROUNDING + u32::from(tolerance);
-            let mut words = then.steps.iter().zip(&today.steps).zip(then.sum.iter().zip(&today.sum));
+            let mut words = then
+                .steps
+                .iter()
+                .zip(&today.steps)
+                .zip(then.sum.padded().into_iter().zip(today.sum.padded()));
             let same = then.cells == today.cells
                 && words.all(|((own, it), (sum, other))| match (own, it) {
                     (Some(own), Some(it)) => own.abs_diff(*it) <= allowed,
-                    (None, _) | (_, None) => alike(*sum, *other),
+                    (None, _) | (_, None) => alike(sum, other),
                 });
             if same {
                 Outcome::Equal

@@ -1,6 +1,6 @@
 //! How replies and recorded ones compare, in counts.
 
-use protocol::packet::WORDS;
+use protocol::packet::Words;
 use serde::Serialize;
 
 use crate::replay::difference::How;
@@ -105,15 +105,14 @@ impl Tally {
     }
 
     /// Compares a torque's words, each within so many steps; whether it is equal.
-    pub(super) fn compare_torque(
-        &mut self,
-        recorded: &[i16; WORDS],
-        now: &[i16; WORDS],
-        tolerance: u16,
-    ) -> bool {
-        let steps = recorded.iter().zip(now).map(|(recorded, now)| recorded.abs_diff(*now).into());
+    pub(super) fn compare_torque(&mut self, recorded: &Words, now: &Words, tolerance: u16) -> bool {
+        let steps = recorded
+            .as_slice()
+            .iter()
+            .zip(now.as_slice())
+            .map(|(recorded, now)| recorded.abs_diff(*now).into());
         let max = self.torque_words.count(steps);
-        let is_equal = max <= u32::from(tolerance);
+        let is_equal = recorded.length() == now.length() && max <= u32::from(tolerance);
         self.tolerated += u64::from(is_equal && max > 0);
         is_equal
     }

@@ -3,8 +3,9 @@ use super::*;
 use crate::replay::survey::{Part, Survey};
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
-use protocol::fixed::{Q3_12, Q7_8};
+use protocol::fixed::Q3_12;
 use protocol::message::{Heard, Heartbeat, Joints, State as Flags, Tree};
+use protocol::packet;
 use protocol::parameters::Parameter as P;
 
 const MS: u64 = 1_000_000;
@@ -14,8 +15,7 @@ fn cell(node: i64) -> CellId {
 }
 
 fn torque(node: i64, epoch: u8, bits: i16) -> Message {
-    let mut torque = [Q3_12::ZERO; WORDS];
-    torque[0] = Q3_12::from_bits(bits);
+    let torque = packet::words([bits]).into();
     Message::Torque { from: cell(node), epoch: Epoch(epoch), torque }
 }
 
@@ -30,8 +30,7 @@ fn heard(node: i64, joints: u16) -> Message {
 }
 
 fn sum(node: i64, epoch: u8, bits: i16, count: u8) -> Message {
-    let mut torque = [Q7_8::ZERO; WORDS];
-    torque[0] = Q7_8::from_bits(bits);
+    let torque = packet::words([bits]).into();
     Message::Sum { from: cell(node), epoch: Epoch(epoch), torque, count }
 }
 

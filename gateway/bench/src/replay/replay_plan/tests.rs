@@ -26,8 +26,7 @@ fn press(number: i64) -> Frame {
 }
 
 fn torque(number: i64, epoch: u8) -> Frame {
-    let torque = [protocol::fixed::Q3_12::ZERO; 6];
-    frame(&Message::Torque { from: CellId::new(number).unwrap(), epoch: Epoch(epoch), torque })
+    frame(&Message::Torque { from: CellId::new(number).unwrap(), epoch: Epoch(epoch), torque: [0; 6].into() })
 }
 
 /// A capture of two buses, 1 ms from one frame to the next.

@@ -6,26 +6,26 @@ fn cell(node: u8) -> CellId {
 }
 
 /// What each cell itself contributes, in steps; cells from 1.
-type Contact = Vec<Option<[i16; WORDS]>>;
+type Contact = Vec<Option<[i16; 6]>>;
 
 /// A tree: the parent of each cell, 0 for the gateway's side. Only cells before it are parents.
 fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
     let (mut sums, mut trees) = (Sums::default(), Trees::default());
-    let mut totals = vec![([0_i32; WORDS], 0_u8); contact.len()];
+    let mut totals = vec![([0_i32; 6], 0_u8); contact.len()];
     for place in (0..contact.len()).rev() {
         if let Some(own) = contact[place] {
             totals[place].1 += 1;
-            (0..WORDS).for_each(|word| totals[place].0[word] += i32::from(own[word]));
+            (0..6).for_each(|word| totals[place].0[word] += i32::from(own[word]));
         }
         let (total, count) = totals[place];
         if let Some(above) = parents[place].checked_sub(1).map(usize::from) {
             totals[above].1 += count;
-            (0..WORDS).for_each(|word| totals[above].0[word] += total[word]);
+            (0..6).for_each(|word| totals[above].0[word] += total[word]);
         }
         let id = cell(u8::try_from(place + 1).unwrap());
         trees.say(id, Some(parents[place]), 0);
         if count > 0 {
-            let torque = total.map(|word| Q7_8::from_bits(word.try_into().unwrap()));
+            let torque = total.map(|word| i16::try_from(word).unwrap()).into();
             sums.take(id, Sum { torque, count });
         }
     }
@@ -34,10 +34,12 @@ fn sums(contact: &Contact, parents: &[u8]) -> (Sums, Trees) {
 
 fn outcomes(then: &(Sums, Trees), today: &(Sums, Trees), cells: usize) -> Vec<Outcome> {
     let (then, today) = (Side::new(&then.0, &then.1, 5), Side::new(&today.0, &today.1, 5));
-    (1..=u8::try_from(cells).unwrap()).map(|node| compare(&then, &today, cell(node), 0)).collect()
+    (1..=u8::try_from(cells).unwrap())
+        .map(|node| compare(&then, &today, cell(node), 0, TorqueFormat::Q3_12))
+        .collect()
 }
 
-fn words(first: i16) -> Option<[i16; WORDS]> {
+fn words(first: i16) -> Option<[i16; 6]> {
     Some([first, 0, -3, 0, 0, 0])
 }
 
@@ -50,7 +52,7 @@ fn the_same_contributions_are_equal_in_any_tree() {
     let side = Side::new(&both.0.0, &both.0.1, 5);
     let own = side.own(cell(1)).unwrap();
     assert_eq!((own.steps[0], own.cells, own.children), (Some(10), 1, vec![cell(2)]));
-    assert_eq!((own.sum[0].to_bits(), own.count), (40, 2));
+    assert_eq!((own.sum.as_slice()[0], own.count), (40, 2));
 }
 
 #[test]
@@ -78,7 +80,9 @@ fn a_forwarding_cell_must_not_add_anything() {
     let contact = vec![None, words(20)];
     let (then, other) = (sums(&contact, &[0, 1]), sums(&contact, &[0, 0]));
     let mut today = sums(&contact, &[0, 1]);
-    today.0.0.get_mut(&cell(1)).unwrap().torque[2] = Q7_8::from_bits(9);
+    let sum = today.0.0.get_mut(&cell(1)).unwrap();
+    let [a, b, _, d, e, f] = sum.torque.six();
+    sum.torque = [a, b, 9, d, e, f].into();
     assert_eq!(outcomes(&then, &today, 2), [Outcome::Different, Outcome::Equal]);
     assert_eq!(outcomes(&other, &today, 2), [Outcome::Different, Outcome::Equal]);
     assert_eq!(outcomes(&today, &other, 2), [Outcome::Different, Outcome::Equal]);
@@ -123,10 +127,11 @@ fn a_child_with_a_late_page_is_no_difference_unless_it_is_counted_twice() {
             for (node, count) in [(1, 3), (2, 2)] {
                 let sum = today.0.0.get_mut(&cell(node)).unwrap();
                 sum.count = count;
-                sum.torque = std::array::from_fn(|word| {
+                let torque: [i16; 6] = std::array::from_fn(|word| {
                     let [second, third] = [1, 2].map(|at: usize| contact[at].unwrap()[word]);
-                    Q7_8::from_bits(second + third * (i16::from(count) - 1))
+                    second + third * (i16::from(count) - 1)
                 });
+                sum.torque = torque.into();
             }
         }
         assert_eq!(outcomes(&then, &today, 1)[0], expected, "{parents:?}, {counted_twice}");
@@ -149,7 +154,7 @@ fn a_sum_that_lacks_a_childs_is_omitted() {
     let contact = vec![words(10), words(20), None];
     let then = sums(&contact, &[0, 1, 0]);
     let mut today = sums(&contact, &[0, 1, 0]);
-    let alone = Sum { torque: words(10).unwrap().map(Q7_8::from_bits), count: 1 };
+    let alone = Sum { torque: words(10).unwrap().into(), count: 1 };
     today.0.0.insert(cell(1), alone);
     let torn = Outcome::Omitted(Why::NotTaken);
     assert_eq!(outcomes(&then, &today, 2), [torn, Outcome::Equal]);
@@ -163,7 +168,7 @@ fn a_sum_that_lacks_a_childs_is_omitted() {
 #[test]
 fn of_two_sums_the_one_with_more_cells_counts() {
     let mut sums = Sums::default();
-    let sum = |word, count| Sum { torque: [Q7_8::from_bits(word); WORDS], count };
+    let sum = |word, count| Sum { torque: [word; 6].into(), count };
     for next in [sum(1, 1), sum(5, 3), sum(4, 2), sum(6, 3)] {
         sums.take(cell(1), next);
     }
@@ -174,7 +179,9 @@ fn of_two_sums_the_one_with_more_cells_counts() {
 fn saturated_words_are_compared_as_saturated() {
     let then = sums(&vec![words(10), words(20)], &[0, 1]);
     let saturate = |mut side: (Sums, Trees), node| {
-        side.0.0.get_mut(&cell(node)).unwrap().torque[0] = Q7_8::MAX;
+        let sum = side.0.0.get_mut(&cell(node)).unwrap();
+        let [_, b, c, d, e, f] = sum.torque.six();
+        sum.torque = [i16::MAX, b, c, d, e, f].into();
         side
     };
     let whole = |contact: &Contact, parents: &[u8]| saturate(sums(contact, parents), 1);
