@@ -14,12 +14,18 @@ import sys
 import time
 
 HEAD = struct.Struct("<4sHH")
-STATE = struct.Struct("<4sHHQQIIII18d")
-ANSWER = struct.Struct("<4sHHQII6d")
+STATE = struct.Struct("<4sHHQQIIII")  # then positions, velocities and torques, n of each
+ANSWER = struct.Struct("<4sHHQII")  # then n numbers
+MAX_BYTES = STATE.size + 3 * 32 * 8
 MAGIC, VERSION = b"SKBC", 1
 KIND_STATE, KIND_ANSWER, KIND_HELLO = 1, 2, 3
 VALID, HALTED = 1, 2
 VELOCITY = 1
+
+
+def values(joints):
+    """How many numbers of each kind a datagram has: one a joint, but at least six."""
+    return max(6, joints)
 
 
 def newest(own):
@@ -28,9 +34,10 @@ def newest(own):
     own.settimeout(0.5)
     try:
         while True:
-            data = own.recv(STATE.size + 1)
-            if len(data) == STATE.size and HEAD.unpack_from(data) == (MAGIC, VERSION, KIND_STATE):
-                state = data
+            data = own.recv(MAX_BYTES + 1)
+            if len(data) >= STATE.size and HEAD.unpack_from(data) == (MAGIC, VERSION, KIND_STATE):
+                if len(data) == STATE.size + 3 * 8 * values(STATE.unpack_from(data)[-1]):
+                    state = data
             own.setblocking(False)
     except (BlockingIOError, TimeoutError):
         return state
@@ -45,12 +52,14 @@ def control(own, gateway, damping):
         if data is None:  # a new gateway may listen there, which does not know us yet
             own.sendto(HEAD.pack(MAGIC, VERSION, KIND_HELLO), gateway)
             continue
-        _, _, _, tick, time_us, age, cells, flags, joints, *values = STATE.unpack(data)
-        q, torque = values[0:6], values[12:18]
+        _, _, _, tick, time_us, age, cells, flags, joints = STATE.unpack_from(data)
+        n = values(joints)
+        numbers = struct.unpack_from(f"<{3 * n}d", data, STATE.size)
+        q, torque = numbers[:n], numbers[2 * n :]
         usable = flags & VALID and not flags & HALTED
         velocity = [tau / damping if usable else 0.0 for tau in torque]
-        answer = ANSWER.pack(MAGIC, VERSION, KIND_ANSWER, tick, VELOCITY, 0, *velocity)
-        own.sendto(answer, gateway)
+        answer = ANSWER.pack(MAGIC, VERSION, KIND_ANSWER, tick, VELOCITY, 0)
+        own.sendto(answer + struct.pack(f"<{n}d", *velocity), gateway)
         states += 1
         if time.monotonic() >= next_report:
             next_report += 1.0

@@ -25,7 +25,8 @@ use protocol::can::Format;
 use protocol::candump::{self, Direction, Line, Record, Timestamp};
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::message::{Joints, Message};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::padded;
+use protocol::packet::{Epoch, Length, WORDS, Words};
 use protocol::skin::Skin;
 use trace::recording::file::FileWriter;
 use trace::recording::layout::Layout;
@@ -75,10 +76,15 @@ fn of_run(skin: &Skin, seconds: u32) -> Vec<Seen> {
         let swings = [(0.3, 0.0), (-1.2, 0.4), (1.0, 0.9), (-1.4, 1.3), (-1.57, 2.0), (0.2, 2.7)];
         let q: [f64; WORDS] = swings.map(|(middle, phase): (f64, f64)| middle + (time + phase).sin() * 0.4);
         let positions = q.map(|q| Q1_14::from_radians(q).unwrap_or_default());
-        say(at, true, &Message::Joints { epoch, joints: Joints { positions, in_use: 6 } });
+        say(
+            at,
+            true,
+            &Message::Joints { epoch, joints: Joints { positions: padded(&positions), in_use: 6 } },
+        );
         let links = central.frames(&positions);
         for (place, cell) in skin.cells.iter().enumerate() {
-            let torque = central.torque(place, &links, 1.5).map(Q3_12::nearest);
+            let torque = central.torque(place, &links, 1.5).map(|nm| Q3_12::nearest(nm).to_bits());
+            let torque = Words::new(Length::Six, torque);
             // Cells wake one after the other, and never twice in the same order of ns.
             let after = 150_000
                 + place as u64 * 22_000

@@ -35,7 +35,7 @@ fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) ->
         let epoch = Epoch(number.to_le_bytes()[0]);
         // Page 0 of the network is a heartbeat.
         let count = u8::from(id.kind != id::Kind::Network);
-        let packet = Packet { id, words: [word; WORDS], epoch, count };
+        let packet = Packet { id, words: [word; WORDS].into(), epoch, count };
         for frame in packet.frames(Format::Fd) {
             let nanos = (1_700_000_000_000_000 + number * PERIOD + micros) * 1_000;
             let time = Timestamp { nanos, nine_digits: false };

@@ -1,0 +1,241 @@
+//! From a URDF to a chain.
+
+use core::f64::consts::PI;
+use std::collections::BTreeMap;
+
+use nalgebra::{Isometry3, Point3};
+use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
+use protocol::skin::{JointKind, REACH, reach};
+
+use super::{Apart, Chain, Joint, LinkFrame, MAX_LENGTH_M, MAX_RESIDUAL};
+use crate::error::{Problem, RobotError};
+use crate::residual::{self, Residual};
+use crate::rows::{self, Axis, Row, frames};
+use crate::urdf::{Kind, Urdf, UrdfJoint};
+
+/// A link and how it hangs on the chain.
+pub(crate) struct Hanging {
+    /// Its name.
+    pub(crate) link: String,
+    /// Moving joints of the chain before it.
+    pub(crate) joint: usize,
+    /// From the link behind that joint (or the root) to this one; it does not move.
+    pub(crate) fixed: Isometry3<f64>,
+}
+
+/// Builds a chain, or says why it cannot.
+pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain, RobotError> {
+    let root = urdf.index(root.unwrap_or_else(|| urdf.root()))?;
+    let path = path(urdf, root, urdf.index(tip)?)?;
+    let root_name = urdf.link_name(root).to_owned();
+    let joints = joints(urdf, &root_name, tip, &path)?;
+    let (base, rows) = table(urdf, &path, &joints, tip)?;
+
+    let (hanging, apart) = hanging(urdf, root, &path);
+    let at_zero = frames(&base, &rows, &[]);
+    let behind = behind(&path, &[]);
+    let carried = hanging.iter().map(|it| (it.link.clone(), carrier(&rows, &at_zero, &behind, it)));
+    let carried: Vec<_> = carried.collect();
+    let mut chain = Chain {
+        root: root_name,
+        tip: tip.to_owned(),
+        joints,
+        rows,
+        base,
+        residual: 0.0,
+        carried,
+        apart,
+        file: urdf.file.clone(),
+    };
+    let rows = chain.chain_rows();
+    for (link, LinkFrame { row, frame, .. }) in &chain.carried {
+        let reach = reach(rows.get(..*row).unwrap_or_default(), frame.translation.vector.into());
+        // Whatever hangs beside the path may carry no cell: only the path has to be in reach.
+        if reach >= REACH && path.iter().any(|joint| urdf.link_name(joint.child) == link) {
+            return Err(urdf.error(Problem::Reach { link: link.clone(), reach }));
+        }
+    }
+    let Residual { residual, link } = residual::residual(&chain, &path, &hanging);
+    if residual.is_nan() || residual > MAX_RESIDUAL {
+        return Err(urdf.error(Problem::Residual { link, residual }));
+    }
+    chain.residual = residual;
+    Ok(chain)
+}
+
+/// The joints from the root to the tip.
+fn path(urdf: &Urdf, root: usize, tip: usize) -> Result<Vec<&UrdfJoint>, RobotError> {
+    let mut path = Vec::new();
+    if root == tip {
+        return Ok(path);
+    }
+    for joint in urdf.above(tip) {
+        path.push(joint);
+        if joint.parent == root {
+            path.reverse();
+            return Ok(path);
+        }
+    }
+    let mut names: Vec<_> = path.iter().rev().map(|joint| urdf.link_name(joint.parent)).collect();
+    names.push(urdf.link_name(tip));
+    let [root, tip] = [root, tip].map(|link| urdf.link_name(link).to_owned());
+    Err(urdf.error(Problem::NotBelow { tip, root, path: names.join(" > ") }))
+}
+
+/// How a joint of a path moves; none if it is fixed.
+fn moves(joint: &UrdfJoint) -> Option<JointKind> {
+    match joint.kind {
+        Kind::Revolute | Kind::Continuous => Some(JointKind::Revolute),
+        Kind::Prismatic => Some(JointKind::Prismatic),
+        Kind::Fixed | Kind::Floating | Kind::Planar => None,
+    }
+}
+
+/// The path's joints that move.
+fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec<Joint>, RobotError> {
+    let mut joints = Vec::new();
+    for joint in path {
+        let name = joint.name.clone();
+        if let Kind::Floating | Kind::Planar = joint.kind {
+            let kind = if joint.kind == Kind::Floating { "floating" } else { "planar" };
+            return Err(urdf.error_at(joint, Problem::Kind { joint: name, kind }));
+        }
+        let Some(kind) = moves(joint) else { continue };
+        if let Some(mimic) = &joint.mimic {
+            return Err(urdf.error_at(joint, Problem::Mimic { joint: name, of: mimic.joint.clone() }));
+        }
+        let limits = if joint.kind == Kind::Continuous { [-PI, PI] } else { joint.limits };
+        let [lower, upper] = limits;
+        if !(lower < upper && (upper - lower).is_finite()) {
+            return Err(urdf.error_at(joint, Problem::Limits { joint: name, lower, upper }));
+        }
+        let max_speed = joint.velocity.filter(|speed| *speed > 0.0 && speed.is_finite());
+        joints.push(Joint { name, kind, limits, max_speed });
+    }
+    let (root, tip) = (root.to_owned(), tip.to_owned());
+    match joints.len() {
+        0 => Err(urdf.error(Problem::NoMovingJoint { root, tip })),
+        count if count > MAX_JOINTS => Err(urdf.error(Problem::TooManyJoints { count, root, tip })),
+        _ => Ok(joints),
+    }
+}
+
+/// The frames of the links right behind the path's moving joints, in the root's coordinates; joints without a position are at zero.
+pub(crate) fn behind(path: &[&UrdfJoint], positions: &[f64]) -> Vec<Isometry3<f64>> {
+    let mut positions = positions.iter();
+    let mut pose = Isometry3::identity();
+    let mut all = Vec::new();
+    for joint in path {
+        if moves(joint).is_some() {
+            pose *= joint.transform(positions.next().copied().unwrap_or_default());
+            all.push(pose);
+        } else {
+            pose *= joint.origin;
+        }
+    }
+    all
+}
+
+/// Frame 0 and the rows.
+fn table(
+    urdf: &Urdf,
+    path: &[&UrdfJoint],
+    joints: &[Joint],
+    tip: &str,
+) -> Result<(Isometry3<f64>, Vec<Row>), RobotError> {
+    let moving = path.iter().filter_map(|joint| Some((joint, moves(joint)?)));
+    let axes: Vec<_> = moving
+        .zip(behind(path, &[]))
+        .map(|((joint, kind), pose)| {
+            let point = pose.translation.vector.into();
+            Axis { point, direction: pose * joint.axis.into_inner(), kind }
+        })
+        .collect();
+    let end = path.iter().fold(Isometry3::identity(), |pose, joint| pose * joint.origin);
+    let end = Point3::from(end.translation.vector);
+    let (base, rows) = rows::chain(&axes, &end);
+    if rows.len() > MAX_ROWS {
+        return Err(urdf.error(Problem::TooManyRows { count: rows.len(), tip: tip.to_owned() }));
+    }
+    let mut moved = Vec::new();
+    for (index, row) in rows.iter().enumerate() {
+        if row.kind != RowKind::Fixed {
+            moved.extend(joints.get(moved.len()));
+        }
+        let mut lengths = vec![("a", row.a), ("d", row.d)];
+        if let (RowKind::Prismatic, Some(joint)) = (row.kind, moved.last()) {
+            lengths.extend(joint.limits.map(|limit| ("d with the joint at its limit", row.d + limit)));
+        }
+        for (what, value) in lengths {
+            if !(-MAX_LENGTH_M..MAX_LENGTH_M).contains(&value) {
+                let next = joints.get(moved.len()).map(|joint| format!("joint {:?}", joint.name));
+                let to = next.unwrap_or_else(|| format!("link {tip:?}"));
+                return Err(urdf.error(Problem::Length { row: index + 1, to, what, value }));
+            }
+        }
+    }
+    Ok((base, rows))
+}
+
+/// The links that move with the chain, the path's first, and why the others do not.
+fn hanging(urdf: &Urdf, root: usize, path: &[&UrdfJoint]) -> (Vec<Hanging>, Vec<(String, Apart)>) {
+    // Of each link of the path: moving joints before it, and how it is fixed behind them.
+    let (mut count, mut fixed) = (0, Isometry3::identity());
+    let mut order = vec![root];
+    let mut on_path = BTreeMap::from([(root, (count, fixed))]);
+    for joint in path {
+        (count, fixed) = match moves(joint) {
+            Some(_) => (count + 1, Isometry3::identity()),
+            None => (count, fixed * joint.origin),
+        };
+        on_path.insert(joint.child, (count, fixed));
+        order.push(joint.child);
+    }
+    order.extend((0..urdf.links().count()).filter(|link| !on_path.contains_key(link)));
+
+    let (mut hanging, mut apart) = (Vec::new(), Vec::new());
+    for index in order {
+        let link = urdf.link_name(index).to_owned();
+        let (mut at, mut behind, mut mover) = (index, Isometry3::identity(), None);
+        let found = loop {
+            if let Some(found) = on_path.get(&at) {
+                break Some(found);
+            }
+            let Some(joint) = urdf.above(at).next() else { break None };
+            mover = mover.filter(|_| joint.kind == Kind::Fixed).or_else(|| joint.moving_name());
+            behind = joint.origin * behind;
+            at = joint.parent;
+        };
+        match (found, mover) {
+            (None, _) => apart.push((link, Apart::Elsewhere)),
+            (_, Some(joint)) => apart.push((link, Apart::MovedBy(joint))),
+            (Some((0, _)), None) => apart.push((link, Apart::Still)),
+            (Some((joint, fixed)), None) => {
+                hanging.push(Hanging { link, joint: *joint, fixed: fixed * behind });
+            }
+        }
+    }
+    (hanging, apart)
+}
+
+/// Where a link is on the chain.
+fn carrier(
+    rows: &[Row],
+    at_zero: &[Isometry3<f64>],
+    behind: &[Isometry3<f64>],
+    Hanging { joint, fixed, .. }: &Hanging,
+) -> LinkFrame {
+    let pose = joint.checked_sub(1).and_then(|index| behind.get(index)).map_or(*fixed, |pose| pose * fixed);
+    let mut moving = 0;
+    let mut candidates = Vec::new();
+    for (index, (row, frame)) in rows.iter().zip(at_zero.iter().skip(1)).enumerate() {
+        moving += usize::from(row.kind != RowKind::Fixed);
+        if moving == *joint {
+            let distance = (frame.translation.vector - pose.translation.vector).norm();
+            candidates.push((distance, index + 1, frame));
+        }
+    }
+    let nearest = candidates.into_iter().min_by(|(one, ..), (other, ..)| one.total_cmp(other));
+    let (row, frame) = nearest.map_or((0, pose), |(_, row, frame)| (row, frame.inv_mul(&pose)));
+    LinkFrame { joint: *joint, row, frame }
+}

@@ -1,0 +1,331 @@
+//! The text of a `skin.toml` for chains of a robot and the cells on their links.
+//!
+//! ```text
+//!   Chain, .. ──┐
+//!               ├─> Import ──> toml ──> text that Skin::parse takes
+//!   CellOnLink ─┘
+//! ```
+
+use core::fmt::Write;
+
+use nalgebra::{Point3, Vector3};
+use protocol::document::DocumentError;
+use protocol::parameters::RowKind;
+use protocol::skin::{JointKind, Skin};
+use thiserror::Error;
+
+use crate::chain::{Chain, Joint};
+use crate::error::RobotError;
+
+/// Cells on a bus, where no other number is asked for: node ids 1 to 250, which leaves some for cells that are added.
+pub const CELLS_OF_A_BUS: usize = 250;
+
+/// The fastest that a joint is allowed where the URDF says nothing, in rad/s or m/s.
+const MAX_SPEED: f64 = 2.0;
+
+/// A cell where somebody says that it is.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct CellOnLink {
+    /// The link of the URDF.
+    pub link: String,
+    /// Where it sits in the link's frame, in m.
+    pub position: [f64; 3],
+    /// Its outward normal in the same frame, of any length above zero.
+    pub normal: [f64; 3],
+    /// Its bus, if that is said.
+    pub bus: Option<String>,
+    /// Its node id there, if that is said.
+    pub node: Option<u8>,
+    /// The node ids that are wired to its ports, on its bus.
+    pub neighbors: [Option<u8>; 4],
+    /// Whether it is wired to the gateway's side.
+    pub root: bool,
+    /// The line of the file that says it, for errors.
+    pub line: usize,
+}
+
+/// What a skin is made of.
+#[derive(Debug)]
+pub struct Import<'a> {
+    /// The robot's name.
+    pub name: &'a str,
+    /// What made it, for the first line.
+    pub command: &'a str,
+    /// The path of its URDF from where the skin's file will be, if that is known.
+    pub urdf: Option<&'a str>,
+    /// Its chains; those after the first have their own tip, and may share joints with those before.
+    pub chains: &'a [Chain],
+    /// The cells, in their order. Without any, there is one on each tip.
+    pub cells: &'a [CellOnLink],
+}
+
+/// Why there is no skin.
+#[derive(Debug, Error)]
+pub enum ImportError {
+    /// A link that carries a cell.
+    #[error("line {line}: {error}")]
+    Link {
+        /// The line of the file of cells.
+        line: usize,
+        /// What is wrong with it.
+        error: RobotError,
+    },
+    /// A normal without a direction.
+    #[error("line {line}: the normal nx,ny,nz = {x},{y},{z} has no direction: it must be longer than 0")]
+    Normal {
+        /// The line of the file of cells.
+        line: usize,
+        /// Its x.
+        x: f64,
+        /// Its y.
+        y: f64,
+        /// Its z.
+        z: f64,
+    },
+    /// One bus for cells of two chains.
+    #[error(
+        "line {line}: bus {bus:?} carries chain {first:?} already, and this cell sits on chain {second:?}: name another bus"
+    )]
+    Bus {
+        /// The line of the file of cells.
+        line: usize,
+        /// The bus.
+        bus: String,
+        /// The chain of its first cell.
+        first: String,
+        /// The chain of this cell.
+        second: String,
+    },
+    /// A bus has no number left.
+    #[error("line {line}: bus {bus:?} has no node id left: it has 254")]
+    Full {
+        /// The line of the file of cells.
+        line: usize,
+        /// The bus.
+        bus: String,
+    },
+    /// What came out is no skin.
+    #[error(transparent)]
+    Skin(#[from] DocumentError),
+}
+
+/// A cell with its place on a chain.
+struct Placed<'a> {
+    cell: &'a CellOnLink,
+    bus: usize,
+    node: u8,
+    chain: usize,
+    joint: usize,
+    row: usize,
+    position: [f64; 3],
+    normal: [f64; 3],
+}
+
+/// A bus as it fills.
+struct Bus {
+    name: String,
+    chain: usize,
+    taken: Vec<u8>,
+    /// Whether it was named, or comes from the count of cells.
+    named: bool,
+}
+
+impl Import<'_> {
+    /// The text of the skin; the same for the same chains and cells.
+    ///
+    /// # Errors
+    /// When a cell sits on a link that no chain moves, or has no direction, or there is no room on its bus, or what comes
+    /// out is no skin.
+    pub fn toml(&self) -> Result<String, ImportError> {
+        let on_tips: Vec<_> = self.chains.iter().map(on_tip).collect();
+        let cells = if self.cells.is_empty() { &on_tips } else { self.cells };
+        let mut buses: Vec<Bus> = Vec::new();
+        let placed = cells.iter().map(|cell| self.place(cell, &mut buses)).collect::<Result<Vec<_>, _>>()?;
+        let text = self.text(&buses, &placed);
+        Skin::parse("imported skin", &text)?;
+        Ok(text)
+    }
+
+    /// The first chain whose link it is, and its bus.
+    fn place<'a>(&self, cell: &'a CellOnLink, buses: &mut Vec<Bus>) -> Result<Placed<'a>, ImportError> {
+        let line = cell.line;
+        let mut found = None;
+        let mut refused = None;
+        for (index, chain) in self.chains.iter().enumerate() {
+            match chain.link(&cell.link) {
+                Ok(frame) => {
+                    found = Some((index, frame));
+                    break;
+                }
+                Err(error) => refused = refused.or(Some(error)),
+            }
+        }
+        let (chain, frame) = match (found, refused) {
+            (Some(found), _) => found,
+            (None, Some(error)) => return Err(ImportError::Link { line, error }),
+            (None, None) => unreachable!("an import has a chain"),
+        };
+        let [x, y, z] = cell.normal;
+        let normal = frame.frame * Vector3::new(x, y, z);
+        let Some(normal) = normal.try_normalize(1e-9).filter(|it| it.iter().all(|part| part.is_finite()))
+        else {
+            return Err(ImportError::Normal { line, x, y, z });
+        };
+        let position = frame.frame * Point3::from(cell.position);
+        let bus = self.bus(cell, chain, buses)?;
+        let Some(there) = buses.get_mut(bus) else { unreachable!("just found") };
+        let next = || (1..=254).find(|node| !there.taken.contains(node));
+        let full = ImportError::Full { line, bus: there.name.clone() };
+        let node = cell.node.or_else(next).ok_or(full)?;
+        there.taken.push(node);
+        let (joint, row) = (frame.joint, frame.row);
+        Ok(Placed { cell, bus, node, chain, joint, row, position: position.into(), normal: normal.into() })
+    }
+
+    /// The bus of a cell: the one that it names, or the last of its chain that is not full.
+    fn bus(&self, cell: &CellOnLink, chain: usize, buses: &mut Vec<Bus>) -> Result<usize, ImportError> {
+        let name = |chain: usize| self.chains.get(chain).map_or_else(String::new, |chain| chain.tip.clone());
+        if let Some(named) = &cell.bus {
+            if let Some(index) = buses.iter().position(|bus| bus.name == *named) {
+                return match buses.get(index) {
+                    Some(bus) if bus.chain != chain => Err(ImportError::Bus {
+                        line: cell.line,
+                        bus: named.clone(),
+                        first: name(bus.chain),
+                        second: name(chain),
+                    }),
+                    _ => Ok(index),
+                };
+            }
+            buses.push(Bus { name: named.clone(), chain, taken: Vec::new(), named: true });
+            return Ok(buses.len() - 1);
+        }
+        let has_room = |bus: &Bus| bus.chain == chain && !bus.named && bus.taken.len() < CELLS_OF_A_BUS;
+        if let Some(index) = buses.iter().rposition(has_room) {
+            return Ok(index);
+        }
+        let free = (0..)
+            .map(|number| format!("vcan{number}"))
+            .find(|name| buses.iter().all(|bus| bus.name != *name));
+        buses.push(Bus { name: free.unwrap_or_default(), chain, taken: Vec::new(), named: false });
+        Ok(buses.len() - 1)
+    }
+
+    /// The joints of all chains, each once.
+    fn joints(&self) -> Vec<&Joint> {
+        let mut joints: Vec<&Joint> = Vec::new();
+        for joint in self.chains.iter().flat_map(|chain| &chain.joints) {
+            if joints.iter().all(|known| known.name != joint.name) {
+                joints.push(joint);
+            }
+        }
+        joints
+    }
+
+    fn text(&self, buses: &[Bus], cells: &[Placed<'_>]) -> String {
+        let joints = self.joints();
+        let each = |value: &dyn Fn(&Joint) -> f64| {
+            joints.iter().map(|joint| format!("{:?}", value(joint))).collect::<Vec<_>>().join(", ")
+        };
+        let by_kind = |turns: f64, slides: f64| {
+            move |joint: &Joint| if joint.kind == JointKind::Prismatic { slides } else { turns }
+        };
+        let mut out = format!("# {}\n", self.command);
+        for chain in self.chains {
+            let (tip, count, rows) = (&chain.tip, chain.joints.len(), chain.rows.len());
+            let _ = writeln!(
+                out,
+                "# {} to {tip}: {count} joints in {rows} rows, which differ from the URDF by {:.1e} m or rad at most.",
+                chain.root, chain.residual
+            );
+        }
+        let name = self.name;
+        let _ = write!(out, "version = 1\nname = {name:?}\n\n[robot]\nname = {name:?}\n");
+        if let Some(urdf) = self.urdf {
+            let _ = writeln!(out, "urdf = {urdf:?}");
+        }
+        for Joint { name, kind, limits: [min, max], .. } in &joints {
+            let (word, unit) = (kind.name(), kind.unit());
+            let _ = write!(
+                out,
+                "\n[[robot.joint]]\nname = {name:?}\nkind = \"{word}\"\nlimits = [{min:?}, {max:?}]   # {unit}\n"
+            );
+        }
+        for chain in self.chains {
+            let _ = write!(
+                out,
+                "\n[[robot.chain]]   # standard Denavit-Hartenberg, base to tip; m, rad\nname = {:?}\nrows = [\n",
+                chain.tip
+            );
+            let mut names = chain.joints.iter();
+            for row in &chain.rows {
+                let joint = if row.kind == RowKind::Fixed { None } else { names.next() };
+                let joint = joint.map_or_else(String::new, |joint| format!("joint = {:?}, ", joint.name));
+                let (a, alpha, d, offset) = (row.a, row.alpha, row.d, row.theta_offset);
+                let _ = writeln!(
+                    out,
+                    "  {{ {joint}a = {a:?}, alpha = {alpha:?}, d = {d:?}, theta_offset = {offset:?} }},"
+                );
+            }
+            out.push_str("]\n");
+        }
+        out.push_str(
+            "\n[timing]\ncontrol_hz = 500.0\njoint_broadcast_hz = 62.5\n\n\
+             [contact]   # the paper's Algorithm 1\nalpha_c = 1.0\nalpha_p = 0.0\ncontact_threshold_n = 0.1\n\
+             proximity_threshold = 0.05\nforce_threshold_n = 0.1\n",
+        );
+        for bus in buses {
+            let chain = self.chains.get(bus.chain).map_or("", |chain| &chain.tip);
+            let _ = write!(
+                out,
+                "\n[[bus]]\nname = {:?}\nchain = {chain:?}\nreply = \"torque\"\nformat = \"fd\"\n",
+                bus.name
+            );
+        }
+        let speed = |joint: &Joint| joint.max_speed.unwrap_or(MAX_SPEED);
+        let _ = write!(
+            out,
+            "\n[controller]   # M q'' + D q' = tau, joint by joint\nkind = \"kinesthetic\"\n\
+             inertia = [{}]     # kg m2, or kg\ndamping = [{}]     # Nm s/rad, or N s/m\nmax_speed = [{}]   # rad/s, or m/s\n",
+            each(&by_kind(1.0, 10.0)),
+            each(&by_kind(4.0, 80.0)),
+            each(&speed),
+        );
+        for cell in cells {
+            let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);
+            let own = self.chains.get(cell.chain).and_then(|chain| row_of(chain, cell.joint));
+            let row = if own == Some(cell.row) { String::new() } else { format!("row = {}\n", cell.row) };
+            let CellOnLink { link, neighbors, root, .. } = cell.cell;
+            let [[px, py, pz], [nx, ny, nz]] = [cell.position, cell.normal].map(|it| it.map(tidy));
+            let _ = write!(
+                out,
+                "\n[[cell]]   # on {}\nbus = {bus:?}\nnode = {}\njoint = {}\n{row}position = [{px:?}, {py:?}, {pz:?}]\n\
+                 normal = [{nx:?}, {ny:?}, {nz:?}]\n",
+                link, cell.node, cell.joint
+            );
+            if neighbors.iter().any(Option::is_some) {
+                let _ = writeln!(out, "neighbors = {:?}", neighbors.map(Option::unwrap_or_default));
+            }
+            if *root {
+                out.push_str("root = true\n");
+            }
+        }
+        out
+    }
+}
+
+/// The row of a joint, both from 1.
+fn row_of(chain: &Chain, joint: usize) -> Option<usize> {
+    let moving = chain.rows.iter().enumerate().filter(|(_, row)| row.kind != RowKind::Fixed);
+    moving.map(|(index, _)| index + 1).nth(joint.checked_sub(1)?)
+}
+
+/// A cell at the origin of a chain's tip, which faces along z.
+fn on_tip(chain: &Chain) -> CellOnLink {
+    CellOnLink { link: chain.tip.clone(), normal: [0.0, 0.0, 1.0], ..CellOnLink::default() }
+}
+
+/// What is left of rounding is nothing; never minus zero.
+fn tidy(value: f64) -> f64 {
+    if value.abs() < 1e-12 { 0.0 } else { value }
+}

@@ -1,0 +1,44 @@
+//! Robots as others describe them: a URDF file is read, and a chain of its joints is turned into standard
+//! Denavit-Hartenberg rows. Nothing here opens a file.
+//!
+//! ```
+//! # fn main() -> Result<(), robots::RobotError> {
+//! let xml = r#"<robot name="pendulum">
+//!   <link name="base"/>
+//!   <link name="arm"/>
+//!   <joint name="hinge" type="revolute">
+//!     <parent link="base"/> <child link="arm"/>
+//!     <origin xyz="0 0 0.5"/> <axis xyz="0 1 0"/> <limit lower="-1" upper="1" velocity="2"/>
+//!   </joint>
+//! </robot>"#;
+//! let urdf = robots::Urdf::parse("pendulum.urdf", xml)?;
+//! let chain = urdf.chain(None, "arm")?;
+//! assert_eq!(chain.joints.len(), 1);
+//! assert!(chain.residual < 1e-12);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! | module | what |
+//! |---|---|
+//! | `urdf` | the file: links, joints, shapes, and its own kinematics |
+//! | `describe` | the text of a skin for chains and cells |
+//! | `chain` | the joints between two links, with rows and the frame of each link |
+//! | `rows` | rows, and how one axis leads to the next |
+
+mod chain;
+mod describe;
+mod error;
+mod nearest;
+mod residual;
+mod rows;
+mod urdf;
+
+pub use chain::{Chain, Joint, LinkFrame, MAX_LENGTH_M, MAX_RESIDUAL};
+pub use describe::{CELLS_OF_A_BUS, CellOnLink, Import, ImportError};
+pub use error::{Problem, RobotError};
+pub use nalgebra::Isometry3;
+pub use protocol::parameters::RowKind;
+pub use protocol::skin::JointKind;
+pub use rows::{Row, frames};
+pub use urdf::{Geometry, Shape, Urdf};

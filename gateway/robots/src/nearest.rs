@@ -1,0 +1,57 @@
+//! Names that a mistyped one may have meant.
+
+/// How many names are proposed.
+const PROPOSED: usize = 3;
+
+/// The names that are nearest to one that does not exist, nearest first, at most three; as a list in words.
+pub(crate) fn nearest<'a>(target: &str, names: impl IntoIterator<Item = &'a str>) -> String {
+    let target = target.to_lowercase();
+    let mut found: Vec<_> =
+        names.into_iter().map(|name| (edits(&target, &name.to_lowercase()), name)).collect();
+    found.sort();
+    let found: Vec<_> = found.into_iter().take(PROPOSED).map(|(_, name)| format!("{name:?}")).collect();
+    match found.as_slice() {
+        [] => "none".to_owned(),
+        [one] => one.clone(),
+        [first @ .., last] => format!("{} or {last}", first.join(", ")),
+    }
+}
+
+/// The fewest characters to insert, delete or replace that turn one word into the other.
+fn edits(from: &str, to: &str) -> usize {
+    let to: Vec<_> = to.chars().collect();
+    let mut row: Vec<_> = (0..=to.len()).collect();
+    for (above, letter) in from.chars().enumerate() {
+        let mut left = above + 1;
+        let mut next = vec![left];
+        for (pair, other) in row.windows(2).zip(&to) {
+            if let [diagonal, up] = *pair {
+                left = (diagonal + usize::from(letter != *other)).min(up + 1).min(left + 1);
+                next.push(left);
+            }
+        }
+        row = next;
+    }
+    row.last().copied().unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{edits, nearest};
+
+    #[test]
+    fn edits_are_counted() {
+        assert_eq!(edits("kitten", "sitting"), 3);
+        assert_eq!(edits("", "abc"), 3);
+        assert_eq!(edits("abc", ""), 3);
+        assert_eq!(edits("same", "same"), 0);
+    }
+
+    #[test]
+    fn three_names_are_proposed_nearest_first() {
+        let names = ["shoulder", "link2", "LINK1", "link11"];
+        assert_eq!(nearest("link1", names), r#""LINK1", "link11" or "link2""#);
+        assert_eq!(nearest("x", ["one"]), r#""one""#);
+        assert_eq!(nearest("x", []), "none");
+    }
+}

@@ -1,0 +1,89 @@
+//! Rows compared with the URDF's own kinematics.
+
+use core::f64::consts::TAU;
+
+use nalgebra::Isometry3;
+
+use crate::chain::Chain;
+use crate::chain::{Hanging, behind};
+use crate::urdf::UrdfJoint;
+use protocol::skin::JointKind;
+
+/// Positions of the joints at which they are compared, besides zero and the limits.
+const RANDOM_POSITIONS: usize = 64;
+
+/// The largest difference, and where.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Residual {
+    /// In m or rad.
+    pub(crate) residual: f64,
+    /// The link.
+    pub(crate) link: String,
+}
+
+/// Compares all links that move with the chain.
+pub(crate) fn residual(chain: &Chain, path: &[&UrdfJoint], hanging: &[Hanging]) -> Residual {
+    let mut worst = Residual::default();
+    for positions in positions(chain) {
+        let frames = chain.frames(&positions);
+        let behind = behind(path, &positions);
+        for (Hanging { link, joint, fixed }, (_, found)) in hanging.iter().zip(chain.links()) {
+            let urdf = joint.checked_sub(1).and_then(|index| behind.get(index)).map(|pose| pose * fixed);
+            let rows = frames.get(found.row).map(|frame| frame * found.frame);
+            let residual = urdf.zip(rows).map_or(f64::INFINITY, |(urdf, rows)| difference(&urdf, &rows));
+            // Not a number is the worst.
+            if residual.is_nan() || residual > worst.residual {
+                worst = Residual { residual, link: link.clone() };
+            }
+        }
+    }
+    worst
+}
+
+/// The greater of the distance in m and the angle in rad between two frames.
+pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
+    let turn = one.rotation.rotation_to(&other.rotation);
+    // Not by the cosine: that of a small angle has lost it.
+    let angle = 2.0 * turn.imag().norm().atan2(turn.scalar().abs());
+    (one.translation.vector - other.translation.vector).norm().max(angle)
+}
+
+/// Zero, the limits, and positions within them, always the same.
+fn positions(chain: &Chain) -> Vec<Vec<f64>> {
+    let limits = chain.joints.iter().map(|joint| match joint.kind {
+        JointKind::Revolute => joint.limits.map(|limit| limit.clamp(-TAU, TAU)),
+        JointKind::Prismatic => joint.limits,
+    });
+    let limits: Vec<_> = limits.collect();
+    let mut all = vec![
+        vec![0.0; limits.len()],
+        limits.iter().map(|[lower, _]| *lower).collect(),
+        limits.iter().map(|[_, upper]| *upper).collect(),
+    ];
+    let mut state = 1_u64;
+    let mut uniform = |[lower, upper]: &[f64; 2]| {
+        // Knuth's linear congruential generator; its upper 32 bits.
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        let high = u32::try_from(state >> 32).unwrap_or_default();
+        lower + (upper - lower) * f64::from(high) / f64::from(u32::MAX)
+    };
+    all.extend((0..RANDOM_POSITIONS).map(|_| limits.iter().map(&mut uniform).collect()));
+    all
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Isometry3, Vector3};
+
+    use super::difference;
+
+    #[test]
+    fn a_small_angle_is_not_lost() {
+        for angle in [1e-3, 1e-8, 1e-12] {
+            let turned = Isometry3::rotation(Vector3::new(0.0, angle, 0.0));
+            let found = difference(&Isometry3::identity(), &turned);
+            assert!((found - angle).abs() < 1e-15, "{angle}: {found}");
+        }
+        assert!(difference(&Isometry3::identity(), &Isometry3::translation(3.0, 4.0, 0.0)) > 4.9);
+    }
+}

@@ -1,0 +1,201 @@
+//! A URDF file: links, joints, shapes, and its own kinematics.
+
+mod read;
+mod shape;
+mod tree;
+
+use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
+
+use crate::error::{Problem, RobotError};
+use crate::nearest::nearest;
+
+pub use shape::{Geometry, Shape};
+
+/// A checked file: its links are one tree, and each joint moves one of them.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Urdf {
+    /// The file's name, as it was given.
+    pub file: String,
+    /// The robot's name; empty if it has none.
+    pub name: String,
+    /// In the file's order.
+    links: Vec<Link>,
+    /// In the file's order.
+    joints: Vec<UrdfJoint>,
+    /// Index of the link without a parent.
+    root: usize,
+}
+
+/// A link.
+#[derive(Clone, Debug, PartialEq)]
+struct Link {
+    name: String,
+    visuals: Vec<Shape>,
+    collisions: Vec<Shape>,
+    /// Index of the joint that moves it.
+    parent: Option<usize>,
+}
+
+/// A joint.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct UrdfJoint {
+    pub(crate) name: String,
+    pub(crate) kind: Kind,
+    /// Index of the link that it is on.
+    pub(crate) parent: usize,
+    /// Index of the link that it moves.
+    pub(crate) child: usize,
+    /// From the parent to the child at position zero.
+    pub(crate) origin: Isometry3<f64>,
+    /// In the child's coordinates; z for a joint without one.
+    pub(crate) axis: Unit<Vector3<f64>>,
+    /// Lower and upper, in rad or m, as written; zero where the file says nothing.
+    pub(crate) limits: [f64; 2],
+    /// In rad/s or m/s, as written.
+    pub(crate) velocity: Option<f64>,
+    pub(crate) mimic: Option<Mimic>,
+    /// The file's line.
+    pub(crate) line: u32,
+}
+
+/// A joint's type.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(crate) enum Kind {
+    Revolute,
+    Continuous,
+    Prismatic,
+    Fixed,
+    Floating,
+    Planar,
+}
+
+/// Which joint another one follows.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Mimic {
+    pub(crate) joint: String,
+    pub(crate) multiplier: f64,
+    pub(crate) offset: f64,
+}
+
+impl UrdfJoint {
+    /// From the parent to the child with the joint at this position in rad or m. Floating and planar joints stay at their origin.
+    pub(crate) fn transform(&self, position: f64) -> Isometry3<f64> {
+        match self.kind {
+            Kind::Revolute | Kind::Continuous => {
+                self.origin * UnitQuaternion::from_axis_angle(&self.axis, position)
+            }
+            Kind::Prismatic => self.origin * Translation3::from(self.axis.into_inner() * position),
+            Kind::Fixed | Kind::Floating | Kind::Planar => self.origin,
+        }
+    }
+
+    /// Its name, unless it is fixed.
+    pub(crate) fn moving_name(&self) -> Option<String> {
+        (self.kind != Kind::Fixed).then(|| self.name.clone())
+    }
+}
+
+impl Urdf {
+    /// Reads a file's text; `file` is its name in errors.
+    ///
+    /// # Errors
+    /// When it is not XML or not a URDF, when a value is not what is allowed, or when its links are not one tree.
+    pub fn parse(file: &str, xml: &str) -> Result<Self, RobotError> {
+        read::read(file, xml)
+    }
+
+    /// The link that has no parent.
+    #[must_use]
+    pub fn root(&self) -> &str {
+        self.link_name(self.root)
+    }
+
+    /// The links' names, in the file's order.
+    pub fn links(&self) -> impl Iterator<Item = &str> {
+        self.links.iter().map(|link| link.name.as_str())
+    }
+
+    /// The links that no joint is on: the ends of the tree, in the file's order.
+    pub fn leaves(&self) -> impl Iterator<Item = &str> {
+        let is_leaf = |index: &usize| self.joints.iter().all(|joint| joint.parent != *index);
+        let indices = (0..self.links.len()).filter(is_leaf);
+        indices.filter_map(|index| self.links.get(index)).map(|link| link.name.as_str())
+    }
+
+    /// What a link looks like.
+    ///
+    /// # Errors
+    /// When there is no such link.
+    pub fn visuals(&self, link: &str) -> Result<&[Shape], RobotError> {
+        Ok(self.link(link)?.1.visuals.as_slice())
+    }
+
+    /// What of a link hits things.
+    ///
+    /// # Errors
+    /// When there is no such link.
+    pub fn collisions(&self, link: &str) -> Result<&[Shape], RobotError> {
+        Ok(self.link(link)?.1.collisions.as_slice())
+    }
+
+    /// Where a joint stands that nobody moves, in rad or m: at zero, or in the middle of its limits if zero is not between them. Zero
+    /// for a joint that does not exist.
+    #[must_use]
+    pub fn rest(&self, joint: &str) -> f64 {
+        let Some(joint) = self.joints.iter().find(|it| it.name == joint) else { return 0.0 };
+        let [lower, upper] = joint.limits;
+        let limited = matches!(joint.kind, Kind::Revolute | Kind::Prismatic);
+        let middle = f64::midpoint(lower, upper);
+        if limited && !(lower <= 0.0 && 0.0 <= upper) && middle.is_finite() { middle } else { 0.0 }
+    }
+
+    /// A link's frame in the root's coordinates, by the file's own kinematics. `position` gives each joint's position in rad or m by
+    /// its name; it is not asked for joints that mimic others. Floating and planar joints stay at their origin.
+    ///
+    /// # Errors
+    /// When there is no such link.
+    pub fn pose(&self, link: &str, position: &dyn Fn(&str) -> f64) -> Result<Isometry3<f64>, RobotError> {
+        let (index, _) = self.link(link)?;
+        let transform = |joint: &UrdfJoint| match &joint.mimic {
+            None => joint.transform(position(&joint.name)),
+            Some(Mimic { joint: of, multiplier, offset }) => {
+                joint.transform(multiplier * position(of) + offset)
+            }
+        };
+        Ok(self.above(index).map(transform).fold(Isometry3::identity(), |pose, joint| joint * pose))
+    }
+
+    /// A link and its index.
+    fn link(&self, name: &str) -> Result<(usize, &Link), RobotError> {
+        let found = self.links.iter().enumerate().find(|(_, link)| link.name == name);
+        found.ok_or_else(|| {
+            self.error(Problem::NoSuchLink { link: name.to_owned(), nearest: nearest(name, self.links()) })
+        })
+    }
+
+    /// A link's index.
+    pub(crate) fn index(&self, link: &str) -> Result<usize, RobotError> {
+        Ok(self.link(link)?.0)
+    }
+
+    /// A link's name.
+    pub(crate) fn link_name(&self, index: usize) -> &str {
+        self.links.get(index).map_or("", |link| &link.name)
+    }
+
+    /// The joints from a link up to the root.
+    pub(crate) fn above(&self, link: usize) -> impl Iterator<Item = &UrdfJoint> {
+        let up = move |link: usize| self.joints.get(self.links.get(link)?.parent?);
+        core::iter::successors(up(link), move |joint| up(joint.parent))
+    }
+
+    /// An error without a line.
+    pub(crate) fn error(&self, problem: Problem) -> RobotError {
+        RobotError::new(&self.file, None, problem)
+    }
+
+    /// An error at a joint.
+    pub(crate) fn error_at(&self, joint: &UrdfJoint, problem: Problem) -> RobotError {
+        RobotError::new(&self.file, Some(joint.line), problem)
+    }
+}

@@ -1,0 +1,91 @@
+//! Links and joints, made a tree.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use super::{Link, Urdf, UrdfJoint};
+use crate::error::{Problem, RobotError};
+use crate::nearest::nearest;
+
+/// A joint whose links are names still.
+pub(super) struct Loose {
+    /// The joint; its parent and child are not yet set.
+    pub(super) joint: UrdfJoint,
+    /// The link that it is on.
+    pub(super) parent: String,
+    /// The link that it moves.
+    pub(super) child: String,
+}
+
+/// A link and its line.
+pub(super) type Placed = (Link, u32);
+
+/// Connects links with joints.
+pub(super) fn grow(
+    file: &str,
+    name: String,
+    placed: Vec<Placed>,
+    loose: Vec<Loose>,
+) -> Result<Urdf, RobotError> {
+    let error = |line, problem| RobotError::new(file, line, problem);
+    let mut names = BTreeMap::new();
+    let mut links = Vec::new();
+    for (link, line) in placed {
+        if names.insert(link.name.clone(), links.len()).is_some() {
+            return Err(error(Some(line), Problem::Duplicate { what: "link", name: link.name }));
+        }
+        links.push(link);
+    }
+    let mut joints = Vec::<UrdfJoint>::new();
+    let mut taken = BTreeSet::new();
+    for Loose { mut joint, parent, child } in loose {
+        let line = Some(joint.line);
+        if !taken.insert(joint.name.clone()) {
+            return Err(error(line, Problem::Duplicate { what: "joint", name: joint.name }));
+        }
+        let find = |role, link: String| {
+            names.get(&link).copied().ok_or_else(|| {
+                let nearest = nearest(&link, names.keys().map(String::as_str));
+                error(line, Problem::JointWithoutLink { joint: joint.name.clone(), role, link, nearest })
+            })
+        };
+        (joint.parent, joint.child) = (find("parent", parent)?, find("child", child)?);
+        if let Some(link) = links.get_mut(joint.child) {
+            if let Some(first) = link.parent.and_then(|index| joints.get(index)) {
+                let (link, first) = (link.name.clone(), first.name.clone());
+                return Err(error(line, Problem::TwoParents { link, first, second: joint.name }));
+            }
+            link.parent = Some(joints.len());
+        }
+        joints.push(joint);
+    }
+    let mut roots = links.iter().enumerate().filter(|(_, link)| link.parent.is_none());
+    let root = roots.next().map(|(index, link)| (index, link.name.clone()));
+    if let (Some((_, first)), Some((_, second))) = (&root, roots.next()) {
+        let (first, second) = (first.clone(), second.name.clone());
+        return Err(error(None, Problem::TwoRoots { first, second }));
+    }
+    let urdf = Urdf { file: file.to_owned(), name, links, joints, root: root.map_or(0, |(index, _)| index) };
+    match cycle(&urdf) {
+        None => Ok(urdf),
+        Some(link) => Err(error(None, Problem::Cycle(link.name.clone()))),
+    }
+}
+
+/// A link that is above itself.
+fn cycle(urdf: &Urdf) -> Option<&Link> {
+    // Links that have been met on the path to the root, and from which link.
+    let mut walked = vec![None; urdf.links.len()];
+    for start in 0..urdf.links.len() {
+        let mut at = Some(start);
+        while let Some(index) = at {
+            match walked.get_mut(index)? {
+                Some(from) if *from == start => return urdf.links.get(index),
+                Some(_) => break,
+                unseen @ None => *unseen = Some(start),
+            }
+            let parent = urdf.links.get(index).and_then(|link| link.parent);
+            at = parent.and_then(|joint| urdf.joints.get(joint)).map(|joint| joint.parent);
+        }
+    }
+    None
+}

@@ -1,0 +1,12 @@
+//! Chains of URDF files: those written here, those made by chance, and those of others.
+
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+mod common;
+mod examples;
+mod foreign;
+mod random;
+mod reading;
+mod refusals;
+mod rows;
+mod written;
