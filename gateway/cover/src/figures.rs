@@ -1,0 +1,41 @@
+//! How well a link is covered.
+
+use crate::grid::Grid;
+use crate::place::{Spot, spacing};
+use crate::surface::{Sample, Surface, real};
+use crate::{Figures, Link};
+
+/// A link's figures.
+pub(crate) fn figures(link: &Link, surface: &Surface<'_>, spots: &[Spot], pitch: f64) -> Figures {
+    let grid = Grid::of(pitch, spots.iter().map(|spot| &spot.point));
+    let covered = |sample: &&Sample| {
+        let mut near = grid.around(grid.cube(&sample.point)).filter_map(|index| spots.get(index));
+        near.any(|spot| {
+            // Not through a thin wall.
+            spot.normal.dot(&sample.face) > -0.5 && (spot.point - sample.point).norm() <= pitch
+        })
+    };
+    let count = surface.samples.len();
+    Figures {
+        name: link.name.clone(),
+        cells: spots.len(),
+        outer_area: real(count) * surface.share,
+        covered: if count == 0 {
+            0.0
+        } else {
+            real(surface.samples.iter().filter(covered).count()) / real(count)
+        },
+        spacing: spacing(spots, pitch),
+        tilt: spots.iter().map(|spot| spot.tilt).fold(0.0, f64::max),
+    }
+}
+
+/// The middle one of some numbers; of two the larger.
+pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len() / 2;
+    if values.is_empty() {
+        return None;
+    }
+    let (_, median, _) = values.select_nth_unstable_by(middle, f64::total_cmp);
+    Some(*median)
+}

@@ -1,0 +1,76 @@
+//! Points in cubes, to find those near to others.
+
+use std::collections::BTreeMap;
+
+use nalgebra::Point3;
+
+/// Points by the cube that they are in.
+#[derive(Clone, Debug)]
+pub(crate) struct Grid {
+    edge: f64,
+    cubes: BTreeMap<[i64; 3], Vec<usize>>,
+}
+
+impl Grid {
+    /// An empty grid of cubes of this edge, in m.
+    pub(crate) const fn new(edge: f64) -> Self {
+        Self { edge, cubes: BTreeMap::new() }
+    }
+
+    /// A grid of these points, numbered from 0.
+    pub(crate) fn of<'a>(edge: f64, points: impl IntoIterator<Item = &'a Point3<f64>>) -> Self {
+        let mut grid = Self::new(edge);
+        for (index, point) in points.into_iter().enumerate() {
+            grid.insert(point, index);
+        }
+        grid
+    }
+
+    pub(crate) fn insert(&mut self, point: &Point3<f64>, index: usize) {
+        self.cubes.entry(self.cube(point)).or_default().push(index);
+    }
+
+    /// The cube that a point is in.
+    #[expect(clippy::cast_possible_truncation, reason = "saturates far away, where nothing is near")]
+    pub(crate) fn cube(&self, point: &Point3<f64>) -> [i64; 3] {
+        [point.x, point.y, point.z].map(|coordinate| (coordinate / self.edge).floor() as i64)
+    }
+
+    /// All cubes that have points.
+    pub(crate) fn cubes(&self) -> impl Iterator<Item = ([i64; 3], &[usize])> {
+        self.cubes.iter().map(|(&cube, points)| (cube, points.as_slice()))
+    }
+
+    /// Points of a cube and of the 26 around it: all that are within an edge of a point in it.
+    pub(crate) fn around(&self, [x, y, z]: [i64; 3]) -> impl Iterator<Item = usize> {
+        let near = |middle: i64| middle.saturating_sub(1)..=middle.saturating_add(1);
+        near(x).flat_map(move |x| near(y).map(move |y| [x, y])).flat_map(move |[x, y]| {
+            let row = [x, y, z.saturating_sub(1)]..=[x, y, z.saturating_add(1)];
+            self.cubes.range(row).flat_map(|(_, points)| points.iter().copied())
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn all_points_within_an_edge_are_found(
+            points in proptest::collection::vec(proptest::array::uniform3(-2.0..2.0_f64), 1..80),
+        ) {
+            let points: Vec<_> = points.into_iter().map(Point3::from).collect();
+            let grid = Grid::of(0.7, &points);
+            prop_assert_eq!(grid.cubes().map(|(_, points)| points.len()).sum::<usize>(), points.len());
+            for point in &points {
+                let found: Vec<_> = grid.around(grid.cube(point)).collect();
+                for (index, other) in points.iter().enumerate() {
+                    prop_assert!((point - other).norm() > 0.7 || found.contains(&index));
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,259 @@
+//! Triangle meshes: STL, COLLADA (DAE) and OBJ files, and primitives.
+
+mod collada;
+mod primitive;
+#[cfg(test)]
+mod tests;
+
+use std::borrow::Cow;
+use std::ffi::OsStr;
+use std::fs;
+use std::io;
+use std::path::Path;
+
+use nalgebra::{Matrix3, Point3, Vector3};
+use thiserror::Error;
+
+/// The most triangles of one mesh.
+pub const MAX_TRIANGLES: usize = 1_000_000;
+
+/// The largest mesh file, in bytes: that of an ASCII STL of [`MAX_TRIANGLES`].
+const MAX_BYTES: u64 = 300_000_000;
+
+/// Three corners, in m, counterclockwise when seen from outside if the file is well made. Nothing in this
+/// crate relies on that.
+pub type Triangle = [Point3<f64>; 3];
+
+/// Which axis of a COLLADA file points up. STL and OBJ files do not say, and are taken as they are.
+#[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
+pub enum UpAxis {
+    /// As the file is written: its `up_axis` is ignored, as RViz and Pinocchio do, with which most URDF files
+    /// were made.
+    #[default]
+    Ignore,
+    /// As the COLLADA specification says: the file's `up_axis`, `Y_UP` when it has none, is turned to z.
+    Follow,
+}
+
+/// Triangles without any order, in m. It has at least one, all coordinates are finite.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mesh {
+    triangles: Vec<Triangle>,
+}
+
+/// Why there is no mesh.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum MeshError {
+    /// The file cannot be read.
+    #[error("mesh {file}: {source}; check the path")]
+    Read {
+        /// The file.
+        file: String,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// The file's name has an extension that is not known.
+    #[error("mesh {file}: extension {extension:?} is none of stl, dae and obj; convert the file")]
+    Extension {
+        /// The file.
+        file: String,
+        /// What is behind the last dot.
+        extension: String,
+    },
+    /// The file is not what its extension says.
+    #[error("mesh {file}: {reason}; export it again")]
+    Syntax {
+        /// The file.
+        file: String,
+        /// What the parser says, in one line.
+        reason: String,
+    },
+    /// The file has no triangle.
+    #[error("mesh {file}: it has no triangle; export it again, or take it out of the description")]
+    Empty {
+        /// The file.
+        file: String,
+    },
+    /// A coordinate is not a number, or infinite.
+    #[error(
+        "mesh {file}: triangle {triangle} has the coordinate {value}, which is not finite; export it again"
+    )]
+    NotFinite {
+        /// The file.
+        file: String,
+        /// Its number, from 0.
+        triangle: usize,
+        /// The coordinate.
+        value: f64,
+    },
+    /// There is more of it than is read.
+    #[error("mesh {file}: {count} {what}, at most {most}; decimate the mesh")]
+    TooLarge {
+        /// The file.
+        file: String,
+        /// How many there are; of triangles maybe only how many were counted.
+        count: u64,
+        /// What is counted.
+        what: &'static str,
+        /// How many there may be.
+        most: u64,
+    },
+    /// A primitive's size is not above zero, or not finite.
+    #[error("{shape} with {what} {value} m: a size is above 0 and finite; correct it")]
+    Size {
+        /// The primitive.
+        shape: &'static str,
+        /// Which size.
+        what: &'static str,
+        /// The size, in m.
+        value: f64,
+    },
+}
+
+impl Mesh {
+    /// A mesh of these triangles, in m; `name` is for errors.
+    ///
+    /// # Errors
+    /// When there is no triangle or more than [`MAX_TRIANGLES`], or a coordinate is not finite.
+    pub fn new(name: &str, triangles: Vec<Triangle>) -> Result<Self, MeshError> {
+        let file = || name.to_owned();
+        if triangles.is_empty() {
+            return Err(MeshError::Empty { file: file() });
+        }
+        if triangles.len() > MAX_TRIANGLES {
+            return Err(too_many(name, triangles.len()));
+        }
+        for (triangle, corners) in triangles.iter().enumerate() {
+            let mut coordinates = corners.iter().flat_map(|corner| corner.iter());
+            if let Some(&value) = coordinates.find(|value| !value.is_finite()) {
+                return Err(MeshError::NotFinite { file: file(), triangle, value });
+            }
+        }
+        Ok(Self { triangles })
+    }
+
+    /// Reads a file; its extension says what it is: `.stl` (binary and ASCII), `.dae` or `.obj`, in small or
+    /// capital letters. STL and OBJ have no unit: their numbers are taken as m.
+    ///
+    /// # Errors
+    /// When the file cannot be read, is of another kind, or is no mesh.
+    pub fn load(path: &Path, up: UpAxis) -> Result<Self, MeshError> {
+        let name = path.display().to_string();
+        let read = |source| MeshError::Read { file: name.clone(), source };
+        let about = fs::metadata(path).map_err(read)?;
+        if !about.is_file() {
+            return Err(read(io::Error::other("it is not a file")));
+        }
+        if about.len() > MAX_BYTES {
+            return Err(MeshError::TooLarge {
+                file: name,
+                count: about.len(),
+                what: "bytes",
+                most: MAX_BYTES,
+            });
+        }
+        Self::parse(&name, &fs::read(path).map_err(read)?, up)
+    }
+
+    /// The mesh of a file with this name and these bytes; as [`Mesh::load`].
+    ///
+    /// # Errors
+    /// As those of [`Mesh::load`].
+    pub fn parse(name: &str, bytes: &[u8], up: UpAxis) -> Result<Self, MeshError> {
+        let extension = Path::new(name).extension().and_then(OsStr::to_str).unwrap_or_default();
+        let triangles = match extension.to_ascii_lowercase().as_str() {
+            "stl" => loaded(mesh_loader::stl::from_slice(&without_title(bytes)), name)?,
+            "obj" => {
+                // Only for materials, which are not needed.
+                let other = |_: &Path| Err::<Vec<u8>, _>(io::Error::from(io::ErrorKind::NotFound));
+                loaded(mesh_loader::obj::from_slice(bytes, None, other), name)?
+            }
+            "dae" => collada::triangles(name, bytes, up)?,
+            _ => return Err(MeshError::Extension { file: name.to_owned(), extension: extension.to_owned() }),
+        };
+        Self::new(name, triangles)
+    }
+
+    /// The triangles, in m.
+    #[must_use]
+    pub fn triangles(&self) -> &[Triangle] {
+        &self.triangles
+    }
+}
+
+/// A binary STL file without the text that it begins with, if that says `solid` as if the file were ASCII. It is binary
+/// when it is exactly as long as its count of triangles says.
+fn without_title(bytes: &[u8]) -> Cow<'_, [u8]> {
+    const TITLE: usize = 80;
+    const TRIANGLE: usize = 50;
+    let text = bytes.iter().position(|byte| !byte.is_ascii_whitespace());
+    let solid = text.and_then(|text| bytes.get(text..)).is_some_and(|text| text.starts_with(b"solid"));
+    let count = bytes.get(TITLE..).and_then(<[u8]>::first_chunk).map(|count| u32::from_le_bytes(*count));
+    let length =
+        count.and_then(|count| usize::try_from(count).ok()?.checked_mul(TRIANGLE)?.checked_add(TITLE + 4));
+    if !solid || length != Some(bytes.len()) {
+        return Cow::Borrowed(bytes);
+    }
+    let mut untitled = bytes.to_vec();
+    untitled.iter_mut().take(TITLE).for_each(|byte| *byte = 0);
+    Cow::Owned(untitled)
+}
+
+fn too_many(file: &str, count: usize) -> MeshError {
+    MeshError::TooLarge {
+        file: file.to_owned(),
+        count: u64::try_from(count).unwrap_or(u64::MAX),
+        what: "triangles",
+        most: u64::try_from(MAX_TRIANGLES).unwrap_or(u64::MAX),
+    }
+}
+
+fn syntax(file: &str, reason: &str) -> MeshError {
+    MeshError::Syntax { file: file.to_owned(), reason: reason.lines().collect::<Vec<_>>().join(" ") }
+}
+
+/// The triangles of a parsed file; those that name a vertex which is not there are an error.
+fn loaded(scene: io::Result<mesh_loader::Scene>, name: &str) -> Result<Vec<Triangle>, MeshError> {
+    let scene = scene.map_err(|error| syntax(name, &error.to_string()))?;
+    let count = scene.meshes.iter().map(|mesh| mesh.faces.len()).sum();
+    if count > MAX_TRIANGLES {
+        return Err(too_many(name, count));
+    }
+    let mut triangles = Vec::with_capacity(count);
+    for mesh in &scene.meshes {
+        let corner = |index: u32| {
+            let vertex = usize::try_from(index).ok().and_then(|index| mesh.vertices.get(index));
+            let [x, y, z] = *vertex.ok_or_else(|| syntax(name, &format!("vertex {index} is not there")))?;
+            Ok(Point3::new(f64::from(x), f64::from(y), f64::from(z)))
+        };
+        for &[a, b, c] in &mesh.faces {
+            triangles.push([corner(a)?, corner(b)?, corner(c)?]);
+        }
+    }
+    Ok(triangles)
+}
+
+/// A linear map and a shift, of corners.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Affine {
+    pub(crate) linear: Matrix3<f64>,
+    pub(crate) shift: Vector3<f64>,
+}
+
+impl Affine {
+    pub(crate) fn identity() -> Self {
+        Self { linear: Matrix3::identity(), shift: Vector3::zeros() }
+    }
+
+    /// First `inner`, then this.
+    pub(crate) fn after(&self, inner: &Self) -> Self {
+        Self { linear: self.linear * inner.linear, shift: self.linear * inner.shift + self.shift }
+    }
+
+    /// A triangle's corners mapped; a map that mirrors exchanges two, so that its winding stays.
+    pub(crate) fn map(&self, triangle: &Triangle) -> Triangle {
+        let [a, b, c] = triangle.map(|corner| Point3::from(self.linear * corner.coords + self.shift));
+        if self.linear.determinant() < 0.0 { [a, c, b] } else { [a, b, c] }
+    }
+}

@@ -1,0 +1,87 @@
+//! Boxes, cylinders and spheres as triangles, where URDF puts them: around the origin, a cylinder along z.
+
+use core::f64::consts::{PI, TAU};
+
+use nalgebra::Point3;
+
+use super::{Mesh, MeshError, Triangle};
+
+/// Corners around a cylinder or a sphere: 5 degrees each, so that a face's normal is within 2.5 degrees of the
+/// surface's.
+const AROUND: u32 = 72;
+
+fn checked(shape: &'static str, what: &'static str, value: f64) -> Result<f64, MeshError> {
+    if value.is_finite() && value > 0.0 { Ok(value) } else { Err(MeshError::Size { shape, what, value }) }
+}
+
+/// The two triangles of four corners in order; those without an area are left out.
+fn quad([a, b, c, d]: [Point3<f64>; 4]) -> impl Iterator<Item = Triangle> {
+    [[a, b, c], [a, c, d]].into_iter().filter(|[a, b, c]| a != b && b != c && c != a)
+}
+
+impl Mesh {
+    /// A box of these edge lengths, in m.
+    ///
+    /// # Errors
+    /// When a length is not above 0.
+    pub fn cuboid(size: [f64; 3]) -> Result<Self, MeshError> {
+        let [x, y, z] = size;
+        let x = checked("box", "x", x)? / 2.0;
+        let y = checked("box", "y", y)? / 2.0;
+        let z = checked("box", "z", z)? / 2.0;
+        let point = |[i, j, k]: [f64; 3]| Point3::new(i * x, j * y, k * z);
+        let sides = [
+            [[1.0, -1.0, -1.0], [1.0, 1.0, -1.0], [1.0, 1.0, 1.0], [1.0, -1.0, 1.0]],
+            [[-1.0, 1.0, -1.0], [-1.0, -1.0, -1.0], [-1.0, -1.0, 1.0], [-1.0, 1.0, 1.0]],
+            [[1.0, 1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, 1.0, 1.0], [1.0, 1.0, 1.0]],
+            [[-1.0, -1.0, -1.0], [1.0, -1.0, -1.0], [1.0, -1.0, 1.0], [-1.0, -1.0, 1.0]],
+            [[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]],
+            [[-1.0, 1.0, -1.0], [1.0, 1.0, -1.0], [1.0, -1.0, -1.0], [-1.0, -1.0, -1.0]],
+        ];
+        Self::new("box", sides.into_iter().flat_map(|side| quad(side.map(point))).collect())
+    }
+
+    /// A cylinder of this radius and length, in m, closed at both ends.
+    ///
+    /// # Errors
+    /// When a size is not above 0.
+    pub fn cylinder(radius: f64, length: f64) -> Result<Self, MeshError> {
+        let radius = checked("cylinder", "radius", radius)?;
+        let top = checked("cylinder", "length", length)? / 2.0;
+        // From the middle of one end over the wall to the middle of the other.
+        let profile = [(0.0, -top), (radius, -top), (radius, top), (0.0, top)];
+        Self::new("cylinder", turned(&profile))
+    }
+
+    /// A sphere of this radius, in m.
+    ///
+    /// # Errors
+    /// When the radius is not above 0.
+    pub fn sphere(radius: f64) -> Result<Self, MeshError> {
+        let radius = checked("sphere", "radius", radius)?;
+        let half = AROUND / 2;
+        let profile: Vec<_> = (0..=half)
+            .map(|step| {
+                let angle = PI * f64::from(step) / f64::from(half);
+                let ring = if step == 0 || step == half { 0.0 } else { radius * angle.sin() };
+                (ring, -radius * angle.cos())
+            })
+            .collect();
+        Self::new("sphere", turned(&profile))
+    }
+}
+
+/// A profile of radius and height, turned about z.
+fn turned(profile: &[(f64, f64)]) -> Vec<Triangle> {
+    let point = |(radius, z): (f64, f64), step: u32| {
+        let angle = TAU * f64::from(step % AROUND) / f64::from(AROUND);
+        Point3::new(radius * angle.cos(), radius * angle.sin(), z)
+    };
+    let strips = profile.iter().zip(profile.iter().skip(1));
+    let quads = strips.flat_map(|(&low, &high)| {
+        (0..AROUND).flat_map(move |step| {
+            quad([point(low, step), point(low, step + 1), point(high, step + 1), point(high, step)])
+        })
+    });
+    quads.collect()
+}

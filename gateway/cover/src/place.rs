@@ -1,0 +1,117 @@
+//! Where cells lie on a surface.
+
+use core::f64::consts::FRAC_PI_3;
+
+use nalgebra::{Point3, Rotation3, Unit, Vector3};
+use rand::seq::SliceRandom;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+use crate::Options;
+use crate::figures::median;
+use crate::relax::{Field, Site};
+use crate::surface::{Sample, Surface, cell_area, real};
+
+/// How far a cell's normal is from the mesh's at most, in rad: 9 degrees.
+const MAX_TILT: f64 = 0.157;
+
+/// How far apart the first sites are, in pitches: relaxed, they make room for those that fit in between.
+const START: f64 = 1.15;
+
+/// How often other distances are tried, until the spacing is the pitch.
+const TRIES: usize = 4;
+
+/// How near to the pitch the median spacing has to be, as a share of it, for no other try.
+const NEAR: f64 = 0.015;
+
+/// What a tilted sample costs when a cell's place is chosen, per squared pitch and 1 minus the cosine: 9 degrees are
+/// worth a fifth of a pitch.
+const TILT_COST: f64 = 3.0;
+
+/// A place for a cell, in the link's frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Spot {
+    pub(crate) point: Point3<f64>,
+    pub(crate) normal: Vector3<f64>,
+    /// Of the normal, off the mesh's, in rad.
+    pub(crate) tilt: f64,
+}
+
+/// The places of a link's cells.
+pub(crate) fn place(surface: &Surface<'_>, options: &Options, link: usize) -> Vec<Spot> {
+    let pitch = options.pitch;
+    let field = Field::new(surface.samples.iter().filter(|sample| sample.free).collect(), 1.2 * pitch);
+    if real(field.samples.len()) * surface.share < cell_area(pitch) / 4.0 {
+        return Vec::new();
+    }
+    let stream = u64::try_from(link).unwrap_or_default().wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    let mut dice = Pcg64Mcg::seed_from_u64(options.seed ^ stream);
+    let mut order: Vec<_> = (0..field.samples.len()).collect();
+    order.shuffle(&mut dice);
+    let mut apart = START * pitch;
+    let mut best: Option<(f64, Vec<Spot>)> = None;
+    for _ in 0..TRIES {
+        let mut sites = field.grow(&order, apart, dice.random_range(0.0..FRAC_PI_3));
+        field.relax(&mut sites, apart);
+        let spots = spots(surface, &field, &sites, pitch);
+        let Some(spacing) = spacing(&spots, pitch) else {
+            return spots;
+        };
+        let off = (spacing / pitch - 1.0).abs();
+        if best.as_ref().is_none_or(|(min, _)| off < *min) {
+            best = Some((off, spots));
+        }
+        if off < NEAR {
+            break;
+        }
+        apart *= (pitch / spacing).clamp(0.7, 1.3);
+    }
+    best.map_or_else(Vec::new, |(_, spots)| spots)
+}
+
+/// The median distance from a place to the nearest one that faces about the same way, in m.
+pub(crate) fn spacing(spots: &[Spot], pitch: f64) -> Option<f64> {
+    let nearest = |spot: &Spot| {
+        let same = spots.iter().filter(|other| *other != spot && other.normal.dot(&spot.normal) > 0.0);
+        same.map(|other| (other.point - spot.point).norm()).min_by(f64::total_cmp)
+    };
+    // A cell that is alone on its side says nothing of the spacing.
+    let nearest = spots.iter().filter_map(nearest).filter(|&distance| distance < 3.0 * pitch);
+    median(&mut nearest.collect::<Vec<_>>())
+}
+
+/// The places on the mesh for relaxed sites.
+fn spots(surface: &Surface<'_>, field: &Field<'_>, sites: &[Site], pitch: f64) -> Vec<Spot> {
+    let mut best: Vec<Option<(f64, &Sample)>> = vec![None; sites.len()];
+    for (owner, sample) in field.owners(sites).into_iter().zip(&field.samples) {
+        let Some((site, best)) = owner.and_then(|owner| Some((sites.get(owner)?, best.get_mut(owner)?)))
+        else {
+            continue;
+        };
+        let tilt = 1.0 - sample.face.dot(&sample.smooth);
+        let cost = (site.point - sample.point).norm_squared() + TILT_COST * pitch * pitch * tilt;
+        if best.is_none_or(|(min, _)| cost < min) {
+            *best = Some((cost, *sample));
+        }
+    }
+    let spot = |(site, best): (&Site, Option<(f64, &Sample)>)| {
+        let (_, sample) = best?;
+        let projected = surface.project(&site.point, sample);
+        let straight = projected.filter(|(_, face)| face.angle(&sample.smooth) < MAX_TILT);
+        let (point, face) = straight.unwrap_or((sample.point, sample.face));
+        let normal = limited(&face, &sample.smooth);
+        Some(Spot { point, normal, tilt: normal.angle(&face) })
+    };
+    sites.iter().zip(best).filter_map(spot).collect()
+}
+
+/// A unit vector towards `requested`, but at most [`MAX_TILT`] off `face`.
+fn limited(face: &Vector3<f64>, requested: &Vector3<f64>) -> Vector3<f64> {
+    let angle = face.angle(requested);
+    if angle <= MAX_TILT {
+        return *requested;
+    }
+    // Without an axis the two are opposite, which samples never are.
+    let axis = Unit::try_new(face.cross(requested), 0.0);
+    axis.map_or(*face, |axis| Rotation3::from_axis_angle(&axis, MAX_TILT) * face)
+}

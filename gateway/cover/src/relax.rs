@@ -1,0 +1,171 @@
+//! Lloyd's relaxation on a surface's samples: every site goes to the middle of the samples nearest to it, until they
+//! lie like the cells of a honeycomb.
+
+use core::f64::consts::FRAC_PI_3;
+use std::collections::VecDeque;
+
+use nalgebra::{Point3, Rotation3, Unit, Vector3};
+
+use crate::grid::Grid;
+use crate::surface::{Sample, tangents};
+
+/// How much two normals agree at least, as their cosine, for a sample to belong to a site. The two sides of a thin
+/// wall and the faces at a sharp edge do not.
+const AGREE: f64 = 0.3;
+
+/// How near to each other sites are at least when they grow, in steps: where a honeycomb meets itself behind a tube.
+const CLOSEST: f64 = 0.75;
+
+/// How often sites are moved.
+const ROUNDS: usize = 60;
+
+/// In these rounds, samples that are far from every site get new ones.
+const ADDING: usize = 15;
+
+/// A middle of samples.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Site {
+    pub(crate) point: Point3<f64>,
+    pub(crate) normal: Vector3<f64>,
+}
+
+impl Site {
+    /// The squared distance to a sample, in m², if they face about the same way.
+    pub(crate) fn distance(&self, sample: &Sample) -> Option<f64> {
+        (self.normal.dot(&sample.smooth) > AGREE).then(|| (self.point - sample.point).norm_squared())
+    }
+}
+
+/// The samples that cells may be at, and how far a site serves.
+#[derive(Debug)]
+pub(crate) struct Field<'a> {
+    pub(crate) samples: Vec<&'a Sample>,
+    grid: Grid,
+    reach: f64,
+}
+
+impl<'a> Field<'a> {
+    pub(crate) fn new(samples: Vec<&'a Sample>, reach: f64) -> Self {
+        let grid = Grid::of(reach, samples.iter().map(|sample| &sample.point));
+        Self { samples, grid, reach }
+    }
+
+    /// Sites among the samples, in this order of numbers, that are `apart` from each other.
+    pub(crate) fn apart(&self, order: &[usize], apart: f64, sites: &mut Vec<Site>) {
+        let mut grid = Grid::of(apart, sites.iter().map(|site| &site.point));
+        for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
+            let near = grid.around(grid.cube(&sample.point)).filter_map(|index| sites.get(index));
+            let free =
+                !near.filter_map(|site| site.distance(sample)).any(|distance| distance < apart * apart);
+            if free {
+                grid.insert(&sample.point, sites.len());
+                sites.push(Site { point: sample.point, normal: sample.smooth });
+            }
+        }
+    }
+
+    /// Grows sites that are a `step` from each other like the cells of a honeycomb, from samples in this order, where
+    /// no other site is near. `turn` is the direction of the first row, in rad.
+    pub(crate) fn grow(&self, order: &[usize], step: f64, turn: f64) -> Vec<Site> {
+        let mut sites: Vec<Site> = Vec::new();
+        let mut grid = Grid::new(step);
+        let free = |site: &Site, apart: f64, sites: &[Site], grid: &Grid| {
+            let mut near = grid.around(grid.cube(&site.point)).filter_map(|index| sites.get(index));
+            near.all(|other| {
+                other.normal.dot(&site.normal) <= AGREE || (other.point - site.point).norm() >= apart
+            })
+        };
+        for sample in order.iter().filter_map(|&index| self.samples.get(index)) {
+            let first = Site { point: sample.point, normal: sample.smooth };
+            if !free(&first, step, &sites, &grid) {
+                continue;
+            }
+            let (s, t) = tangents(&first.normal);
+            let mut open = VecDeque::from([(first, s * turn.cos() + t * turn.sin())]);
+            while let Some((site, row)) = open.pop_front() {
+                if !free(&site, CLOSEST * step, &sites, &grid) {
+                    continue;
+                }
+                grid.insert(&site.point, sites.len());
+                sites.push(site);
+                for sixth in 0..6 {
+                    let turn = Rotation3::from_axis_angle(
+                        &Unit::new_unchecked(site.normal),
+                        f64::from(sixth) * FRAC_PI_3,
+                    );
+                    let direction = turn * row;
+                    let next = Site { point: site.point + direction * step, normal: site.normal };
+                    let Some(next) = self.snapped(&next, 0.4 * step) else { continue };
+                    let flat = Unit::try_new(direction - next.normal * direction.dot(&next.normal), 0.0);
+                    open.extend(flat.map(|flat| (next, flat.into_inner())));
+                }
+            }
+        }
+        sites
+    }
+
+    /// A site brought to the surface at the nearest sample, if one is near.
+    fn snapped(&self, site: &Site, within: f64) -> Option<Site> {
+        let near = self.grid.around(self.grid.cube(&site.point)).filter_map(|index| self.samples.get(index));
+        let near = near.filter_map(|sample| Some((site.distance(sample)?, sample)));
+        let (distance, sample) = near.min_by(|a, b| a.0.total_cmp(&b.0))?;
+        let height = (site.point - sample.point).dot(&sample.smooth);
+        let point = site.point - sample.smooth * height;
+        (distance <= within * within).then_some(Site { point, normal: sample.smooth })
+    }
+
+    /// By sample, the site nearest to it, if one is within reach.
+    pub(crate) fn owners(&self, sites: &[Site]) -> Vec<Option<usize>> {
+        let mut owners = vec![None; self.samples.len()];
+        let grid = Grid::of(self.reach, sites.iter().map(|site| &site.point));
+        for (cube, members) in self.grid.cubes() {
+            let near: Vec<_> =
+                grid.around(cube).filter_map(|index| Some((index, sites.get(index)?))).collect();
+            for &member in members {
+                let Some(sample) = self.samples.get(member) else { continue };
+                let mut best = None;
+                let mut within = self.reach * self.reach;
+                for &(index, site) in &near {
+                    if let Some(distance) = site.distance(sample).filter(|&distance| distance <= within) {
+                        within = distance;
+                        best = Some(index);
+                    }
+                }
+                if let Some(owner) = owners.get_mut(member) {
+                    *owner = best;
+                }
+            }
+        }
+        owners
+    }
+
+    /// Moves sites until they are spread evenly; those that no sample is nearest to are lost.
+    pub(crate) fn relax(&self, sites: &mut Vec<Site>, apart: f64) {
+        for round in 1..=ROUNDS {
+            let owners = self.owners(sites);
+            let mut sums = vec![(0.0, Vector3::zeros(), Vector3::zeros()); sites.len()];
+            let mut alone = Vec::new();
+            for (index, (owner, sample)) in owners.iter().zip(&self.samples).enumerate() {
+                match owner.and_then(|owner| sums.get_mut(owner)) {
+                    Some((count, points, normals)) => {
+                        *count += 1.0;
+                        *points += sample.point.coords;
+                        *normals += sample.smooth;
+                    }
+                    None => alone.push(index),
+                }
+            }
+            *sites = sums
+                .into_iter()
+                .filter(|&(count, ..)| count > 0.0)
+                .filter_map(|(count, points, normals)| {
+                    let normal = Unit::try_new(normals, 0.0)?.into_inner();
+                    Some(Site { point: Point3::from(points / count), normal })
+                })
+                .collect();
+            if round % ADDING == 0 && round < ROUNDS {
+                self.apart(&alone, apart, sites);
+            }
+        }
+    }
+}

@@ -1,0 +1,310 @@
+//! The outer surface of a link, as samples.
+
+use core::f64::consts::{PI, TAU};
+
+use nalgebra::{Isometry3, Matrix3, Point3, Unit, Vector3};
+
+use crate::grid::Grid;
+use crate::mesh::{Affine, MAX_TRIANGLES, Triangle};
+use crate::tree::{Ray, Tree};
+use crate::{CoverError, KeepOut, Link, Options};
+
+/// Samples for the area of one cell.
+const PER_CELL: f64 = 64.0;
+
+/// The most cells that the triangles of a link may have room for.
+const MAX_CELLS: usize = 6000;
+
+/// Fewer samples than these are never taken, so that the figures of a small link mean something.
+const MIN_SAMPLES: f64 = 2000.0;
+
+/// Rays from a side of a sample; if the first [`FEW`] agree, no others are cast.
+const RAYS: u32 = 32;
+const FEW: u32 = 8;
+
+/// Which share of the rays from a side of the outer surface escapes at the minimum: more than through a screw's hole, less
+/// than from between the arms of a fork.
+const ESCAPING: f64 = 0.3;
+
+/// Which share of the rays from inside another link may leave it through gaps of its mesh.
+const LEAKING: f64 = 0.1;
+
+/// How far above the surface rays start, in pitches.
+const ABOVE: f64 = 1e-3;
+
+/// How far other links hide a surface, in pitches.
+const HIDING: f64 = 2.0;
+
+/// Which share of the disc below a cell has to be surface that faces about the same way: at a straight edge it is
+/// half, on the rim of a sheet next to nothing.
+const SUPPORT: f64 = 0.4;
+
+/// A point of the outer surface. Each stands for the same area.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sample {
+    pub(crate) point: Point3<f64>,
+    /// Of the triangle, outward.
+    pub(crate) face: Vector3<f64>,
+    /// Mean of the outer surface below a cell there, outward.
+    pub(crate) smooth: Vector3<f64>,
+    /// Whether a cell may be there.
+    pub(crate) free: bool,
+}
+
+/// A link's outer surface in its own frame.
+#[derive(Debug)]
+pub(crate) struct Surface<'a> {
+    own: Tree,
+    others: Tree,
+    keep_out: Vec<&'a KeepOut>,
+    clearance: f64,
+    pitch: f64,
+    pub(crate) samples: Vec<Sample>,
+    /// The area that each sample stands for, in m².
+    pub(crate) share: f64,
+}
+
+/// The area of a hexagonal cell, in m².
+pub(crate) fn cell_area(pitch: f64) -> f64 {
+    pitch * pitch * 0.75_f64.sqrt()
+}
+
+impl<'a> Surface<'a> {
+    /// The outer surface of one of the links.
+    pub(crate) fn new(
+        index: usize,
+        links: &[Link],
+        others: &[Link],
+        options: &'a Options,
+    ) -> Result<Self, CoverError> {
+        let mut own = Vec::new();
+        let mut obstacles = Vec::new();
+        let frame = links.get(index).map_or_else(Isometry3::identity, |link| link.pose.inverse());
+        for (other, link) in links.iter().chain(others).enumerate() {
+            if other == index {
+                collect(link, &Isometry3::identity(), &mut own)?;
+            } else {
+                collect(link, &(frame * link.pose), &mut obstacles)?;
+            }
+        }
+        once(&mut own);
+        let pitch = options.pitch;
+        let area: f64 = own.iter().map(area).sum();
+        let cells = area / cell_area(pitch);
+        if cells.is_nan() || cells > real(MAX_CELLS) {
+            let link = links.get(index).map_or_else(String::new, |link| link.name.clone());
+            return Err(CoverError::TooLarge { link, area, cells, pitch, most: MAX_CELLS });
+        }
+        let mut surface = Self {
+            own: Tree::new(own),
+            others: Tree::new(obstacles),
+            keep_out: options.keep_out.iter().filter(|keep_out| keep_out.link == index).collect(),
+            clearance: options.clearance,
+            pitch,
+            samples: Vec::new(),
+            share: 0.0,
+        };
+        if area > 0.0 {
+            surface.sample(area, (cells * PER_CELL).max(MIN_SAMPLES));
+            surface.smooth();
+        }
+        Ok(surface)
+    }
+
+    /// Takes samples of all triangles, evenly by area, and keeps the outer ones.
+    fn sample(&mut self, area: f64, count: f64) {
+        self.share = area / count;
+        // Half of the first share is skipped, so that rounding does not decide whether there is one more.
+        let mut due = -0.5;
+        let mut taken = 0;
+        for &triangle in self.own.triangles() {
+            due += self::area(&triangle) / self.share;
+            let [a, b, c] = triangle;
+            let Some(face) = normal(&triangle) else { continue };
+            while due > 0.0 {
+                due -= 1.0;
+                taken += 1;
+                let (mut u, mut v) = scattered(taken);
+                if u + v > 1.0 {
+                    (u, v) = (1.0 - u, 1.0 - v);
+                }
+                let point = a + (b - a) * u + (c - a) * v;
+                if let Some(face) = self.outward(&point, &face) {
+                    let free = self.allowed(&point);
+                    self.samples.push(Sample { point, face, smooth: face, free });
+                }
+            }
+        }
+    }
+
+    /// The outward normal of a point on a triangle with this normal; `None` if it is not on the outer surface.
+    fn outward(&self, point: &Point3<f64>, face: &Vector3<f64>) -> Option<Vector3<f64>> {
+        let front = self.escaping(point, face);
+        // A sheet has two outer sides: the one that faces more of the world, and of two equal ones the front.
+        let back = if front < 0.95 { self.escaping(point, &-face) } else { 0.0 };
+        let (side, share) = if back > front { (-face, back) } else { (*face, front) };
+        (share >= ESCAPING && !self.inside_another(&(point + side * (ABOVE * self.pitch)))).then_some(side)
+    }
+
+    /// The share of rays from just above a point that escapes, weighted by how directly they leave.
+    fn escaping(&self, point: &Point3<f64>, side: &Vector3<f64>) -> f64 {
+        let origin = point + side * (ABOVE * self.pitch);
+        let (s, t) = tangents(side);
+        let escapes = |ray: &u32| {
+            let (u, v) = scattered(*ray);
+            let (radius, (sin, cos)) = (u.sqrt(), (TAU * v).sin_cos());
+            let direction = s * (radius * cos) + t * (radius * sin) + side * (1.0 - u).sqrt();
+            let ray = Ray::new(origin, direction);
+            !self.own.blocks(&ray, f64::INFINITY) && !self.others.blocks(&ray, HIDING * self.pitch)
+        };
+        share(escapes)
+    }
+
+    fn inside_another(&self, point: &Point3<f64>) -> bool {
+        let mut leaking = 0;
+        for ray in 0..RAYS {
+            let (u, v) = scattered(ray);
+            let (height, (sin, cos)) = (2.0 * u - 1.0, (TAU * v).sin_cos());
+            let radius = (1.0 - height * height).sqrt();
+            let ray = Ray::new(*point, Vector3::new(radius * cos, radius * sin, height));
+            if !self.others.blocks(&ray, f64::INFINITY) {
+                leaking += 1;
+            }
+            if f64::from(leaking) > LEAKING * f64::from(RAYS) {
+                return false;
+            }
+        }
+        true
+    }
+
+    /// Whether neither a box nor another link keeps cells from a point.
+    fn allowed(&self, point: &Point3<f64>) -> bool {
+        let inside = |keep_out: &&KeepOut| {
+            let sides = keep_out.min.iter().zip(&keep_out.max);
+            sides.zip(point.iter()).all(|((min, max), at)| (min..=max).contains(&at))
+        };
+        !self.keep_out.iter().any(inside) && !self.others.near(point, self.clearance)
+    }
+
+    /// Means of normals below each sample, and whether there is enough surface below a cell.
+    fn smooth(&mut self) {
+        let radius = self.pitch / 2.0;
+        let grid = Grid::of(radius, self.samples.iter().map(|sample| &sample.point));
+        let min = SUPPORT * PI * radius * radius / self.share;
+        let mut smoothed = Vec::new();
+        for (cube, members) in grid.cubes() {
+            let near: Vec<_> = grid.around(cube).filter_map(|index| self.samples.get(index)).collect();
+            for &member in members {
+                let Some(sample) = self.samples.get(member) else { continue };
+                let mut sum = Vector3::zeros();
+                let mut support = 0_u32;
+                for other in &near {
+                    if other.face.dot(&sample.face) > 0.5 && (other.point - sample.point).norm() <= radius {
+                        sum += other.face;
+                        support += 1;
+                    }
+                }
+                let mean = Unit::try_new(sum, 0.0).map_or(sample.face, Unit::into_inner);
+                smoothed.push((member, mean, f64::from(support) >= min));
+            }
+        }
+        for (member, mean, supported) in smoothed {
+            if let Some(sample) = self.samples.get_mut(member) {
+                sample.smooth = mean;
+                sample.free &= supported;
+            }
+        }
+    }
+
+    /// The point of the mesh above or below `point`, near a sample, with the mesh's outward normal there; `None` if
+    /// a cell may not be there.
+    pub(crate) fn project(
+        &self,
+        point: &Point3<f64>,
+        sample: &Sample,
+    ) -> Option<(Point3<f64>, Vector3<f64>)> {
+        let up = sample.smooth;
+        let reach = self.pitch / 4.0;
+        let origin = point + up * ((sample.point - point).dot(&up) + reach);
+        let (at, triangle) = self.own.first(&Ray::new(origin, -up), 2.0 * reach)?;
+        let point = origin - up * at;
+        let face = self.outward(&point, &normal(self.own.triangle(triangle)?)?)?;
+        (face.dot(&up) > 0.0 && self.allowed(&point)).then_some((point, face))
+    }
+}
+
+/// The share of rays that pass, from few of them when those agree.
+fn share(escapes: impl Fn(&u32) -> bool) -> f64 {
+    let count = |rays: core::ops::Range<u32>| rays.filter(&escapes).fold(0_u32, |count, _| count + 1);
+    let few = count(0..FEW);
+    if few == 0 || few == FEW {
+        return f64::from(few) / f64::from(FEW);
+    }
+    f64::from(few + count(FEW..RAYS)) / f64::from(RAYS)
+}
+
+/// Points of the unit square that are spread evenly however many are taken (a sequence of Roberts).
+fn scattered(index: u32) -> (f64, f64) {
+    let at = f64::from(index);
+    ((0.5 + at * 0.754_877_666_246_692_8).fract(), (0.5 + at * 0.569_840_290_998_053_3).fract())
+}
+
+/// Two unit vectors that are at right angles to a unit vector and to each other.
+pub(crate) fn tangents(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
+    let mut axis = Vector3::zeros();
+    if let Some(smallest) = axis.get_mut(normal.iamin()) {
+        *smallest = 1.0;
+    }
+    let s = normal.cross(&axis).normalize();
+    (s, normal.cross(&s))
+}
+
+/// A triangle's area, in m².
+pub(crate) fn area([a, b, c]: &Triangle) -> f64 {
+    (b - a).cross(&(c - a)).norm() / 2.0
+}
+
+/// A triangle's normal, if it has an area.
+pub(crate) fn normal([a, b, c]: &Triangle) -> Option<Vector3<f64>> {
+    Unit::try_new((b - a).cross(&(c - a)), 0.0).map(Unit::into_inner)
+}
+
+/// The triangles of a link, in a frame in which its own is at `pose`.
+fn collect(link: &Link, pose: &Isometry3<f64>, triangles: &mut Vec<Triangle>) -> Result<(), CoverError> {
+    let count = link.parts.iter().map(|part| part.mesh.triangles().len()).sum();
+    if count > MAX_TRIANGLES {
+        return Err(CoverError::Triangles { link: link.name.clone(), count });
+    }
+    for (index, part) in link.parts.iter().enumerate() {
+        let pose = pose * part.pose;
+        let map = Affine {
+            linear: pose.rotation.to_rotation_matrix().into_inner()
+                * Matrix3::from_diagonal(&Vector3::from(part.scale)),
+            shift: pose.translation.vector,
+        };
+        let from = triangles.len();
+        triangles.extend(part.mesh.triangles().iter().map(|triangle| map.map(triangle)));
+        let new = triangles.get(from..).unwrap_or_default();
+        if new.iter().flatten().any(|corner| corner.iter().any(|value| !value.is_finite())) {
+            return Err(CoverError::NotFinite { link: link.name.clone(), part: index, scale: part.scale });
+        }
+    }
+    Ok(())
+}
+
+/// Leaves out triangles that are there twice, in whatever order their corners are.
+fn once(triangles: &mut Vec<Triangle>) {
+    let mut seen = std::collections::HashSet::with_capacity(triangles.len());
+    triangles.retain(|triangle| {
+        // The sum makes -0 to 0.
+        let mut corners =
+            triangle.map(|corner| [corner.x, corner.y, corner.z].map(|value| (value + 0.0).to_bits()));
+        corners.sort_unstable();
+        seen.insert(corners)
+    });
+}
+
+#[expect(clippy::cast_precision_loss, reason = "counts")]
+pub(crate) const fn real(count: usize) -> f64 {
+    count as f64
+}

@@ -1,0 +1,245 @@
+//! Which bus and node each cell is, and which cells wires join.
+//!
+//! Cells are numbered by link, along the link in rings of one row each, and around it; a bus gets those that follow
+//! each other, so that it is one patch of each link. Wires join neighbours of one bus and link: first as few and
+//! short ones as reach all cells, then more of them, the shortest first, while both cells have a free port.
+
+mod ports;
+
+use nalgebra::{Matrix3, Point3, SymmetricEigen, Vector3};
+use std::collections::VecDeque;
+
+use crate::grid::Grid;
+use crate::place::Spot;
+use crate::surface::{real, tangents};
+use crate::{Cell, Options};
+
+/// Ports of a cell.
+pub const PORTS: usize = 4;
+
+/// The most cells of one bus.
+pub const MAX_NODES: usize = 250;
+
+/// The longest wire, in pitches.
+const LONGEST: f64 = 1.5;
+
+/// How much the normals of two wired cells agree at least, as their cosine: cells are wired around a sharp edge, and
+/// not through a wall.
+const AGREE: f64 = -0.2;
+
+/// How far from its even share a bus may end for the sake of ending with a link, in nodes of its budget.
+const SLACK: f64 = 0.1;
+
+/// The cells of all links with their wires, and how many buses they are on.
+pub(crate) fn wire(placed: &[Vec<Spot>], options: &Options) -> (Vec<Cell>, usize) {
+    let sizes: Vec<_> = placed.iter().map(Vec::len).collect();
+    let buses = shares(&sizes, options.nodes_per_bus);
+    let all = placed.iter().enumerate().flat_map(|(link, spots)| {
+        let limb = Limb::of(spots);
+        limb.order(spots, options.pitch).into_iter().map(move |spot| Place { link, spot, axis: limb.axis })
+    });
+    let mut all = all.collect::<Vec<_>>().into_iter();
+    let mut cells = Vec::new();
+    for (bus, &size) in buses.iter().enumerate() {
+        let places: Vec<_> = all.by_ref().take(size).collect();
+        cells.extend(wired(bus, &places, options.pitch));
+    }
+    (cells, buses.len())
+}
+
+/// How many cells each bus gets, of links with so many cells.
+fn shares(links: &[usize], budget: usize) -> Vec<usize> {
+    let mut ends = Vec::with_capacity(links.len());
+    let mut total = 0;
+    for size in links {
+        total += size;
+        ends.push(total);
+    }
+    let mut shares = Vec::new();
+    let mut from = 0;
+    // Before each bus, the rest fits on those that are left, and not on one less.
+    for buses in (1..=total.div_ceil(budget)).rev() {
+        let rest = total - from;
+        let even = rest.div_ceil(buses);
+        let possible = rest.saturating_sub((buses - 1) * budget).max(1)..=budget.min(rest);
+        let off = |share: &usize| share.abs_diff(even);
+        let of_links =
+            ends.iter().map(|end| end.saturating_sub(from)).filter(|share| possible.contains(share));
+        let share =
+            of_links.filter(|share| real(off(share)) <= SLACK * real(budget)).min_by_key(off).unwrap_or(even);
+        shares.push(share);
+        from += share;
+    }
+    shares
+}
+
+/// A cell before it has wires.
+#[derive(Clone, Copy, Debug)]
+struct Place {
+    link: usize,
+    spot: Spot,
+    axis: Vector3<f64>,
+}
+
+/// A link as its cells lie: along an axis.
+#[derive(Clone, Copy, Debug)]
+struct Limb {
+    middle: Point3<f64>,
+    axis: Vector3<f64>,
+}
+
+impl Limb {
+    /// The axis is the one along which cells are farthest from each other, away from the link's origin.
+    fn of(spots: &[Spot]) -> Self {
+        let count = real(spots.len().max(1));
+        let middle = Point3::from(spots.iter().map(|spot| spot.point.coords).sum::<Vector3<f64>>() / count);
+        let spread: Matrix3<f64> = spots
+            .iter()
+            .map(|spot| {
+                let off = spot.point - middle;
+                off * off.transpose()
+            })
+            .sum();
+        let eigen = SymmetricEigen::new(spread);
+        let axis: Vector3<f64> = eigen.eigenvectors.column(eigen.eigenvalues.imax()).into_owned();
+        let axis = if axis.dot(&middle.coords) < 0.0 { -axis } else { axis };
+        Self { middle, axis }
+    }
+
+    /// Cells by ring along the axis, and around it.
+    fn order(&self, spots: &[Spot], pitch: f64) -> Vec<Spot> {
+        let along = |spot: &Spot| (spot.point - self.middle).dot(&self.axis);
+        let first = spots.iter().map(along).min_by(f64::total_cmp).unwrap_or_default();
+        let row = pitch * 0.75_f64.sqrt();
+        let (s, t) = tangents(&self.axis);
+        let mut keyed: Vec<_> = spots
+            .iter()
+            .map(|spot| {
+                let off = spot.point - self.middle;
+                let ring = ((along(spot) - first) / row).floor();
+                (ring, off.dot(&t).atan2(off.dot(&s)), *spot)
+            })
+            .collect();
+        keyed.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+        keyed.into_iter().map(|(.., spot)| spot).collect()
+    }
+}
+
+/// The cells of one bus.
+fn wired(bus: usize, places: &[Place], pitch: f64) -> Vec<Cell> {
+    let wires = joined(places.len(), &near(places, pitch));
+    let roots = roots(&wires);
+    let cell = |(index, place): (usize, &Place)| {
+        let others = wires.get(index).map_or(&[][..], Vec::as_slice);
+        let directions: Vec<_> = others
+            .iter()
+            .filter_map(|&other| Some((other, places.get(other)?.spot.point - place.spot.point)))
+            .collect();
+        Cell {
+            link: place.link,
+            position: place.spot.point.coords.into(),
+            normal: place.spot.normal.into(),
+            bus,
+            node: node(index),
+            neighbors: ports::assigned(&place.spot.normal, &place.axis, &directions)
+                .map(|other| other.map(node)),
+            root: roots.contains(&index),
+        }
+    };
+    places.iter().enumerate().map(cell).collect()
+}
+
+/// The node id of a place in a bus.
+fn node(index: usize) -> u8 {
+    // No bus has more than MAX_NODES.
+    u8::try_from(index + 1).unwrap_or(u8::MAX)
+}
+
+/// Pairs of cells that a wire may join, the nearest ones first.
+fn near(places: &[Place], pitch: f64) -> Vec<[usize; 2]> {
+    let longest = LONGEST * pitch;
+    let mut found = Vec::new();
+    let grid = Grid::of(longest, places.iter().map(|place| &place.spot.point));
+    for (index, place) in places.iter().enumerate() {
+        for other in grid.around(grid.cube(&place.spot.point)).filter(|&other| other > index) {
+            let Some(there) = places.get(other).filter(|there| there.link == place.link) else { continue };
+            let distance = (there.spot.point - place.spot.point).norm();
+            if distance <= longest && there.spot.normal.dot(&place.spot.normal) > AGREE {
+                found.push((distance, [index, other]));
+            }
+        }
+    }
+    found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+    found.into_iter().map(|(_, pair)| pair).collect()
+}
+
+/// By cell, those that it is wired to.
+fn joined(count: usize, pairs: &[[usize; 2]]) -> Vec<Vec<usize>> {
+    let mut wires: Vec<Vec<usize>> = vec![Vec::new(); count];
+    let mut groups: Vec<_> = (0..count).collect();
+    let join = |wires: &mut Vec<Vec<usize>>, [a, b]: [usize; 2], most: usize| {
+        let free = |cell: usize| wires.get(cell).is_some_and(|wires| wires.len() < most);
+        let there = wires.get(a).is_some_and(|wires| wires.contains(&b));
+        if there || !free(a) || !free(b) {
+            return false;
+        }
+        for (cell, other) in [(a, b), (b, a)] {
+            if let Some(wires) = wires.get_mut(cell) {
+                wires.push(other);
+            }
+        }
+        true
+    };
+    // One port of each cell is left at first, for cells that have no other neighbour.
+    for (most, &[a, b]) in
+        [PORTS - 1, PORTS].into_iter().flat_map(|most| pairs.iter().map(move |pair| (most, pair)))
+    {
+        let group = |cell: usize| groups.get(cell).copied();
+        let (Some(from), Some(to)) = (group(b), group(a)) else { continue };
+        if from != to && join(&mut wires, [a, b], most) {
+            groups.iter_mut().filter(|group| **group == from).for_each(|group| *group = to);
+        }
+    }
+    for &pair in pairs {
+        join(&mut wires, pair, PORTS);
+    }
+    wires
+}
+
+/// One cell of all that wires join: the first of those from which the farthest one is nearest.
+fn roots(wires: &[Vec<usize>]) -> Vec<usize> {
+    let mut seen = vec![false; wires.len()];
+    let mut roots = Vec::new();
+    for first in 0..wires.len() {
+        if seen.get(first).is_none_or(|seen| *seen) {
+            continue;
+        }
+        let mut group: Vec<_> = reached(wires, first).into_iter().map(|(cell, _)| cell).collect();
+        group.sort_unstable();
+        for &cell in &group {
+            if let Some(seen) = seen.get_mut(cell) {
+                *seen = true;
+            }
+        }
+        let depth = |&from: &usize| reached(wires, from).last().map_or(0, |&(_, depth)| depth);
+        roots.extend(group.into_iter().min_by_key(depth));
+    }
+    roots
+}
+
+/// The cells that wires join with one, and how many wires away they are, the nearest first.
+fn reached(wires: &[Vec<usize>], from: usize) -> Vec<(usize, usize)> {
+    let mut seen = vec![false; wires.len()];
+    let mut found = Vec::new();
+    let mut next = VecDeque::from([(from, 0)]);
+    while let Some((cell, depth)) = next.pop_front() {
+        let (Some(seen @ false), Some(others)) = (seen.get_mut(cell), wires.get(cell)) else { continue };
+        *seen = true;
+        found.push((cell, depth));
+        next.extend(others.iter().map(|&other| (other, depth + 1)));
+    }
+    found
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,43 @@
+//! Which port of a cell each of its wires has.
+
+use core::f64::consts::{FRAC_PI_2, PI, TAU};
+
+use nalgebra::{Unit, Vector3};
+
+use super::PORTS;
+use crate::surface::tangents;
+
+/// By port, what is wired to it, given where each is from the cell's middle. Port 0 points along `axis`, as far as
+/// it lies in the cell's plane, and the others follow counterclockwise when seen from outside.
+pub(super) fn assigned(
+    normal: &Vector3<f64>,
+    axis: &Vector3<f64>,
+    others: &[(usize, Vector3<f64>)],
+) -> [Option<usize>; PORTS] {
+    let flat = Unit::try_new(axis - normal * axis.dot(normal), 1e-3);
+    let (forward, left) =
+        flat.map_or_else(|| tangents(normal), |flat| (flat.into_inner(), normal.cross(&flat)));
+    let turns: Vec<_> = others.iter().map(|(_, to)| to.dot(&left).atan2(to.dot(&forward))).collect();
+    let (_, wires) = best(&turns, [None; PORTS], 0);
+    wires.map(|wire| others.get(wire?).map(|&(other, _)| other))
+}
+
+/// The smallest sum of squared angles between wires and their ports, and which wire each port has: of this wire and
+/// those after it, when some ports are taken.
+fn best(turns: &[f64], taken: [Option<usize>; PORTS], wire: usize) -> (f64, [Option<usize>; PORTS]) {
+    let Some(&turn) = turns.get(wire) else { return (0.0, taken) };
+    let mut min = (f64::INFINITY, taken);
+    let mut direction = 0.0;
+    for port in 0..PORTS {
+        let off = (turn - direction + PI).rem_euclid(TAU) - PI;
+        direction += FRAC_PI_2;
+        let mut with = taken;
+        let Some(slot @ None) = with.get_mut(port) else { continue };
+        *slot = Some(wire);
+        let (cost, with) = best(turns, with, wire + 1);
+        if cost + off * off < min.0 {
+            min = (cost + off * off, with);
+        }
+    }
+    min
+}
