@@ -14,10 +14,10 @@ use model::generate::{Target, generate};
 use model::table::Table;
 use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{Format, Frame};
-use protocol::fixed::{Q1_14, Q3_12};
+use protocol::fixed::Q3_12;
 use protocol::id::CellId;
 use protocol::message::{Joints, Message};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::Epoch;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use vcan_setup::embedded::Served;
@@ -74,7 +74,7 @@ impl Wire {
 fn replies(epoch: Epoch) -> Vec<Frame> {
     let reply = |from: CellId| {
         let torque = [0.1, -0.2, 0.3, 0.05, 0.01, 0.0].map(Q3_12::nearest);
-        Message::Torque { from, epoch, torque }.encode().frames(Format::Fd)
+        Message::Torque { from, epoch, torque: torque.map(Q3_12::to_bits).into() }.encode().frames(Format::Fd)
     };
     CellId::all().take(CELLS).flat_map(reply).collect()
 }
@@ -97,7 +97,7 @@ impl Listener {
     /// Opens the next epoch, as the gateway's own joints do that it reads back.
     fn open(&mut self) -> Epoch {
         let epoch = Epoch(self.number.to_le_bytes()[0]);
-        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        let joints = Joints { in_use: 6, ..Joints::default() };
         for frame in (Message::Joints { epoch, joints }).encode().frames(Format::Fd) {
             self.table.handle_frame(Micros(self.number * 16_000), true, &frame, &mut |_| None);
         }

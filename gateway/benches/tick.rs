@@ -19,7 +19,9 @@ use model::scenario::{Mode, ModeChange, Scenario};
 use model::table::{Snapshot, Sums};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::message::SkinSensors;
+use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Bus, Skin};
 use protocol::time::{Micros, Span};
 
@@ -80,7 +82,7 @@ fn skin(cells: usize) -> Skin {
 /// What a bus' receiver holds.
 struct Receiver {
     snapshots: triple_buffer::Input<Snapshot>,
-    positions: rtrb::Consumer<(Epoch, [f64; WORDS])>,
+    positions: rtrb::Consumer<(Epoch, [f64; MAX_JOINTS])>,
 }
 
 /// A loop, and the ends of it that threads hold in a run.
@@ -106,7 +108,7 @@ impl Bench {
         let modes = vec![ModeChange { at: Micros(0), mode }];
         let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
         let controller = Box::new(Kinesthetic::new(skin).expect("a generated skin has one"));
-        let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, [0.1; WORDS])));
+        let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, padded(&[0.1; WORDS]))));
         let (producer, records) = rtrb::RingBuffer::new(64);
         let turn = Turn::new(cycle, lines, Arc::new(scenario), Arc::new(Shared::default()), producer);
         Self { turn, buses, records, tick: 0 }
@@ -119,7 +121,7 @@ impl Bench {
             let next = snapshots.input_buffer_mut();
             next.sums.read_back = last;
             next.sums.contributing = u32::try_from(next.sensors.len()).unwrap_or(u32::MAX);
-            next.sums.torque = [0.01, -0.02, 0.03, 0.01, -0.01, 0.0];
+            next.sums.torque = padded(&[0.01, -0.02, 0.03, 0.01, -0.01, 0.0]);
             snapshots.publish();
         }
         let mut sent = 0;

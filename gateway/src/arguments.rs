@@ -6,8 +6,11 @@ use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::can::Format;
+use protocol::id::CellId;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
+
+use super::print::list;
 
 /// A word that may be given, what it means where that is not plain, and its value.
 pub(crate) type Word<T> = (&'static str, &'static str, T);
@@ -103,7 +106,59 @@ pub(crate) fn bus_names(skin: &Skin) -> impl Iterator<Item = &str> {
 /// The place of a bus in the skin that a file describes.
 pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failure> {
     skin.bus_named(name).ok_or_else(|| {
-        let names = crate::print::list(bus_names(skin));
+        let names = list(bus_names(skin));
         Failure::usage(format!("bus {name} is not in {file}, which has {names}"))
     })
+}
+
+/// A cell as given: on a bus, or on the only bus that has it.
+#[derive(Clone, Debug)]
+pub(crate) struct Named {
+    /// Its bus, if that is said.
+    pub(crate) bus: Option<String>,
+    /// Its node id there.
+    pub(crate) node: CellId,
+}
+
+/// Parses a cell: its node id, or BUS:NODE.
+pub(crate) fn cell(text: &str) -> Result<Named, String> {
+    let (bus, number) = match text.rsplit_once(':') {
+        Some((bus, number)) => (Some(bus.to_owned()), number),
+        None => (None, text),
+    };
+    match number.parse().ok().and_then(|number| CellId::new(number).ok()) {
+        Some(node) => Ok(Named { bus, node }),
+        None => Err(format!("{number:?} is no node id: 1 to 254 are")),
+    }
+}
+
+impl Named {
+    /// The cell's index into [`Skin::cells`]; `option` names it in errors.
+    pub(crate) fn find(&self, skin: &Skin, option: &str) -> Result<usize, Failure> {
+        let Self { bus, node } = self;
+        let names = || list(bus_names(skin));
+        if let Some(bus) = bus.as_ref().filter(|bus| skin.bus_named(bus).is_none()) {
+            return Err(Failure::usage(format!("{option} {bus}:{node}: the skin's buses are {}", names())));
+        }
+        let on = |name: &str| bus.as_ref().is_none_or(|bus| bus == name);
+        let there: Vec<_> = skin
+            .cells
+            .iter()
+            .enumerate()
+            .filter(|(_, cell)| cell.node == *node)
+            .filter_map(|(index, cell)| Some((index, skin.buses.get(cell.bus)?)))
+            .filter(|(_, bus)| on(&bus.name))
+            .collect();
+        match there.as_slice() {
+            [(index, _)] => Ok(*index),
+            [] => Err(Failure::usage(format!(
+                "{option} {node}: the skin has no such cell on {}",
+                bus.clone().unwrap_or_else(names)
+            ))),
+            buses => {
+                let choices = list(buses.iter().map(|(_, bus)| format!("{}:{node}", bus.name)));
+                Err(Failure::usage(format!("{option} {node} is on several buses: choose one of {choices}")))
+            }
+        }
+    }
 }

@@ -29,7 +29,7 @@ pub(crate) struct Dbc {
     /// Which bus, when the skin has several
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
-    /// On a classic bus: describe the 16 bytes of two frames joined, for a program that joins them first
+    /// On a classic bus: describe the bytes of the frames of a packet joined, for a program that joins them first
     #[arg(long)]
     joined: bool,
     /// The file to write, whole or not at all; else standard output
@@ -62,8 +62,8 @@ impl Dbc {
         match (description.format, self.joined) {
             (Format::Classic, false) => {
                 return Err(Failure::usage(format!(
-                    "bus {} is classic: a packet is two frames of 8 bytes under one identifier, which a DBC cannot \
-                     tell apart; --joined describes the 16 bytes of both, for a program that joins them first",
+                    "bus {} is classic: a packet is several frames under one identifier, which a DBC cannot \
+                     tell apart; --joined describes their bytes joined, for a program that joins them first",
                     description.name
                 )));
             }

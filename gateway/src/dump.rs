@@ -30,7 +30,7 @@ use super::print::{json, list};
 /// Show the traffic of a bus or a capture, decoded beside the raw frames
 ///
 /// One line a frame: the frame as `candump -L` prints it, a tab, a verdict, and the decoded frame. The verdict is ok;
-/// segment, the first of two frames of a packet on a classic bus; foreign, no packet of this protocol; length, CRC or
+/// segment, a frame of a packet on a classic bus, but its last; foreign, no packet of this protocol; length, CRC or
 /// incomplete, a damaged packet under an identifier that carries packets; or meaning, a packet of unknown meaning. So
 /// `cut -f1` gives a candump log. A capture is a candump log or an MCAP recording; lines that cannot be read are reported
 /// on standard error, and the rest is shown. With --json each line is an object, and keys end in their unit; with

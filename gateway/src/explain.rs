@@ -6,16 +6,15 @@ use std::path::PathBuf;
 
 use analysis::explain::{Explanation, Requested, explain, find};
 use clap::Args;
-use protocol::id::CellId;
 use protocol::packet::Epoch;
 use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
 use serde::Serialize;
 use trace::capture::{Format, Reader};
 
-use super::arguments::{bus_names, nanos};
+use super::arguments::{Named, cell, nanos};
 use super::output;
-use super::print::{json, list};
+use super::print::json;
 
 /// Explain the torque of one epoch
 ///
@@ -45,7 +44,7 @@ pub(crate) struct Explain {
     #[arg(long, value_name = "CELL", value_parser = cell)]
     cell: Option<Named>,
     /// One joint, cell by cell
-    #[arg(long, value_name = "J", value_parser = clap::value_parser!(u8).range(1..=6))]
+    #[arg(long, value_name = "J", value_parser = clap::value_parser!(u8).range(1..=32))]
     joint: Option<u8>,
     /// The skin's description; else the one in the recording
     #[arg(long, value_name = "FILE")]
@@ -53,24 +52,6 @@ pub(crate) struct Explain {
     /// One JSON object
     #[arg(long)]
     json: bool,
-}
-
-/// A cell as given: on a bus, or on the only bus that has it.
-#[derive(Clone, Debug)]
-struct Named {
-    bus: Option<String>,
-    node: CellId,
-}
-
-fn cell(text: &str) -> Result<Named, String> {
-    let (bus, number) = match text.rsplit_once(':') {
-        Some((bus, number)) => (Some(bus.to_owned()), number),
-        None => (None, text),
-    };
-    match number.parse().ok().and_then(|number| CellId::new(number).ok()) {
-        Some(node) => Ok(Named { bus, node }),
-        None => Err(format!("{number:?} is no node id: 1 to 254 are")),
-    }
 }
 
 /// What is printed as JSON.
@@ -136,30 +117,7 @@ impl Explain {
                 skin.robot.name
             )));
         }
-        let Some(Named { bus, node }) = &self.cell else { return Ok(()) };
-        let on = |name: &str| bus.as_ref().is_none_or(|bus| bus == name);
-        let names = || list(bus_names(skin));
-        if let Some(bus) = bus.as_ref().filter(|bus| skin.bus_named(bus).is_none()) {
-            return Err(Failure::usage(format!("--cell {bus}:{node}: the skin's buses are {}", names())));
-        }
-        let there: Vec<_> = skin
-            .cells
-            .iter()
-            .filter(|cell| cell.node == *node)
-            .filter_map(|cell| skin.buses.get(cell.bus))
-            .filter(|bus| on(&bus.name))
-            .collect();
-        match there.as_slice() {
-            [_] => Ok(()),
-            [] => Err(Failure::usage(format!(
-                "--cell {node}: the skin has no such cell on {}",
-                bus.clone().unwrap_or_else(names)
-            ))),
-            buses => {
-                let choices = list(buses.iter().map(|bus| format!("{}:{node}", bus.name)));
-                Err(Failure::usage(format!("--cell {node} is on several buses: choose one of {choices}")))
-            }
-        }
+        self.cell.as_ref().map_or(Ok(()), |cell| cell.find(skin, "--cell").map(|_| ()))
     }
 }
 

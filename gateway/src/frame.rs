@@ -14,7 +14,8 @@ use protocol::can::{BIT_RATE_SWITCH, Format, Frame as CanFrame};
 use protocol::fixed::{Q, Q1_14, Q5_10};
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Answer, From, Joints, Message, Request, SensorPage, SkinSensors};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
 use protocol::schema::packets;
 use protocol::usage::{Failure, print};
 
@@ -84,7 +85,7 @@ struct Positions {
 #[derive(Args, Debug)]
 #[group(required = true, multiple = false)]
 struct Angles {
-    /// One position for each of the robot's joints, 1 to 6 of them, in rad; wrapped to a turn
+    /// One position for each joint of the chain, 1 to 14 of them, in rad; wrapped to a turn
     #[arg(long, value_name = "RAD", num_args = 1.., allow_negative_numbers = true)]
     rad: Option<Vec<String>>,
     /// The same as words: -32768 to 32767 or 0x0 to 0xFFFF, in steps of a turn / 65536
@@ -285,10 +286,11 @@ impl Positions {
             (Some(rad), _) => ("--rad", rad, parameter::angle),
             (None, words) => ("--words", words.as_ref().ok_or("--rad or --words is needed")?, parameter::raw),
         };
-        if texts.len() > WORDS {
-            return Err(format!("{name} has {} positions: a robot has at most {WORDS} joints", texts.len()));
+        if texts.len() > MAX_JOINTS {
+            let got = texts.len();
+            return Err(format!("{name} has {got} positions: a chain has at most {MAX_JOINTS} joints"));
         }
-        let mut positions = [Q1_14::ZERO; WORDS];
+        let mut positions = [Q1_14::ZERO; MAX_JOINTS];
         for (position, text) in positions.iter_mut().zip(texts) {
             *position = Q1_14::from_bits(value(name, text, read)?);
         }
@@ -407,8 +409,8 @@ mod tests {
     fn what_cannot_be_is_said_with_what_can() {
         assert_eq!(says("joints --epoch 7 --rad 0 x"), "--rad x: it must be a number");
         assert_eq!(
-            says("joints --epoch 7 --words 1 2 3 4 5 6 7"),
-            "--words has 7 positions: a robot has at most 6 joints"
+            says("joints --epoch 7 --words 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15"),
+            "--words has 15 positions: a chain has at most 14 joints"
         );
         assert_eq!(
             says("stimulus --node 12 --force 96"),

@@ -24,11 +24,13 @@ mod print;
 mod recover;
 mod replay;
 mod report;
+mod robot_file;
 mod run;
 mod scenario;
 mod sensing;
 mod shadow;
 mod skin;
+mod torque;
 
 use std::process::ExitCode;
 
@@ -63,6 +65,7 @@ enum Command {
     Sensing(sensing::Sensing),
     Skin(skin::Skin),
     Scenario(scenario::Scenario),
+    Torque(torque::Torque),
     Dbc(dbc::Dbc),
     Explain(explain::Explain),
     Shadow(shadow::ShadowCommand),
@@ -87,6 +90,7 @@ impl Command {
             Self::Sensing(command) => command.run(),
             Self::Skin(command) => command.run(),
             Self::Scenario(command) => command.run(),
+            Self::Torque(command) => command.run(),
             Self::Dbc(command) => command.run(),
             Self::Explain(command) => command.run(),
             Self::Shadow(command) => command.run(),

@@ -2,6 +2,7 @@
 
 mod show;
 
+use std::fs;
 use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -24,6 +25,7 @@ use super::arguments::{BusKinds, Programs, bus_names, seconds, time};
 use super::buses;
 use super::output::{self, Force, apart, note};
 use super::print::json;
+use super::robot_file::urdf_of;
 
 /// The skin and the scenario of the demonstration.
 const SKIN: &str = include_str!("../examples/ur5-253.toml");
@@ -48,6 +50,13 @@ struct Common {
     quiet: bool,
     #[command(flatten)]
     recording: Recording,
+}
+
+/// The files that a run is made of, as they are.
+struct Files {
+    skin: String,
+    scenario: Option<String>,
+    urdf: Option<String>,
 }
 
 /// What is recorded beside frames as text.
@@ -87,13 +96,7 @@ fn limit(text: &str) -> Result<Limit, String> {
 
 impl Recording {
     /// What is recorded where; the files go with it as they are.
-    fn options(
-        &self,
-        candump: Option<Candump>,
-        skin: &Skin,
-        skin_file: String,
-        scenario_file: Option<String>,
-    ) -> record::Options {
+    fn options(&self, candump: Option<Candump>, skin: &Skin, files: Files) -> record::Options {
         let mut split = Split::default();
         for &limit in &self.record_split {
             match limit {
@@ -102,13 +105,14 @@ impl Recording {
             }
         }
         let mcap = self.record.clone().map(|path| {
-            let toml = |name: &str, text: String| Attached {
+            let file = |name: &str, media_type, text: String| Attached {
                 name: name.to_owned(),
-                media_type: "application/toml",
+                media_type,
                 bytes: text.into_bytes(),
             };
-            let mut attachments = vec![toml("skin.toml", skin_file)];
-            attachments.extend(scenario_file.map(|text| toml("scenario.toml", text)));
+            let mut attachments = vec![file("skin.toml", "application/toml", files.skin)];
+            attachments.extend(files.scenario.map(|text| file("scenario.toml", "application/toml", text)));
+            attachments.extend(files.urdf.map(|text| file("robot.urdf", "application/xml", text)));
             attachments.extend(skin.buses.iter().enumerate().map(|(index, bus)| Attached {
                 name: match skin.buses.as_slice() {
                     [_] => "skin.dbc".to_owned(),
@@ -203,8 +207,8 @@ impl Demo {
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
-        options.record =
-            recording.options(candump, &options.skin, SKIN.to_owned(), Some(SCENARIO.to_owned()));
+        let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), urdf: None };
+        options.record = recording.options(candump, &options.skin, files);
         bench(&options, summary.as_deref(), recording.force, &[])
     }
 }
@@ -220,7 +224,11 @@ impl Run {
             (Some(path), Some(text)) => Scenario::parse(&name(path), text, &skin).map_err(Failure::usage)?,
             _ => Scenario::idle(IDLE),
         };
-        let read: Vec<_> = [Some(self.skin.clone()), self.scenario.clone()].into_iter().flatten().collect();
+        let urdf = self.common.recording.record.as_ref().and(skin.robot.urdf.as_deref());
+        let urdf = urdf.map(|urdf| urdf_of(&self.skin, urdf));
+        let urdf_text = urdf.as_deref().map(urdf_text).transpose()?;
+        let read = [Some(self.skin.clone()), self.scenario.clone(), urdf];
+        let read: Vec<_> = read.into_iter().flatten().collect();
         // What can be read once only is read by the cells from memory.
         let (_file, skin_file) = if self.skin.is_file() {
             (None, self.skin)
@@ -235,12 +243,21 @@ impl Run {
         let Common { recording, summary, .. } = self.common;
         options.kinds = self.kinds.of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
-        options.record = recording.options(candump, &options.skin, skin_text, scenario_text);
+        let files = Files { skin: skin_text, scenario: scenario_text, urdf: urdf_text };
+        options.record = recording.options(candump, &options.skin, files);
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.receive_buffer = self.receive_buffer as usize;
         bench(&options, summary.as_deref(), recording.force, &read)
     }
+}
+
+/// The URDF that goes into a recording.
+fn urdf_text(path: &Path) -> Result<String, Failure> {
+    fs::read_to_string(path).map_err(|error| {
+        let path = path.display();
+        Failure::usage(format!("robot.urdf: {path}: {error}; correct the skin's path, or take the key out"))
+    })
 }
 
 impl Common {

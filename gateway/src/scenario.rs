@@ -80,7 +80,10 @@ struct Plan {
 #[derive(Serialize)]
 struct Motion {
     kind: &'static str,
-    start_rad: Vec<f64>,
+    /// In the units of the joints.
+    start: Vec<f64>,
+    /// By joint: rad, or m of those that slide.
+    units: Vec<&'static str>,
     #[serde(flatten)]
     how: Map<String, Value>,
 }
@@ -104,8 +107,8 @@ impl Plan {
         let each = |values: &[f64]| values.iter().take(joints).copied().collect::<Vec<_>>();
         let how = match scenario.motion.kind {
             MotionKind::Hold | MotionKind::Kinesthetic => Map::new(),
-            MotionKind::Sine { amplitude_rad, period_s } => {
-                map([("amplitude_rad", json!(each(&amplitude_rad))), ("period_s", json!(period_s))])
+            MotionKind::Sine { amplitude, period_s } => {
+                map([("amplitude", json!(each(&amplitude))), ("period_s", json!(period_s))])
             }
         };
         let mut events = Vec::new();
@@ -134,8 +137,9 @@ impl Plan {
             events.extend(broken(skin, fault.at, &fault.kind));
         }
         events.sort_by(|a, b| a.at_s.total_cmp(&b.at_s));
+        let units = skin.robot.joints.iter().map(|joint| joint.kind.unit()).collect();
         let motion =
-            Motion { kind: scenario.motion.kind.name(), start_rad: each(&scenario.motion.start_rad), how };
+            Motion { kind: scenario.motion.kind.name(), start: each(&scenario.motion.start), units, how };
         let (duration_s, seed) = (scenario.duration.seconds(), scenario.seed);
         let remarks = scenario.remarks(skin);
         Self { skin: skin.name.clone(), duration_s, seed, motion, events, remarks }
@@ -150,9 +154,15 @@ impl Plan {
         };
         let how =
             if motion.how.is_empty() { String::new() } else { format!(" ({})", described(&motion.how)) };
-        let start = words(&motion.start_rad);
+        let is_mixed = motion.units.iter().any(|unit| *unit != "rad");
+        let start = if is_mixed {
+            let each = motion.start.iter().zip(&motion.units).map(|(start, unit)| format!("{start} {unit}"));
+            list(each)
+        } else {
+            format!("{} rad", words(&motion.start))
+        };
         let head = format!(
-            "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start} rad{how}\n",
+            "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start}{how}\n",
             count(events.len(), "event")
         );
         let remarks: String = remarks.iter().map(|remark| format!("remark: {remark}\n")).collect();

@@ -1,4 +1,9 @@
-//! `gateway skin generate` and `gateway skin check`.
+//! `gateway skin generate`, `gateway skin import`, `gateway skin check` and `gateway skin show`.
+
+mod covering;
+mod import;
+mod show;
+mod visuals;
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap};
@@ -7,6 +12,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use model::generate::{Reply as Answers, Robot, Target, generate};
 use protocol::can::Format;
+use protocol::fixed::TorqueFormat;
 use protocol::packet::crc16;
 use protocol::skin::{Cell, ControllerKind, Reply, Skin as Description};
 use protocol::usage::{Failure, print};
@@ -19,7 +25,7 @@ const ROBOTS: &[Word<Robot>] = &[("ur5", "Universal Robots UR5", Robot::Ur5)];
 const REPLIES: &[Word<Answers>] =
     &[("torque", "Each cell its own torque", Answers::Torque), ("sum", "Sums along the tree", Answers::Sum)];
 
-/// Make and check the descriptions of skins
+/// Make, check and draw the descriptions of skins
 #[derive(Args, Debug)]
 pub(crate) struct Skin {
     #[command(subcommand)]
@@ -29,7 +35,9 @@ pub(crate) struct Skin {
 #[derive(Debug, Subcommand)]
 enum Command {
     Generate(Generate),
+    Import(import::Import),
     Check(Check),
+    Show(show::Show),
 }
 
 /// Describe a skin of hexagonal cells on a robot's arm
@@ -88,7 +96,9 @@ impl Skin {
     pub(crate) fn run(self) -> Result<(), Failure> {
         match self.command {
             Command::Generate(command) => command.run(),
+            Command::Import(command) => command.run(),
             Command::Check(command) => command.run(),
+            Command::Show(command) => command.run(),
         }
     }
 }
@@ -140,6 +150,14 @@ fn describe(skin: &Description) -> String {
         timing.broadcast_hz(),
         or(every, ""),
     );
+    for chain in
+        robot.chains.iter().filter(|chain| robot.chains.len() > 1 || chain.rows.len() > chain.joints.len())
+    {
+        let names =
+            words(chain.joints.iter().filter_map(|joint| robot.joints.get(*joint)).map(|joint| &joint.name));
+        let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
+        text += &format!("chain {}: {joints} in {rows}: {names}\n", chain.name);
+    }
     for (index, bus) in buses.iter().enumerate() {
         let format = bus.format.name();
         let reply = match bus.reply {
@@ -164,7 +182,19 @@ fn describe(skin: &Description) -> String {
             None => format!(", {nominal} bit/s"),
         });
         let rates = or(rates, "");
-        text += &format!("bus {} ({format}{rates}, {reply}): {cells}: {parts}; {roots}\n", bus.name);
+        let chain = if robot.chains.len() > 1 {
+            format!(", chain {}", skin.chain(index).name)
+        } else {
+            String::new()
+        };
+        let torques = match bus.torque_format {
+            TorqueFormat::Q3_12 => String::new(),
+            format @ (TorqueFormat::Q5_10 | TorqueFormat::Q7_8) => format!(", torques in {}", format.name()),
+        };
+        text += &format!(
+            "bus {} ({format}{rates}{chain}, {reply}{torques}): {cells}: {parts}; {roots}\n",
+            bus.name
+        );
     }
     for [first, second] in at_one_place(skin) {
         let name = |cell: &Cell| format!("{} on {}", cell.node, bus_name(skin, cell));
@@ -178,7 +208,13 @@ fn describe(skin: &Description) -> String {
 /// Cells that sit where a cell before them sits.
 fn at_one_place(skin: &Description) -> Vec<[&Cell; 2]> {
     let mut known = HashMap::new();
-    let place = |cell: &Cell| (cell.joint, cell.position.map(|metres| (metres + 0.0).to_bits()));
+    let place = |cell: &Cell| {
+        (
+            skin.buses.get(cell.bus).map(|bus| bus.chain),
+            cell.row,
+            cell.position.map(|metres| (metres + 0.0).to_bits()),
+        )
+    };
     let pair = |cell| match known.entry(place(cell)) {
         Entry::Occupied(first) => Some([*first.get(), cell]),
         Entry::Vacant(free) => {
@@ -197,14 +233,16 @@ fn bus_name<'a>(skin: &'a Description, cell: &Cell) -> &'a str {
 fn cells(skin: &Description, node: Option<u8>) -> String {
     let line = |cell: &Cell| {
         let on_bus = bus_name(skin, cell);
-        let Cell { bus: _, node, serial, joint, position, normal, neighbors, root, contact: _ } = cell;
+        let Cell { bus: _, node, serial, joint, row, position, normal, neighbors, root, contact: _ } = cell;
         let (position, ports) = (words(position), words(neighbors.map(|port| or(port, "-"))));
         // What comes of a quaternion has more digits than anybody measured.
         let normal = words(normal.map(|part| (part * 1e4).round() / 1e4 + 0.0));
         let root = if *root { " root" } else { "" };
+        let row = Some(*row).filter(|row| skin.chain(cell.bus).row_of(*joint) != Some(*row));
+        let row = or(row.map(|row| format!(" row {row}")), "");
         let hash = skin.parameters(cell).hash();
         format!(
-            "{on_bus} {node} joint {joint} at {position} m normal {normal} ports {ports}{root} serial {serial} hash \
+            "{on_bus} {node} joint {joint}{row} at {position} m normal {normal} ports {ports}{root} serial {serial} hash \
              {hash:04X}\n"
         )
     };

@@ -7,6 +7,7 @@ use std::time::{Duration, Instant};
 
 use control::controller::{Controller, Input, Step};
 use control::external::External;
+use protocol::packet::padded;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
@@ -30,13 +31,14 @@ fn the_example_in_python_makes_the_arm_give_way() {
     let python = Command::new("python3").arg(example).arg(&path).stdout(Stdio::piped()).spawn();
     let mut python = Running(python.expect("python3 is needed: apt install python3"));
     let torque = [2.0, -1.0, 0.5, 0.0, 0.0, 0.0];
-    let target = Step::Move([0.5, -0.25, 0.125, 0.0, 0.0, 0.0]);
+    let target = Step::Move(padded(&[0.5, -0.25, 0.125, 0.0, 0.0, 0.0]));
     let (start, mut tick, mut answers) = (Instant::now(), 0, 0);
     // A tick as soon as the last one is answered, so that the first report comes after a second.
     while answers < 100 || start.elapsed() < Duration::from_millis(1_500) {
         assert!(start.elapsed() < Duration::from_secs(20), "no answers from python3");
         let time = Micros(u64::try_from(start.elapsed().as_micros()).unwrap());
-        let input = Input { tick, time, torque, contributing: 3, valid: true, ..Input::default() };
+        let input =
+            Input { tick, time, torque: padded(&torque), contributing: 3, valid: true, ..Input::default() };
         tick += 1;
         if let Step::Move(velocity) = gateway.step(&input) {
             assert_eq!(Step::Move(velocity), target);

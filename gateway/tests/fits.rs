@@ -8,9 +8,10 @@ use std::process::{Command, Output};
 
 use protocol::can::Format;
 use protocol::candump::{Direction, Record, Timestamp, write_record};
-use protocol::fixed::{Q1_14, Q3_12};
+use protocol::fixed::Q1_14;
 use protocol::id::{CellId, Node};
 use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use serde_json::Value;
 use tempfile::TempDir;
@@ -109,11 +110,11 @@ fn run() -> Vec<(u64, Message)> {
             let page = SensorPage::Skin(SkinSensors::default());
             said.push((now, Message::Stimulus { to: Node::Cell(cell(node)), from: From::Next, page }));
         }
-        let joints = Joints { positions: [Q1_14::from_bits(0x2345); WORDS], in_use: 6 };
+        let joints = Joints { positions: padded(&[Q1_14::from_bits(0x2345); WORDS]), in_use: 6 };
         said.push((now, Message::Joints { epoch, joints }));
         for node in 1..=ANSWERING {
-            let torque = [Q3_12::from_bits(0x1234); WORDS];
-            said.push((now + MS, Message::Torque { from: cell(node), epoch, torque }));
+            let torque = [0x1234; WORDS];
+            said.push((now + MS, Message::Torque { from: cell(node), epoch, torque: torque.into() }));
         }
         now += 16 * MS;
     }

@@ -13,7 +13,6 @@ use model::decode::settle::Settler;
 use model::decode::{Decoded, Foreign};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Record, Timestamp};
-use protocol::fixed::Q3_12;
 use protocol::id::CellId;
 use protocol::message::{self, Message};
 use protocol::packet::Epoch;
@@ -68,7 +67,7 @@ fn ours(format: Format, epochs: u64) -> Vec<(u64, Frame)> {
         let torques = (1..=9).map(|cell| Message::Torque {
             from: CellId::new(cell).unwrap(),
             epoch: number,
-            torque: [Q3_12::from_bits(word(cell)); 6],
+            torque: [word(cell); 6].into(),
         });
         let messages = std::iter::once(Message::Joints { epoch: number, joints }).chain(torques);
         for (place, frame) in messages.flat_map(|message| message.encode().frames(format)).enumerate() {

@@ -53,7 +53,7 @@ fn a_dbc_goes_to_standard_output_or_into_a_file_that_is_not_there_yet() {
     assert_eq!(said, "gateway: -o one.dbc: it exists: name another file, or overwrite it with --force");
     assert_eq!(written(), text);
     output(folder, "dbc classic.toml --joined -o one.dbc --force");
-    assert!(written().contains("Classic: a packet travels in two frames of 8 bytes under one identifier"));
+    assert!(written().contains("Classic: a packet travels in frames of up to 8 bytes under one identifier"));
     let said = refusal(folder, "dbc one.toml -o nowhere/one.dbc", 2);
     assert!(said.starts_with("gateway: -o nowhere/one.dbc: "), "{said}");
     assert!(said.ends_with("; name a file in a folder that can be written"), "{said}");
@@ -80,8 +80,8 @@ fn a_classic_bus_is_described_only_as_joined_packets() {
     let folder = skins();
     let folder = folder.path();
     let said = refusal(folder, "dbc classic.toml", 2);
-    let expected = "gateway: bus vcan0 is classic: a packet is two frames of 8 bytes under one identifier, which a \
-                    DBC cannot tell apart; --joined describes the 16 bytes of both, for a program that joins them \
+    let expected = "gateway: bus vcan0 is classic: a packet is several frames under one identifier, which a \
+                    DBC cannot tell apart; --joined describes their bytes joined, for a program that joins them \
                     first";
     assert_eq!(said, expected);
     let said = refusal(folder, "dbc one.toml --joined", 2);

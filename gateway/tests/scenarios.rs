@@ -9,6 +9,8 @@ use model::central::Central;
 use model::scenario::{Scenario, Touches};
 use protocol::fixed::Q1_14;
 use protocol::message::SkinSensors;
+use protocol::packet::padded;
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
@@ -22,7 +24,7 @@ struct Most {
     /// Cells at once, in every epoch.
     active: Vec<u32>,
     /// Joints that came to a limit.
-    at_limit: u8,
+    at_limit: u32,
     /// rad, from the start, of the joint that went farthest.
     way: f64,
 }
@@ -30,21 +32,21 @@ struct Most {
 fn play(scenario: &str) -> Most {
     let skin = Skin::parse("ur5-253.toml", include_str!("../examples/ur5-253.toml")).unwrap();
     let scenario = Scenario::parse("scenario", scenario, &skin).unwrap();
-    let start = scenario.motion.start_rad;
+    let start = scenario.motion.start;
     let mut controller = controller_of(&skin, &scenario.motion).unwrap();
     let central = Central::new(&skin);
     let mut arm = SimulatedArm::new(&skin, start);
     let mut touches = Touches::new(&scenario, &skin);
     let mut sensors = vec![SkinSensors::default(); skin.cells.len()];
     let mut most = Most::default();
-    let mut torque = [0.0; 6];
+    let mut torque = [0.0; MAX_JOINTS];
     let per_broadcast = u64::from(skin.timing.ticks_per_broadcast);
     for tick in 0..scenario.duration.0 / 2_000 {
         if tick % per_broadcast == 0 {
             for stimulus in touches.stimuli_for(tick / per_broadcast) {
                 *sensors.get_mut(stimulus.cell).unwrap() = stimulus.sensors;
             }
-            let joints = arm.positions().map(|angle| Q1_14::from_radians(angle).unwrap());
+            let joints: Vec<_> = arm.positions().map(|angle| Q1_14::from_radians(angle).unwrap()).to_vec();
             let frames = central.frames(&joints);
             let total = central.total(&frames, &sensors);
             torque = total.torque;
@@ -57,7 +59,7 @@ fn play(scenario: &str) -> Most {
         }
         let (q, qdot) = (arm.positions(), arm.velocities());
         let time = Micros(tick * 2_000);
-        let input = Input { tick, time, q, qdot, torque, valid: true, ..Input::default() };
+        let input = Input { tick, time, q, qdot, torque: padded(&torque), valid: true, ..Input::default() };
         let Step::Move(velocity) = controller.step(&input) else { unreachable!("the input is valid") };
         most.at_limit |= arm.step(&velocity, 0.002).at_limit;
         for (q, start) in arm.positions().iter().zip(start) {

@@ -10,7 +10,7 @@ use bench::summary::{
 use model::quantiles::{Quantiles, histogram};
 use model::table::{Accuracy, Event, Status, Table};
 use protocol::can::Format;
-use protocol::fixed::{Q1_14, Q3_12, Q5_10};
+use protocol::fixed::{Q3_12, Q5_10};
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::{Epoch, WORDS};
@@ -230,11 +230,11 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
         let from = Node::Cell(cells[place]);
         Message::Network { from, epoch: Epoch(0), page: NetworkPage::Heartbeat(page) }
     };
-    let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+    let joints = Joints { in_use: 6, ..Joints::default() };
     let torque = |place: usize, epoch| Message::Torque {
         from: cells[place],
         epoch: Epoch(epoch),
-        torque: [Q3_12::nearest(0.5); WORDS],
+        torque: [Q3_12::nearest(0.5); WORDS].map(Q3_12::to_bits).into(),
     };
     let skin_page = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
     table.set_comparing(true);

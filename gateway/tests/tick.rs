@@ -21,6 +21,7 @@ use model::scenario::{Mode, ModeChange, Scenario};
 use model::table::Table;
 use protocol::bus::{Bus, BusKind, Choice, Options};
 use protocol::can::Frame;
+use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -76,7 +77,7 @@ fn turn_of(
     let modes = vec![ModeChange { at: Micros(0), mode }];
     let scenario = Scenario { modes, ..Scenario::idle(Span::from_millis(1_000)) };
     let controller = Box::new(Kinesthetic::new(skin).unwrap());
-    let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, [0.1; WORDS])));
+    let cycle = Cycle::new(skin, controller, Box::new(SimulatedArm::new(skin, padded(&[0.1; WORDS]))));
     let turn = Turn::new(cycle, vec![line], Arc::new(scenario), Arc::new(Shared::default()), records);
     (turn, input, table, state)
 }

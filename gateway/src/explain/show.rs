@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 
 use analysis::explain::{CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict};
+use protocol::fixed::TorqueFormat;
 
 use crate::print::{self, decimals, or};
 
@@ -32,7 +33,8 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
         };
         let head = line("", &mut (1..=bus.position_words.len()).map(|joint| format!("joint {joint}")));
         let words = line("word", &mut bus.position_words.iter().map(i16::to_string));
-        let angles = line("rad", &mut bus.position_rad.iter().map(|rad| format!("{rad:.4}")));
+        let unit = if bus.units.contains(&"m") { "rad, m" } else { "rad" };
+        let angles = line(unit, &mut bus.position_rad.iter().map(|position| format!("{position:.4}")));
         text += &table(head, [words, angles], false);
     }
     let cells = &explanation.cells;
@@ -44,7 +46,11 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
                 text += &every_step(cell, first);
             }
         }
-        (What::All, _) => text += &one_line_each(cells),
+        (What::All, _) => {
+            let finest = TorqueFormat::default().name();
+            let is_finest = explanation.buses.iter().all(|bus| bus.torque_format == finest);
+            text += &one_line_each(cells, is_finest);
+        }
     }
     if what != What::Cells && !cells.is_empty() {
         text += &totals(&explanation.total);
@@ -80,23 +86,35 @@ fn millis(nanos: u64) -> String {
     format!("{:.3} ms", nanos as f64 / 1e6)
 }
 
-fn one_line_each(cells: &[CellExplained]) -> String {
+fn one_line_each(cells: &[CellExplained], is_finest: bool) -> String {
     // Joints beyond those that move any of them have nothing but zeros, if all is well.
-    let odd = |row: &&Row| row.word.is_some_and(|word| word != 0);
-    let odd = cells.iter().flat_map(|cell| cell.rows.iter().filter(odd)).map(|row| row.joint);
-    let joints = cells.iter().map(|cell| cell.joint).chain(odd).max().map_or(0, usize::from);
+    let says = |cell: &CellExplained| {
+        let rows = cell.rows.iter().enumerate();
+        let used = |(at, row): (usize, &Row)| {
+            let is_used = at < usize::from(cell.joint) || row.word.is_some_and(|word| word != 0);
+            is_used.then_some((row.joint, row.unit))
+        };
+        rows.filter_map(used).collect::<Vec<_>>()
+    };
+    let joints: BTreeSet<_> = cells.iter().flat_map(says).collect();
     let names = Names::of(cells);
     let mut head = vec![names.head(), "F_z N".to_owned()];
-    head.extend((1..=joints).map(|joint| format!("Nm {joint}")));
+    head.extend(joints.iter().map(|(joint, unit)| format!("{unit} {joint}")));
     head.extend(["off", "which is"].map(str::to_owned));
     let lines = cells.iter().map(|cell| {
         let mut line = vec![names.of_cell(cell), decimals(force_of(cell), 3, "?")];
-        line.extend(cell.rows.iter().take(joints).map(|row| decimals(row.word_nm, 4, "-")));
+        line.extend(joints.iter().map(|(joint, _)| {
+            let row = cell.rows.iter().find(|row| row.joint == *joint);
+            row.map_or_else(String::new, |row| decimals(row.word_nm, 4, "-"))
+        }));
         line.extend([steps_off(&cell.rows), worst(&cell.rows)]);
         line
     });
+    let turns = cells.iter().flat_map(|cell| &cell.rows).all(|row| row.unit == "Nm");
+    let (unit, steps) =
+        (if turns { " in Nm" } else { "" }, if is_finest { "2^-12" } else { "their bus's format" });
     format!(
-        "\ntorques of the cells in Nm, and the largest difference in steps of 2^-12; --cell shows each step\n{}",
+        "\ntorques of the cells{unit}, and the largest difference in steps of {steps}; --cell shows each step\n{}",
         table(head, lines, true)
     )
 }
@@ -147,12 +165,14 @@ fn about(verdict: &Verdict) -> (u8, &'static str, Option<String>) {
             (1, "16 bits", Some(means.to_owned()))
         }
         Verdict::Saturated => {
-            let means = "the product is above 8 Nm: the word is saturated";
+            let means = "the product is beyond the range of the torque format: the word is saturated";
             (2, "saturated", Some(means.to_owned()))
         }
         Verdict::Open => (3, "open", None),
         Verdict::Unexplained => {
-            let means = format!("no J within {JACOBIAN_STEPS} steps of the exact one gives this word");
+            let means = format!(
+                "no J within {JACOBIAN_STEPS} steps, and one for each row after the sixth, of the exact one gives this word"
+            );
             (4, "NOT EXPLAINED", Some(means))
         }
     }
@@ -249,7 +269,7 @@ fn rows(cells: &[CellExplained], by_cell: bool) -> String {
     head.extend(by_cell.then(|| "F_z N".to_owned()));
     head.extend(["J m", "J F_z Nm", "nearest", "word", "Nm", "off", "which is"].map(str::to_owned));
     let line = |cell: &CellExplained, row: &Row| {
-        let mut line = vec![if by_cell { names.of_cell(cell) } else { row.joint.to_string() }];
+        let mut line = vec![if by_cell { names.of_cell(cell) } else { joint_name(row.joint, row.unit) }];
         line.extend(by_cell.then(|| decimals(force_of(cell), 2, "?")));
         line.extend([
             decimals(row.jacobian_m, 6, "?"),
@@ -266,6 +286,11 @@ fn rows(cells: &[CellExplained], by_cell: bool) -> String {
     table(head, lines.map(|(cell, row)| line(cell, row)), true) + &legend(cells)
 }
 
+/// A joint's number; that of a prismatic one with its unit, as the columns are named for the others.
+fn joint_name(joint: u8, unit: &str) -> String {
+    if unit == "Nm" { joint.to_string() } else { format!("{joint} ({unit})") }
+}
+
 fn totals(total: &[Total]) -> String {
     let head = ["joint", "words", "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"];
     let lines = total.iter().map(|it| {
@@ -276,7 +301,15 @@ fn totals(total: &[Total]) -> String {
         };
         let [words, products] = [it.words_nm, it.products_nm].map(|nm| format!("{nm:.6}"));
         let [central, unrounded] = [it.central_nm, it.unrounded_nm].map(|nm| format!("{nm:.6}"));
-        vec![it.joint.to_string(), it.word_steps.to_string(), words, products, central, difference, unrounded]
+        vec![
+            joint_name(it.joint, it.unit),
+            it.word_steps.to_string(),
+            words,
+            products,
+            central,
+            difference,
+            unrounded,
+        ]
     });
     format!(
         "\nthe whole skin: the words of the frames added up, beside the central computation\n{}",

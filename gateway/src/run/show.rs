@@ -66,7 +66,7 @@ fn accuracy(rows: &mut Rows, summary: &Summary) {
         rows.row("sums, loaded joints", errors(&accuracy.sums), paper);
         rows.row("  averaged over 32 epochs", errors(&accuracy.sums_averaged), "");
     }
-    rows.any("saturated words, left out", accuracy.saturated, "above 8 Nm");
+    rows.any("saturated words, left out", accuracy.saturated, "beyond the range of the torque format");
 }
 
 fn errors(errors: &Errors) -> String {

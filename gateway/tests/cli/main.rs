@@ -10,7 +10,7 @@ use std::process::{Command, Output, Stdio};
 use protocol::can::{Format, Frame};
 use protocol::candump;
 use protocol::message::Message;
-use protocol::packet::{Packet, Reassembly, Segment, data_id};
+use protocol::packet::{Lengths, Packet, Reassembly, Segment, data_id};
 use protocol::time::Micros;
 use tempfile::TempDir;
 
@@ -222,8 +222,9 @@ fn packet(frames: &[Frame], format: Format) -> Packet {
         (Format::Fd, [frame]) => Packet::from_fd(frame).unwrap(),
         (Format::Classic, [first, second]) => {
             let mut segment = Segment::NONE;
-            let mut push =
-                |frame: &Frame| segment.push(Micros(0), data_id(frame).unwrap(), frame.data()).unwrap();
+            let mut push = |frame: &Frame| {
+                segment.push(Micros(0), data_id(frame).unwrap(), Lengths::ALL, frame.data()).unwrap()
+            };
             assert_eq!(push(first), Reassembly::Waiting);
             let Reassembly::Complete(packet) = push(second) else { panic!("{frames:?}") };
             packet

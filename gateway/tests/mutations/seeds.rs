@@ -21,6 +21,7 @@ use trace::ros2::standard::JointState;
 use trace::ros2::{Header, Message};
 
 use crate::mutate::{chunk, record, string};
+use protocol::packet::padded;
 
 const BEGAN: u64 = 1_700_000_000_000_000_000;
 
@@ -144,7 +145,8 @@ fn run(skin: &str, options: WriteOptions, files_last: bool) -> Vec<u8> {
             file.packet("/can/vcan0", at, &joints(epoch));
             for (place, from) in cells.into_iter().enumerate() {
                 let torque = [Q3_12::nearest(0.25); 6];
-                let packet = Packet::Torque { from, epoch: Epoch(epoch), torque };
+                let packet =
+                    Packet::Torque { from, epoch: Epoch(epoch), torque: torque.map(Q3_12::to_bits).into() };
                 file.packet("/can/vcan0", at + 1_000 * (place as u64 + 1), &packet);
             }
         }
@@ -166,7 +168,7 @@ fn run(skin: &str, options: WriteOptions, files_last: bool) -> Vec<u8> {
 
 fn joints(epoch: u8) -> Packet {
     let positions = [Q1_14::from_radians(0.1).unwrap_or_default(); 6];
-    Packet::Joints { epoch: Epoch(epoch), joints: Joints { positions, in_use: 6 } }
+    Packet::Joints { epoch: Epoch(epoch), joints: Joints { positions: padded(&positions), in_use: 6 } }
 }
 
 /// Frames as another bridge records them.

@@ -1,0 +1,209 @@
+//! Cells on the visual meshes of links, for `gateway skin import --cover`.
+
+use std::ops::RangeInclusive;
+use std::path::Path;
+
+use clap::Args;
+use cover::{Figures, KeepOut, Link, MAX_NODES, MAX_PITCH, MIN_PITCH, Options, cover};
+use protocol::usage::Failure;
+use robots::{CellOnLink, Chain, Urdf};
+
+use super::super::print::{count, list};
+use super::visuals::{Packages, Visuals};
+
+/// Which links are covered, and how.
+#[derive(Args, Debug)]
+pub(super) struct Covering {
+    /// Cover these links with cells, on the meshes and shapes of their visuals; the other links are in the way
+    #[arg(long, value_name = "LINK,..", value_delimiter = ',', conflicts_with = "cells")]
+    pub(super) cover: Vec<String>,
+    /// From one cell's middle to the next one's in m, 0.001 to 1
+    #[arg(long, value_name = "M", requires = "cover", default_value_t = 0.028, value_parser = pitch, allow_negative_numbers = true)]
+    pitch: f64,
+    /// A box in a covered link's frame that holds no cell, in m; may be given several times
+    #[arg(long, value_name = "LINK:MINX,MINY,MINZ,MAXX,MAXY,MAXZ", requires = "cover", value_parser = keep_out)]
+    keep_out: Vec<KeptOut>,
+    /// Where chance begins: the same seed gives the same cells
+    #[arg(long, value_name = "N", requires = "cover", default_value_t = 1)]
+    seed: u64,
+    /// The most cells of one bus
+    #[arg(long, value_name = "N", requires = "cover", default_value_t = 250, value_parser = clap::value_parser!(u8).range(1..=250))]
+    nodes_per_bus: u8,
+    #[command(flatten)]
+    packages: Packages,
+}
+
+/// A box of a link.
+#[derive(Clone, Debug)]
+struct KeptOut {
+    link: String,
+    min: [f64; 3],
+    max: [f64; 3],
+    /// As it was given.
+    text: String,
+}
+
+const PITCH: RangeInclusive<f64> = MIN_PITCH..=MAX_PITCH;
+
+fn pitch(text: &str) -> Result<f64, String> {
+    let pitch = text.parse().ok().filter(|pitch| PITCH.contains(pitch));
+    pitch.ok_or_else(|| format!("a length from {MIN_PITCH} to {MAX_PITCH} m"))
+}
+
+fn keep_out(text: &str) -> Result<KeptOut, String> {
+    let parsed = || {
+        let (link, numbers) = text.rsplit_once(':')?;
+        let numbers =
+            numbers.split(',').map(|number| number.trim().parse().ok().filter(|it: &f64| it.is_finite()));
+        let numbers: Vec<f64> = numbers.collect::<Option<_>>()?;
+        let [min @ .., x, y, z] = numbers.as_slice() else { return None };
+        let (min, max) = (<[f64; 3]>::try_from(min).ok()?, [*x, *y, *z]);
+        let is_box = min.iter().zip(&max).all(|(min, max)| min <= max);
+        is_box.then(|| KeptOut { link: link.to_owned(), min, max, text: text.to_owned() })
+    };
+    parsed().ok_or_else(|| {
+        "a link, a colon, and six lengths in m: the min x, y, z of the box and the max".to_owned()
+    })
+}
+
+/// What came of it.
+pub(super) struct Covered {
+    pub(super) cells: Vec<CellOnLink>,
+    pub(super) figures: Vec<Figures>,
+}
+
+impl Covering {
+    /// Covers the links. A link belongs to the first chain that moves it, and each bus to one chain.
+    pub(super) fn cells(&self, urdf: &Urdf, file: &Path, chains: &[Chain]) -> Result<Covered, Failure> {
+        let owners = self.owners(urdf, chains)?;
+        let visuals = Visuals::new(urdf, file, &self.packages);
+        let links = urdf.links().map(|name| {
+            let pose = urdf.pose(name, &|joint| urdf.rest(joint)).map_err(|error| error.to_string())?;
+            Ok(Link { name: name.to_owned(), parts: visuals.parts(name)?, pose })
+        });
+        let links: Vec<_> = links.collect::<Result<_, String>>().map_err(Failure::usage)?;
+        if let Some(bare) = self
+            .cover
+            .iter()
+            .find(|name| links.iter().any(|link| link.name == **name && link.parts.is_empty()))
+        {
+            let file = &urdf.file;
+            return Err(Failure::usage(format!(
+                "--cover {bare}: {file} has no visual of this link: add one, or leave the link out"
+            )));
+        }
+        let mut covered = Covered { cells: Vec::new(), figures: Vec::new() };
+        let mut buses = 0;
+        for chain in 0..chains.len() {
+            let names: Vec<_> = self
+                .cover
+                .iter()
+                .zip(&owners)
+                .filter(|(_, owner)| **owner == chain)
+                .map(|(name, _)| name)
+                .collect();
+            let own: Vec<_> = names
+                .iter()
+                .filter_map(|name| links.iter().find(|link| link.name == ***name))
+                .cloned()
+                .collect();
+            if own.is_empty() {
+                continue;
+            }
+            let others: Vec<_> = links
+                .iter()
+                .filter(|link| !link.parts.is_empty() && !names.contains(&&link.name))
+                .cloned()
+                .collect();
+            let skin = cover(&own, &others, &self.options(&own))
+                .map_err(|error| Failure::usage(format!("--cover: {error}")))?;
+            covered.cells.extend(skin.cells.iter().map(|cell| CellOnLink {
+                link: own.get(cell.link).map_or_else(String::new, |link| link.name.clone()),
+                position: cell.position,
+                normal: cell.normal,
+                bus: Some(format!("vcan{}", buses + cell.bus)),
+                node: Some(cell.node),
+                neighbors: cell.neighbors,
+                root: cell.root,
+                line: 0,
+            }));
+            covered.figures.extend(skin.links);
+            buses += skin.buses;
+        }
+        if covered.cells.is_empty() {
+            let links = list(&self.cover);
+            return Err(Failure::usage(format!(
+                "--cover: there is no room for a cell on {links}: lower the pitch, or choose other links"
+            )));
+        }
+        Ok(covered)
+    }
+
+    /// The chain of each covered link.
+    fn owners(&self, urdf: &Urdf, chains: &[Chain]) -> Result<Vec<usize>, Failure> {
+        let moved = || {
+            let on_path = urdf.links().filter(|link| chains.iter().any(|chain| chain.link(link).is_ok()));
+            list(on_path)
+        };
+        let mut owners = Vec::with_capacity(self.cover.len());
+        for (index, name) in self.cover.iter().enumerate() {
+            let wrong = |why: String| Failure::usage(format!("--cover {name}: {why}"));
+            if self.cover.iter().take(index).any(|before| before == name) {
+                return Err(wrong("this link is named twice".to_owned()));
+            }
+            urdf.visuals(name).map_err(|error| wrong(error.to_string()))?;
+            let owner = chains.iter().position(|chain| chain.link(name).is_ok());
+            owners.push(owner.ok_or_else(|| {
+                wrong(format!("no chain moves this link: those that a chain moves are {}", moved()))
+            })?);
+        }
+        if let Some(lost) = self.keep_out.iter().find(|lost| !self.cover.contains(&lost.link)) {
+            let links = list(&self.cover);
+            return Err(Failure::usage(format!(
+                "--keep-out {}: {} is not covered: the covered links are {links}",
+                lost.text, lost.link
+            )));
+        }
+        Ok(owners)
+    }
+
+    fn options(&self, links: &[Link]) -> Options {
+        let keep_out = self.keep_out.iter().filter_map(|it| {
+            let link = links.iter().position(|link| link.name == it.link)?;
+            Some(KeepOut { link, min: it.min, max: it.max })
+        });
+        Options {
+            pitch: self.pitch,
+            seed: self.seed,
+            keep_out: keep_out.collect(),
+            nodes_per_bus: usize::from(self.nodes_per_bus).min(MAX_NODES),
+            ..Options::default()
+        }
+    }
+
+    /// The options as they were given.
+    pub(super) fn words(&self) -> String {
+        let Self { cover, pitch, keep_out, seed, nodes_per_bus, packages: _ } = self;
+        if cover.is_empty() {
+            return String::new();
+        }
+        let mut words = format!(" --cover {} --pitch {pitch}", cover.join(","));
+        for it in keep_out {
+            words += &format!(" --keep-out {}", it.text);
+        }
+        words + &format!(" --seed {seed} --nodes-per-bus {nodes_per_bus}")
+    }
+}
+
+/// How a link is covered, in a line.
+pub(super) fn reported(figures: &Figures) -> String {
+    let Figures { name, cells, outer_area, covered, spacing, tilt } = figures;
+    let spacing =
+        spacing.map_or_else(String::new, |metres| format!("; {:.1} mm from cell to cell", metres * 1e3));
+    format!(
+        "{name}: {}, {:.1} % of {outer_area:.4} m2 covered{spacing}; tilted by {:.1} degrees at most",
+        count(*cells, "cell"),
+        covered * 100.0,
+        tilt.to_degrees()
+    )
+}

@@ -1,0 +1,111 @@
+//! What a robot's links look like: the shapes of a URDF as meshes, from the files that it names.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use cover::Part;
+use cover::mesh::{Mesh, MeshError, UpAxis};
+use robots::{Geometry, Shape, Urdf};
+use trace::files::folder_of;
+
+/// Where the files of packages are.
+#[derive(Args, Clone, Debug)]
+pub(super) struct Packages {
+    /// Where files are that the URDF names as package://NAME/..., as often as there are packages; else they are searched
+    /// for in the folder of the URDF and those above it
+    #[arg(long, value_name = "NAME=DIR", value_parser = package)]
+    package: Vec<(String, PathBuf)>,
+}
+
+fn package(text: &str) -> Result<(String, PathBuf), String> {
+    match text.split_once('=') {
+        Some((name, folder)) if !name.is_empty() && !folder.is_empty() => {
+            Ok((name.to_owned(), folder.into()))
+        }
+        _ => Err("NAME=DIR, the package of package://NAME/... and its folder".to_owned()),
+    }
+}
+
+/// The shapes of a robot.
+pub(super) struct Visuals<'a> {
+    urdf: &'a Urdf,
+    /// The folder of the URDF.
+    folder: PathBuf,
+    packages: &'a Packages,
+}
+
+impl<'a> Visuals<'a> {
+    /// Those of the URDF in this file.
+    pub(super) fn new(urdf: &'a Urdf, file: &Path, packages: &'a Packages) -> Self {
+        let folder = folder_of(file);
+        // From `.` there are no folders above.
+        let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
+        Self { urdf, folder, packages }
+    }
+
+    /// What a link is made of; nothing, if the URDF has no visual of it.
+    pub(super) fn parts(&self, link: &str) -> Result<Vec<Part>, String> {
+        let shapes = self.urdf.visuals(link).map_err(|error| error.to_string())?;
+        let part =
+            |shape| self.part(shape).map_err(|error| format!("{}: link {link}: {error}", self.urdf.file));
+        shapes.iter().map(part).collect()
+    }
+
+    fn part(&self, shape: &Shape) -> Result<Part, String> {
+        let plain = |mesh: Result<Mesh, MeshError>| mesh.map(Part::new).map_err(|error| error.to_string());
+        let part = match &shape.geometry {
+            Geometry::Mesh { path, scale } => {
+                let mesh = Mesh::load(&self.find(path)?, UpAxis::Ignore);
+                Part { scale: *scale, ..plain(mesh)? }
+            }
+            Geometry::Box { size } => plain(Mesh::cuboid(*size))?,
+            Geometry::Cylinder { radius, length } => plain(Mesh::cylinder(*radius, *length))?,
+            Geometry::Sphere { radius } => plain(Mesh::sphere(*radius))?,
+            Geometry::Other { element } => {
+                return Err(format!(
+                    "visual {element:?}: mesh, box, cylinder and sphere are known; make it a mesh"
+                ));
+            }
+            other => return Err(format!("visual {other:?} is not known; make it a mesh")),
+        };
+        Ok(Part { pose: shape.origin, ..part })
+    }
+
+    /// The file that a URI or a path of the URDF names.
+    fn find(&self, uri: &str) -> Result<PathBuf, String> {
+        let of_package = uri.strip_prefix("package://").or_else(|| uri.strip_prefix("model://"));
+        let Some((name, rest)) = of_package.map(|path| path.split_once('/').unwrap_or((path, ""))) else {
+            let path = self.folder.join(uri.strip_prefix("file://").unwrap_or(uri));
+            let tried = path.display();
+            return if path.is_file() {
+                Ok(path)
+            } else {
+                Err(format!("mesh {uri}: {tried} is no file: correct the path"))
+            };
+        };
+        let given = self.packages.package.iter().find(|(known, _)| known == name);
+        let tried: Vec<_> = match given {
+            Some((_, folder)) => vec![folder.join(rest)],
+            None => self
+                .folder
+                .ancestors()
+                .flat_map(|above| {
+                    let is_it = above.file_name().is_some_and(|it| it == name);
+                    [is_it.then(|| above.join(rest)), Some(above.join(name).join(rest))].into_iter().flatten()
+                })
+                .collect(),
+        };
+        if let Some(path) = tried.iter().find(|path| path.is_file()) {
+            return Ok(path.clone());
+        }
+        // Of several folders the one that has the package's name.
+        let named =
+            |path: &&PathBuf| given.is_some() || path.ancestors().any(|it| it.ends_with(name) && it.is_dir());
+        let shown = tried
+            .iter()
+            .find(named)
+            .or_else(|| tried.first())
+            .map_or_else(String::new, |path| path.display().to_string());
+        Err(format!("mesh {uri}: {shown} is no file: say where the package is with --package {name}=DIR"))
+    }
+}

@@ -1,0 +1,206 @@
+//! `gateway torque`.
+
+use std::fs;
+use std::path::PathBuf;
+
+use clap::{ArgGroup, Args};
+use model::central::Central;
+use protocol::fixed::Q1_14;
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::Skin;
+use protocol::usage::{Failure, print};
+use reference::Reference;
+use serde::{Deserialize, Serialize};
+
+use super::arguments::{Named, cell};
+use super::print::{count, json_line, table};
+
+/// Compute the torques of a force on a cell: centrally, and as the cell's fixed-point code does
+///
+/// The central computation is that of the run's comparison, in double precision with the numbers of the skin's file. The
+/// cell's is the code that a cell runs, on the words of its parameters and of the joints' positions.
+#[derive(Args, Debug)]
+#[command(group = ArgGroup::new("what").required(true).args(["cell", "batch"]),
+    after_help = "ROWS.csv has a line for each row, positions with spaces between them:
+  cell,force_n,q
+  vcan0:12,2.5,0 -1.2 1.0 -1.4 -1.57 0
+
+Examples:
+  gateway torque skin.toml --cell 12 --force 2.5 --joints \"0 -1.2 1.0 -1.4 -1.57 0\"
+  gateway torque skin.toml --batch rows.csv --json > torques.jsonl")]
+pub(crate) struct Torque {
+    /// The skin's description
+    #[arg(value_name = "SKIN")]
+    file: PathBuf,
+    /// The cell: its node id, or BUS:NODE
+    #[arg(long, value_name = "CELL", value_parser = cell, requires_all = ["force", "joints"])]
+    cell: Option<Named>,
+    /// The force against its outward normal in N
+    #[arg(long, value_name = "N", requires = "cell", allow_negative_numbers = true)]
+    force: Option<f64>,
+    /// The positions of its chain's joints, rad or m, with spaces between them
+    #[arg(long, value_name = "POSITIONS", requires = "cell", allow_hyphen_values = true)]
+    joints: Option<String>,
+    /// Many rows from a file
+    #[arg(long, value_name = "ROWS.csv")]
+    batch: Option<PathBuf>,
+    /// One JSON object a row
+    #[arg(long)]
+    json: bool,
+}
+
+/// A line of the file of rows.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Line {
+    cell: String,
+    force_n: f64,
+    q: String,
+}
+
+/// What comes out, in Nm, of prismatic joints in N.
+#[derive(Serialize)]
+struct Row {
+    cell: String,
+    force_n: f64,
+    joints: Vec<String>,
+    units: Vec<&'static str>,
+    central: Vec<f64>,
+    fixed: Vec<f64>,
+    difference: Vec<f64>,
+    saturated: bool,
+}
+
+impl Torque {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let skin = Skin::read(&self.file).map_err(Failure::usage)?;
+        let calculator = Calculator::new(&skin);
+        let rows = match (&self.cell, &self.batch) {
+            (Some(cell), _) => {
+                let (force, joints) =
+                    (self.force.unwrap_or_default(), self.joints.as_deref().unwrap_or_default());
+                vec![calculator.row(cell, "--cell", force, joints).map_err(Failure::usage)?]
+            }
+            (None, Some(path)) => calculator.batch(path)?,
+            (None, None) => Vec::new(),
+        };
+        if self.json {
+            return rows.iter().try_for_each(|row| print(&json_line(row)?));
+        }
+        rows.iter().try_for_each(|row| print(&row.text()))
+    }
+}
+
+/// Both computations, for one skin.
+struct Calculator<'a> {
+    skin: &'a Skin,
+    /// By bus.
+    central: Vec<Central>,
+}
+
+impl<'a> Calculator<'a> {
+    fn new(skin: &'a Skin) -> Self {
+        let central = (0..skin.buses.len()).map(|bus| Central::unquantised(&skin.part_on(bus)));
+        Self { skin, central: central.collect() }
+    }
+
+    fn batch(&self, path: &PathBuf) -> Result<Vec<Row>, Failure> {
+        let file = path.display();
+        let text = fs::read_to_string(path).map_err(|error| Failure::usage(format!("{file}: {error}")))?;
+        let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(text.as_bytes());
+        let mut rows = Vec::new();
+        for record in reader.deserialize::<Line>() {
+            let columns = "the columns are cell,force_n,q";
+            let Line { cell: text, force_n, q } =
+                record.map_err(|error| Failure::usage(format!("{file}: {error}; {columns}")))?;
+            let at = format!("{file}, row {}: cell", rows.len() + 1);
+            let named = cell(&text).map_err(|error| Failure::usage(format!("{at} {error}")))?;
+            rows.push(
+                self.row(&named, &at, force_n, &q)
+                    .map_err(|error| Failure::usage(format!("{at} {text}: {error}")))?,
+            );
+        }
+        if rows.is_empty() {
+            return Err(Failure::usage(format!("{file}: there is no row in it: write a line for each")));
+        }
+        Ok(rows)
+    }
+
+    /// Both computations of one row, or why there is none.
+    fn row(&self, named: &Named, option: &str, force: f64, positions: &str) -> Result<Row, String> {
+        let skin = self.skin;
+        let index = named.find(skin, option).map_err(|failure| failure.to_string())?;
+        let Some(cell) = skin.cells.get(index) else { return Err("no such cell".to_owned()) };
+        let joints: Vec<_> = skin.joints_of(cell.bus).map(|(_, joint)| joint).collect();
+        if !(force.is_finite() && force >= 0.0) {
+            return Err(format!(
+                "force {force} N: a force presses against the outward normal, with 0 N or more"
+            ));
+        }
+        let given: Vec<&str> = positions.split([' ', ',']).filter(|text| !text.is_empty()).collect();
+        if given.len() != joints.len() {
+            let names = joints.iter().map(|joint| joint.name.as_str()).collect::<Vec<_>>().join(", ");
+            let (got, needed) = (count(given.len(), "position"), count(joints.len(), "joint"));
+            return Err(format!("{got}: one is needed for each of the chain's {needed}, {names}"));
+        }
+        let mut q = Vec::with_capacity(given.len());
+        let mut words = [Q1_14::ZERO; MAX_JOINTS];
+        for ((text, joint), word) in given.iter().zip(&joints).zip(&mut words) {
+            let position = text.parse().ok().and_then(|value: f64| Some((value, joint.kind.word(value)?)));
+            let Some((position, nearest)) = position else {
+                return Err(format!(
+                    "position {text:?} of {}: a number in {} is needed",
+                    joint.name,
+                    joint.kind.unit()
+                ));
+            };
+            q.push(position);
+            *word = nearest;
+        }
+        let parameters = skin.parameters(cell);
+        let reference = Reference::new(&parameters);
+        let words = reference.torque_of(&words, force);
+        // The place of the cell on its bus.
+        let place = skin.cells_of(cell.bus).position(|other| other.node == cell.node).unwrap_or_default();
+        let central =
+            self.central.get(cell.bus).map(|central| central.torque(place, &central.frames_at(&q), force));
+        // Without the sign of a zero.
+        let central: Vec<f64> =
+            central.into_iter().flatten().take(joints.len()).map(|value| value + 0.0).collect();
+        let words = words.get(..joints.len()).unwrap_or_default();
+        let fixed: Vec<f64> = words.iter().map(|&word| reference.format().real(word)).collect();
+        let bus = skin.buses.get(cell.bus).map_or("", |bus| &bus.name);
+        Ok(Row {
+            cell: format!("{bus}:{}", cell.node),
+            force_n: force,
+            joints: joints.iter().map(|joint| joint.name.clone()).collect(),
+            units: joints.iter().map(|joint| joint.kind.torque_unit()).collect(),
+            difference: fixed.iter().zip(&central).map(|(fixed, central)| fixed - central).collect(),
+            central,
+            fixed,
+            saturated: words.iter().any(|word| [i16::MIN, i16::MAX].contains(word)),
+        })
+    }
+}
+
+impl Row {
+    fn text(&self) -> String {
+        let numbers = self.central.iter().zip(&self.fixed).zip(&self.difference);
+        let rows = self.joints.iter().zip(&self.units).zip(numbers).map(
+            |((name, unit), ((central, fixed), difference))| {
+                vec![
+                    name.clone(),
+                    format!("{central:.6}"),
+                    format!("{fixed:.6}"),
+                    format!("{difference:+.6}"),
+                    (*unit).to_owned(),
+                ]
+            },
+        );
+        let head = ["joint", "central", "cell", "difference", "unit"];
+        let table = table(head, rows, |column| (1..4).contains(&column));
+        let saturated =
+            if self.saturated { "\nsaturated: a word is at the end of its format's range" } else { "" };
+        format!("cell {}, {} N{saturated}\n{table}\n", self.cell, self.force_n)
+    }
+}
