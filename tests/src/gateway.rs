@@ -11,7 +11,8 @@ use model::table::{Notice, Snapshot, Table};
 use protocol::can::Frame;
 use protocol::id::{CellId, Command, Node};
 use protocol::message::{From, Message, SensorPage, SkinSensors};
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
@@ -35,7 +36,7 @@ pub struct Gateway {
     pub broadcasts_skipped: u64,
     cycle: Cycle,
     snapshot: Snapshot,
-    positions: VecDeque<(Epoch, [f64; WORDS])>,
+    positions: VecDeque<(Epoch, [f64; MAX_JOINTS])>,
     touches: Touches,
     script_epoch: u64,
     /// The last stimulus of each cell from a test.
@@ -56,7 +57,7 @@ impl Gateway {
     pub fn new(skin: &Skin, scenario: &Scenario) -> Self {
         let table = Table::new(skin, 0);
         let controller = controller_of(skin, &scenario.motion).expect("a controller of our own");
-        let robot = SimulatedArm::new(skin, scenario.motion.start_rad);
+        let robot = SimulatedArm::new(skin, scenario.motion.start);
         Self {
             snapshot: table.snapshot().clone(),
             table,
@@ -141,9 +142,9 @@ impl Gateway {
         self.records.push(outcome.record);
         self.broadcasts_skipped += outcome.broadcasts_skipped;
         let mut messages = Vec::new();
-        if let Some((epoch, joints)) = outcome.joints {
-            self.positions.push_back((epoch, outcome.record.q));
-            messages.push(Message::Joints { epoch, joints });
+        if let Some(epoch) = outcome.broadcast {
+            self.positions.push_back((epoch, self.cycle.positions_of(0)));
+            messages.push(Message::Joints { epoch, joints: self.cycle.joints(0) });
         }
         match outcome.command {
             Some(Command::Halt) => messages.push(Message::Halt),

@@ -24,7 +24,7 @@ use cell_node::node::Node;
 use cell_node::sum::Words;
 use model::network::Uplinks;
 use protocol::can::Format;
-use protocol::fixed::{Q1_14, Q5_10};
+use protocol::fixed::{Q1_14, Q5_10, Q7_8};
 use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
 use protocol::packet::{self, Epoch, WORDS};
 use protocol::parameters::{LinksDown, Parameter, Reply, Slots};
@@ -37,6 +37,7 @@ use rand_pcg::Pcg64Mcg;
 use crate::agenda::Agenda;
 use crate::life::Life;
 use place::Inlet;
+use protocol::packet::padded;
 
 pub use place::Place;
 
@@ -364,6 +365,7 @@ impl Wiring {
             let message = Message::decode(&packet).expect("cells say what has a meaning");
             match message {
                 Message::Sum { from, epoch, torque, count } => {
+                    let torque = torque.padded().map(Q7_8::from_bits);
                     self.hear_sum(cell, from, epoch, Words { torque, count });
                 }
                 Message::Network { page: NetworkPage::Tree(tree), .. } => self.cells[cell].tree = Some(tree),
@@ -411,7 +413,7 @@ impl Wiring {
         self.epoch = Some(epoch);
         self.root_sums.clear();
         self.took.push(Took::default());
-        let joints = Joints { positions: positions(), in_use: 6 };
+        let joints = Joints { positions: padded(&positions()), in_use: 6 };
         self.say(&Message::Joints { epoch, joints });
         self.agenda.enter_in(PERIOD, Event::Joints);
     }

@@ -7,6 +7,7 @@ use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::{Epoch, Packet, Segment, WORDS};
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Safety, Skin};
 use protocol::time::Micros;
 
@@ -75,9 +76,9 @@ pub struct Tally {
 struct Mirror {
     /// The broadcast that its newest torque answered.
     answered: Option<usize>,
-    held: Option<[i32; WORDS]>,
+    held: Option<[i32; MAX_JOINTS]>,
     /// What of it is in the sum.
-    value: [i32; WORDS],
+    value: [i32; MAX_JOINTS],
     torques: Vec<(u8, [i16; WORDS])>,
     arrived: u64,
     /// The owner of the node id, by the last heartbeat that was no claim.
@@ -162,8 +163,8 @@ impl Oracle {
         match message {
             Message::Torque { epoch, torque, .. } => {
                 mirror.arrived += 1;
-                let words = torque.map(|word| word.to_bits());
-                mirror.torques.push((epoch.0, words));
+                mirror.torques.push((epoch.0, torque.six()));
+                let words = torque.padded();
                 // The newest broadcast of this epoch, if it is not too old.
                 let recent = self.broadcasts.iter().enumerate().rev().take(LATEST);
                 let answers = recent.into_iter().find(|(_, of)| **of == epoch).map(|(number, _)| number);
@@ -275,13 +276,13 @@ impl Oracle {
         if !self.compares {
             return;
         }
-        let mut sum = [0_i32; WORDS];
+        let mut sum = [0_i32; MAX_JOINTS];
         let mut contributing = 0;
         for mirror in &self.mirrors {
             for (sum, value) in sum.iter_mut().zip(mirror.value) {
                 *sum += value;
             }
-            contributing += u32::from(mirror.value != [0; WORDS]);
+            contributing += u32::from(mirror.value != [0; MAX_JOINTS]);
         }
         let sum = sum.map(|steps| f64::from(steps) / 4_096.0);
         assert!(
@@ -298,7 +299,7 @@ impl Oracle {
 impl Mirror {
     fn release(&mut self) {
         self.held = None;
-        self.value = [0; WORDS];
+        self.value = [0; MAX_JOINTS];
     }
 
     /// Held, then decays to zero in equal steps.
@@ -310,7 +311,7 @@ impl Mirror {
         let remaining = (hold + decay).saturating_sub(unanswered);
         self.value = match unanswered {
             _ if unanswered <= hold => held,
-            _ if remaining == 0 => [0; WORDS],
+            _ if remaining == 0 => [0; MAX_JOINTS],
             _ => held.map(|word| word * as_i32(remaining) / as_i32(decay)),
         };
     }

@@ -10,7 +10,7 @@ use model::tracker::DEAD_AFTER;
 use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::{Message, State};
-use protocol::packet::WORDS;
+use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;
 use skinbus_tests::bench::{Act, Bench};
@@ -39,7 +39,7 @@ fn finish(bench: &mut Bench) {
     accounts::check(bench);
 }
 
-fn magnitude(torque: &[f64; WORDS]) -> f64 {
+fn magnitude(torque: &[f64; MAX_JOINTS]) -> f64 {
     torque.iter().map(|torque| torque.abs()).sum()
 }
 
@@ -95,7 +95,7 @@ fn a_heartbeat_of_a_quiet_cell_clears_a_held_torque() {
         bench.run(Span::from_millis(1));
         assert!(bench.now().since(released) <= Span(HEARTBEAT.0 + bench.epoch().0), "held for ever");
     }
-    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; WORDS]);
+    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; MAX_JOINTS]);
     assert_eq!(status(&bench, CELL), Status::Quiet);
     finish(&mut bench);
 }
@@ -148,7 +148,7 @@ fn nothing_is_held_of_a_dead_cell_however_long_torques_are_held() {
     assert_eq!(bench.gateway.table.snapshot().sums.contributing, 1, "held");
     bench.run(Span(2 * bench.epoch().0));
     assert_eq!(bench.gateway.table.snapshot().sums.contributing, 0, "dead");
-    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; WORDS]);
+    assert_eq!(bench.gateway.table.snapshot().sums.torque.map(f64::to_bits), [0; MAX_JOINTS]);
     finish(&mut bench);
 }
 

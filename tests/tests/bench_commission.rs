@@ -355,7 +355,7 @@ fn flash_that_cannot_be_written_is_named_and_the_old_remains() {
 fn other_pose(packet: Packet) -> Packet {
     let is_pose = packet.id.kind == Kind::Configure && packet.count & 0x7F == Parameter::Pose.number();
     let mut packet = packet;
-    packet.words[0] = packet.words[0].wrapping_add(i16::from(is_pose));
+    packet.words = packet.words.with(0, packet.words.six()[0].wrapping_add(i16::from(is_pose)));
     packet
 }
 
@@ -363,7 +363,7 @@ fn other_pose(packet: Packet) -> Packet {
 fn pose_back(packet: Packet) -> Packet {
     let is_pose = packet.id.kind == Kind::Configured && packet.count == Parameter::Pose.number() | 0x80;
     let mut packet = packet;
-    packet.words[0] = packet.words[0].wrapping_sub(i16::from(is_pose));
+    packet.words = packet.words.with(0, packet.words.six()[0].wrapping_sub(i16::from(is_pose)));
     packet
 }
 
@@ -415,7 +415,8 @@ fn a_pose_whose_crc_is_wrong_is_not_taken_and_the_old_one_stays() {
 fn liar(packet: Packet) -> Packet {
     let is_period = packet.id.kind == Kind::Configured && packet.count == Parameter::Timing.number();
     let mut packet = packet;
-    packet.words[0] = packet.words[0].wrapping_add(i16::from(is_period && packet.id.node == 5));
+    packet.words =
+        packet.words.with(0, packet.words.six()[0].wrapping_add(i16::from(is_period && packet.id.node == 5)));
     packet
 }
 

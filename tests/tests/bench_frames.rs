@@ -4,7 +4,6 @@
 
 use model::table::{Event, Notice, Replies, Uplink};
 use protocol::can::Format;
-use protocol::fixed::Q1_14;
 use protocol::id::{Kind, Node};
 use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage};
 use protocol::packet::{Epoch, WORDS};
@@ -103,10 +102,10 @@ fn a_torque_may_be_three_epochs_late_and_not_four() {
         let answers = epoch_of(bench.gateway.broadcasts() - 1);
         let before = bench.gateway.table.cells()[0].replies;
         bench.run_epochs(late);
-        let torque = [protocol::fixed::Q3_12::from_bits(5); WORDS];
+        let torque = [5; WORDS];
         let from = bench.cell_slots[0].identity.cell.unwrap();
         bench.oracle.compares = false;
-        bench.act(Act::Inject(Message::Torque { from, epoch: answers, torque }));
+        bench.act(Act::Inject(Message::Torque { from, epoch: answers, torque: torque.into() }));
         bench.run(Span(epoch.0 / 4));
         let now = bench.gateway.table.cells()[0].replies;
         assert_eq!(now.late - before.late, u64::from(used), "{late} epochs late");
@@ -152,7 +151,7 @@ fn epochs_may_jump_forward_and_back() {
         // As if it had restarted, or a recording was repeated. Not the epoch of the last or next one.
         let ours = bench.gateway.broadcasts();
         let epoch = Epoch(epoch_of(ours).0.wrapping_add(dice.random_range(10..240)));
-        let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+        let joints = Joints { in_use: 6, ..Joints::default() };
         bench.act(Act::Say(Message::Joints { epoch, joints }));
         bench.run(Span(bench.epoch().0 / 2));
     }
@@ -205,7 +204,7 @@ fn a_lost_stimulus_of_a_release_shows_as_torques_that_are_not_due() {
 
 #[test]
 fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
-    let joints = Joints { positions: [Q1_14::ZERO; WORDS], in_use: 6 };
+    let joints = Joints { in_use: 6, ..Joints::default() };
     let joints = Message::Joints { epoch: Epoch(77), joints };
     let page = NetworkPage::Heartbeat(Heartbeat::default());
     let heartbeat = Message::Network { from: Node::Gateway, epoch: Epoch(0), page };

@@ -8,7 +8,8 @@ use model::table::Replies;
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind};
 use protocol::message::{Message, State};
-use protocol::packet::WORDS;
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::MAX_ROBOT_JOINTS;
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;
 use skinbus_tests::bench::{Act, Bench};
@@ -40,7 +41,7 @@ fn halted(bench: &Bench) -> Option<Halt> {
     bench.gateway.last().unwrap().halted
 }
 
-fn q(bench: &Bench) -> [u64; WORDS] {
+fn q(bench: &Bench) -> [u64; MAX_ROBOT_JOINTS] {
     bench.gateway.last().unwrap().q.map(f64::to_bits)
 }
 
@@ -52,7 +53,7 @@ fn a_halt_from_any_sender_stops_robot_and_cells_and_a_resume_continues_both() {
     assert_eq!(halted(&bench), Some(Halt::Frame));
     assert_eq!(
         (bench.gateway.table.snapshot().sums.torque, bench.gateway.table.snapshot().sums.contributing),
-        ([0.0; WORDS], 0)
+        ([0.0; MAX_JOINTS], 0)
     );
     let (stands, due, sent) = (q(&bench), replies(&bench).due, bench.torques(0).len());
     bench.run_epochs(30);

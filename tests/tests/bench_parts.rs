@@ -297,7 +297,7 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
         let is_torque = |seen: &Seen| {
             let packet = protocol::packet::Packet::from_fd(&seen.frame).ok()?;
             let Ok(Message::Torque { torque, .. }) = Message::decode(&packet) else { return None };
-            (torque[0].to_bits() != 0).then_some(packet)
+            (torque.six()[0] != 0).then_some(packet)
         };
         let Some((place, mut packet)) =
             seen.iter().enumerate().skip(at + 60).find_map(|(place, seen)| Some((place, is_torque(seen)?)))
@@ -305,7 +305,7 @@ fn a_word_that_is_another_one_is_found_in_every_part() {
             continue;
         };
         let (from, before) = split(&seen, at);
-        packet.words[0] += 1;
+        packet.words = packet.words.with(0, packet.words.six()[0] + 1);
         let kept = seen[place].frame;
         seen[place].frame = packet.frames(Format::Fd).next().unwrap();
         let comparator = replayed(&skin, &before, &seen[from..]);

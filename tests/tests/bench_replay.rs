@@ -17,6 +17,7 @@ use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
 use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::{Parameter, Parameters};
 use protocol::skin::Skin;
@@ -75,7 +76,7 @@ fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
                 let angle = |random: &mut Pcg64| Q1_14::from_bits(random.random());
                 Message::Joints {
                     epoch,
-                    joints: Joints { positions: [(); WORDS].map(|()| angle(random)), in_use: 6 },
+                    joints: Joints { positions: padded(&[(); WORDS].map(|()| angle(random))), in_use: 6 },
                 }
             }
             9..=14 => {
@@ -171,7 +172,8 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
                 "seed {seed}, {at} messages after {link_down}: {message:?}\nrestored: {:#?}",
                 state.restoring(|_| true, next)
             );
-            let zero = |answer: &&Message| matches!(answer, Message::Torque { torque, .. } if *torque == [Q3_12::ZERO; WORDS]);
+            let zero =
+                |answer: &&Message| matches!(answer, Message::Torque { torque, .. } if torque.is_zero());
             ends += then.iter().filter(zero).count();
             torques += then.iter().filter(|it| matches!(it, Message::Torque { .. })).count();
             all += 1;

@@ -14,7 +14,7 @@ use model::scenario::Scenario;
 use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Message, Request, SensorPage, SkinSensors};
-use protocol::packet::{Packet, Reassembly, Segment, data_id};
+use protocol::packet::{Lengths, Packet, Reassembly, Segment, data_id};
 use protocol::parameters::{Parameter, Sensing};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
@@ -74,9 +74,10 @@ fn sensors_frames(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPa
         Format::Fd => Packet::from_fd(frame).ok(),
         Format::Classic => {
             let id = data_id(frame).ok()?;
-            match segments.entry(id).or_insert(Segment::NONE).push(Micros(0), id, frame.data()) {
+            match segments.entry(id).or_insert(Segment::NONE).push(Micros(0), id, Lengths::ALL, frame.data())
+            {
                 Ok(Reassembly::Complete(packet)) => Some(packet),
-                Ok(Reassembly::Waiting | Reassembly::Incomplete) | Err(_) => None,
+                Ok(Reassembly::Waiting | Reassembly::Incomplete | Reassembly::Ambiguous) | Err(_) => None,
             }
         }
     };

@@ -8,6 +8,7 @@ use protocol::can::Format;
 use protocol::id::Kind;
 use protocol::message::From;
 use protocol::packet::WORDS;
+use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;
 use skinbus_tests::bench::Bench;
@@ -74,7 +75,7 @@ fn a_contact_ends_with_one_zero_torque_and_nothing_is_held() {
     bench.press(1, 0.0);
     bench.run_epochs(2);
     let snapshot = bench.gateway.table.snapshot().sums;
-    assert_eq!((snapshot.torque, snapshot.contributing), ([0.0; WORDS], 0));
+    assert_eq!((snapshot.torque, snapshot.contributing), ([0.0; MAX_JOINTS], 0));
     let torques = bench.torques(1);
     bench.run_epochs(10);
     assert_eq!(bench.torques(1), torques, "silence after the zeros");

@@ -8,7 +8,7 @@ use std::path::Path;
 use paper::tree::{Came, Tree};
 use protocol::fixed::Q5_10;
 use protocol::message::SkinSensors;
-use protocol::packet::WORDS;
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
@@ -29,7 +29,7 @@ fn tree(carry: bool) -> Tree {
 }
 
 /// One epoch, in whose sum everybody is who is touched.
-fn turn(tree: &mut Tree, q: &[f64; WORDS], touch: &[(usize, SkinSensors)]) -> Came {
+fn turn(tree: &mut Tree, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> Came {
     let came = tree.turn(q, touch);
     assert_eq!(came.count, touch.len());
     came
@@ -62,7 +62,7 @@ impl Mean {
     }
 }
 
-fn difference(a: &[f64; WORDS], b: &[f64; WORDS]) -> [f64; WORDS] {
+fn difference(a: &[f64; MAX_JOINTS], b: &[f64; MAX_JOINTS]) -> [f64; MAX_JOINTS] {
     core::array::from_fn(|joint| a[joint] - b[joint])
 }
 
@@ -73,7 +73,7 @@ fn moving(carry: bool) -> (f64, f64) {
     let mut tree = tree(carry);
     for _ in 0..20 {
         let touch = touched(&mut dice, tree.cells());
-        let phase: [f64; WORDS] = core::array::from_fn(|_| dice.random_range(0.0..6.0));
+        let phase: [f64; MAX_JOINTS] = core::array::from_fn(|_| dice.random_range(0.0..6.0));
         for step in 0..50_u32 {
             let q = phase.map(|phase| (phase + f64::from(step) * 0.016).sin());
             let came = turn(&mut tree, &q, &touch);
@@ -91,9 +91,9 @@ fn constant(carry: bool) -> f64 {
     for _ in 0..60 {
         let mut tree = tree(carry);
         let touch = touched(&mut dice, tree.cells());
-        let q: [f64; WORDS] = core::array::from_fn(|_| dice.random_range(-1.5..1.5));
-        let mut average = [0.0; WORDS];
-        let mut expected = ([0.0; WORDS], 0);
+        let q: [f64; MAX_JOINTS] = core::array::from_fn(|_| dice.random_range(-1.5..1.5));
+        let mut average = [0.0; MAX_JOINTS];
+        let mut expected = ([0.0; MAX_JOINTS], 0);
         for _ in 0..AVERAGED {
             let came = turn(&mut tree, &q, &touch);
             for (average, sum) in average.iter_mut().zip(came.sum) {

@@ -24,7 +24,7 @@ use process::{Place, Running, Summary, TIMEOUT, until};
 use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Line, parse};
-use protocol::packet::{Reassembly, Segment, data_id};
+use protocol::packet::{Length, Lengths, Reassembly, Segment, data_id};
 use protocol::time::Micros;
 use rustix::process::Signal;
 use serde_json::Value;
@@ -186,9 +186,14 @@ fn pairs(log: &str) -> (u64, u64) {
         let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}") };
         let Ok(id) = data_id(&record.frame) else { continue };
         let segment = &mut segments[usize::from(id.to_bits())];
-        match segment.push(Micros(record.time.nanos / 1_000), id, record.frame.data()) {
+        match segment.push(
+            Micros(record.time.nanos / 1_000),
+            id,
+            Lengths::only(Length::Six),
+            record.frame.data(),
+        ) {
             Ok(Reassembly::Waiting) => {}
-            Ok(Reassembly::Incomplete) => incomplete += 1,
+            Ok(Reassembly::Incomplete | Reassembly::Ambiguous) => incomplete += 1,
             Ok(Reassembly::Complete(_)) => whole += 1,
             Err(error) => panic!("{line}: {error}"),
         }

@@ -7,7 +7,6 @@ mod process;
 use process::log::Log;
 use process::{Ended, PRESSED, Place, Summary, is_stopped, skin, tells, until};
 use protocol::can::{Format, Frame};
-use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::{Epoch, WORDS};
@@ -221,8 +220,7 @@ fn a_newcomer_with_a_taken_node_id_ends_with_one_line() {
 fn odd_frames() -> Vec<(Frame, &'static str)> {
     let cell = |node| CellId::new(node).unwrap();
     let torque = |node| {
-        let torque =
-            Message::Torque { from: cell(node), epoch: Epoch(0), torque: [Q3_12::from_bits(4_096); WORDS] };
+        let torque = Message::Torque { from: cell(node), epoch: Epoch(0), torque: [4_096; WORDS].into() };
         torque.encode().frames(Format::Fd).next().unwrap()
     };
     let good = torque(5);
@@ -232,7 +230,7 @@ fn odd_frames() -> Vec<(Frame, &'static str)> {
     let meaningless = |kind: Kind, count| {
         let packet = protocol::packet::Packet {
             id: protocol::id::Id::new(kind, Node::Cell(cell(5))),
-            words: [0; WORDS],
+            words: [0; WORDS].into(),
             epoch: Epoch(0),
             count,
         };

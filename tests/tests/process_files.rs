@@ -15,6 +15,7 @@ use process::{Place, Running, Summary, names, skin, until};
 use protocol::can::Format;
 use protocol::fixed::Q1_14;
 use protocol::message::{Joints, Message};
+use protocol::packet::padded;
 use protocol::packet::{Epoch, WORDS};
 use rand::{RngExt, SeedableRng};
 use rustix::fs::{CWD, FileType, Mode, mknodat};
@@ -295,7 +296,10 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     let test_client = place.test_client();
     test_client.waits_for_epoch(10);
     let positions = [Q1_14::ZERO; WORDS];
-    test_client.sends(&Message::Joints { epoch: Epoch(77), joints: Joints { positions, in_use: 6 } });
+    test_client.sends(&Message::Joints {
+        epoch: Epoch(77),
+        joints: Joints { positions: padded(&positions), in_use: 6 },
+    });
     let ended = bench.end();
     let summary = failed(&place, &ended);
     assert!(summary.number("/loop/ticks") > 0 && ended.stdout.contains(" s, failed "), "{ended:#?}");

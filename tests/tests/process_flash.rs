@@ -64,7 +64,7 @@ fn a_damaged_file_is_not_used_and_the_gateway_names_the_cell() {
          delete the file"
             .to_owned(),
         format!(
-            "cell-node: flash of cell 5 (flash/vcan0-5.flash) is not used: 40 bytes, not {}; write it again or \
+            "cell-node: flash of cell 5 (flash/vcan0-5.flash) is not used: 40 bytes, not {} to 445; write it again or \
              delete the file",
             image.len()
         ),

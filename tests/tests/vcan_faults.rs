@@ -8,10 +8,8 @@ use process::log::Log;
 use process::vcan::{Candump, Vcan, Vcan0, cansend, small_skin};
 use process::{Ended, PRESSED, Place, Running, Summary, is_stopped, until};
 use protocol::can::Format;
-use protocol::fixed::Q3_12;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
-use protocol::packet::WORDS;
 use rustix::process::{Pid, Signal};
 
 const CELLS: usize = 6;
@@ -31,7 +29,7 @@ fn prepare() -> Place {
 fn torque_of(cell: u8) -> impl Fn(&Message) -> bool {
     move |message| {
         matches!(message, Message::Torque { from, torque, .. }
-            if from.get() == cell && *torque != [Q3_12::ZERO; WORDS])
+            if from.get() == cell && !torque.is_zero())
     }
 }
 

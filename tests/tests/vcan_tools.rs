@@ -14,7 +14,6 @@ use process::vcan::{Candump, cansend, frames_of, small_skin, tool};
 use process::{PRESSED, Place, Summary};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Line, parse};
-use protocol::fixed::Q3_12;
 use protocol::id::{Id, Kind, Node};
 use protocol::message::{Message, NetworkPage, Refused};
 use protocol::packet::{Packet, PacketError, WORDS, data_id};
@@ -63,7 +62,7 @@ profile = "ramp"
 fn torque_of(cell: u8, pressed: bool) -> impl Fn(&Message) -> bool {
     move |message| {
         matches!(message, Message::Torque { from, torque, .. }
-            if from.get() == cell && (*torque != [Q3_12::ZERO; WORDS]) == pressed)
+            if from.get() == cell && torque.is_zero() != pressed)
     }
 }
 
@@ -107,8 +106,8 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
         torques.iter().partition(|(_, _, packet)| packet.words == [0; WORDS]);
     assert!(torques.iter().all(|(_, (cell, ..), _)| *cell == 2), "no other cell is pressed");
     assert_eq!(
-        (ended.len(), torques.last().unwrap().2.words),
-        (1, [0; WORDS]),
+        (ended.len(), torques.last().unwrap().2.words.is_zero()),
+        (1, true),
         "one torque of zeros, the last one"
     );
     assert!(pressed.len() >= 20, "{}", pressed.len());
@@ -130,7 +129,7 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
     assert!(summary.figure("/accuracy/single/mean_nm") < 3e-4, "{:#}", summary.0);
     assert!(summary.figure("/accuracy/single/max_nm") < 2e-3, "{:#}", summary.0);
     // And it is not little that is compared.
-    let max = pressed.iter().flat_map(|(_, _, packet)| packet.words).map(i16::unsigned_abs).max();
+    let max = pressed.iter().flat_map(|(_, _, packet)| packet.words.six()).map(i16::unsigned_abs).max();
     assert!(max > Some(1_024), "a quarter of a newton metre: {max:?}");
 }
 
@@ -185,8 +184,11 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
 type Reply = (usize, Cause, [i16; WORDS]);
 
 fn replies(log: &Log) -> Vec<Reply> {
-    let mut replies: Vec<_> =
-        log.torques().into_iter().map(|(number, cause, packet)| (number, cause, packet.words)).collect();
+    let mut replies: Vec<_> = log
+        .torques()
+        .into_iter()
+        .map(|(number, cause, packet)| (number, cause, packet.words.six()))
+        .collect();
     replies.sort_unstable();
     replies
 }

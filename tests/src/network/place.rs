@@ -9,8 +9,7 @@ use protocol::can::Frame;
 use protocol::fixed::{Q1_14, Q3_12, Q7_8};
 use protocol::id::CellId;
 use protocol::message::{Ports, Tree};
-use protocol::packet::WORDS;
-use protocol::parameters::{Contact, Parameters, Pose, Row};
+use protocol::parameters::{Contact, MAX_JOINTS, Parameters, Pose, Row};
 use protocol::time::Micros;
 use protocol::wire::{PORTS, PortMessage};
 use rand::RngExt;
@@ -18,6 +17,7 @@ use rand_pcg::Pcg64Mcg;
 
 use super::{End, positions};
 use crate::life::Life;
+use protocol::packet::padded;
 
 /// What comes in to a cell.
 #[derive(Clone, Copy, Debug)]
@@ -40,7 +40,7 @@ pub struct Place {
     /// The last page of its ports.
     pub ports: Option<Ports>,
     /// Its own torque, as it enters sums.
-    pub(super) own: [i32; WORDS],
+    pub(super) own: [i32; MAX_JOINTS],
     pub(super) serial: u32,
     pub(super) parameters: Parameters,
     pub(super) force: Force,
@@ -65,7 +65,7 @@ impl Place {
             a: Q1_14::nearest(a),
             d: Q1_14::nearest(d),
             alpha: Q1_14::nearest(alpha),
-            theta_offset: Q1_14::ZERO,
+            ..Row::default()
         };
         let rows = [
             row(0.0, 1.0, 0.09),
@@ -84,10 +84,11 @@ impl Place {
             },
             contact: Contact { alpha_c: Q3_12::nearest(1.0), ..Contact::default() },
             period_us: 16_000,
-            rows: std::array::from_fn(|joint| rows.get(joint).copied().unwrap_or_default()),
+            rows: padded(&rows),
+            ..Parameters::default()
         };
         let force = Force::from_steps(i64::from(dice.random_range(1_000_i32..4_000)) << 6);
-        let jacobian = Wrench::new(&parameters).jacobian(&positions());
+        let jacobian = Wrench::new(&parameters).jacobian(&padded(&positions()));
         let own = Torque::new(&jacobian, force).exact().map(|exact| {
             let word: Q7_8 = exact.round();
             i32::from(word.to_bits())

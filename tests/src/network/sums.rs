@@ -4,9 +4,11 @@ use std::collections::BTreeSet;
 
 use cell_node::sum::Words;
 use protocol::can::Format;
+use protocol::fixed::Q7_8;
 use protocol::id::CellId;
 use protocol::message::Message;
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::{self, Epoch, Length};
+use protocol::parameters::MAX_JOINTS;
 
 use super::place::Inlet;
 use super::{End, Event, Wiring};
@@ -20,7 +22,13 @@ impl Wiring {
             said.retain(|of, _| Epoch(*of).since(epoch) >= -4);
         }
         said.entry(epoch.0).or_default().push((words, cells));
-        let frame = Message::Sum { from, epoch, torque: words.torque, count: words.count }.encode();
+        let frame = Message::Sum {
+            from,
+            epoch,
+            torque: packet::Words::new(Length::Six, words.torque.map(Q7_8::to_bits)),
+            count: words.count,
+        };
+        let frame = frame.encode();
         let frame = frame.frames(Format::Fd).next().expect("one frame");
         let neighbours: BTreeSet<usize> = self.cells[cell]
             .wires
@@ -76,7 +84,7 @@ impl Wiring {
         let expected = words.torque.map(|word| i32::from(word.to_bits()));
         let mut found = None;
         for own in [1_u32, 0] {
-            let sum = if own == 1 { place.own } else { [0; WORDS] };
+            let sum = if own == 1 { place.own } else { [0; MAX_JOINTS] };
             choose(&heard, sum, own, u128::from(own) << cell, (&expected, words.count.into()), &mut found);
         }
         // The end of a contact: zeros of its own, and no torque.
@@ -105,10 +113,10 @@ fn frame_id(from: CellId) -> protocol::id::Id {
 /// Tries every choice of one sum, or none, of each neighbour.
 fn choose(
     heard: &[Vec<(Words, u128)>],
-    sum: [i32; WORDS],
+    sum: [i32; MAX_JOINTS],
     count: u32,
     cells: u128,
-    expected: (&[i32; WORDS], u32),
+    expected: (&[i32; MAX_JOINTS], u32),
     found: &mut Option<u128>,
 ) {
     if count == expected.1 && sum == *expected.0 && found.is_none_or(|before| before == TWICE) {

@@ -7,7 +7,8 @@ use protocol::candump::{self, Line};
 use protocol::fixed::Q;
 use protocol::id::{Kind, Node};
 use protocol::message::{From, Heartbeat, Message, NetworkPage, SensorPage, SkinSensors};
-use protocol::packet::{Epoch, Packet, Reassembly, Segment, WORDS, data_id};
+use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Segment, data_id};
+use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
 /// A whole log.
@@ -18,7 +19,7 @@ pub(crate) struct Log {
 }
 
 /// What a torque is a function of, beside the cell's parameters: its node id, the joints, and its contact state.
-pub(crate) type Cause = (u8, [i16; WORDS], [i16; 6]);
+pub(crate) type Cause = (u8, [i16; MAX_JOINTS], [i16; 6]);
 
 impl Log {
     /// Reads a log of one bus; every line must be a frame.
@@ -38,7 +39,7 @@ impl Log {
             Format::Classic => {
                 let id = data_id(frame).ok()?;
                 let segment = segments.entry(id).or_insert(Segment::NONE);
-                match segment.push(Micros(0), id, frame.data()) {
+                match segment.push(Micros(0), id, Lengths::ALL, frame.data()) {
                     Ok(Reassembly::Complete(packet)) => Some(packet),
                     _ => None,
                 }
@@ -91,7 +92,7 @@ impl Log {
     }
 
     /// Each broadcast's words.
-    pub(crate) fn joints(&self) -> Vec<[i16; WORDS]> {
+    pub(crate) fn joints(&self) -> Vec<[i16; MAX_JOINTS]> {
         let joints = self.messages.iter().filter_map(|(message, _)| match message {
             Message::Joints { joints, .. } => Some(joints.positions.map(Q::to_bits)),
             _ => None,
@@ -170,11 +171,11 @@ impl ContactState {
 /// same broadcast have the same packets; returns how many causes they share, and how many the smaller has.
 pub(crate) fn same_torques(one: &Log, other: &Log) -> (usize, usize) {
     let [one, other] = [one, other].map(Log::torques);
-    let mut by_cause: BTreeMap<Cause, [i16; WORDS]> = BTreeMap::new();
+    let mut by_cause: BTreeMap<Cause, [i16; MAX_JOINTS]> = BTreeMap::new();
     let mut by_number: BTreeMap<(usize, Cause), Packet> = BTreeMap::new();
     for (number, cause, packet) in &one {
-        let words = *by_cause.entry(*cause).or_insert(packet.words);
-        assert_eq!(words, packet.words, "one run, twice the same cause: {cause:?}");
+        let words = *by_cause.entry(*cause).or_insert_with(|| packet.words.padded());
+        assert_eq!(words, packet.words.padded(), "one run, twice the same cause: {cause:?}");
         by_number.insert((*number, *cause), *packet);
     }
     let mut shared = BTreeMap::new();
@@ -182,7 +183,7 @@ pub(crate) fn same_torques(one: &Log, other: &Log) -> (usize, usize) {
     for (number, cause, packet) in &other {
         causes.insert(*cause, ());
         if let Some(words) = by_cause.get(cause) {
-            assert_eq!(*words, packet.words, "the same cause in two runs: {cause:?}");
+            assert_eq!(*words, packet.words.padded(), "the same cause in two runs: {cause:?}");
             shared.insert(*cause, ());
         }
         if let Some(before) = by_number.get(&(*number, *cause)) {

@@ -192,7 +192,9 @@ pub(crate) fn changed(
         if left != usize::MAX {
             return line.to_owned();
         }
-        change(&mut packet.words);
+        let mut words = packet.words.six();
+        change(&mut words);
+        packet.words = words.into();
         let frame = packet.frames(Format::Fd).next().unwrap();
         candump::Record { frame, ..record }.to_string()
     };
@@ -213,7 +215,7 @@ pub(crate) fn without(log: &str, mut unwanted: impl FnMut(&Message) -> bool) -> 
 
 /// Whether a message is a torque of a cell that is pressed.
 pub(crate) fn is_torque(message: &Message, cell: u8) -> bool {
-    matches!(message, Message::Torque { from, torque, .. } if from.get() == cell && *torque != [Q3_12::ZERO; WORDS])
+    matches!(message, Message::Torque { from, torque, .. } if from.get() == cell && !torque.is_zero())
 }
 
 /// The embedded bus and the cells of `skin.toml`, started by hand.

@@ -8,10 +8,8 @@ use std::time::{Duration, Instant};
 use model::decode::{Decoded, Decoder};
 use protocol::bus::{Bus, Choice, Inbox, Options};
 use protocol::can::{Format, Frame};
-use protocol::fixed::Q3_12;
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
-use protocol::packet::WORDS;
 use protocol::time::Micros;
 
 use super::{Place, TIMEOUT, until};
@@ -75,7 +73,7 @@ impl TestClient {
         let mut missing: BTreeSet<u8> = cells.collect();
         self.waits_for("torques", |message| {
             if let Message::Torque { from, torque, .. } = message
-                && *torque != [Q3_12::ZERO; WORDS]
+                && !torque.is_zero()
             {
                 missing.remove(&from.get());
             }
