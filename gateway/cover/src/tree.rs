@@ -138,27 +138,16 @@ impl Tree {
 
     /// Whether a ray meets a triangle before it is `until` long.
     pub(crate) fn blocks(&self, ray: &Ray, until: f64) -> bool {
-        let mut open = vec![0];
-        while let Some(node) = open.pop() {
-            let Some((bounds, kind)) = self.nodes.get(node) else { continue };
-            if bounds.entered(ray, until).is_none() {
-                continue;
-            }
-            match *kind {
-                Kind::Fork(first, second) => open.extend([second, first]),
-                Kind::Leaf(from, to) => {
-                    let met = |(_, triangle): (usize, &Triangle)| ray.meets(triangle);
-                    if self.leaf(from, to).filter_map(met).any(|at| at <= until) {
-                        return true;
-                    }
-                }
-            }
-        }
-        false
+        self.meets(ray, until, true).is_some()
     }
 
     /// Where a ray first meets a triangle before it is `until` long, and which.
     pub(crate) fn first(&self, ray: &Ray, until: f64) -> Option<(f64, usize)> {
+        self.meets(ray, until, false)
+    }
+
+    /// The first triangle that a ray meets before it is `until` long, or the `any` that is found soonest.
+    fn meets(&self, ray: &Ray, until: f64, any: bool) -> Option<(f64, usize)> {
         let mut best = None;
         let mut until = until;
         let mut open = vec![0];
@@ -174,6 +163,9 @@ impl Tree {
                         if let Some(at) = ray.meets(triangle).filter(|&at| at <= until) {
                             until = at;
                             best = Some((at, index));
+                            if any {
+                                return best;
+                            }
                         }
                     }
                 }
