@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args};
 use model::central::Central;
-use protocol::fixed::Q1_14;
+use protocol::fixed::{Q1_14, is_saturated};
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
@@ -178,7 +178,7 @@ impl<'a> Calculator<'a> {
             difference: fixed.iter().zip(&central).map(|(fixed, central)| fixed - central).collect(),
             central,
             fixed,
-            saturated: words.iter().any(|word| [i16::MIN, i16::MAX].contains(word)),
+            saturated: words.iter().any(|&word| is_saturated(word)),
         })
     }
 }

@@ -26,6 +26,12 @@ pub type Q7_8 = Q<8>;
 /// Temperatures in degrees Celsius: [-512, 512) in steps of 1.6e-2.
 pub type Q9_6 = Q<6>;
 
+/// Whether a word of any format means *saturated* where saturation is marked (torques and sums).
+#[must_use]
+pub const fn is_saturated(word: i16) -> bool {
+    word == i16::MAX || word == i16::MIN
+}
+
 /// In which format the cells of a bus send their own torques: a wider range for a coarser step. Sums are Q7.8.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub enum TorqueFormat {
@@ -197,7 +203,7 @@ impl<const F: u32> Q<F> {
     /// Whether this word means *saturated* where saturation is marked (torques and sums).
     #[must_use]
     pub const fn is_saturated(self) -> bool {
-        self.0 == i16::MAX || self.0 == i16::MIN
+        is_saturated(self.0)
     }
 
     /// The negative; the smallest number becomes the largest.

@@ -3,6 +3,7 @@
 use core::fmt;
 
 use super::{MAX_WORDS, SEGMENT_BYTES, WORDS};
+use crate::fixed::is_saturated;
 use crate::id::{Command, Id, Kind};
 
 /// The length of a packet, by its words.
@@ -193,7 +194,7 @@ impl Words {
     /// Whether one is at an end of its range, which in torques and sums means *saturated*.
     #[must_use]
     pub fn is_saturated(&self) -> bool {
-        self.words.iter().any(|word| [i16::MIN, i16::MAX].contains(word))
+        self.words.iter().any(|&word| is_saturated(word))
     }
 }
 

@@ -17,7 +17,7 @@ mod watch;
 pub use read::{Found, find};
 pub use watch::{CellMoment, Moment, NotFound, Origin, Requested, Watch};
 
-use protocol::fixed::{Acc, Q, TorqueFormat};
+use protocol::fixed::{Acc, Q, TorqueFormat, is_saturated};
 use protocol::message::{SkinSensors, State};
 use protocol::packet::Words;
 use protocol::parameters::MAX_JOINTS;
@@ -453,11 +453,6 @@ fn row(
         difference_steps: difference,
         verdict,
     }
-}
-
-/// Whether a word of a torque means *saturated*.
-fn is_saturated(word: i16) -> bool {
-    [i16::MIN, i16::MAX].contains(&word)
 }
 
 /// How many steps a cell's J may err that so many rows carry.

@@ -1,6 +1,6 @@
 //! The errors of distributed torques against central ones.
 
-use protocol::fixed::TorqueFormat;
+use protocol::fixed::{TorqueFormat, is_saturated};
 use protocol::packet::Words;
 use protocol::parameters::MAX_JOINTS;
 use serde::ser::{Serialize, SerializeStruct, Serializer};
@@ -103,7 +103,7 @@ impl Accuracy {
         for (((error, of_joint), &word), (quantised, unquantised)) in
             joints.zip(words.as_slice()).zip(both).take(joint)
         {
-            if [i16::MIN, i16::MAX].contains(&word) {
+            if is_saturated(word) {
                 self.saturated += 1;
                 continue;
             }
