@@ -15,6 +15,7 @@ use protocol::bus::Options;
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
 use protocol::id::Node;
+use protocol::skin::Skin;
 use protocol::stop::{self, Stoppable};
 use protocol::time::Micros;
 use protocol::usage::{Failure, print, written};
@@ -87,6 +88,11 @@ pub(crate) struct Dump {
     /// The frame format of packets; auto accepts both
     #[arg(long, value_parser = one_of(ANY_FORMAT), default_value = "auto")]
     format: Packets,
+    /// The skin's description, which gives torques and positions their units; else the one in the recording
+    ///
+    /// Without one, torques are read as Q3.12, and joints as revolute.
+    #[arg(long, value_name = "FILE", conflicts_with = "stats")]
+    skin: Option<PathBuf>,
     #[command(flatten)]
     on: BusKind,
 }
@@ -117,9 +123,21 @@ impl Dump {
         let max = self.max.unwrap_or(u64::MAX);
         let to_out = BufWriter::new(Stoppable::new(&out));
         let mut show = Show::new(to_out, self.format, pick, self.contact, how, max);
+        if let Some(path) = &self.skin {
+            show.describe(&Skin::read(path).map_err(Failure::usage)?);
+        }
         let (what, extras, done) = if is_capture {
             let mut reader = captures(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
+            if self.skin.is_none() && !self.stats {
+                match reader.extras().skin() {
+                    None => {}
+                    Some(Ok(skin)) => show.describe(&skin),
+                    Some(Err(error)) => output::note(format_args!(
+                        "{title}, {error}; torques are read as Q3.12 and joints as revolute: name the skin with --skin"
+                    )),
+                }
+            }
             let done = captured(&mut reader, &mut show, self.strict);
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {

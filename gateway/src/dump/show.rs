@@ -11,6 +11,8 @@ use model::decode::{Decoded, json};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};
 use protocol::id::Kind;
+use protocol::schema::Units;
+use protocol::skin::Skin;
 use protocol::time::Micros;
 
 /// Colours of a terminal.
@@ -39,6 +41,7 @@ pub(super) enum How {
 struct Waiting {
     time: Timestamp,
     bus: Arc<str>,
+    units: Units,
     frame: Frame,
     direction: Option<Direction>,
 }
@@ -47,8 +50,11 @@ struct Waiting {
 pub(super) struct Show<W> {
     out: W,
     settler: Settler<Waiting>,
-    /// The bus of the last frame.
+    /// The bus of the last frame, and its units.
     bus: Arc<str>,
+    units: Units,
+    /// Those of the buses that a skin describes.
+    described: Vec<(String, Units)>,
     pick: Pick,
     /// Only traffic of touches.
     contact: bool,
@@ -62,8 +68,25 @@ pub(super) struct Show<W> {
 
 impl<W: Write> Show<W> {
     pub(super) fn new(out: W, format: Option<Format>, pick: Pick, contact: bool, how: How, max: u64) -> Self {
-        let (settler, bus) = (Settler::new(format), Arc::from(""));
-        Self { out, settler, bus, pick, contact, how, left: max, first: None, raw: String::new() }
+        Self {
+            out,
+            settler: Settler::new(format),
+            bus: Arc::from(""),
+            units: Units::default(),
+            described: Vec::new(),
+            pick,
+            contact,
+            how,
+            left: max,
+            first: None,
+            raw: String::new(),
+        }
+    }
+
+    /// Takes the units of the skin's buses; of others they stay the default. Before the first frame.
+    pub(super) fn describe(&mut self, skin: &Skin) {
+        let buses = skin.buses.iter().enumerate();
+        self.described = buses.map(|(index, bus)| (bus.name.clone(), Units::of(skin, index))).collect();
     }
 
     /// Takes the next frame; it is shown once it is settled, if the filters select it.
@@ -71,8 +94,10 @@ impl<W: Write> Show<W> {
         let Record { time, interface, frame, direction } = *record;
         if *self.bus != *interface {
             self.bus = Arc::from(interface);
+            let described = self.described.iter().find(|(name, _)| name == interface);
+            self.units = described.map_or_else(Units::default, |(_, units)| *units);
         }
-        let waiting = Waiting { time, bus: Arc::clone(&self.bus), frame, direction };
+        let waiting = Waiting { time, bus: Arc::clone(&self.bus), units: self.units, frame, direction };
         self.settler.push(Micros(time.nanos / 1_000), interface, &frame, waiting);
         self.settled()
     }
@@ -97,9 +122,9 @@ impl<W: Write> Show<W> {
     /// Shows the frames that are settled.
     fn settled(&mut self) -> io::Result<()> {
         while self.left > 0
-            && let Some((Waiting { time, bus, frame, direction }, decoded)) = self.settler.pop()
+            && let Some((Waiting { time, bus, units, frame, direction }, decoded)) = self.settler.pop()
         {
-            self.show(&Record { time, interface: &bus, frame, direction }, decoded)?;
+            self.show(&Record { time, interface: &bus, frame, direction }, &decoded, units)?;
         }
         Ok(())
     }
@@ -110,22 +135,23 @@ impl<W: Write> Show<W> {
     }
 
     /// Shows a frame if the filters select it.
-    fn show(&mut self, record: &Record<'_>, decoded: Decoded) -> io::Result<()> {
+    fn show(&mut self, record: &Record<'_>, decoded: &Decoded, units: Units) -> io::Result<()> {
         let nanos = record.time.nanos;
         let first = *self.first.get_or_insert(nanos);
-        if !self.pick.takes(first, nanos, &record.frame, &decoded) || self.contact && !decoded.is_contact() {
+        if !self.pick.takes(first, nanos, &record.frame, decoded) || self.contact && !decoded.is_contact() {
             return Ok(());
         }
+        let said = decoded.in_units(units);
         match &mut self.how {
-            How::Stats(stats) => stats.take(record, &decoded),
-            How::Json => json::write(&mut self.out, record, &decoded)?,
+            How::Stats(stats) => stats.take(record, decoded),
+            How::Json => json::write(&mut self.out, record, decoded, units)?,
             How::Brief { colour } => {
                 // Where times run backwards a frame may be before the first one.
                 let (sign, since) = if nanos < first { ("-", first - nanos) } else { ("", nanos - first) };
                 let (seconds, micros) = (since / 1_000_000_000, since / 1_000 % 1_000_000);
-                let (dim, of, plain) = if *colour { (DIM, of(&decoded), PLAIN) } else { ("", "", "") };
+                let (dim, of, plain) = if *colour { (DIM, of(decoded), PLAIN) } else { ("", "", "") };
                 let bus = record.interface;
-                writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {bus}{plain} {of}{decoded}{plain}")?;
+                writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {bus}{plain} {of}{said}{plain}")?;
             }
             How::Lines { colour } => {
                 self.raw.clear();
@@ -138,10 +164,10 @@ impl<W: Write> Show<W> {
                 let _ = write!(self.raw, "{record}{way}");
                 let raw = &self.raw;
                 if *colour {
-                    let colour = of(&decoded);
-                    writeln!(self.out, "{DIM}{raw}{PLAIN}\t{colour}{decoded}{PLAIN}")?;
+                    let colour = of(decoded);
+                    writeln!(self.out, "{DIM}{raw}{PLAIN}\t{colour}{said}{PLAIN}")?;
                 } else {
-                    writeln!(self.out, "{raw}\t{decoded}")?;
+                    writeln!(self.out, "{raw}\t{said}")?;
                 }
             }
         }

@@ -2,7 +2,7 @@
 
 use serde::Deserialize;
 
-use crate::fixed::{Q1_14, TorqueFormat};
+use crate::fixed::TorqueFormat;
 use crate::packet::{MAX_WORDS, WORDS};
 
 /// Bytes of the words of a packet of six.
@@ -184,16 +184,6 @@ impl Field {
         let all = there.iter().take(5).rev().fold(0_u64, |all, &byte| all << 8 | u64::from(byte));
         let bits = (all >> (at % 8) & ((1 << width) - 1)).cast_signed();
         if self.is_signed() && bits >> (width - 1) == 1 { bits - (1 << width) } else { bits }
-    }
-
-    /// What such bits are worth in the unit.
-    #[must_use]
-    pub fn real(&self, raw: i64) -> f64 {
-        let word = i16::try_from(raw).unwrap_or_default();
-        if matches!(self.format, Format::Angle | Format::Position) {
-            return Q1_14::from_bits(word).to_radians();
-        }
-        f64::from(word) / f64::from(1_u32 << self.fraction())
     }
 
     /// The sum of its word and the two after it.

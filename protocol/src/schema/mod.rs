@@ -9,9 +9,11 @@
 
 mod field;
 mod file;
+mod units;
 
 pub use field::{Absent, Field, Format, Range};
 pub use file::{Layout, PacketSchema, Part, Piece, packets, parameters, reasons, wires};
+pub use units::Units;
 
 use crate::id::{Id, Kind};
 use crate::message::{FROM_THE_NEXT, Message, REFUSED, Request, WRITE};

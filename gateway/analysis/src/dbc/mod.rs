@@ -22,7 +22,7 @@ use core::iter;
 use protocol::can::Format;
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::packet::{Length, Lengths};
-use protocol::schema::{PacketSchema, packets};
+use protocol::schema::{PacketSchema, Units, packets};
 use protocol::skin::{Bus, Skin};
 
 use signal::Signal;
@@ -84,10 +84,8 @@ struct Message {
 fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
     let mut nodes: Vec<_> = skin.cells_of(bus).map(|cell| Node::Cell(cell.node)).collect();
     nodes.sort_unstable_by_key(|node| node.to_byte());
-    let bus_format = skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default();
-    let kinds: Vec<_> = skin.joints_of(bus).map(|(_, joint)| joint.kind).collect();
-    let rows = skin.chain(bus).rows.len();
-    let chain = signal::Chain { length: skin.length_of(bus), format: bus_format, kinds, rows };
+    let (units, rows) = (Units::of(skin, bus), skin.chain(bus).rows.len());
+    let chain = signal::Chain { length: skin.length_of(bus), units, rows };
     let of = |schema: &'static PacketSchema| {
         let said = |node| message(schema, node, period_ms(skin), &chain);
         let each = nodes.iter().map(|node| said(*node));

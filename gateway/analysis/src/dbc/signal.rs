@@ -1,15 +1,12 @@
 //! Signals: their place in a packet, scale, unit and range.
 
-use core::f64::consts::FRAC_PI_2;
 use core::slice;
 
-use protocol::fixed::TorqueFormat;
 use protocol::id::Kind;
 use protocol::message::State;
 use protocol::packet::{Length, WORDS};
 use protocol::parameters::Parameter;
-use protocol::schema::{Field, Format, Layout, PacketSchema, Range, parameters, reasons};
-use protocol::skin::JointKind;
+use protocol::schema::{Field, Format, Layout, PacketSchema, Range, Units, parameters, reasons};
 
 /// Where the words of a packet of six end.
 const END: usize = WORDS * 16;
@@ -19,10 +16,8 @@ const END: usize = WORDS * 16;
 pub(super) struct Chain {
     /// How long they are.
     pub(super) length: Length,
-    /// In which format its cells send torques.
-    pub(super) format: TorqueFormat,
-    /// By joint.
-    pub(super) kinds: Vec<JointKind>,
+    /// What they are worth.
+    pub(super) units: Units,
     /// Rows of its table.
     pub(super) rows: usize,
 }
@@ -38,24 +33,6 @@ impl Chain {
             }
             Some(_) | None => true,
         }
-    }
-
-    /// A field's element as the joint makes it.
-    fn adapt(&self, field: &Field, element: usize, signal: Signal) -> Signal {
-        let mut signal = signal;
-        if field.format == Format::Torque {
-            let ratio = self.format.step() / TorqueFormat::default().step();
-            signal.factor *= ratio;
-            signal.range = signal.range.map(|bound| bound * ratio);
-        }
-        if field.grows() && self.kinds.get(element) == Some(&JointKind::Prismatic) {
-            if field.format == Format::Position {
-                signal.factor /= FRAC_PI_2;
-                signal.range = signal.range.map(|bound| bound / FRAC_PI_2);
-            }
-            signal.unit = if field.unit == "rad" { "m" } else { "N" };
-        }
-        signal
     }
 }
 
@@ -100,12 +77,9 @@ pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) 
             .iter()
             .flat_map(move |field| {
                 let count = if field.grows() { length.words() } else { usize::MAX };
-                let signals = of(field, &layout.prefix).into_iter().take(count).enumerate();
+                let signals = of(field, &layout.prefix, chain.units).into_iter().take(count);
                 let further = if field.at() < END { 0 } else { further };
-                signals.map(move |(element, signal)| {
-                    let signal = chain.adapt(field, element, signal);
-                    Signal { start: signal.start + further, ..signal }
-                })
+                signals.map(move |signal| Signal { start: signal.start + further, ..signal })
             })
             .map(move |it| Signal { page, ..it })
     };
@@ -115,7 +89,7 @@ pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) 
         let is_number = matches!(field.format, Format::Page(_) | Format::Parameter(_));
         let numbered =
             |signal| Signal { page: Page::Number, names: numbers(layouts.iter().copied()), ..signal };
-        let signals_of = of(field, "").into_iter();
+        let signals_of = of(field, "", chain.units).into_iter();
         let placed = |signal: Signal| Signal { start: signal.start + further, ..signal };
         signals
             .extend(signals_of.map(placed).map(|signal| if is_number { numbered(signal) } else { signal }));
@@ -148,7 +122,7 @@ fn bits(name: String, start: usize, bits: u8) -> Signal {
 }
 
 /// The signals of one field: one for each element, for each bit that has a meaning of its own.
-fn of(field: &'static Field, prefix: &str) -> Vec<Signal> {
+fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
     let at = field.at();
     let named = |label: &str| field.signal_name(prefix, label);
     if matches!(field.format, Format::Total(_)) {
@@ -165,14 +139,14 @@ fn of(field: &'static Field, prefix: &str) -> Vec<Signal> {
         return (0..usize::from(ports)).map(|port| bits(named(&port.to_string()), at + port, 1)).collect();
     }
     if field.labels.is_empty() {
-        return vec![one(field, named(""))];
+        return vec![one(field, 0, units, named(""))];
     }
     let element = |(word, label): (usize, &String)| {
         let parts =
             if let Format::Group(parts) = &field.format { &parts[..] } else { slice::from_ref(field) };
         let label = label.clone();
         let signal = move |part: &'static Field| {
-            let signal = one(part, part.signal_name(prefix, &label));
+            let signal = one(part, word, units, part.signal_name(prefix, &label));
             Signal { start: signal.start + word * 16, ..signal }
         };
         parts.iter().map(signal)
@@ -180,11 +154,10 @@ fn of(field: &'static Field, prefix: &str) -> Vec<Signal> {
     field.labels.iter().enumerate().flat_map(element).collect()
 }
 
-/// The signal of a field that has one.
-fn one(field: &'static Field, name: String) -> Signal {
+/// The signal of a field's element that has one.
+fn one(field: &'static Field, element: usize, units: Units, name: String) -> Signal {
     let unscaled = bits(name, field.at(), field.width());
-    let is_angle = matches!(field.format, Format::Angle | Format::Position);
-    let factor = if is_angle { FRAC_PI_2 } else { 1.0 } / f64::from(1_u32 << field.fraction());
+    let factor = field.step_in(element, units);
     let signed = [i16::MIN, i16::MAX].map(|end| f64::from(end) * factor);
     let [min, max] = if field.is_signed() { signed } else { unscaled.range };
     let range = match field.range {
@@ -203,6 +176,9 @@ fn one(field: &'static Field, name: String) -> Signal {
         field.names.iter().map(named).collect()
     };
     // Readers differ in which bytes beyond ASCII they take.
-    let unit = if field.unit == "°C" { "degC" } else { &field.unit };
+    let unit = match field.unit_in(element, units) {
+        "°C" => "degC",
+        unit => unit,
+    };
     Signal { signed: field.is_signed(), factor, range, unit, names, ..unscaled }
 }

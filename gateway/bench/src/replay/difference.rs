@@ -7,6 +7,8 @@ use protocol::id::{CellId, Id, Kind, Node};
 use protocol::message::{Answer, Message};
 use protocol::packet::{Epoch, Packet, Words};
 use protocol::parameters::MAX_JOINTS;
+use protocol::schema::Units;
+use protocol::skin::JointKind;
 use serde::Serialize;
 
 use super::comparator::Own;
@@ -39,7 +41,7 @@ pub enum How {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Said {
     /// The words of a reply to joints.
-    Words(What, Words, TorqueFormat),
+    Words(What, Words),
     /// A sum, and the remainder without those of the children.
     Sum(Own),
     /// An answer to `configure`, with its tag.
@@ -78,7 +80,7 @@ impl Difference {
     #[must_use]
     pub fn new(
         how: How,
-        bus: &str,
+        (bus, units): (&str, Units),
         cell: CellId,
         when: Option<When>,
         recorded: Option<&Said>,
@@ -93,17 +95,18 @@ impl Difference {
             format!(", joints {joints} (epoch {epoch}, {at_s:.3} s into the recording)")
         });
         let epoch = Epoch(when.map_or(0, |when| when.epoch));
-        let shown =
-            |said: Option<&Said>| said.map_or_else(|| "nothing".to_owned(), |said| said.text(cell, epoch));
+        let shown = |said: Option<&Said>| {
+            said.map_or_else(|| "nothing".to_owned(), |said| said.text(cell, epoch, units))
+        };
         let mut text = format!(
             "the first {what}: cell {cell} on {bus}{joints}\n  recorded  {}\n  now       {}",
             shown(recorded),
             shown(now)
         );
-        if let Some(((recorded, step), (now, _))) =
-            recorded.and_then(Said::steps).zip(now.and_then(Said::steps))
+        if let Some(((recorded, format), (now, _))) =
+            recorded.and_then(|said| said.steps(units)).zip(now.and_then(|said| said.steps(units)))
         {
-            text += &format!("\n  {}", Steps(recorded, now, step));
+            text += &format!("\n  {}", Steps { recorded, now, format, units });
         }
         Self { how, bus: bus.to_owned(), cell: cell.get(), when, text }
     }
@@ -111,36 +114,37 @@ impl Difference {
 
 impl Said {
     /// As the text of a message.
-    fn text(&self, cell: CellId, epoch: Epoch) -> String {
+    fn text(&self, cell: CellId, epoch: Epoch, units: Units) -> String {
         match self {
-            &Self::Words(what, words, _) => {
+            &Self::Words(what, words) => {
                 let (kind, count) = match what {
                     What::Torque => (Kind::Torque, 1),
                     What::Skin => (Kind::Sensors, 0),
                     What::Acceleration => (Kind::Sensors, 1),
                 };
                 let packet = Packet { id: Id::new(kind, Node::Cell(cell)), words, epoch, count };
-                Message::decode(&packet).map_or_else(|error| error.to_string(), meaning)
+                Message::decode(&packet)
+                    .map_or_else(|error| error.to_string(), |message| meaning(message, units))
             }
-            Self::Sum(own) => summed(cell, epoch, own),
-            &Self::Answer(tag, answer) => meaning(Message::Configured { from: cell, tag, answer }),
+            Self::Sum(own) => summed(cell, epoch, own, units),
+            &Self::Answer(tag, answer) => meaning(Message::Configured { from: cell, tag, answer }, units),
         }
     }
 
-    /// Its torques in steps, none where one is saturated, and a step in Nm.
-    fn steps(&self) -> Option<([Option<i32>; MAX_JOINTS], f64)> {
+    /// Its torques in steps, none where one is saturated, and their format.
+    fn steps(&self, units: Units) -> Option<([Option<i32>; MAX_JOINTS], TorqueFormat)> {
         match self {
-            Self::Words(What::Torque, words, format) => {
-                Some((words.padded().map(|word| Some(word.into())), format.step()))
+            Self::Words(What::Torque, words) => {
+                Some((words.padded().map(|word| Some(word.into())), units.torque_format()))
             }
-            Self::Sum(own) => Some((own.steps, TorqueFormat::Q7_8.step())),
+            Self::Sum(own) => Some((own.steps, TorqueFormat::Q7_8)),
             Self::Words(What::Skin | What::Acceleration, ..) | Self::Answer(..) => None,
         }
     }
 }
 
 /// A sum, its children, and what the cell itself put into it.
-fn summed(cell: CellId, epoch: Epoch, own: &Own) -> String {
+fn summed(cell: CellId, epoch: Epoch, own: &Own, units: Units) -> String {
     let sum = Message::Sum { from: cell, epoch, torque: own.sum, count: own.count };
     let children: Vec<_> = own.children.iter().map(ToString::to_string).collect();
     let less = match children.as_slice() {
@@ -148,36 +152,49 @@ fn summed(cell: CellId, epoch: Epoch, own: &Own) -> String {
         [one] => format!("less its child {one}"),
         several => format!("less its children {}", several.join(", ")),
     };
-    let word = |step: &Option<i32>| match step {
-        Some(step) => format!(" {:.3}", f64::from(*step) * TorqueFormat::Q7_8.step()),
-        None => " saturated".to_owned(),
+    let word = |(joint, step): (usize, &Option<i32>)| match (step, units.torque_unit(joint)) {
+        (None, _) => " saturated".to_owned(),
+        (Some(step), unit) => {
+            let value = f64::from(*step) * TorqueFormat::Q7_8.step();
+            if unit == JointKind::Revolute.torque_unit() {
+                format!(" {value:.3}")
+            } else {
+                format!(" {value:.3} {unit}")
+            }
+        }
     };
-    let words: String = own.steps.iter().take(own.sum.length().words()).map(word).collect();
-    format!("{}; {less}:{words} Nm", meaning(sum))
+    let words: String = own.steps.iter().take(own.sum.length().words()).enumerate().map(word).collect();
+    format!("{}; {less}:{words} Nm", meaning(sum, units))
 }
 
 /// A message as text, without the verdict.
-fn meaning(message: Message) -> String {
-    let text = Decoded::Message(message).to_string();
+fn meaning(message: Message, units: Units) -> String {
+    let text = Decoded::Message(message).in_units(units).to_string();
     text.split_once(' ').map_or(String::new(), |(_, text)| text.trim_start().to_owned())
 }
 
 /// By how much torques differ: `joint 1: 2 steps more (0.0005 Nm), joint 3: ...`.
-struct Steps([Option<i32>; MAX_JOINTS], [Option<i32>; MAX_JOINTS], f64);
+struct Steps {
+    recorded: [Option<i32>; MAX_JOINTS],
+    now: [Option<i32>; MAX_JOINTS],
+    format: TorqueFormat,
+    units: Units,
+}
 
 impl Display for Steps {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let mut comma = "";
-        for (joint, (&recorded, &now)) in (1..).zip(self.0.iter().zip(&self.1)) {
+        for (index, (&recorded, &now)) in self.recorded.iter().zip(&self.now).enumerate() {
+            let joint = index + 1;
             let steps = now.unwrap_or(0) - recorded.unwrap_or(0);
             if now.is_none() != recorded.is_none() {
                 let when = if now.is_none() { "now" } else { "then" };
                 write!(f, "{comma}joint {joint}: saturated {when}")?;
             } else if steps != 0 {
                 let (count, way) = (steps.unsigned_abs(), if steps > 0 { "more" } else { "less" });
-                let unit = if count == 1 { "step" } else { "steps" };
-                let nm = f64::from(count) * self.2;
-                write!(f, "{comma}joint {joint}: {count} {unit} {way} ({nm:.4} Nm)")?;
+                let steps = if count == 1 { "step" } else { "steps" };
+                let (value, unit) = (f64::from(count) * self.format.step(), self.units.torque_unit(index));
+                write!(f, "{comma}joint {joint}: {count} {steps} {way} ({value:.4} {unit})")?;
             } else {
                 continue;
             }
@@ -193,11 +210,18 @@ mod tests {
 
     #[test]
     fn a_different_torque_is_shown_word_by_word() {
-        let torque = |words: [i16; 6]| Said::Words(What::Torque, words.into(), TorqueFormat::Q3_12);
+        let torque = |words: [i16; 6]| Said::Words(What::Torque, words.into());
         let (recorded, now) = (torque([-1075, 3195, 0, 0, 0, 0]), torque([-1074, 3193, 0, 0, 0, 0]));
         let when = Some(When { joints: 37, epoch: 7, at_s: 2.3842 });
         let cell = CellId::new(12).unwrap();
-        let difference = Difference::new(How::Different, "vcan0", cell, when, Some(&recorded), Some(&now));
+        let difference = Difference::new(
+            How::Different,
+            ("vcan0", Units::default()),
+            cell,
+            when,
+            Some(&recorded),
+            Some(&now),
+        );
         let expected =
             "the first difference: cell 12 on vcan0, joints 37 (epoch 7, 2.384 s into the recording)
   recorded  torque 12 epoch 7: -0.2625 0.7800 0.0000 0.0000 0.0000 0.0000 Nm
@@ -210,7 +234,8 @@ mod tests {
     fn a_reply_that_was_not_sent_is_nothing() {
         let refused = Said::Answer(9, Answer::Refused { number: 127, reason: Answer::WRONG_HASH });
         let cell = CellId::new(3).unwrap();
-        let text = Difference::new(How::Missing, "can1", cell, None, Some(&refused), None).text;
+        let text =
+            Difference::new(How::Missing, ("can1", Units::default()), cell, None, Some(&refused), None).text;
         let lines: Vec<_> = text.lines().collect();
         assert_eq!(lines.len(), 3, "{text}");
         assert_eq!(lines[0], "the first missing reply: cell 3 on can1");

@@ -6,7 +6,7 @@ use protocol::candump::{Direction, Record};
 use protocol::id::{Id, Kind};
 use protocol::message::{Message, State};
 use protocol::packet::{Bytes, PacketError};
-use protocol::schema::{self, Absent, Field, Format, Layout, PacketSchema};
+use protocol::schema::{self, Absent, Field, Format, Layout, PacketSchema, Units};
 use protocol::wire::LinkId;
 use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 
@@ -52,19 +52,20 @@ struct Values {
     end: &'static [Field],
     layout: &'static Layout,
     bytes: Bytes,
+    units: Units,
 }
 
 impl Serialize for Values {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
-        let Self { link_id, end, layout, bytes } = self;
+        let Self { link_id, end, layout, bytes, units } = self;
         if let Some(LinkId { wire, back }) = link_id {
             map.serialize_entry("wire", wire)?;
             map.serialize_entry("back", back)?;
             map.serialize_entry("says", &layout.name)?;
         }
-        entries(&mut map, end, &layout.name, bytes)?;
-        entries(&mut map, &layout.fields, &layout.name, bytes)?;
+        entries(&mut map, end, &layout.name, bytes, *units)?;
+        entries(&mut map, &layout.fields, &layout.name, bytes, *units)?;
         map.end()
     }
 }
@@ -75,13 +76,19 @@ struct Group<'a>(&'a [Field], &'a [u8]);
 impl Serialize for Group<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
-        entries(&mut map, self.0, "", self.1)?;
+        entries(&mut map, self.0, "", self.1, Units::default())?;
         map.end()
     }
 }
 
 /// Each field that is there; the epoch and the tag stand beside the values.
-fn entries<M: SerializeMap>(map: &mut M, fields: &[Field], page: &str, bytes: &[u8]) -> Result<(), M::Error> {
+fn entries<M: SerializeMap>(
+    map: &mut M,
+    fields: &[Field],
+    page: &str,
+    bytes: &[u8],
+    units: Units,
+) -> Result<(), M::Error> {
     let Some(first) = fields.first() else { return Ok(()) };
     for field in fields.iter().filter(|field| !matches!(field.name.as_str(), "" | "epoch" | "tag")) {
         let raw = field.raw(bytes, 0);
@@ -97,7 +104,7 @@ fn entries<M: SerializeMap>(map: &mut M, fields: &[Field], page: &str, bytes: &[
             map.serialize_entry("joint", &state.joint())?;
             map.serialize_entry("version", &state.version())?;
         } else {
-            map.serialize_entry(&field.name, &Shown(field, bytes))?;
+            map.serialize_entry(&field.name, &Shown(field, bytes, units))?;
             if field.format == Format::Reason {
                 map.serialize_entry("because", schema::reason(raw))?;
             }
@@ -107,13 +114,13 @@ fn entries<M: SerializeMap>(map: &mut M, fields: &[Field], page: &str, bytes: &[
 }
 
 /// The value of a field, or those of its elements.
-struct Shown<'a>(&'a Field, &'a [u8]);
+struct Shown<'a>(&'a Field, &'a [u8], Units);
 
 impl Serialize for Shown<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let Self(field, bytes) = *self;
+        let Self(field, bytes, units) = *self;
         let (first, elements) = (field.raw(bytes, 0), 0..field.elements_in(bytes));
-        let real = |element| field.real(field.raw(bytes, element));
+        let real = |element| field.real_in(field.raw(bytes, element), element, units);
         match &field.format {
             Format::Choice => serializer.serialize_str(field.name_of(first).unwrap_or_default()),
             Format::Flag(_) => serializer.serialize_bool(first == 1),
@@ -154,11 +161,11 @@ impl Serialize for Shown<'_> {
     }
 }
 
-/// Writes one frame and the end of its line.
+/// Writes one frame in the units of its bus, and the end of its line.
 ///
 /// # Errors
 /// When `out` fails.
-pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io::Result<()> {
+pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units: Units) -> io::Result<()> {
     let raw = record.frame.to_string();
     let id = raw.split('#').next().unwrap_or_default().to_owned();
     let mut line = Line {
@@ -193,7 +200,7 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io
             line.crc = Some(word(last_word(record)));
             let (bytes, layout) = wires::said(message);
             line.epoch = wires::epoch(message);
-            line.values = Some(Values { link_id: Some(link_id), end: &[], layout, bytes });
+            line.values = Some(Values { link_id: Some(link_id), end: &[], layout, bytes, units });
         }
         Decoded::Segment { id } => line.about(id),
         Decoded::Damaged { id, fault } => {
@@ -210,7 +217,7 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded) -> io
             line.about(message.id());
             line.crc = Some(word(last_word(record)));
             line.saturated = message.is_saturated();
-            line.say(&message);
+            line.say(&message, units);
         }
     }
     serde_json::to_writer(&mut *out, &line)?;
@@ -240,13 +247,14 @@ impl Line<'_> {
         }
     }
 
-    fn say(&mut self, message: &Message) {
+    fn say(&mut self, message: &Message, units: Units) {
         (self.epoch, self.tag) = (message.epoch().map(|epoch| epoch.0), message.tag());
         let packet = message.encode();
         let layout = schema::layout(message, &packet);
         let end = PacketSchema::of(packet.id).map_or(&[][..], |schema| schema.end(layout));
         let is_bare = end.is_empty() && layout.fields.is_empty();
-        self.values = (!is_bare).then(|| Values { link_id: None, end, layout, bytes: packet.fields() });
+        self.values =
+            (!is_bare).then(|| Values { link_id: None, end, layout, bytes: packet.fields(), units });
     }
 }
 
@@ -273,7 +281,7 @@ mod tests {
                     let at = Micros(record.time.nanos / 1_000);
                     let decoded = decoder.decode(at, record.interface, &record.frame);
                     let mut text = Vec::new();
-                    write(&mut text, &record, &decoded).unwrap();
+                    write(&mut text, &record, &decoded, Units::default()).unwrap();
                     assert_eq!(text.iter().filter(|&&byte| byte == b'\n').count(), 1);
                     all.push((comment.to_owned(), serde_json::from_slice(&text).unwrap()));
                 }
@@ -393,8 +401,13 @@ mod tests {
         let record = Record { time, interface: "can0", frame, direction: None };
         let id = protocol::packet::data_id(&frame).unwrap();
         let mut line = Vec::new();
-        write(&mut line, &record, &Decoded::Damaged { id, fault: PacketError::Crc { expected: 1, got: 2 } })
-            .unwrap();
+        write(
+            &mut line,
+            &record,
+            &Decoded::Damaged { id, fault: PacketError::Crc { expected: 1, got: 2 } },
+            Units::default(),
+        )
+        .unwrap();
         let damaged: Value = serde_json::from_slice(&line).unwrap();
         assert_eq!((&damaged["verdict"], &damaged["kind"]), (&json!("CRC"), &json!("torque")));
         assert_eq!((&damaged["node"], &damaged["crc_expected"]), (&json!(12), &json!("0001")));

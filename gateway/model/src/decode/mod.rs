@@ -17,6 +17,8 @@ pub mod settle;
 mod text;
 mod wires;
 
+pub use text::InUnits;
+
 use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id};
 use protocol::message::{Message, MessageError};

@@ -1,10 +1,16 @@
 //! The text of every kind of frame, against lines made by hand from the document and the golden logs'
 //! comments.
 
+use core::f64::consts::FRAC_PI_2;
+
 use super::settle::Settler;
 use super::*;
 use proptest::prelude::*;
-use protocol::candump::{self, Line};
+use protocol::candump::{self, Line, Timestamp};
+use protocol::fixed::TorqueFormat;
+use protocol::id::Kind;
+use protocol::schema::Units;
+use protocol::skin::JointKind;
 
 const DOCUMENT: &str = include_str!("../../../../protocol/tests/golden/document.log");
 const FD: &str = include_str!("../../../../protocol/tests/golden/fd.log");
@@ -33,7 +39,7 @@ fn decoded(log: &str, format: Option<Format>) -> Vec<(String, String)> {
 fn knowing(format: Option<Format>) -> Decoder {
     let mut decoder = Decoder::new(format);
     let packet = Packet {
-        id: Id { kind: protocol::id::Kind::Torque, node: 12 },
+        id: Id { kind: Kind::Torque, node: 12 },
         words: [0; protocol::packet::WORDS].into(),
         epoch: protocol::packet::Epoch(1),
         count: 1,
@@ -407,6 +413,48 @@ fn contact_is_a_frame_that_shows_a_touch() {
         let decoded = Decoder::new(None).decode(Micros(0), "vcan0", &frame);
         assert_eq!((decoded.verdict(), decoded.is_contact()), ("ok", expected), "{text}");
     }
+}
+
+#[test]
+fn joints_and_torques_are_in_the_units_of_their_bus() {
+    let mut skin = crate::testing::skin();
+    skin.buses[0].torque_format = TorqueFormat::Q5_10;
+    skin.robot.joints[1].kind = JointKind::Prismatic;
+    let units = Units::of(&skin, 0);
+    assert_eq!(Units::of(&skin, 9).torque_format(), TorqueFormat::Q3_12);
+    let words: [i16; protocol::packet::WORDS] = [1024, -8192, 16384, 0, i16::MAX, i16::MIN];
+    let said = |id, count| {
+        let epoch = protocol::packet::Epoch(7);
+        let packet = Packet { id, words: words.into(), epoch, count };
+        let frame = packet.frames(Format::Fd).next().unwrap();
+        let record = candump::Record {
+            time: Timestamp { nanos: 0, nine_digits: false },
+            interface: "vcan0",
+            frame,
+            direction: None,
+        };
+        let decoded = Decoder::new(None).decode(Micros(0), "vcan0", &frame);
+        let mut line = Vec::new();
+        json::write(&mut line, &record, &decoded, units).unwrap();
+        let object: serde_json::Value = serde_json::from_slice(&line).unwrap();
+        (decoded.in_units(units).to_string(), decoded.to_string(), object["values"].clone())
+    };
+    let cell = |kind| Id { kind, node: 12 };
+    let (text, plain, values) = said(cell(Kind::Torque), 1);
+    assert_eq!(text, "ok      torque 12 epoch 7: 1.0000 -8.0000 N 16.0000 0.0000 +saturated -saturated Nm");
+    assert_eq!(plain, "ok      torque 12 epoch 7: 0.2500 -2.0000 4.0000 0.0000 +saturated -saturated Nm");
+    let expected = [1.0, -8.0, 16.0, 0.0, f64::from(i16::MAX) / 1024.0, -32.0];
+    assert_eq!(values, serde_json::json!({ "torque_nm": expected }));
+    // Sums have a format of their own.
+    let (text, _, values) = said(cell(Kind::Sum), 2);
+    assert_eq!(
+        text,
+        "ok      sum 12 epoch 7: 4.000 -32.000 N 64.000 0.000 +saturated -saturated Nm, cells 2"
+    );
+    assert_eq!(values["torque_nm"][1], serde_json::json!(-32.0));
+    let (text, _, values) = said(Id::command(Command::Joints), 3);
+    assert_eq!(text, "ok      joints epoch 7: 0.0982 -0.5000 m 1.5708 rad");
+    assert_eq!(values["position_rad"], serde_json::json!([FRAC_PI_2 / 16.0, -0.5, FRAC_PI_2]));
 }
 
 #[test]

@@ -5,22 +5,42 @@ use core::fmt::{self, Display, Formatter};
 use protocol::id::{Command, Id, Kind, Node};
 use protocol::message::{Message, State};
 use protocol::packet::WORDS;
-use protocol::schema::{self, Field, Format, Layout, PacketSchema, Part, Piece};
+use protocol::schema::{self, Field, Format, Layout, PacketSchema, Part, Piece, Units};
 
 use super::Decoded;
 use super::wires::{self, Port, Said};
 
 impl Display for Decoded {
+    /// As on a bus without a torque format of its own, whose joints are revolute.
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        self.in_units(Units::default()).fmt(f)
+    }
+}
+
+/// A frame in the units of its bus.
+#[derive(Clone, Copy, Debug)]
+pub struct InUnits<'a>(&'a Decoded, Units);
+
+impl Decoded {
+    /// As the bus' joints and torques are meant.
+    #[must_use]
+    pub const fn in_units(&self, units: Units) -> InUnits<'_> {
+        InUnits(self, units)
+    }
+}
+
+impl Display for InUnits<'_> {
     /// A verdict, a space, and what the frame says.
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        write!(f, "{:<7} ", self.verdict())?;
-        match *self {
-            Self::Foreign(foreign) => write!(f, "{foreign}"),
-            Self::Wire(link_id, message) => write!(f, "{}", Said(link_id, message)),
-            Self::Segment { id } => write!(f, "{}", Subject(id)),
-            Self::Damaged { id, fault } => write!(f, "{}: {fault}", Subject(id)),
-            Self::Meaningless { packet, error } => write!(f, "{}: {error}", Subject(packet.id)),
-            Self::Message(message) => write!(f, "{}", Meaning(&message)),
+        let Self(decoded, units) = *self;
+        write!(f, "{:<7} ", decoded.verdict())?;
+        match *decoded {
+            Decoded::Foreign(foreign) => write!(f, "{foreign}"),
+            Decoded::Wire(link_id, message) => write!(f, "{}", Said(link_id, message)),
+            Decoded::Segment { id } => write!(f, "{}", Subject(id)),
+            Decoded::Damaged { id, fault } => write!(f, "{}: {fault}", Subject(id)),
+            Decoded::Meaningless { packet, error } => write!(f, "{}: {error}", Subject(packet.id)),
+            Decoded::Message(message) => write!(f, "{}", Meaning(&message, units)),
         }
     }
 }
@@ -43,7 +63,7 @@ impl Display for Subject {
 }
 
 /// A message in words.
-struct Meaning<'a>(&'a Message);
+struct Meaning<'a>(&'a Message, Units);
 
 impl Display for Meaning<'_> {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
@@ -54,8 +74,9 @@ impl Display for Meaning<'_> {
         };
         let (layout, bytes) = (schema::layout(self.0, &packet), packet.fields());
         f.write_str(" ")?;
-        fill(f, &schema.text, u16::from(packet.count), &bytes, &|f, name| match name {
-            "" => say(f, layout, &bytes).map(|()| None),
+        let words = Bytes { bytes: &bytes, units: self.1 };
+        fill(f, &schema.text, u16::from(packet.count), words, &|f, name| match name {
+            "" => fields(f, layout, words).map(|()| None),
             "page" => f.write_str(&layout.name).map(|()| None),
             _ => Ok(field(&schema.end, name).or_else(|| field(&layout.fields, name))),
         })
@@ -95,8 +116,20 @@ impl Display for Name {
 
 /// The text of a layout's fields in these bytes.
 pub(super) fn say(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
-    let number = layout.fields.first().map_or(0, |first| first.raw(bytes, 0));
-    fill(f, &layout.text, u16::try_from(number).unwrap_or_default(), bytes, &|_, name| {
+    fields(f, layout, Bytes { bytes, units: Units::default() })
+}
+
+/// The bytes of a packet, and what those of joints, torques and sums are worth.
+#[derive(Clone, Copy)]
+struct Bytes<'a> {
+    bytes: &'a [u8],
+    units: Units,
+}
+
+/// The text of a layout's fields.
+fn fields(f: &mut Formatter<'_>, layout: &Layout, words: Bytes<'_>) -> fmt::Result {
+    let number = layout.fields.first().map_or(0, |first| first.raw(words.bytes, 0));
+    fill(f, &layout.text, u16::try_from(number).unwrap_or_default(), words, &|_, name| {
         Ok(field(&layout.fields, name))
     })
 }
@@ -110,29 +143,35 @@ fn field<'a>(fields: &'a [Field], name: &str) -> Option<&'a Field> {
 type Find<'a> = dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a Field>, fmt::Error> + 'a;
 
 /// Writes the parts of a text that belong to a number.
-fn fill<'a>(f: &mut Formatter<'_>, text: &[Part], number: u16, bytes: &[u8], find: &Find<'a>) -> fmt::Result {
+fn fill<'a>(
+    f: &mut Formatter<'_>,
+    text: &[Part],
+    number: u16,
+    words: Bytes<'_>,
+    find: &Find<'a>,
+) -> fmt::Result {
     for part in text {
         let of = part.of.as_deref().map(|name| find(f, name)).transpose()?.flatten();
-        let number = of.map_or_else(|| i64::from(number), |field| field.raw(bytes, 0));
+        let number = of.map_or_else(|| i64::from(number), |field| field.raw(words.bytes, 0));
         if !(part.when[0].into()..=part.when[1].into()).contains(&number) {
             continue;
         }
-        pieces(f, &part.pieces, bytes, find)?;
+        pieces(f, &part.pieces, words, find)?;
     }
     Ok(())
 }
 
-fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[Piece], bytes: &[u8], find: &Find<'a>) -> fmt::Result {
+fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[Piece], words: Bytes<'_>, find: &Find<'a>) -> fmt::Result {
     for piece in pieces {
         match piece {
-            Piece::Words(words) => f.write_str(words)?,
+            Piece::Words(text) => f.write_str(text)?,
             Piece::Field { name, decimals } => {
                 if let Some(field) = find(f, name)? {
-                    show(f, field, bytes, *decimals)?;
+                    show(f, field, words, *decimals)?;
                 }
             }
             Piece::Either { name, words: [no, yes] } => {
-                let is = find(f, name)?.is_some_and(|field| field.raw(bytes, 0) == 1);
+                let is = find(f, name)?.is_some_and(|field| field.raw(words.bytes, 0) == 1);
                 f.write_str(if is { yes } else { no })?;
             }
         }
@@ -140,8 +179,13 @@ fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[Piece], bytes: &[u8], find: &Find
     Ok(())
 }
 
-/// Writes a field as a part of a text asks for it.
-fn show(f: &mut Formatter<'_>, field: &Field, bytes: &[u8], decimals: usize) -> fmt::Result {
+/// Writes a field as a part of a text asks for it. An element whose unit is not the field's has its unit behind it.
+fn show(
+    f: &mut Formatter<'_>,
+    field: &Field,
+    Bytes { bytes, units }: Bytes<'_>,
+    decimals: usize,
+) -> fmt::Result {
     let first = field.raw(bytes, 0);
     match &field.format {
         Format::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
@@ -169,8 +213,14 @@ fn show(f: &mut Formatter<'_>, field: &Field, bytes: &[u8], decimals: usize) -> 
             match i16::try_from(raw) {
                 Ok(i16::MAX) if field.is_saturating() => f.write_str("+saturated"),
                 Ok(i16::MIN) if field.is_saturating() => f.write_str("-saturated"),
-                _ if field.fraction() > 0 => write!(f, "{:.decimals$}", field.real(raw)),
+                _ if field.fraction() > 0 => {
+                    write!(f, "{:.decimals$}", field.real_in(raw, element, units))
+                }
                 _ => write!(f, "{raw}"),
+            }?;
+            match field.unit_in(element, units) {
+                unit if unit == field.unit => Ok(()),
+                unit => write!(f, " {unit}"),
             }
         }),
     }

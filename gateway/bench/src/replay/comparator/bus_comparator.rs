@@ -3,10 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use model::tracker::{Claim, Word};
-use protocol::fixed::TorqueFormat;
 use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Heard, Joints, Message, NetworkPage};
 use protocol::packet::{Epoch, Words};
+use protocol::schema::Units;
 
 use super::WINDOW;
 use super::sums::{Sums, Trees};
@@ -131,8 +131,8 @@ struct Pass {
 #[derive(Debug, Default)]
 pub(super) struct BusComparator {
     pub(super) name: String,
-    /// In which format its cells send torques, as far as a skin tells.
-    pub(super) torque_format: TorqueFormat,
+    /// What its torques are worth, as far as a skin tells.
+    pub(super) units: Units,
     pub(super) present: BTreeMap<CellId, Present>,
     pub(super) known: BTreeMap<CellId, KnownCell>,
     pub(super) announcements: u64,
@@ -162,6 +162,11 @@ pub(super) struct BusComparator {
 }
 
 impl BusComparator {
+    /// Its name, and what its torques are worth.
+    pub(super) fn called(&self) -> (&str, Units) {
+        (&self.name, self.units)
+    }
+
     pub(super) fn new(name: String, cells: BTreeMap<CellId, Surveyed>) -> Self {
         let known_cell = |(node, cell)| (node, KnownCell { cell, ended_earlier: false, speaks: None });
         Self {

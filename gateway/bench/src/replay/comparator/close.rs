@@ -27,9 +27,8 @@ impl Comparator {
                 bus_comparator.compare_reply(number, &round, (cell, what), pair, (tally, tolerance))
             {
                 tally.count(how, round.is_unsent);
-                let said = [pair.recorded, pair.now]
-                    .map(|words| Some(Said::Words(what, words?, bus_comparator.torque_format)));
-                first.note(how, &bus_comparator.name, cell, at, said);
+                let said = [pair.recorded, pair.now].map(|words| Some(Said::Words(what, words?)));
+                first.note(how, bus_comparator.called(), cell, at, said);
             }
         }
         if !round.sums.recorded.is_empty() || !round.sums.now.is_empty() {
@@ -117,7 +116,7 @@ impl BusComparator {
                 lacking.measured += u64::from(round.sums.recorded.has(cell));
                 continue;
             }
-            let mut outcome = compare(&then, &now, cell, tolerance, self.torque_format);
+            let mut outcome = compare(&then, &now, cell, tolerance, self.units.torque_format());
             let is_touched = round.is_touched(cell);
             let is_doubtful = || {
                 then.is_doubtful(cell, is_touched, false)
@@ -162,7 +161,7 @@ impl BusComparator {
             };
             tally.count(how, round.is_unsent);
             let said = owns.map(|own| own.map(Said::Sum));
-            first.note(how, &self.name, cell, Some((number, round.epoch, round.nanos)), said);
+            first.note(how, self.called(), cell, Some((number, round.epoch, round.nanos)), said);
         }
         for (cell, count) in round.sums.recorded.counts() {
             if count > 0 {
@@ -199,7 +198,7 @@ impl BusComparator {
                 };
                 tally.count(how, false);
                 let said = [recorded, now].map(|said| said.map(|(tag, answer)| Said::Answer(tag, answer)));
-                first.note(how, &self.name, cell, None, said);
+                first.note(how, self.called(), cell, None, said);
             }
         }
     }

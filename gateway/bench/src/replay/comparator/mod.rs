@@ -21,6 +21,7 @@ use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Message, NetworkPage, Request, SensorPage};
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::{Parameter, Sensing};
+use protocol::schema::Units;
 use protocol::skin::Skin;
 
 pub use bus_comparator::Present;
@@ -48,7 +49,7 @@ impl First {
     fn note(
         &mut self,
         how: How,
-        bus: &str,
+        (bus, units): (&str, Units),
         cell: CellId,
         round: Option<(u64, Epoch, u64)>,
         [recorded, now]: [Option<Said>; 2],
@@ -60,7 +61,8 @@ impl First {
             let at_s = std::time::Duration::from_nanos(nanos.saturating_sub(self.nanos)).as_secs_f64();
             When { joints, epoch: epoch.0, at_s }
         });
-        self.difference = Some(Difference::new(how, bus, cell, when, recorded.as_ref(), now.as_ref()));
+        self.difference =
+            Some(Difference::new(how, (bus, units), cell, when, recorded.as_ref(), now.as_ref()));
     }
 }
 
@@ -98,11 +100,11 @@ impl Comparator {
         }
     }
 
-    /// The skin's buses of these names send torques in their formats.
+    /// The skin's buses of these names have its units.
     pub fn describe(&mut self, skin: &Skin) {
         for bus in &mut self.bus_comparators {
-            if let Some(described) = skin.bus_named(&bus.name).and_then(|index| skin.buses.get(index)) {
-                bus.torque_format = described.torque_format;
+            if let Some(index) = skin.bus_named(&bus.name) {
+                bus.units = Units::of(skin, index);
             }
         }
     }
@@ -267,8 +269,14 @@ impl Comparator {
             Some(_) if what != What::Torque => pair.now = Some(words),
             Some(_) => {
                 self.tally.extra += 1;
-                let said = [None, Some(Said::Words(what, words, bus_comparator.torque_format))];
-                self.first.note(How::Extra, &bus_comparator.name, cell, Some((number, epoch, nanos)), said);
+                let said = [None, Some(Said::Words(what, words))];
+                self.first.note(
+                    How::Extra,
+                    bus_comparator.called(),
+                    cell,
+                    Some((number, epoch, nanos)),
+                    said,
+                );
             }
         }
     }

@@ -1,0 +1,93 @@
+//! What the words of a bus' joints, torques and sums are worth.
+
+use core::f64::consts::FRAC_PI_2;
+
+use super::{Field, Format};
+use crate::fixed::TorqueFormat;
+use crate::skin::{JointKind, Skin};
+
+/// What depends on the bus: its torque format, and which joints of its chain are prismatic. The default is Q3.12 and
+/// revolute joints.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Units {
+    torque: TorqueFormat,
+    /// Bit j: joint j + 1 is prismatic.
+    prismatic: u16,
+}
+
+impl Units {
+    /// Those of a bus, given as an index into [`Skin::buses`].
+    #[must_use]
+    pub fn of(skin: &Skin, bus: usize) -> Self {
+        let torque = skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default();
+        let is_prismatic = |kind| u16::from(kind == JointKind::Prismatic);
+        let bits = skin.joints_of(bus).zip(0..16).map(|((_, joint), at)| is_prismatic(joint.kind) << at);
+        Self { torque, prismatic: bits.fold(0, |all, bit| all | bit) }
+    }
+
+    /// In which format cells send their torques.
+    #[must_use]
+    pub const fn torque_format(self) -> TorqueFormat {
+        self.torque
+    }
+
+    /// The unit of a joint's torque, by its place in the chain from 0.
+    #[must_use]
+    pub const fn torque_unit(self, joint: usize) -> &'static str {
+        if self.slides(joint) {
+            JointKind::Prismatic.torque_unit()
+        } else {
+            JointKind::Revolute.torque_unit()
+        }
+    }
+
+    const fn slides(self, joint: usize) -> bool {
+        joint < 16 && self.prismatic >> joint & 1 == 1
+    }
+
+    /// Whether a field's element is a position or a torque of a prismatic joint.
+    fn is_prismatic(self, field: &Field, element: usize) -> bool {
+        field.grows() && self.slides(element)
+    }
+}
+
+impl Field {
+    /// What one step of an element is worth, in [`Self::unit_in`].
+    #[must_use]
+    pub fn step_in(&self, element: usize, units: Units) -> f64 {
+        let step = 1.0 / f64::from(1_u32 << self.fraction());
+        if self.format == Format::Torque {
+            units.torque.step()
+        } else if self.format == Format::Angle
+            || self.format == Format::Position && !units.is_prismatic(self, element)
+        {
+            step * FRAC_PI_2
+        } else {
+            step
+        }
+    }
+
+    /// What the bits of an element are worth, in [`Self::unit_in`].
+    #[must_use]
+    pub fn real_in(&self, raw: i64, element: usize, units: Units) -> f64 {
+        f64::from(i16::try_from(raw).unwrap_or_default()) * self.step_in(element, units)
+    }
+
+    /// What bits are worth where they mean the same on each bus.
+    #[must_use]
+    pub fn real(&self, raw: i64) -> f64 {
+        self.real_in(raw, 0, Units::default())
+    }
+
+    /// The unit of an element: that of the field, but m and N of prismatic joints.
+    #[must_use]
+    pub fn unit_in(&self, element: usize, units: Units) -> &str {
+        let (turns, slides) = (JointKind::Revolute, JointKind::Prismatic);
+        match self.unit.as_str() {
+            unit if !units.is_prismatic(self, element) => unit,
+            unit if unit == turns.unit() => slides.unit(),
+            unit if unit == turns.torque_unit() => slides.torque_unit(),
+            unit => unit,
+        }
+    }
+}
