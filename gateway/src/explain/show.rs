@@ -2,7 +2,9 @@
 
 use std::collections::BTreeSet;
 
-use analysis::explain::{CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict};
+use analysis::explain::{
+    BusExplained, CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict,
+};
 use protocol::fixed::TorqueFormat;
 
 use crate::print::{self, decimals, or};
@@ -28,14 +30,7 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
             "{name}: joints of epoch {epoch} on {}, {at} s after the first frame{halted}\n",
             bus.bus
         );
-        let line = |name: &str, values: &mut dyn Iterator<Item = String>| {
-            [name.to_owned()].into_iter().chain(values).collect::<Vec<_>>()
-        };
-        let head = line("", &mut (1..=bus.position_words.len()).map(|joint| format!("joint {joint}")));
-        let words = line("word", &mut bus.position_words.iter().map(i16::to_string));
-        let unit = if bus.units.contains(&"m") { "rad, m" } else { "rad" };
-        let angles = line(unit, &mut bus.position_rad.iter().map(|position| format!("{position:.4}")));
-        text += &table(head, [words, angles], false);
+        text += &positions(bus);
     }
     let cells = &explanation.cells;
     match (what, cells.as_slice()) {
@@ -64,14 +59,45 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
     text
 }
 
+/// Joints that stand beside each other.
+const BESIDE: usize = 6;
+
+/// The positions that a bus' cells heard.
+fn positions(bus: &BusExplained) -> String {
+    let unit = if bus.units.contains(&"m") { "rad, m" } else { "rad" };
+    // Of seven the last one would stand alone.
+    let beside = if bus.joints.len() == BESIDE + 1 { BESIDE + 1 } else { BESIDE };
+    let words = bus.position_words.chunks(beside).zip(bus.position_rad.chunks(beside));
+    let tables = bus.joints.chunks(beside).zip(words).map(|(joints, (words, positions))| {
+        let line =
+            |name: &str, values: Vec<String>| [name.to_owned()].into_iter().chain(values).collect::<Vec<_>>();
+        let head = line("", joints.iter().map(|joint| format!("joint {joint}")).collect());
+        let words = line("word", words.iter().map(i16::to_string).collect());
+        let positions = positions.iter().map(|position| format!("{position:.4}")).collect();
+        table(head, [words, line(unit, positions)], false)
+    });
+    tables.collect()
+}
+
 /// A table with its columns to the right, but the first and, where that is of words, the last; close together, so
 /// that it fits on 80 columns.
 fn table(head: Vec<String>, rows: impl IntoIterator<Item = Vec<String>>, words_at_the_end: bool) -> String {
+    spaced(head, rows, words_at_the_end, 1)
+}
+
+/// The same, with so many more spaces than one before a number.
+fn spaced(
+    head: Vec<String>,
+    rows: impl IntoIterator<Item = Vec<String>>,
+    words_at_the_end: bool,
+    spaces: u16,
+) -> String {
     let count = head.len();
     let numbers = |index| index > 0 && index < count.saturating_sub(usize::from(words_at_the_end));
     let mut table = print::table(head, rows, numbers);
     for (index, column) in table.column_iter_mut().enumerate() {
-        column.set_padding((1, u16::from(!numbers(index) || index + 1 == count)));
+        let before = if numbers(index) { spaces } else { 1 };
+        column.set_padding((before, u16::from(!numbers(index) || index + 1 == count)));
     }
     format!("{table}\n")
 }
@@ -86,37 +112,50 @@ fn millis(nanos: u64) -> String {
     format!("{:.3} ms", nanos as f64 / 1e6)
 }
 
+/// Cells, each in a line; chain by chain, and of chains with many joints in several tables.
 fn one_line_each(cells: &[CellExplained], is_finest: bool) -> String {
-    // Joints beyond those that move any of them have nothing but zeros, if all is well.
-    let says = |cell: &CellExplained| {
-        let rows = cell.rows.iter().enumerate();
-        let used = |(at, row): (usize, &Row)| {
-            let is_used = at < usize::from(cell.joint) || row.word.is_some_and(|word| word != 0);
-            is_used.then_some((row.joint, row.unit))
-        };
-        rows.filter_map(used).collect::<Vec<_>>()
-    };
-    let joints: BTreeSet<_> = cells.iter().flat_map(says).collect();
-    let names = Names::of(cells);
-    let mut head = vec![names.head(), "F_z N".to_owned()];
-    head.extend(joints.iter().map(|(joint, unit)| format!("{unit} {joint}")));
-    head.extend(["off", "which is"].map(str::to_owned));
-    let lines = cells.iter().map(|cell| {
-        let mut line = vec![names.of_cell(cell), decimals(force_of(cell), 3, "?")];
-        line.extend(joints.iter().map(|(joint, _)| {
-            let row = cell.rows.iter().find(|row| row.joint == *joint);
-            row.map_or_else(String::new, |row| decimals(row.word_nm, 4, "-"))
-        }));
-        line.extend([steps_off(&cell.rows), worst(&cell.rows)]);
-        line
-    });
     let turns = cells.iter().flat_map(|cell| &cell.rows).all(|row| row.unit == "Nm");
     let (unit, steps) =
         (if turns { " in Nm" } else { "" }, if is_finest { "2^-12" } else { "their bus's format" });
+    let joints = |cell: &CellExplained| cell.rows.iter().map(|row| row.joint).collect::<Vec<_>>();
+    let tables = cells.chunk_by(|one, other| joints(one) == joints(other)).map(torques);
     format!(
         "\ntorques of the cells{unit}, and the largest difference in steps of {steps}; --cell shows each step\n{}",
-        table(head, lines, true)
+        tables.collect::<String>()
     )
+}
+
+/// The torques of one chain's cells.
+fn torques(cells: &[CellExplained]) -> String {
+    // Joints beyond those that move any of them have nothing but zeros, if all is well.
+    let says = |cell: &CellExplained| {
+        let moved = cell.rows.iter().position(|row| row.joint == cell.joint);
+        let rows = cell.rows.iter().enumerate();
+        let used = rows.filter(|(at, row)| {
+            moved.is_some_and(|moved| *at <= moved) || row.word.is_some_and(|word| word != 0)
+        });
+        used.map(|(at, _)| at + 1).max().unwrap_or_default()
+    };
+    let used = cells.iter().map(says).max().unwrap_or_default();
+    let joints = cells.first().map_or(&[][..], |cell| cell.rows.get(..used).unwrap_or_default());
+    let names = Names::of(cells);
+    let tables = joints.chunks(BESIDE).enumerate().map(|(part, joints)| {
+        let is_last = (part + 1) * BESIDE >= used;
+        let mut head = vec![names.head()];
+        head.extend((part == 0).then(|| "F_z N".to_owned()));
+        head.extend(joints.iter().map(|row| format!("{} {}", row.unit, row.joint)));
+        head.extend(["off", "which is"].iter().filter(|_| is_last).map(|&name| name.to_owned()));
+        let lines = cells.iter().map(|cell| {
+            let mut line = vec![names.of_cell(cell)];
+            line.extend((part == 0).then(|| decimals(force_of(cell), 3, "?")));
+            let rows = cell.rows.iter().skip(part * BESIDE).take(joints.len());
+            line.extend(rows.map(|row| decimals(row.word_nm, 4, "-")));
+            line.extend(is_last.then(|| [steps_off(&cell.rows), worst(&cell.rows)]).into_iter().flatten());
+            line
+        });
+        spaced(head, lines, is_last, u16::from(joints.len() < BESIDE))
+    });
+    tables.collect()
 }
 
 fn force_of(cell: &CellExplained) -> Option<f64> {

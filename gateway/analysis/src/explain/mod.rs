@@ -12,23 +12,21 @@
 //! and left open.
 
 mod read;
+mod row;
 mod watch;
 
 pub use read::{Found, find};
+pub use row::{JACOBIAN_STEPS, Row, Verdict};
 pub use watch::{CellMoment, Moment, NotFound, Origin, Requested, Watch};
 
-use protocol::fixed::{Acc, Q, TorqueFormat, is_saturated};
+use protocol::fixed::{Q, is_saturated};
 use protocol::message::{SkinSensors, State};
-use protocol::packet::Words;
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{Cell, Joint, MAX_ROBOT_JOINTS, Reply, Skin};
+use protocol::skin::{Cell, MAX_ROBOT_JOINTS, Reply, Skin};
 use serde::Serialize;
 
+use self::row::{jacobian_steps, number, row};
 use model::central::Central;
-
-/// The most by which the J of a cell that computes in 16 bits may err, in steps of 2^-14 m: the 5e-4 m that the
-/// kernels promise for arms of any shape. Each row of the chain after the sixth, up to the cell's, allows one more.
-pub const JACOBIAN_STEPS: i64 = 8;
 
 /// One epoch, explained.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -50,7 +48,9 @@ pub struct BusExplained {
     pub bus: String,
     /// When the joints came.
     pub at_ns: u64,
-    /// The words of the joints in use.
+    /// The joints of its chain, as the robot numbers them from 1.
+    pub joints: Vec<u8>,
+    /// The words of these joints.
     pub position_words: Vec<i16>,
     /// The same in rad, of prismatic joints in m.
     pub position_rad: Vec<f64>,
@@ -69,7 +69,7 @@ pub struct CellExplained {
     pub bus: String,
     /// Its node id.
     pub node: u8,
-    /// The joint that moves it.
+    /// The robot's joint that moves it, from 1.
     pub joint: u8,
     /// Its contact state and the force from it; absent when not known.
     pub force: Option<Force>,
@@ -106,50 +106,6 @@ pub struct Force {
     pub force_steps: i64,
     /// The same in N.
     pub force_n: f64,
-}
-
-/// One joint of one cell.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-pub struct Row {
-    /// The joint, from 1.
-    pub joint: u8,
-    /// The unit of its torques: that of a prismatic joint is N.
-    pub unit: &'static str,
-    /// The exact J of the quantised parameters in m; absent when they are not known.
-    pub jacobian_m: Option<f64>,
-    /// J F_z in f64, in Nm.
-    pub product_nm: Option<f64>,
-    /// The nearest step of 2^-12 Nm, held within the word.
-    pub nearest_word: Option<i16>,
-    /// The word of the frame.
-    pub word: Option<i16>,
-    /// The same in Nm.
-    pub word_nm: Option<f64>,
-    /// The word less the nearest step.
-    pub difference_steps: Option<i32>,
-    /// Where the difference comes from.
-    pub verdict: Verdict,
-}
-
-/// Whether a word is what it should be.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
-#[serde(rename_all = "kebab-case", tag = "is")]
-pub enum Verdict {
-    /// The step nearest to the exact product.
-    Nearest,
-    /// Out of range: the word is saturated, as required.
-    Saturated,
-    /// Rounding in 16 bits: this J, near the exact one, gives this word.
-    Rounded {
-        /// The J in m.
-        jacobian_m: f64,
-        /// How far it is from the exact one, in steps of 2^-14 m.
-        jacobian_steps: f64,
-    },
-    /// No J near the exact one gives this word.
-    Unexplained,
-    /// The word or what it is to be compared with is not known.
-    Open,
 }
 
 /// One joint of the whole skin.
@@ -207,6 +163,7 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
         explanation.buses.push(BusExplained {
             bus: name.clone(),
             at_ns: moment.at_ns,
+            joints: chain.iter().map(|(joint, _)| number(*joint)).collect(),
             position_words: positions.iter().take(chain.len()).map(|word| word.to_bits()).collect(),
             position_rad: central.positions(&positions).into_iter().take(chain.len()).collect(),
             units: chain.iter().map(|(_, joint)| joint.kind.unit()).collect(),
@@ -266,7 +223,7 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
             explanation.cells.push(CellExplained {
                 bus: name.clone(),
                 node: cell.node.get(),
-                joint: cell.joint,
+                joint: chain.get(usize::from(cell.joint) - 1).map_or(0, |(joint, _)| number(*joint)),
                 force,
                 answered_after_ns: said.answer.map(|(at, _)| at.saturating_sub(moment.at_ns)),
                 rows,
@@ -417,78 +374,6 @@ fn force(cell: &Cell, sensors: &SkinSensors, origin: Origin) -> Force {
 #[expect(clippy::cast_precision_loss, reason = "at most 2^28 steps")]
 fn to_newtons(steps: i64) -> f64 {
     steps as f64 / 65_536.0
-}
-
-#[expect(clippy::too_many_arguments, reason = "what a row shows")]
-fn row(
-    &(joint, described): &(usize, &Joint),
-    at: usize,
-    steps: Option<i64>,
-    force: Option<&Force>,
-    exact: &[f64; MAX_JOINTS],
-    unit: &[f64; MAX_JOINTS],
-    format: TorqueFormat,
-    words: Option<&Words>,
-) -> Row {
-    let joint = u8::try_from(joint + 1).unwrap_or(u8::MAX);
-    let of = |values: &[f64; MAX_JOINTS]| force.and_then(|_| values.get(at).copied());
-    let (jacobian_m, product_nm) = (of(unit), of(exact));
-    let nearest = product_nm.map(|product| format.nearest(product));
-    let word = words.and_then(|words| words.as_slice().get(at).copied());
-    let difference = nearest.zip(word).map(|(nearest, word)| i32::from(word) - i32::from(nearest));
-    let verdict = match (force, jacobian_m, nearest, word) {
-        (Some(force), Some(jacobian), Some(nearest), Some(word)) => {
-            comparator(force.force_steps, jacobian, steps, format, nearest, word)
-        }
-        (_, _, _, _) => Verdict::Open,
-    };
-    Row {
-        joint,
-        unit: described.kind.torque_unit(),
-        jacobian_m,
-        product_nm,
-        nearest_word: nearest,
-        word,
-        word_nm: word.map(|word| format.real(word)),
-        difference_steps: difference,
-        verdict,
-    }
-}
-
-/// How many steps a cell's J may err that so many rows carry.
-fn jacobian_steps(rows: usize) -> i64 {
-    JACOBIAN_STEPS + i64::try_from(rows.saturating_sub(6)).unwrap_or(i64::MAX - JACOBIAN_STEPS)
-}
-
-/// Where a word that should be `nearest` comes from. A joint that does not move the cell has no J that could err.
-#[expect(
-    clippy::cast_possible_truncation,
-    clippy::cast_precision_loss,
-    reason = "J is within +-2 m: 2^15 steps"
-)]
-fn comparator(
-    force_steps: i64,
-    jacobian_m: f64,
-    steps: Option<i64>,
-    format: TorqueFormat,
-    nearest: i16,
-    word: i16,
-) -> Verdict {
-    if word == nearest {
-        return if is_saturated(word) { Verdict::Saturated } else { Verdict::Nearest };
-    }
-    let Some(within) = steps else { return Verdict::Unexplained };
-    let exact = jacobian_m * 16_384.0;
-    let middle = exact.round() as i64;
-    let mut near: Vec<i64> = (middle - within - 1..=middle + within + 1).collect();
-    let off = |steps: i64| steps as f64 - exact;
-    near.sort_by(|one, other| off(*one).abs().total_cmp(&off(*other).abs()));
-    let gives = |steps: i64| format.round(Acc::<30>::from_steps(steps * force_steps)) == word;
-    let found = near.into_iter().find(|&steps| off(steps).abs() <= within as f64 && gives(steps));
-    found.map_or(Verdict::Unexplained, |steps| Verdict::Rounded {
-        jacobian_m: steps as f64 / 16_384.0,
-        jacobian_steps: off(steps),
-    })
 }
 
 #[cfg(test)]
