@@ -62,6 +62,30 @@ impl Errors {
     }
 }
 
+/// Exact torques in a torque format: what rounding to it alone makes of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Rounded {
+    /// Of the torques within its range.
+    pub errors: Errors,
+    /// Torques beyond its range, whose words are saturated.
+    pub beyond: u64,
+}
+
+impl Rounded {
+    fn take(&mut self, format: TorqueFormat, torque: f64) {
+        let word = format.nearest(torque);
+        if is_saturated(word) {
+            self.beyond += 1;
+        } else {
+            self.errors.add(format.real(word) - torque);
+        }
+    }
+
+    fn with(self, other: Self) -> Self {
+        Self { errors: self.errors.with(other.errors), beyond: self.beyond + other.beyond }
+    }
+}
+
 /// Distributed against central torques, over the joints that a contact loads (l <= k).
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Accuracy {
@@ -78,6 +102,9 @@ pub struct Accuracy {
     pub sums_averaged: Errors,
     /// Words that were left out because they were saturated.
     pub saturated: u64,
+    /// The central torques of `single`, saturated ones too, in each of [`TorqueFormat::ALL`].
+    #[serde(skip)]
+    pub formats: [Rounded; TorqueFormat::ALL.len()],
     /// `single` joint by joint.
     #[serde(skip)]
     pub single_by_joint: [Errors; MAX_JOINTS],
@@ -103,6 +130,9 @@ impl Accuracy {
         for (((error, of_joint), &word), (quantised, unquantised)) in
             joints.zip(words.as_slice()).zip(both).take(joint)
         {
+            for (rounded, format) in self.formats.iter_mut().zip(TorqueFormat::ALL) {
+                rounded.take(format, *quantised);
+            }
             if is_saturated(word) {
                 self.saturated += 1;
                 continue;
@@ -133,7 +163,12 @@ impl Accuracy {
             }
             sum
         };
+        let mut formats = self.formats;
+        for (sum, other) in formats.iter_mut().zip(other.formats) {
+            *sum = sum.with(other);
+        }
         Self {
+            formats,
             single_by_joint: joint_by_joint(self.single_by_joint, other.single_by_joint),
             whole_by_joint: joint_by_joint(self.whole_by_joint, other.whole_by_joint),
             single: self.single.with(other.single),

@@ -41,7 +41,7 @@ use held::{Change, to_nm};
 use root_totals::RootTotals;
 use switched::Switched;
 
-pub use accuracy::{Accuracy, Errors};
+pub use accuracy::{Accuracy, Errors, Rounded};
 pub use cell::{Cell, Said, Status};
 pub use counters::{Counters, Event};
 pub use epoch::Positions;

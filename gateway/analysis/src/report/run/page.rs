@@ -2,6 +2,7 @@
 
 mod arm;
 mod bus;
+mod formats;
 
 use super::Run;
 use super::bus_figures::LinkId;
@@ -131,6 +132,7 @@ impl Draft<'_> {
             let what = format!("replies not there before the next joints, of {due} that were due");
             findings.push(none(what, due - in_time));
         }
+        findings.extend(self.beyond_range());
         findings.extend(self.fits());
         let uplink: Uplink = self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
         findings.push(none("packets of cells lost, by their own count".to_owned(), uplink.lost));

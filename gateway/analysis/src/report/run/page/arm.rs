@@ -4,10 +4,11 @@ use hdrhistogram::Histogram;
 
 use super::Draft;
 use crate::paper;
-use crate::report::figure::{Axis, Mark, Section, Shape, Table, number};
+use crate::report::figure::{Axis, Figure, Mark, Section, Shape, Table, number};
 use crate::report::thin::Thinned;
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Errors};
+use protocol::skin::JointKind;
 
 impl Draft<'_> {
     /// The paper's Fig. 6.
@@ -15,9 +16,13 @@ impl Draft<'_> {
         let motion = &self.run.motion;
         let pairs = motion.distributed.iter().zip(&motion.central).enumerate();
         let figures = pairs.map(|(joint, (distributed, central))| {
-            let joint = joint + 1;
-            let title = format!("Joint {joint}: sum of the cells' torques, and the central computation");
-            self.figure(format!("torque-joint{joint}"), title, Axis::new("torque", "Nm"))
+            let name = self.joint(joint);
+            let title = format!("{name}: sum of the cells' torques, and the central computation");
+            let axis = match self.run.skin.robot.joints.get(joint).map(|joint| joint.kind) {
+                Some(kind @ JointKind::Prismatic) => Axis::new("force", kind.torque_unit()),
+                Some(JointKind::Revolute) | None => Axis::new("torque", JointKind::Revolute.torque_unit()),
+            };
+            self.figure(format!("torque-joint{}", joint + 1), title, axis)
                 .half()
                 .series([self.line("distributed", distributed)])
                 .draw("central", Shape::Dashed, self.points(central))
@@ -35,13 +40,23 @@ impl Draft<'_> {
                 )
                 .marks([papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)])
         });
-        Section::new("torque", "Distributed and central torque")
-            .text(
-                "The curves hold what has come at each tick: while a touch changes they differ by what is on its way. The \
-                 errors below compare like with like: each torque with the central computation for the joints that it answers.",
-            )
-            .figures(figures.chain(error))
-            .tables(self.errors())
+        let mut section = Section::new("torque", "Distributed and central torque").text(
+            "The curves hold what has come at each tick: while a touch changes they differ by what is on its way. The \
+             errors below compare like with like: each torque with the central computation for the joints that it answers.",
+        );
+        if let Some(advice) = self.advice() {
+            section = section.text(advice);
+        }
+        section.figures(figures.chain(error)).tables(self.errors()).tables(self.formats())
+    }
+
+    /// A joint as the skin's file names it; with its number where that is no part of the name.
+    fn joint(&self, index: usize) -> String {
+        let number = index + 1;
+        match self.run.skin.robot.joints.get(index) {
+            Some(joint) if joint.name != format!("joint{number}") => format!("{number} {}", joint.name),
+            Some(_) | None => format!("joint {number}"),
+        }
     }
 
     /// Errors joint by joint.
@@ -70,13 +85,13 @@ impl Draft<'_> {
         if accuracy.single.count() == 0 {
             return None;
         }
-        let joints =
-            single.zip(1..).map(|((single, whole), joint)| row(format!("joint {joint}"), single, whole));
+        let joints = single.enumerate().map(|(joint, (single, whole))| row(self.joint(joint), single, whole));
         let all = row("all".to_owned(), &accuracy.single, &accuracy.whole);
         let [single, whole] = [paper::SINGLE_NM, paper::SUMMED_NM].map(number);
         let papers = ["paper", &single, "", "", &whole, "", ""].map(str::to_owned).into();
         Some(Table::new(
-            "Absolute errors in Nm, joint by joint: single cells where the joint carries them, and the whole skin's sum",
+            "Absolute errors in Nm (N where the joint slides), joint by joint: single cells where the joint carries them, and the \
+             whole skin's sum",
             ["", "single cells: mean", "max", "torques", "whole skin: mean", "max", "epochs"],
             joints.chain([all, papers]),
         ))
@@ -84,15 +99,37 @@ impl Draft<'_> {
 
     /// The paper's Fig. 7, and the positions.
     pub(super) fn motion(&self) -> Section {
-        let figure = |name: &str, title: &str, y: Axis, series: &[Thinned]| {
-            let joints = (1..).zip(series).map(|(joint, series)| self.line(format!("joint {joint}"), series));
-            self.figure(name, title, y).series(joints).marks(self.marks())
-        };
         let motion = &self.run.motion;
-        Section::new("motion", "The arm").figures([
-            figure("positions", "Joint positions", Axis::new("position", "rad"), &motion.position),
-            figure("velocities", "Joint velocities", Axis::new("velocity", "rad/s"), &motion.velocity),
-        ])
+        let figures = self.groups().into_iter().enumerate().flat_map(|(group, (kind, joints))| {
+            let figure = |name: &str, title: &str, y: Axis, all: &[Thinned]| {
+                let of_joint = |&joint: &usize| Some(self.line(self.joint(joint), all.get(joint)?));
+                let name = if group == 0 { name.to_owned() } else { format!("{name}-{}", group + 1) };
+                self.figure(name, title, y).series(joints.iter().filter_map(of_joint)).marks(self.marks())
+            };
+            let (unit, speed) = (kind.unit(), format!("{}/s", kind.unit()));
+            [
+                figure("positions", "Joint positions", Axis::new("position", unit), &motion.position),
+                figure("velocities", "Joint velocities", Axis::new("velocity", speed), &motion.velocity),
+            ]
+        });
+        Section::new("motion", "The arm").figures(figures)
+    }
+
+    /// Joints that share a figure: those of one kind that a chain adds to the chains before it.
+    fn groups(&self) -> Vec<(JointKind, Vec<usize>)> {
+        let robot = &self.run.skin.robot;
+        let mut rest: Vec<_> = (0..robot.joints.len()).collect();
+        let mut groups = Vec::new();
+        for chain in &robot.chains {
+            for kind in [JointKind::Prismatic, JointKind::Revolute] {
+                let is_in = |joint: &mut usize| {
+                    chain.joints.contains(joint) && robot.joints.get(*joint).is_some_and(|it| it.kind == kind)
+                };
+                let joints: Vec<_> = rest.extract_if(.., is_in).collect();
+                groups.extend(joints.chunks(Figure::COLOURS).map(|joints| (kind, joints.to_vec())));
+            }
+        }
+        groups
     }
 
     pub(super) fn cells(&self) -> Section {

@@ -1,0 +1,103 @@
+//! Whether another torque format would have fitted a bus better.
+
+use model::table::Rounded;
+use protocol::fixed::TorqueFormat;
+
+use super::super::bus_figures::LinkId;
+use super::Draft;
+use crate::report::figure::{Finding, Table, number};
+
+/// What the formats would have made of the torques on a bus.
+struct Choice<'a> {
+    bus: &'a str,
+    used: TorqueFormat,
+    all: [(TorqueFormat, Rounded); TorqueFormat::ALL.len()],
+}
+
+impl Choice<'_> {
+    fn of(&self, format: TorqueFormat) -> Rounded {
+        self.all.iter().find(|(it, _)| *it == format).map_or_else(Rounded::default, |(_, rounded)| *rounded)
+    }
+
+    /// The finest format that holds every torque; the widest where none does.
+    fn best(&self) -> TorqueFormat {
+        let holds = |(_, rounded): &&(TorqueFormat, Rounded)| rounded.beyond == 0;
+        self.all.iter().find(holds).or_else(|| self.all.last()).map_or(self.used, |(format, _)| *format)
+    }
+
+    /// What another format would have brought, and what it would have cost.
+    fn advice(&self) -> Option<String> {
+        let (used, best) = (self.used, self.best());
+        let beyond = self.of(used).beyond;
+        let cost = |format: TorqueFormat| number(self.of(format).errors.mean().unwrap_or(f64::NAN));
+        let (costs, instead) = (cost(best), cost(used));
+        let (name, bus) = (best.name(), self.bus);
+        match (best == used, beyond) {
+            (true, _) => None,
+            (false, 0) => Some(format!(
+                "{bus}: {name} would have fitted better: it holds every torque too, and rounds by {costs} instead of \
+                 {instead} Nm on average."
+            )),
+            (false, _) => Some(format!(
+                "{bus}: {name} would have fitted better: {beyond} torques are beyond {} Nm, the range of {}. It rounds by \
+                 {costs} instead of {instead} Nm on average.",
+                number(used.bound()),
+                used.name(),
+            )),
+        }
+    }
+}
+
+impl Draft<'_> {
+    /// Of each bus whose torques were compared.
+    fn choices(&self) -> impl Iterator<Item = Choice<'_>> {
+        let buses = self.run.bus_figures.iter().zip(&self.run.skin.buses);
+        buses.filter_map(|(LinkId { name, table, .. }, bus)| {
+            let formats = table.accuracy().formats;
+            let is_compared = formats.iter().any(|it| it.beyond + it.errors.count() > 0);
+            let mut rounded = formats.into_iter();
+            let all = TorqueFormat::ALL.map(|format| (format, rounded.next().unwrap_or_default()));
+            is_compared.then_some(Choice { bus: name, used: bus.torque_format, all })
+        })
+    }
+
+    /// Torques beyond the range of the format that the bus has.
+    pub(super) fn beyond_range(&self) -> impl Iterator<Item = Finding> {
+        self.choices().map(|choice| {
+            let (bus, used) = (choice.bus, choice.used);
+            let bound = number(used.bound());
+            let what = format!("{bus}: torques beyond the range of {}, {bound} Nm", used.name());
+            super::none(what, choice.of(used).beyond)
+        })
+    }
+
+    /// Bus by bus, the format that would have fitted better.
+    pub(super) fn advice(&self) -> Option<String> {
+        let all: Vec<_> = self.choices().filter_map(|choice| choice.advice()).collect();
+        (!all.is_empty()).then(|| all.join(" "))
+    }
+
+    pub(super) fn formats(&self) -> Option<Table> {
+        let rows = self.choices().flat_map(|choice| {
+            choice.all.map(|(format, rounded)| {
+                let used = if format == choice.used { ", used" } else { "" };
+                [
+                    format!("{} {}{used}", choice.bus, format.name()),
+                    number(format.bound()),
+                    rounded.beyond.to_string(),
+                    number(rounded.errors.mean().unwrap_or(f64::NAN)),
+                    number(rounded.errors.max()),
+                ]
+                .to_vec()
+            })
+        });
+        let rows: Vec<_> = rows.collect();
+        (!rows.is_empty()).then(|| {
+            Table::new(
+                "Torque formats: the central torques of single cells, rounded to each, in Nm or N",
+                ["", "range", "beyond it", "rounding: mean", "max"],
+                rows,
+            )
+        })
+    }
+}
