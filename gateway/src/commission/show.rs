@@ -8,7 +8,7 @@ use protocol::id::CellId;
 use protocol::usage::Failure;
 use serde::Serialize;
 
-use crate::print::{Rows, some};
+use crate::print::{Rows, count, some};
 
 /// Cells with other node ids that get a line each.
 const LINES: usize = 8;
@@ -71,7 +71,7 @@ impl<'a> BusShown<'a> {
     }
 
     fn rows(&self, rows: &mut Rows) {
-        let cells = format!("{} cells described", self.cells.len());
+        let cells = format!("{} described", count(self.cells.len(), "cell"));
         let others = match self.unknown_nodes.len() {
             0 => String::new(),
             1 => "1 other, left alone".to_owned(),

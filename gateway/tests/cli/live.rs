@@ -13,7 +13,7 @@ use protocol::can::{Format, Frame};
 use protocol::candump;
 use protocol::candump::Line;
 use protocol::id::{CellId, Node};
-use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request};
+use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request, State};
 use protocol::packet::Epoch;
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
@@ -60,14 +60,18 @@ impl Bench {
         assert_eq!(said, (Some(0), "", "sent on vcan0 (embedded)\n"), "{arguments}");
     }
 
-    /// Does something while cell 12 is on the bus: it sends heartbeats, and answers requests for its mount.
+    /// Does something while cell 12 is on the bus: it sends heartbeats, and answers requests for its identity and its mount.
     fn beside<T>(&self, format: Format, work: impl FnOnce() -> T) -> T {
         let (mut cell, over) = (Listener::new(self.open(), Some(format)), AtomicBool::new(false));
         std::thread::scope(|scope| {
             scope.spawn(|| {
                 let from = CellId::new(12).unwrap();
                 while !over.load(Ordering::Relaxed) {
-                    let page = NetworkPage::Heartbeat(Heartbeat::default());
+                    let page = NetworkPage::Heartbeat(Heartbeat {
+                        serial: 1,
+                        state: State(0x1000),
+                        ..Heartbeat::default()
+                    });
                     let mut answers =
                         vec![Message::Network { from: Node::Cell(from), epoch: Epoch(0), page }];
                     cell.hear(Duration::from_millis(20)).unwrap();
@@ -76,6 +80,10 @@ impl Bench {
                             continue;
                         };
                         let answer = match request {
+                            // Without abilities, as the first cells.
+                            Request::Read { number: 0 } => {
+                                Answer::Value { number: 0, written: false, words: [1, 0, 1, 0, 0x1000, 0] }
+                            }
                             Request::Read { number: 1 } => {
                                 Answer::Value { number: 1, written: false, words: [2, 6, 0, 0, 0, 0] }
                             }
@@ -160,6 +168,30 @@ fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
             );
             assert_eq!(nobody.2, expected);
         });
+    }
+}
+
+#[test]
+fn a_cell_that_cannot_compute_its_part_is_named_and_not_written() {
+    let bench = Bench::new();
+    let skin = bench.parent.path().join("skin.toml");
+    let generated = output(gateway("skin generate --cells 1"));
+    let plain = generated.replace("node = 1\n", "node = 12\n").replace("serial = 100001", "serial = 1");
+    // A seventh joint: the last element of each list once more.
+    let longer =
+        plain.replacen("},\n]", "},\n  { a = 0.0, alpha = 0.0, d = 0.05, theta_offset = 0.0 },\n]", 1);
+    let longer = ["0.5, 0.5, 0.5", "2.0, 2.0, 2.0", "3.0, 3.0, 3.0"]
+        .iter()
+        .fold(longer, |text, three| text.replace(&format!("{three}]"), &format!("{three}, 1.0]")));
+    let wide = plain.replace("format = \"fd\"", "format = \"fd\"\ntorque_format = \"Q7.8\"");
+    for (skin_text, expected) in [(wide, "torques in Q7.8"), (longer, "7 joints (it can have 6)")] {
+        std::fs::write(&skin, &skin_text).unwrap();
+        let mut command = bench.gateway(&format!("commission {}", skin.display()));
+        let Output { status, stdout, stderr } = bench.beside(Format::Fd, || command.output().unwrap());
+        let said = format!("12             cannot have {expected}: give it newer firmware");
+        assert_eq!(status.code(), Some(1), "{}", text(&stderr));
+        let all = format!("{}{}", text(&stdout), text(&stderr));
+        assert!(all.contains(&said) && all.contains("requests         1 "), "{all}");
     }
 }
 
