@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use super::{Count, seconds};
 use model::decode::Foreign;
-use protocol::packet::PacketError;
+use protocol::packet::{Length, Lengths, PacketError, data_id};
 
 /// Identifiers of a bus that are counted separately; frames of others are counted together.
 const IDENTIFIERS: usize = 4096;
@@ -31,7 +31,7 @@ pub(super) struct Foreigners {
     identifiers: BTreeMap<(FrameType, u32), Seen>,
     /// Frames of identifiers beyond those that are counted separately.
     others: u64,
-    /// Frames whose CRC, alone or joined with the frame before, was checked.
+    /// Groups of frames whose CRC was checked: a frame alone, or with those before it that make a length.
     tried: u64,
 }
 
@@ -55,7 +55,8 @@ pub struct ForeignFrames {
     pub remote: u64,
     /// The driver's error frames.
     pub error: u64,
-    /// Expected number of packets by chance: one of 65 536 pairs has a right CRC. They count as packets.
+    /// Expected number of packets by chance, where the chain is not known: one of 65 536 groups of frames has a right CRC.
+    /// They count as packets.
     pub packets_by_chance: f64,
     /// Each, the one with the most frames first.
     pub identifiers: Vec<ForeignId>,
@@ -95,8 +96,11 @@ impl Foreigners {
             Foreign::Extended | Foreign::Data(_) => FrameType::Data,
         };
         let wrong_crc = u64::from(matches!(why, Foreign::Data(PacketError::Crc { .. })));
-        self.tried +=
-            u64::from(matches!(why, Foreign::Data(PacketError::Crc { .. } | PacketError::Incomplete)));
+        self.tried += match why {
+            Foreign::Data(PacketError::Crc { .. }) => 1,
+            Foreign::Data(PacketError::Incomplete) => groups(frame),
+            Foreign::Data(_) | Foreign::Extended | Foreign::Remote | Foreign::Error => 0,
+        };
         let key = (of, frame.raw_id());
         if self.identifiers.len() == IDENTIFIERS && !self.identifiers.contains_key(&key) {
             self.others += 1;
@@ -136,6 +140,12 @@ impl Foreigners {
         foreign.identifiers.sort_by_key(|id| Reverse(id.frames));
         foreign
     }
+}
+
+/// How many lengths of packets a classic frame can end.
+fn groups(frame: &Frame) -> u64 {
+    let ends = |length: &Length| length.last_segment() == frame.data().len();
+    data_id(frame).map_or(0, |id| Lengths::of(id).iter().filter(ends).count() as u64)
 }
 
 impl Seen {
