@@ -2,7 +2,6 @@
 
 mod show;
 
-use std::fs;
 use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -254,9 +253,8 @@ impl Run {
 
 /// The URDF that goes into a recording.
 fn urdf_text(path: &Path) -> Result<String, Failure> {
-    fs::read_to_string(path).map_err(|error| {
-        let path = path.display();
-        Failure::usage(format!("robot.urdf: {path}: {error}; correct the skin's path, or take the key out"))
+    document::text(path).map_err(|error| {
+        Failure::usage(format!("robot.urdf: {error}; correct the skin's path, or take the key out"))
     })
 }
 

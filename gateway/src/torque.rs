@@ -1,10 +1,10 @@
 //! `gateway torque`.
 
-use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{ArgGroup, Args};
 use model::central::Central;
+use protocol::document;
 use protocol::fixed::{Q1_14, is_saturated};
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
@@ -14,6 +14,9 @@ use serde::{Deserialize, Serialize};
 
 use super::arguments::{Named, cell};
 use super::print::{count, json_line, table};
+
+/// Bytes of a file of rows.
+const BATCH: u64 = 256 << 20;
 
 /// Compute the torques of a force on a cell: centrally, and as the cell's fixed-point code does
 ///
@@ -104,9 +107,9 @@ impl<'a> Calculator<'a> {
         Self { skin, central: central.collect() }
     }
 
-    fn batch(&self, path: &PathBuf) -> Result<Vec<Row>, Failure> {
+    fn batch(&self, path: &Path) -> Result<Vec<Row>, Failure> {
         let file = path.display();
-        let text = fs::read_to_string(path).map_err(|error| Failure::usage(format!("{file}: {error}")))?;
+        let text = document::text_within(path, BATCH).map_err(Failure::usage)?;
         let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(text.as_bytes());
         let mut rows = Vec::new();
         for record in reader.deserialize::<Line>() {

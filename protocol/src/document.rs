@@ -204,12 +204,20 @@ pub const LONGEST: u64 = 16 << 20;
 /// # Errors
 /// When it is longer, or cannot be read as UTF-8.
 pub fn text(path: &Path) -> Result<String, DocumentError> {
+    text_within(path, LONGEST)
+}
+
+/// The text of a file of at most so many bytes.
+///
+/// # Errors
+/// When it is longer, or cannot be read as UTF-8.
+pub fn text_within(path: &Path, longest: u64) -> Result<String, DocumentError> {
     let read = || {
         let mut bytes = Vec::new();
-        File::open(path)?.take(LONGEST + 1).read_to_end(&mut bytes)?;
-        if bytes.len() as u64 > LONGEST {
+        File::open(path)?.take(longest.saturating_add(1)).read_to_end(&mut bytes)?;
+        if bytes.len() as u64 > longest {
             return Err(io::Error::other(format!(
-                "it is longer than a skin or a scenario may be: at most {LONGEST} bytes are read"
+                "it is longer than {longest} bytes, the most that are read"
             )));
         }
         String::from_utf8(bytes).map_err(|_| io::Error::other("it is not UTF-8"))

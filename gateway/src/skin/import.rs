@@ -1,9 +1,9 @@
 //! `gateway skin import`.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use protocol::document;
 use protocol::usage::{Failure, print};
 use robots::{CellOnLink, Chain, Import as Described, Urdf};
 use serde::Deserialize;
@@ -145,7 +145,7 @@ fn reported(chain: &Chain) -> String {
 }
 
 fn text(path: &Path) -> Result<String, Failure> {
-    fs::read_to_string(path).map_err(|error| Failure::usage(format!("{}: {error}", path.display())))
+    document::text(path).map_err(Failure::usage)
 }
 
 /// The cells of a file.

@@ -1,11 +1,11 @@
 //! `gateway skin show`.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 use cover::Part;
 use cover::drawing::{Drawing, DrawnCell, page};
+use protocol::document;
 use protocol::parameters::RowKind;
 use protocol::skin::{Cell, Chain, ChainRow, Skin};
 use protocol::usage::{Failure, print};
@@ -70,7 +70,7 @@ impl Show {
 
 fn text(path: &Path) -> Result<Urdf, String> {
     let file = path.display().to_string();
-    let text = fs::read_to_string(path).map_err(|error| format!("{file}: {error}"))?;
+    let text = document::text(path).map_err(|error| error.to_string())?;
     Urdf::parse(&file, &text).map_err(|error| error.to_string())
 }
 

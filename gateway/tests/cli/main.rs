@@ -425,6 +425,9 @@ fn every_command_has_help_with_an_example() {
         "ack",
         "skin generate",
         "skin check",
+        "skin import",
+        "skin show",
+        "torque",
         "scenario check",
     ] {
         let help = output(gateway(&format!("{command} --help")));
@@ -437,9 +440,16 @@ fn every_command_has_help_with_an_example() {
 
 #[test]
 fn a_file_without_an_end_is_read_up_to_a_limit() {
-    let said = refusal("skin check /dev/zero", 2);
-    assert!(
-        said.contains("/dev/zero: it is longer than a skin or a scenario may be: at most 16777216 bytes"),
-        "{said}"
-    );
+    let urdf = format!("{}/examples/panda.urdf", env!("CARGO_MANIFEST_DIR"));
+    for command in [
+        "skin check /dev/zero",
+        "skin import /dev/zero --tip hand",
+        &format!("skin import {urdf} --tip hand --cells /dev/zero"),
+    ] {
+        let said = refusal(command, 2);
+        assert!(
+            said.contains("/dev/zero: it is longer than 16777216 bytes, the most that are read"),
+            "{said}"
+        );
+    }
 }

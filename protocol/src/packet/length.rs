@@ -41,6 +41,9 @@ impl Length {
         2 * self.words() + 4
     }
 
+    /// Classic frames of the longest packet.
+    pub const MAX_SEGMENTS: usize = Self::Fourteen.segments();
+
     /// Classic frames of a packet.
     #[must_use]
     pub const fn segments(self) -> usize {

@@ -6,9 +6,6 @@ use super::{Length, Lengths, MAX_BYTES, Packet, PacketError, SEGMENT_BYTES};
 use crate::id::{Command, Id, Kind};
 use crate::time::{Micros, Span};
 
-/// Segments of the longest packet.
-const SEGMENTS: usize = Length::Fourteen.segments();
-
 /// What became of a classic frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Reassembly {
@@ -30,7 +27,7 @@ pub enum Reassembly {
 /// is dropped, so that a lost frame costs one packet and not every later one.
 #[derive(Clone, Debug, Default)]
 pub struct Segment {
-    waiting: Deque<Waiting, SEGMENTS>,
+    waiting: Deque<Waiting, { Length::MAX_SEGMENTS }>,
     /// So many of the oldest may belong to a packet that has been counted as incomplete: they are not counted again.
     counted: usize,
     /// A packet was lost before the last complete one, and is not counted yet.

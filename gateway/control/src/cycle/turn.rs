@@ -17,8 +17,6 @@ use model::table::Snapshot;
 
 /// While the robot is halted, the halt is resent before every so many joints.
 const HALT_AGAIN: u8 = 8;
-/// Classic frames of the longest packet.
-const SEGMENTS: usize = Length::Fourteen.segments();
 
 /// What all threads of a run share.
 #[derive(Debug, Default)]
@@ -257,8 +255,8 @@ impl Line {
 }
 
 /// A packet's frames in place: an array, and how many of it are used.
-fn frames(packet: &Packet, format: Format) -> ([Frame; SEGMENTS], usize) {
-    let mut frames = [Frame::EMPTY; SEGMENTS];
+fn frames(packet: &Packet, format: Format) -> ([Frame; Length::MAX_SEGMENTS], usize) {
+    let mut frames = [Frame::EMPTY; Length::MAX_SEGMENTS];
     let mut count = 0;
     for (place, frame) in frames.iter_mut().zip(packet.frames(format)) {
         *place = frame;

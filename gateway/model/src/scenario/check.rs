@@ -102,7 +102,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
         if !(start - reach >= min && start + reach <= max) {
             let swings =
                 if reach > 0.0 { format!(", and it swings by {reach} {unit}") } else { String::new() };
-            let why = format!("joint {} may go from {min:.4} to {max:.4} {unit}{swings}", index + 1);
+            let why = format!("{} may go from {min:.4} to {max:.4} {unit}{swings}", joint.name);
             return Err(at.key(start_key).nth(index).fault(format_args!("{start} {unit}"), why));
         }
     }
