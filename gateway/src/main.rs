@@ -31,6 +31,7 @@ mod sensing;
 mod shadow;
 mod skin;
 mod torque;
+mod view;
 
 use std::process::ExitCode;
 
@@ -66,6 +67,7 @@ enum Command {
     Skin(skin::Skin),
     Scenario(scenario::Scenario),
     Torque(torque::Torque),
+    View(view::View),
     Dbc(dbc::Dbc),
     Explain(explain::Explain),
     Shadow(shadow::ShadowCommand),
@@ -91,6 +93,7 @@ impl Command {
             Self::Skin(command) => command.run(),
             Self::Scenario(command) => command.run(),
             Self::Torque(command) => command.run(),
+            Self::View(command) => command.run(),
             Self::Dbc(command) => command.run(),
             Self::Explain(command) => command.run(),
             Self::Shadow(command) => command.run(),

@@ -2,6 +2,7 @@
 
 mod show;
 
+use std::net::SocketAddr;
 use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -25,10 +26,14 @@ use super::buses;
 use super::output::{self, Force, apart, note};
 use super::print::json;
 use super::robot_file::urdf_of;
+use super::view::Page;
 
 /// The skin and the scenario of the demonstration.
 const SKIN: &str = include_str!("../examples/ur5-253.toml");
 const SCENARIO: &str = include_str!("../examples/demo.toml");
+
+/// How long a run may last that is watched, in s.
+const UNTIL_STOPPED: f64 = 24.0 * 3600.0;
 
 /// Where the demonstration's frames are recorded.
 const DEMO_LOG: &str = "skinbus-demo.log";
@@ -47,6 +52,10 @@ struct Common {
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
+    /// Show the skin live in a browser: a page is served until the run ends, at this address or any free port of this
+    /// machine; docs/how-to/view.md. Without --duration the run then ends with Ctrl-C
+    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true)]
+    view: Option<Option<SocketAddr>>,
     #[command(flatten)]
     recording: Recording,
 }
@@ -202,13 +211,14 @@ impl Demo {
             let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
             note(format_args!("its frames in words: {place}gateway dump vcan0 --bus-kind {kind}"));
         }
-        let Common { recording, summary, .. } = self.common;
+        let Common { recording, summary, view, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
         let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), urdf: None };
         options.record = recording.options(candump, &options.skin, files);
-        bench(&options, summary.as_deref(), recording.force, &[])
+        let page = view.map(|listen| Page::of(&options, listen)).transpose()?;
+        bench(&options, summary.as_deref(), recording.force, &[], page)
     }
 }
 
@@ -239,7 +249,7 @@ impl Run {
             note(format_args!("remark: {remark}"));
         }
         let mut options = self.common.options(skin_file, skin, scenario);
-        let Common { recording, summary, .. } = self.common;
+        let Common { recording, summary, view, .. } = self.common;
         options.kinds = self.kinds.of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
         let files = Files { skin: skin_text, scenario: scenario_text, urdf: urdf_text };
@@ -247,7 +257,8 @@ impl Run {
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.receive_buffer = self.receive_buffer as usize;
-        bench(&options, summary.as_deref(), recording.force, &read)
+        let page = view.map(|listen| Page::of(&options, listen)).transpose()?;
+        bench(&options, summary.as_deref(), recording.force, &read, page)
     }
 }
 
@@ -261,7 +272,8 @@ fn urdf_text(path: &Path) -> Result<String, Failure> {
 impl Common {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e13: checked")]
     fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> Options {
-        if let Some(seconds) = self.duration {
+        let until_stopped = self.view.map(|_| UNTIL_STOPPED);
+        if let Some(seconds) = self.duration.or(until_stopped) {
             scenario.duration = Span((seconds * 1e6) as u64);
         }
         Options {
@@ -287,6 +299,7 @@ fn bench(
     summary_file: Option<&Path>,
     force: Force,
     read: &[PathBuf],
+    page: Option<Page>,
 ) -> Result<(), Failure> {
     let written = [
         ("--candump", options.record.candump.as_ref().map(|candump| candump.path.as_path())),
@@ -298,6 +311,7 @@ fn bench(
     let summary = summary_file.map(|path| force.create("--summary", path)).transpose()?;
     // A panic is reported in the summary too.
     let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options)));
+    drop(page);
     let (ended, panicked) = match ended {
         Ok(ended) => (ended.map_err(|error| Failure::with_code(error.exit_code(), error))?, None),
         Err(panic) => (Summary::of_no_run(&options.skin, "the gateway panicked".to_owned()), Some(panic)),

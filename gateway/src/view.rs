@@ -1,0 +1,128 @@
+//! `gateway view`, and the option `--view` of runs.
+
+use std::ffi::OsString;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::{io, thread};
+
+use bench::run;
+use clap::Args;
+use protocol::skin::Skin;
+use protocol::usage::Failure;
+use view::serve::{Options, serve};
+use view::server::Access;
+
+use super::arguments::{BusKinds, bus_names};
+use super::input::stopped;
+use super::output::note;
+
+/// Where a page is served unless it is told.
+const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
+
+/// Show a skin live in a browser, and press its cells with the mouse
+///
+/// Listens to the buses of a bench or of a robot, and serves one page that draws the arm and its cells: coloured by force,
+/// proximity or temperature, their state by their shape, each joint's torque beside the central computation. A click presses
+/// a cell with a stimulus, if it is in test mode. The page needs no network but this server, which only answers this
+/// machine, unless --listen names another address; then each request needs the --token. It ends with Ctrl-C.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway demo --view
+  gateway view gateway/examples/ur5-253.toml --bus-kind embedded
+  gateway view skin.toml --listen 0.0.0.0:8100 --token $(openssl rand -hex 16) --read-only")]
+pub(crate) struct View {
+    /// The skin's description
+    skin: PathBuf,
+    /// The address of the page; port 0 is any that is free
+    #[arg(long, value_name = "ADDRESS:PORT", default_value_t = LISTEN)]
+    listen: SocketAddr,
+    /// What every request has to carry as ?token=; at least 16 letters or digits
+    #[arg(long, value_name = "TOKEN", value_parser = token)]
+    token: Option<String>,
+    /// Let pages look, but not press, halt or resume
+    #[arg(long)]
+    read_only: bool,
+    /// Wait for buses that are not there yet
+    #[arg(long)]
+    wait: bool,
+    /// End with standard input: with the run that has started it
+    #[arg(long, hide = true)]
+    of_run: bool,
+    #[command(flatten)]
+    kinds: BusKinds,
+}
+
+fn token(text: &str) -> Result<String, String> {
+    let is_plain = text.bytes().all(|byte| byte.is_ascii_alphanumeric());
+    if text.len() < 16 || !is_plain {
+        return Err("a token has at least 16 letters or digits".to_owned());
+    }
+    Ok(text.to_owned())
+}
+
+impl View {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let skin = Skin::read(&self.skin).map_err(Failure::usage)?;
+        if !self.listen.ip().is_loopback() && self.token.is_none() {
+            return Err(Failure::usage(format!(
+                "--listen {}: others than this machine may come there: give a --token, or listen on 127.0.0.1",
+                self.listen
+            )));
+        }
+        let kinds = self.kinds.of(bus_names(&skin))?;
+        let access = Access { listen: self.listen, may_act: !self.read_only, token: self.token };
+        let stop = stopped()?;
+        if self.of_run {
+            end_with_input(&stop);
+        }
+        let options = Options { skin, kinds, directory: None, access, patient: self.wait };
+        serve(options, &stop, |url| note(format_args!("view: {url}"))).map_err(Failure::usage)?;
+        Ok(())
+    }
+}
+
+/// Stops at the end of standard input, which a run holds open while it lives.
+fn end_with_input(stop: &Arc<AtomicBool>) {
+    let stop = Arc::clone(stop);
+    thread::spawn(move || {
+        let _ = io::copy(&mut io::stdin(), &mut io::sink());
+        stop.store(true, Ordering::Relaxed);
+    });
+}
+
+/// The page of a run, in a process of its own; it ends with this value.
+#[derive(Debug)]
+pub(crate) struct Page(Child);
+
+impl Page {
+    /// Serves the page of a run, whose buses open later.
+    pub(crate) fn of(run: &run::Options, listen: Option<SocketAddr>) -> Result<Self, Failure> {
+        let run::Options { skin_file, skin, kinds, directory, .. } = run;
+        let program = std::env::current_exe().map_err(|error| Failure::run(format!("--view: {error}")))?;
+        let mut command = Command::new(program);
+        command.args(["view", "--wait", "--of-run"]).arg(skin_file);
+        for bus in &skin.buses {
+            let kind = kinds.of(&bus.name).resolve();
+            command.arg("--bus-kind").arg(OsString::from(format!("{}={kind}", bus.name)));
+        }
+        if let Some(listen) = listen {
+            command.arg("--listen").arg(listen.to_string());
+        }
+        if let Some(directory) = directory {
+            command.env("SKINBUS_DIR", directory);
+        }
+        // Its signals are its own: the run ends it.
+        let child = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn();
+        child.map(Self).map_err(|error| Failure::run(format!("--view: {error}")))
+    }
+}
+
+impl Drop for Page {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}

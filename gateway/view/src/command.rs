@@ -1,0 +1,86 @@
+//! What a page asks for.
+
+use serde::Deserialize;
+
+/// A message of the page.
+#[derive(Clone, Debug, Deserialize, PartialEq)]
+#[serde(tag = "do", rename_all = "lowercase", deny_unknown_fields)]
+pub enum Command {
+    /// Presses this cell, and no other of this page's.
+    Press {
+        /// Its bus, as an index into the skin's.
+        bus: usize,
+        /// Its node id.
+        node: u8,
+        /// The force in N.
+        force_n: f64,
+    },
+    /// Releases what this page presses.
+    Release,
+    /// Halts all cells.
+    Halt,
+    /// Resumes all cells.
+    Resume,
+    /// Asks for the details of a cell with each snapshot.
+    Choose {
+        /// Its bus.
+        bus: usize,
+        /// Its node id.
+        node: u8,
+    },
+    /// Asks for no details any more.
+    Unchoose,
+}
+
+/// The longest message of a page, in bytes.
+pub const LONGEST: usize = 512;
+
+impl Command {
+    /// Reads a message; `None` of anything else.
+    #[must_use]
+    pub fn parse(text: &str) -> Option<Self> {
+        if text.len() > LONGEST {
+            return None;
+        }
+        serde_json::from_str(text).ok()
+    }
+
+    /// Whether it changes what cells do.
+    #[must_use]
+    pub const fn acts(&self) -> bool {
+        !matches!(self, Self::Choose { .. } | Self::Unchoose)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn commands_are_json_and_nothing_else_is_one() {
+        let press = Command::Press { bus: 0, node: 12, force_n: 2.5 };
+        assert_eq!(Command::parse(r#"{"do":"press","bus":0,"node":12,"force_n":2.5}"#), Some(press.clone()));
+        assert!(press.acts() && !Command::Unchoose.acts());
+        for wrong in [
+            "",
+            "null",
+            "[]",
+            r#"{"do":"kill"}"#,
+            r#"{"do":"press","bus":-1,"node":12,"force_n":2.5}"#,
+            r#"{"do":"press","bus":0,"node":256,"force_n":2.5}"#,
+            r#"{"do":"press","bus":0,"node":1,"force_n":"x"}"#,
+            r#"{"do":"press","bus":0,"node":1,"force_n":1,"more":1}"#,
+        ] {
+            assert_eq!(Command::parse(wrong), None, "{wrong}");
+        }
+        assert_eq!(Command::parse(&format!("{}{{\"do\":\"halt\"}}", " ".repeat(LONGEST))), None);
+    }
+
+    proptest! {
+        #[test]
+        fn any_text_is_read_without_a_panic(text: String) {
+            let _ = Command::parse(&text);
+        }
+    }
+}

@@ -1,0 +1,23 @@
+//! The skin live in a browser: a page that draws it, and the server behind the page.
+//!
+//! ```text
+//!   buses ──> Live ── snapshot, 30 Hz ──> newest ──> a thread for each client ──> WebSocket ──> page
+//!     ^         │                                            │
+//!     └── stimuli ── Pressed <──────── commands ─────────────┘
+//! ```
+//!
+//! It listens to the buses as any other node, so that a control loop beside it is not touched: what it shows is what
+//! the buses carried. Touches are stimuli on the bus, which cells in test mode obey.
+//!
+//! [`live`], [`pressed`], [`scene`] and [`command`] have no socket and no clock; [`server`] and [`serve`] are the shell.
+
+pub mod command;
+pub mod live;
+pub mod pressed;
+pub mod scene;
+pub mod serve;
+pub mod server;
+mod web;
+
+pub use live::Live;
+pub use scene::Scene;

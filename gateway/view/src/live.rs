@@ -1,0 +1,147 @@
+//! What is known of a skin from what its buses carry.
+
+mod bus;
+mod said;
+
+use protocol::can::Frame;
+use protocol::id::CellId;
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+use self::bus::LiveBus;
+pub use self::said::{Answer, BusSaid, Dead, Detail, Said};
+use crate::pressed::{Place, Pressed};
+use protocol::message::SkinSensors;
+
+/// A skin as its buses say.
+#[derive(Debug)]
+pub struct Live {
+    skin: Skin,
+    buses: Vec<LiveBus>,
+    /// By cell of the skin: its bus, and its place there.
+    places: Vec<(usize, usize)>,
+    number: u32,
+    /// When the first frame came.
+    began: Option<Micros>,
+}
+
+/// Flags of a cell in a snapshot.
+mod flag {
+    pub(super) const UNCONFIGURED: u8 = 1;
+    pub(super) const OTHER_CONFIGURATION: u8 = 2;
+    pub(super) const MEASURES: u8 = 4;
+    pub(super) const HALTED: u8 = 8;
+    pub(super) const PRESSED: u8 = 16;
+}
+
+impl Live {
+    /// Before any frame.
+    #[must_use]
+    pub fn new(skin: Skin) -> Self {
+        let buses: Vec<_> = (0..skin.buses.len()).map(|bus| LiveBus::new(&skin, bus)).collect();
+        let mut next = vec![0; buses.len()];
+        let places = skin.cells.iter().map(|cell| {
+            let place = next.get_mut(cell.bus).map_or(0, |next| std::mem::replace(next, *next + 1));
+            (cell.bus, place)
+        });
+        Self { places: places.collect(), skin, buses, number: 0, began: None }
+    }
+
+    /// The skin.
+    #[must_use]
+    pub const fn skin(&self) -> &Skin {
+        &self.skin
+    }
+
+    /// A frame stood on a bus.
+    pub fn frame(&mut self, bus: usize, at: Micros, frame: &Frame) {
+        self.began.get_or_insert(at);
+        if let Some(bus) = self.buses.get_mut(bus) {
+            bus.frame(at, frame);
+        }
+    }
+
+    /// Whether a bus is open and works, and how many frames were not received.
+    pub fn set_bus(&mut self, bus: usize, is_up: bool, dropped: u64) {
+        if let Some(bus) = self.buses.get_mut(bus) {
+            bus.set_up(is_up, dropped);
+        }
+    }
+
+    /// Time has passed.
+    pub fn handle_time(&mut self, now: Micros) {
+        self.buses.iter_mut().for_each(|bus| bus.handle_time(now));
+    }
+
+    /// The cell of this name, if it is one of the skin's and may be pressed: it has said that it is in test mode.
+    #[must_use]
+    pub fn may_press(&self, bus: usize, node: u8) -> Option<Place> {
+        let node = CellId::new(node.into()).ok()?;
+        let cell = self.buses.get(bus)?.cell(node)?;
+        (cell.measures() == Some(false)).then_some((bus, node))
+    }
+
+    /// The sensor words that a cell has latched, as far as the bus says.
+    #[must_use]
+    pub fn latched(&self, (bus, node): Place, now: Micros) -> Option<SkinSensors> {
+        self.buses.get(bus)?.sensors(node, now)
+    }
+
+    /// The next snapshot: all that changes fast, as bytes.
+    ///
+    /// | bytes | what |
+    /// |---|---|
+    /// | 4 | its number, u32 |
+    /// | 4 | joints J of the robot, u32 |
+    /// | 4 | cells, u32 |
+    /// | 4 | 0 |
+    /// | 8 | seconds since the first frame, f64 |
+    /// | 12 J | of each joint position (rad or m), distributed torque, central torque (Nm or N), f32 |
+    /// | 8 for each cell | status u8, flags u8, force mN u16, proximity 2^-15 u16, temperature 0.01 °C i16 |
+    ///
+    /// All are little-endian. The torques are those of the last epoch that is over. Status: 0 never heard, 1 quiet, 2 active, 3 stale, 4 dead. Flags: 1 without
+    /// parameters, 2 with others than the skin's, 4 measures, 8 halted, 16 pressed by a page.
+    pub fn snapshot(&mut self, now: Micros, pressed: &Pressed) -> Vec<u8> {
+        self.number = self.number.wrapping_add(1);
+        let joints = self.skin.robot.joints.len();
+        let count = |number: usize| u32::try_from(number).unwrap_or(u32::MAX);
+        let mut bytes = Vec::with_capacity(24 + 12 * joints + 8 * self.places.len());
+        for word in [self.number, count(joints), count(self.places.len()), 0] {
+            bytes.extend(word.to_le_bytes());
+        }
+        bytes.extend(self.seconds(now).to_le_bytes());
+        let mut rows = vec![[0.0_f64; 3]; joints];
+        for (index, bus) in self.buses.iter().enumerate() {
+            for ((place, (joint, _)), torque) in self.skin.joints_of(index).enumerate().zip(bus.torques()) {
+                let Some([position, distributed, central]) = rows.get_mut(joint) else { continue };
+                *position = bus.position(place).unwrap_or(*position);
+                *distributed += torque.0;
+                *central += torque.1;
+            }
+        }
+        for value in rows.into_iter().flatten() {
+            #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
+            bytes.extend((value as f32).to_le_bytes());
+        }
+        let shown: Vec<Vec<_>> = self.buses.iter().map(|bus| bus.shown(now)).collect();
+        for (cell, &(bus, place)) in self.skin.cells.iter().zip(&self.places) {
+            let Some(mut cell_bytes) = shown.get(bus).and_then(|bus| bus.get(place)).copied() else {
+                continue;
+            };
+            if pressed.is_pressed((bus, cell.node)) {
+                cell_bytes[1] |= flag::PRESSED;
+            }
+            bytes.extend(cell_bytes);
+        }
+        bytes
+    }
+
+    #[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
+    fn seconds(&self, at: Micros) -> f64 {
+        self.began.map_or(0.0, |began| at.0.saturating_sub(began.0) as f64 * 1e-6)
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "words are exact")]
+mod tests;

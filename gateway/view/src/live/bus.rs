@@ -1,0 +1,229 @@
+//! One bus: the table of its cells, and what an epoch came to.
+
+use analysis::fit::rates::Requested;
+use bench::view::CellView;
+use model::central::Central;
+use model::decode::{Decoded, Decoder};
+use model::table::{Cell, Status, Table};
+use protocol::can::Frame;
+use protocol::fixed::{Q1_14, TorqueFormat};
+use protocol::id::CellId;
+use protocol::message::{Message, SkinSensors};
+use protocol::packet::{Epoch, Words};
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::{Reply, Skin};
+use protocol::time::Micros;
+use protocol::wire_time::{BitRates, Bits};
+
+use super::flag;
+
+/// The load is that of the last so many µs.
+const WINDOW_US: u64 = 1_000_000;
+
+/// Joints as they stood on the bus.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Heard {
+    pub(super) epoch: Epoch,
+    pub(super) positions: [Q1_14; MAX_JOINTS],
+}
+
+/// What the real bus would carry.
+#[derive(Clone, Copy, Debug, Default)]
+struct Load {
+    since: Option<Micros>,
+    busy_s: f64,
+    /// Of the last window.
+    share: Option<f64>,
+}
+
+#[derive(Debug)]
+pub(super) struct LiveBus {
+    pub(super) name: String,
+    pub(super) table: Table,
+    pub(super) central: Central,
+    pub(super) torque_format: TorqueFormat,
+    pub(super) sums: bool,
+    decoder: Decoder,
+    /// The joints that cells answer, and those before them.
+    pub(super) heard: Option<Heard>,
+    before: Option<Heard>,
+    /// Of the last epoch that is over, distributed and central, by joint of the chain.
+    torques: [(f64, f64); MAX_JOINTS],
+    joints: usize,
+    /// The last torque of each cell, by its place.
+    pub(super) last: Vec<Option<(Epoch, Words)>>,
+    /// Since when each cell is dead.
+    pub(super) dead_since: Vec<Option<Micros>>,
+    rates: Option<BitRates>,
+    load: Load,
+    pub(super) halted: bool,
+    pub(super) is_up: bool,
+    pub(super) dropped: u64,
+}
+
+impl LiveBus {
+    pub(super) fn new(skin: &Skin, bus: usize) -> Self {
+        let mut table = Table::new(skin, bus);
+        table.set_comparing(true);
+        let roots: Vec<_> = table.cells().iter().filter(|cell| cell.root).map(|cell| cell.node).collect();
+        roots.into_iter().for_each(|root| table.set_feeds(root, true));
+        let described = skin.buses.get(bus);
+        let cells = table.cells().len();
+        Self {
+            name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
+            central: Central::new(&skin.part_on(bus)),
+            torque_format: described.map(|bus| bus.torque_format).unwrap_or_default(),
+            sums: described.is_some_and(|bus| bus.reply != Reply::Torque),
+            decoder: Decoder::new(described.map(|bus| bus.format)),
+            heard: None,
+            before: None,
+            torques: [(0.0, 0.0); MAX_JOINTS],
+            joints: skin.joints_of(bus).len(),
+            last: vec![None; cells],
+            dead_since: vec![None; cells],
+            rates: described.and_then(|bus| Some(Requested::default().of_bus(bus).ok()?.rates)),
+            load: Load::default(),
+            halted: false,
+            is_up: false,
+            dropped: 0,
+            table,
+        }
+    }
+
+    pub(super) fn frame(&mut self, at: Micros, frame: &Frame) {
+        let decoded = self.decoder.decode(at, &self.name, frame);
+        let message = decoded.message().copied();
+        if !matches!(decoded, Decoded::Wire(..)) && !matches!(message, Some(Message::Stimulus { .. })) {
+            // Wires and stimuli are the bench's.
+            let busy = self.rates.zip(Bits::of(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
+            self.load.busy_s += busy;
+        }
+        let mut joints = false;
+        match message {
+            Some(Message::Joints { epoch, joints: said }) => {
+                joints = true;
+                self.close();
+                let heard = Heard { epoch, positions: said.positions };
+                self.before = self.heard.replace(heard);
+            }
+            Some(Message::Torque { from, epoch, torque }) => {
+                let place = self.place(from);
+                if let Some(last) = place.and_then(|place| self.last.get_mut(place)) {
+                    *last = Some((epoch, torque));
+                }
+            }
+            Some(Message::Halt) => self.halted = true,
+            Some(Message::Resume) => self.halted = false,
+            Some(_) | None => {}
+        }
+        // Whoever sent them, joints open an epoch.
+        self.table.handle_frame(at, joints, frame, &mut |_| None);
+    }
+
+    /// Before the next joints: what has come for the last ones, and what the central computation says of them.
+    fn close(&mut self) {
+        let Some(heard) = self.heard else { return };
+        let frames = self.central.frames(&heard.positions);
+        let central = self.central.total(&frames, &self.table.snapshot().sensors).torque;
+        let distributed = self.table.snapshot().sums.torque;
+        for ((torque, distributed), central) in self.torques.iter_mut().zip(distributed).zip(central) {
+            *torque = (distributed, central);
+        }
+    }
+
+    pub(super) fn handle_time(&mut self, now: Micros) {
+        self.table.handle_time(now);
+        self.table.notices().for_each(drop);
+        for ((_, status), since) in self.table.statuses(now).zip(&mut self.dead_since) {
+            match status {
+                Status::Dead => _ = since.get_or_insert(now),
+                Status::Unknown | Status::Quiet | Status::Active | Status::Stale => *since = None,
+            }
+        }
+        let since = *self.load.since.get_or_insert(now);
+        let passed = now.0.saturating_sub(since.0);
+        if passed >= WINDOW_US {
+            #[expect(clippy::cast_precision_loss, reason = "a few seconds")]
+            let share = self.load.busy_s / (passed as f64 * 1e-6);
+            self.load = Load { since: Some(now), busy_s: 0.0, share: Some(share) };
+        }
+    }
+
+    pub(super) const fn set_up(&mut self, is_up: bool, dropped: u64) {
+        (self.is_up, self.dropped) = (is_up, dropped);
+    }
+
+    pub(super) const fn load(&self) -> Option<f64> {
+        self.load.share
+    }
+
+    pub(super) fn place(&self, node: CellId) -> Option<usize> {
+        self.table.cells().iter().position(|cell| cell.node == node)
+    }
+
+    pub(super) fn cell(&self, node: CellId) -> Option<&Cell> {
+        self.table.cells().get(self.place(node)?)
+    }
+
+    pub(super) fn sensors(&self, node: CellId, now: Micros) -> Option<SkinSensors> {
+        self.table.sensors(now).nth(self.place(node)?)?.0
+    }
+
+    /// Distributed and central, by joint of the chain.
+    pub(super) fn torques(&self) -> impl Iterator<Item = (f64, f64)> {
+        self.torques.into_iter().take(self.joints)
+    }
+
+    /// The position of a joint of the chain in rad or m, once joints came.
+    pub(super) fn position(&self, joint: usize) -> Option<f64> {
+        self.central.positions(&self.heard?.positions).get(joint).copied()
+    }
+
+    /// The positions that were broadcast in an epoch, of the last two.
+    pub(super) fn positions_of(&self, epoch: Epoch) -> Option<[Q1_14; MAX_JOINTS]> {
+        let both = [self.heard, self.before];
+        both.into_iter().flatten().find(|heard| heard.epoch == epoch).map(|heard| heard.positions)
+    }
+
+    /// Each cell's bytes in a snapshot.
+    pub(super) fn shown(&self, now: Micros) -> Vec<[u8; 8]> {
+        let cells = self.table.statuses(now).zip(self.table.sensors(now)).enumerate();
+        let bytes = cells.map(|(place, ((cell, status), (sensors, _)))| {
+            let view = CellView::of(cell, status);
+            let flags = [
+                (view.unconfigured, flag::UNCONFIGURED),
+                (view.heard && view.other, flag::OTHER_CONFIGURATION),
+                (view.measures, flag::MEASURES),
+                (view.halted, flag::HALTED),
+            ];
+            let flags = flags.iter().filter(|(is, _)| *is).fold(0, |all, (_, bit)| all | bit);
+            let sensors = sensors.unwrap_or_default();
+            let force = whole(self.central.force(place, &sensors) * 1e3, 0.0, f64::from(u16::MAX));
+            let proximity = whole(sensors.proximity.to_f64() * 32_768.0, 0.0, f64::from(u16::MAX));
+            let [warmth, _] =
+                sensors.temperature.map(|word| whole(word.to_f64() * 100.0, -32_768.0, 32_767.0));
+            let [f0, f1, ..] = force.to_le_bytes();
+            let [p0, p1, ..] = proximity.to_le_bytes();
+            let [t0, t1, ..] = warmth.to_le_bytes();
+            [number(status), flags, f0, f1, p0, p1, t0, t1]
+        });
+        bytes.collect()
+    }
+}
+
+/// The nearest whole number within these bounds.
+#[expect(clippy::cast_possible_truncation, reason = "within 17 bits")]
+fn whole(value: f64, min: f64, max: f64) -> i32 {
+    value.round().clamp(min, max) as i32
+}
+
+/// The number of a status in a snapshot.
+const fn number(status: Status) -> u8 {
+    match status {
+        Status::Unknown => 0,
+        Status::Quiet => 1,
+        Status::Active => 2,
+        Status::Stale => 3,
+        Status::Dead => 4,
+    }
+}

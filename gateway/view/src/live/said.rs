@@ -1,0 +1,225 @@
+//! What changes more slowly, as JSON for the page.
+
+use model::table::{Event, Replies, Status};
+use protocol::fixed::is_saturated;
+use protocol::id::CellId;
+use protocol::time::Micros;
+use serde::Serialize;
+
+use super::Live;
+use super::bus::LiveBus;
+
+/// Dead cells that are named.
+const NAMED: usize = 20;
+
+/// What the page shows in words.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Said {
+    /// What this message is: `said`.
+    pub is: &'static str,
+    /// Cells in contact.
+    pub contacts: usize,
+    /// Cells that fell silent.
+    pub dead: usize,
+    /// The first of them.
+    pub dead_cells: Vec<Dead>,
+    /// Whether a halt stands.
+    pub halted: bool,
+    /// Each bus.
+    pub buses: Vec<BusSaid>,
+    /// The cell that the page has chosen.
+    pub detail: Option<Detail>,
+}
+
+/// A cell that fell silent.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Dead {
+    /// Its bus.
+    pub bus: String,
+    /// Its node id.
+    pub node: u8,
+    /// For so many seconds.
+    pub for_s: f64,
+}
+
+/// One bus.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct BusSaid {
+    /// Its name.
+    pub name: String,
+    /// Whether it works.
+    pub up: bool,
+    /// The share of its time that a real bus would be busy, 0 to 1 and above.
+    pub load: Option<f64>,
+    /// Epochs that somebody had to answer.
+    pub epochs_due: u64,
+    /// Of these, those that all answered in time.
+    pub epochs_complete: u64,
+    /// Replies.
+    pub due: u64,
+    /// In time.
+    pub in_time: u64,
+    /// Late.
+    pub late: u64,
+    /// Missing.
+    pub missing: u64,
+    /// Packets of cells that never came, by the cells' own counts.
+    pub lost: u64,
+    /// Packets that came damaged or without a meaning.
+    pub rejected: u64,
+    /// Torques with a saturated word.
+    pub saturated: u64,
+    /// Frames that this program did not receive.
+    pub dropped: u64,
+    /// Mean absolute error of single torques against the central computation, in Nm.
+    pub error_nm: Option<f64>,
+}
+
+/// A cell in detail.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Detail {
+    /// Its bus, as an index into the skin's.
+    pub bus: usize,
+    /// Its node id.
+    pub node: u8,
+    /// Its serial number.
+    pub serial: u32,
+    /// Its status in a word.
+    pub status: &'static str,
+    /// The hash of its configuration, and the one it must have.
+    pub configuration: [Option<String>; 2],
+    /// Its three contact forces in N.
+    pub contact_n: [f64; 3],
+    /// Its proximity, 0 to 1.
+    pub proximity: f64,
+    /// Its temperatures in °C.
+    pub temperature_c: [f64; 2],
+    /// The force by Algorithm 1, in N.
+    pub force_n: f64,
+    /// Its last torque.
+    pub torque: Option<Answer>,
+    /// Replies due and in time.
+    pub replies: [u64; 2],
+    /// Packets lost by its own count, and restarts.
+    pub lost: u64,
+    /// Restarts.
+    pub restarts: u32,
+}
+
+/// A torque of a cell.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Answer {
+    /// Its epoch.
+    pub epoch: u8,
+    /// Its words.
+    pub words: Vec<i16>,
+    /// The same in Nm or N.
+    pub distributed: Vec<f64>,
+    /// The central computation at the positions of that epoch, while they are known.
+    pub central: Option<Vec<f64>>,
+    /// Whether a word is saturated.
+    pub saturated: bool,
+}
+
+impl Live {
+    /// What is to be said now.
+    #[must_use]
+    pub fn said(&self, now: Micros, chosen: Option<(usize, u8)>) -> Said {
+        let (mut contacts, mut dead, mut dead_cells) = (0, 0, Vec::new());
+        for bus in &self.buses {
+            for ((cell, status), since) in bus.table.statuses(now).zip(&bus.dead_since) {
+                contacts += usize::from(matches!(status, Status::Active | Status::Stale));
+                dead += usize::from(status == Status::Dead);
+                if let Some(since) = since.filter(|_| dead_cells.len() < NAMED) {
+                    let for_s = (self.seconds(now) - self.seconds(since)).max(0.0);
+                    dead_cells.push(Dead { bus: bus.name.clone(), node: cell.node.get(), for_s });
+                }
+            }
+        }
+        Said {
+            is: "said",
+            contacts,
+            dead,
+            dead_cells,
+            halted: self.buses.iter().any(|bus| bus.halted),
+            buses: self.buses.iter().map(LiveBus::said).collect(),
+            detail: chosen.and_then(|(bus, node)| self.detail(bus, node, now)),
+        }
+    }
+
+    fn detail(&self, index: usize, node: u8, now: Micros) -> Option<Detail> {
+        let bus = self.buses.get(index)?;
+        let place = bus.place(CellId::new(node.into()).ok()?)?;
+        let (cell, status) = bus.table.statuses(now).nth(place)?;
+        let sensors = bus.table.sensors(now).nth(place)?.0.unwrap_or_default();
+        let force_n = bus.central.force(place, &sensors);
+        let torque = bus.last.get(place).copied().flatten().map(|(epoch, words)| {
+            let words = words.as_slice();
+            let frames = bus.positions_of(epoch).map(|positions| bus.central.frames(&positions));
+            let central = frames.map(|frames| bus.central.torque(place, &frames, force_n));
+            let joints = self.skin.joints_of(index).len();
+            Answer {
+                epoch: epoch.0,
+                words: words.iter().take(joints).copied().collect(),
+                distributed: words.iter().take(joints).map(|&word| bus.torque_format.real(word)).collect(),
+                central: central.map(|central| central.into_iter().take(joints).collect()),
+                saturated: words.iter().any(|&word| is_saturated(word)),
+            }
+        });
+        let hash = |hash: u16| format!("{hash:04X}");
+        let uplink = cell.uplink();
+        Some(Detail {
+            bus: index,
+            node,
+            serial: cell.serial,
+            status: status.name(),
+            configuration: [
+                cell.heartbeat().map(|it| hash(it.configuration)),
+                Some(hash(cell.configuration)),
+            ],
+            contact_n: sensors.contact.map(|word| word.to_f64()),
+            proximity: sensors.proximity.to_f64(),
+            temperature_c: sensors.temperature.map(|word| word.to_f64()),
+            force_n,
+            torque,
+            replies: [cell.replies.due, cell.replies.in_time],
+            lost: uplink.lost,
+            restarts: uplink.restarts,
+        })
+    }
+}
+
+impl LiveBus {
+    fn said(&self) -> BusSaid {
+        let counters = self.table.counters();
+        let uplink = self.table.uplink();
+        let account = match self.table.sums() {
+            Some((_, cells)) => Replies {
+                due: cells.due,
+                in_time: cells.in_time,
+                late: cells.late,
+                missing: cells.missing,
+                ..Replies::default()
+            },
+            None => Replies::total(self.table.cells().iter().map(|cell| cell.replies)),
+        };
+        let accuracy = self.table.accuracy();
+        let errors = if self.sums { accuracy.sums } else { accuracy.single };
+        BusSaid {
+            name: self.name.clone(),
+            up: self.is_up,
+            load: self.load(),
+            epochs_due: counters.epochs_due,
+            epochs_complete: counters.epochs_complete,
+            due: account.due,
+            in_time: account.in_time,
+            late: account.late,
+            missing: account.missing,
+            lost: uplink.lost,
+            rejected: uplink.rejected,
+            saturated: counters.events(Event::Saturated),
+            dropped: self.dropped,
+            error_nm: errors.mean(),
+        }
+    }
+}

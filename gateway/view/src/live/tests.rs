@@ -1,0 +1,135 @@
+//! Frames made here, and what is known after them.
+
+use super::*;
+use protocol::fixed::{Q1_14, Q5_10};
+use protocol::id::Node;
+use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, State};
+use protocol::packet::{Epoch, Packet};
+
+fn skin() -> Skin {
+    Skin::parse("ur5", include_str!("../../../examples/ur5-253.toml")).unwrap()
+}
+
+/// A bus of the example at 62.5 Hz.
+struct Bench {
+    live: Live,
+    now: Micros,
+}
+
+impl Bench {
+    fn new() -> Self {
+        Self { live: Live::new(skin()), now: Micros(1_000_000) }
+    }
+
+    fn say(&mut self, message: &Message) {
+        self.now.0 += 100;
+        let packet: Packet = message.encode();
+        for frame in packet.frames(protocol::can::Format::Fd) {
+            self.live.frame(0, self.now, &frame);
+        }
+    }
+
+    fn heartbeat(&mut self, node: u8, configuration: u16) {
+        let from = CellId::new(node.into()).unwrap();
+        let state = State(0x1000 | State::CONFIGURED.0 | State::TEST_MODE.0 | 2 << 8);
+        let heartbeat =
+            Heartbeat { serial: 100_000 + u32::from(node), configuration, state, ..Heartbeat::default() };
+        let page = NetworkPage::Heartbeat(heartbeat);
+        self.say(&Message::Network { from: Node::Cell(from), epoch: Epoch(0), page });
+    }
+
+    fn joints(&mut self, epoch: u8, q: [f64; 6]) {
+        self.now.0 += 16_000;
+        let mut positions = [Q1_14::ZERO; protocol::parameters::MAX_JOINTS];
+        for (position, q) in positions.iter_mut().zip(q) {
+            *position = Q1_14::from_radians(q).unwrap();
+        }
+        self.say(&Message::Joints { epoch: Epoch(epoch), joints: Joints { positions, in_use: 6 } });
+    }
+
+    fn snapshot(&mut self) -> Vec<u8> {
+        self.live.handle_time(self.now);
+        self.live.snapshot(self.now, &Pressed::default())
+    }
+}
+
+fn float(bytes: &[u8], at: usize) -> f32 {
+    f32::from_le_bytes(bytes[at..at + 4].try_into().unwrap())
+}
+
+const Q: [f64; 6] = [0.3, -1.2, 1.0, -1.4, -1.5, 0.2];
+
+#[test]
+fn a_snapshot_holds_the_last_epoch_that_is_over() {
+    let mut bench = Bench::new();
+    let hash = bench.live.skin.parameters(&bench.live.skin.cells[4]).hash();
+    bench.heartbeat(5, hash);
+    bench.heartbeat(6, 1);
+    bench.joints(1, Q);
+    let node = CellId::new(5).unwrap();
+    let page = SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() });
+    bench.say(&Message::Stimulus { to: Node::Cell(node), from: From::Next, page });
+    bench.joints(2, Q);
+    let words = [100_i16, -200, 0, 0, 0, 0];
+    bench.say(&Message::Torque { from: node, epoch: Epoch(2), torque: words.into() });
+    let before = bench.snapshot();
+    assert_eq!(before.len(), 24 + 12 * 6 + 8 * 253);
+    assert_eq!(float(&before, 24 + 4), 0.0, "epoch 2 is not over");
+    bench.joints(3, Q);
+    let bytes = bench.snapshot();
+    assert_eq!(u32::from_le_bytes(bytes[..4].try_into().unwrap()), 2);
+    for (joint, q) in Q.iter().enumerate() {
+        assert!((f64::from(float(&bytes, 24 + 12 * joint)) - q).abs() < 1e-4, "{joint}");
+    }
+    assert_eq!(float(&bytes, 24 + 4), 100.0 / 4096.0);
+    assert_eq!(float(&bytes, 24 + 16), -200.0 / 4096.0);
+    let central = float(&bytes, 24 + 8);
+    assert!(central != 0.0 && central.abs() < 3.0, "{central}");
+    let cell = |node: usize| &bytes[24 + 72 + 8 * (node - 1)..24 + 72 + 8 * node];
+    assert_eq!((cell(5)[0], cell(5)[1]), (2, 0), "active");
+    let force = u16::from_le_bytes([cell(5)[2], cell(5)[3]]);
+    assert!((2990..=3010).contains(&force), "{force} mN");
+    assert_eq!((cell(6)[0], cell(6)[1]), (1, flag::OTHER_CONFIGURATION), "quiet, with another configuration");
+    assert_eq!(cell(7)[0], 0, "never heard");
+
+    let said = bench.live.said(bench.now, Some((0, 5)));
+    assert_eq!((said.contacts, said.dead, said.halted, said.buses[0].due), (1, 0, false, 2));
+    let detail = said.detail.unwrap();
+    let answer = detail.torque.unwrap();
+    assert_eq!((answer.epoch, answer.words[..2].to_vec(), detail.serial), (2, vec![100, -200], 100_005));
+    let exact = answer.central.unwrap();
+    assert!((exact[0] - f64::from(central)).abs() < 1e-6, "the only cell in contact: {exact:?} {central}");
+    assert_eq!(bench.live.said(bench.now, Some((0, 254))).detail, None);
+    assert_eq!(bench.live.said(bench.now, Some((7, 1))).detail, None);
+}
+
+#[test]
+fn a_silent_cell_is_dead_since_it_was_noticed_and_a_halt_stands_until_the_resume() {
+    let mut bench = Bench::new();
+    bench.heartbeat(5, 0);
+    bench.joints(1, Q);
+    bench.say(&Message::Halt);
+    bench.now.0 += 2_000_000;
+    let bytes = bench.snapshot();
+    assert_eq!(bytes[24 + 72 + 8 * 4], 4);
+    bench.now.0 += 3_000_000;
+    let said = bench.live.said(bench.now, None);
+    assert!(said.halted && said.dead == 1 && (said.dead_cells[0].for_s - 3.0).abs() < 0.1, "{said:?}");
+    bench.say(&Message::Resume);
+    assert!(!bench.live.said(bench.now, None).halted);
+    bench.heartbeat(5, 0);
+    bench.snapshot();
+    assert_eq!(bench.live.said(bench.now, None).dead_cells, []);
+}
+
+#[test]
+fn only_cells_of_the_skin_in_test_mode_may_be_pressed() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.live.may_press(0, 12), None, "it has not said that it is in test mode");
+    bench.heartbeat(12, 0);
+    assert_eq!(bench.live.may_press(0, 12), Some((0, CellId::new(12).unwrap())));
+    assert_eq!(
+        (bench.live.may_press(0, 0), bench.live.may_press(0, 254), bench.live.may_press(1, 12)),
+        (None, None, None)
+    );
+}

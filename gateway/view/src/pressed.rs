@@ -1,0 +1,152 @@
+//! What pages press, and the stimuli that make it so.
+
+use std::collections::BTreeMap;
+
+use model::scenario::contact_words;
+use protocol::id::CellId;
+use protocol::message::SkinSensors;
+use protocol::time::Micros;
+
+/// The largest force of a touch, in N.
+pub const MAX_FORCE_N: f64 = 90.0;
+/// A stimulus that the cell has not latched is sent again after so long, in µs.
+const AGAIN_US: u64 = 150_000;
+/// As often a release is sent that is not latched: the cell may be gone.
+const RELEASES: u32 = 20;
+
+/// A cell: its bus, and its node id there.
+pub type Place = (usize, CellId);
+
+/// A target for a cell.
+#[derive(Clone, Copy, Debug)]
+struct Target {
+    force_n: f64,
+    sent: Option<Micros>,
+    /// Of a release, how often it was sent.
+    tries: u32,
+}
+
+/// The touches of all pages.
+#[derive(Clone, Debug, Default)]
+pub struct Pressed {
+    /// By page.
+    pages: BTreeMap<u64, (Place, f64)>,
+    targets: BTreeMap<Place, Target>,
+}
+
+impl Pressed {
+    /// A page presses a cell, and releases what it has pressed before. The force is held within 0 and
+    /// [`MAX_FORCE_N`]; what is not a number is 0.
+    pub fn press(&mut self, page: u64, cell: Place, force_n: f64) {
+        let force_n = if force_n.is_finite() { force_n.clamp(0.0, MAX_FORCE_N) } else { 0.0 };
+        let before = self.pages.insert(page, (cell, force_n));
+        if let Some((before, _)) = before.filter(|(before, _)| *before != cell) {
+            self.aim(before);
+        }
+        self.aim(cell);
+    }
+
+    /// A page releases its cell, or is gone.
+    pub fn release(&mut self, page: u64) {
+        if let Some((cell, _)) = self.pages.remove(&page) {
+            self.aim(cell);
+        }
+    }
+
+    /// The force that a cell is to feel: forces of several pages add up.
+    fn aim(&mut self, cell: Place) {
+        let pages = self.pages.values().filter(|(of, _)| *of == cell);
+        let force_n = pages.map(|(_, force_n)| force_n).sum::<f64>().min(MAX_FORCE_N);
+        self.targets.insert(cell, Target { force_n, sent: None, tries: 0 });
+    }
+
+    /// Whether a cell is pressed.
+    #[must_use]
+    pub fn is_pressed(&self, cell: Place) -> bool {
+        self.targets.get(&cell).is_some_and(|target| target.force_n > 0.0)
+    }
+
+    /// The stimuli to send now. `latched` gives the contact words that a cell has, as far as the bus says.
+    pub fn due(
+        &mut self,
+        now: Micros,
+        latched: impl Fn(Place) -> Option<SkinSensors>,
+    ) -> Vec<(Place, SkinSensors)> {
+        let mut due = Vec::new();
+        self.targets.retain(|&cell, target| {
+            let sensors =
+                SkinSensors { contact: contact_words(target.force_n), ..latched(cell).unwrap_or_default() };
+            let is_latched = latched(cell).is_some_and(|now| now.contact == sensors.contact);
+            let released = target.force_n <= 0.0;
+            if is_latched && target.sent.is_some() {
+                return !released;
+            }
+            if target.sent.is_none_or(|sent| now.since(sent).0 >= AGAIN_US) {
+                target.sent = Some(now);
+                target.tries += 1;
+                due.push((cell, sensors));
+            }
+            !(released && target.tries >= RELEASES)
+        });
+        due
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "words are exact")]
+mod tests {
+    use super::*;
+
+    fn cell(node: u8) -> Place {
+        (0, CellId::new(node.into()).unwrap())
+    }
+
+    fn force(sensors: &SkinSensors) -> f64 {
+        sensors.contact.iter().map(|word| word.to_f64()).sum()
+    }
+
+    #[test]
+    fn a_touch_is_sent_until_it_is_latched_and_goes_with_its_page() {
+        let mut pressed = Pressed::default();
+        pressed.press(1, cell(3), 4.5);
+        let first = pressed.due(Micros(0), |_| None);
+        assert_eq!((first.len(), force(&first[0].1), first[0].0), (1, 4.5, cell(3)));
+        assert_eq!(pressed.due(Micros(1_000), |_| None), [], "it may still come");
+        assert_eq!(pressed.due(Micros(200_000), |_| None).len(), 1, "it was lost");
+        let sensors = first[0].1;
+        assert_eq!(pressed.due(Micros(900_000), |_| Some(sensors)), []);
+        assert!(pressed.is_pressed(cell(3)));
+        // The cell restarts.
+        assert_eq!(pressed.due(Micros(1_900_000), |_| Some(SkinSensors::default())).len(), 1);
+        pressed.release(1);
+        let last = pressed.due(Micros(2_000_000), |_| Some(sensors));
+        assert_eq!((last.len(), force(&last[0].1)), (1, 0.0));
+        assert_eq!(pressed.due(Micros(2_020_000), |_| Some(SkinSensors::default())), []);
+        assert!(pressed.targets.is_empty() && !pressed.is_pressed(cell(3)));
+    }
+
+    #[test]
+    fn a_page_presses_one_cell_and_forces_of_pages_add_up() {
+        let mut pressed = Pressed::default();
+        pressed.press(1, cell(3), 1.0);
+        pressed.press(2, cell(3), f64::INFINITY);
+        pressed.press(2, cell(3), 2.0);
+        assert_eq!(force(&pressed.due(Micros(0), |_| None)[0].1), 3.0);
+        pressed.press(1, cell(4), -7.0);
+        let due = pressed.due(Micros(1), |_| None);
+        assert_eq!(
+            due.iter().map(|(cell, it)| (cell.1.get(), force(it))).collect::<Vec<_>>(),
+            [(3, 2.0), (4, 0.0)]
+        );
+        pressed.release(9);
+    }
+
+    #[test]
+    fn a_release_that_nobody_takes_ends() {
+        let mut pressed = Pressed::default();
+        pressed.press(1, cell(3), 1.0);
+        pressed.release(1);
+        let sent = (0..100_u64).map(|at| pressed.due(Micros(at * AGAIN_US), |_| None).len()).sum::<usize>();
+        assert_eq!((sent, pressed.targets.len()), (RELEASES as usize, 0));
+    }
+}

@@ -1,0 +1,265 @@
+//! What does not change while a skin is watched: its robot, and where its cells are.
+
+use std::collections::BTreeMap;
+
+use nalgebra::{Matrix3, Vector3};
+use protocol::parameters::RowKind;
+use protocol::skin::{Chain, Skin};
+use serde::Serialize;
+
+/// The smallest number of cells on a link to which a tube is fitted.
+const TUBE_CELLS: usize = 6;
+/// Of more cells, the pitch is taken from about so many.
+const ASKED: usize = 200;
+/// The pitch of a skin of single cells, in m.
+const PITCH: f64 = 0.028;
+
+/// What the page draws; lengths in m, angles in rad.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Scene {
+    /// The skin's name.
+    pub name: String,
+    /// The robot's joints.
+    pub joints: Vec<SceneJoint>,
+    /// Its chains, base to tip.
+    pub chains: Vec<SceneChain>,
+    /// The buses, and the chain whose skin each carries.
+    pub buses: Vec<SceneBus>,
+    /// The cells, in the skin's order.
+    pub cells: Vec<SceneCell>,
+    /// From a cell's middle to the next one's.
+    pub pitch: f64,
+    /// Links as tubes below their cells.
+    pub tubes: Vec<Tube>,
+    /// Whether the page may press cells, halt and resume.
+    pub may_press: bool,
+}
+
+/// A joint.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SceneJoint {
+    /// Its name.
+    pub name: String,
+    /// `rad` or `m`.
+    pub unit: &'static str,
+    /// `Nm` or `N`.
+    pub torque_unit: &'static str,
+}
+
+/// A chain of rows.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SceneChain {
+    /// Its name.
+    pub name: String,
+    /// Its rows, base to tip.
+    pub rows: Vec<SceneRow>,
+}
+
+/// A Denavit-Hartenberg row.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SceneRow {
+    /// The joint that moves it, as an index into [`Scene::joints`]; absent of a fixed row.
+    pub joint: Option<usize>,
+    /// Whether the joint's position is added to `d` in place of `theta`.
+    pub slides: bool,
+    /// Length.
+    pub a: f64,
+    /// Twist.
+    pub alpha: f64,
+    /// Offset.
+    pub d: f64,
+    /// The angle at position 0.
+    pub theta: f64,
+}
+
+/// A bus.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SceneBus {
+    /// Its name.
+    pub name: String,
+    /// Its chain, as an index into [`Scene::chains`].
+    pub chain: usize,
+}
+
+/// A cell.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct SceneCell {
+    /// Its bus, as an index into [`Scene::buses`].
+    pub bus: usize,
+    /// Its node id.
+    pub node: u8,
+    /// The row in whose frame it sits, from 1.
+    pub row: u8,
+    /// The joint of its chain that moves it, from 1.
+    pub joint: u8,
+    /// Its middle in that frame.
+    pub position: [f64; 3],
+    /// Which way it faces there.
+    pub normal: [f64; 3],
+    /// The node ids that it is wired to.
+    pub neighbors: Vec<u8>,
+    /// Whether it is wired to the gateway.
+    pub root: bool,
+}
+
+/// A cylinder in a row's frame.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Tube {
+    /// The chain.
+    pub chain: usize,
+    /// The row, from 1.
+    pub row: u8,
+    /// The middles of its ends.
+    pub ends: [[f64; 3]; 2],
+    /// Its radius.
+    pub radius: f64,
+}
+
+impl Scene {
+    /// That of a skin.
+    #[must_use]
+    pub fn of(skin: &Skin, may_press: bool) -> Self {
+        let joints = skin.robot.joints.iter().map(|joint| SceneJoint {
+            name: joint.name.clone(),
+            unit: joint.kind.unit(),
+            torque_unit: joint.kind.torque_unit(),
+        });
+        let cells = skin.cells.iter().map(|cell| SceneCell {
+            bus: cell.bus,
+            node: cell.node.get(),
+            row: cell.row,
+            joint: cell.joint,
+            position: cell.position,
+            normal: cell.normal,
+            neighbors: cell.neighbors.iter().flatten().map(|node| node.get()).collect(),
+            root: cell.root,
+        });
+        let cells: Vec<_> = cells.collect();
+        let buses = skin.buses.iter().map(|bus| SceneBus { name: bus.name.clone(), chain: bus.chain });
+        let buses: Vec<_> = buses.collect();
+        Self {
+            name: skin.name.clone(),
+            joints: joints.collect(),
+            chains: skin.robot.chains.iter().map(chain).collect(),
+            pitch: pitch(&cells),
+            tubes: tubes(&buses, &cells),
+            buses,
+            cells,
+            may_press,
+        }
+    }
+}
+
+fn chain(chain: &Chain) -> SceneChain {
+    let mut joints = chain.joints.iter();
+    let rows = chain.rows.iter().map(|row| SceneRow {
+        joint: if row.kind == RowKind::Fixed { None } else { joints.next().copied() },
+        slides: row.kind == RowKind::Prismatic,
+        a: row.table.a,
+        alpha: row.table.alpha,
+        d: row.table.d,
+        theta: row.table.theta_offset,
+    });
+    SceneChain { name: chain.name.clone(), rows: rows.collect() }
+}
+
+/// The median distance from a cell to the nearest one of its link.
+fn pitch(cells: &[SceneCell]) -> f64 {
+    let nearest = |cell: &SceneCell| {
+        let same = cells.iter().filter(|other| (other.bus, other.row) == (cell.bus, cell.row));
+        let distance =
+            |other: &SceneCell| (Vector3::from(other.position) - Vector3::from(cell.position)).norm();
+        same.map(distance).filter(|distance| *distance > 1e-6).min_by(f64::total_cmp)
+    };
+    let each = cells.len().div_ceil(ASKED).max(1);
+    let mut all: Vec<_> = cells.iter().step_by(each).filter_map(nearest).collect();
+    all.sort_by(f64::total_cmp);
+    all.get(all.len() / 2).copied().unwrap_or(PITCH).min(0.1)
+}
+
+/// Links with many cells, as tubes.
+fn tubes(buses: &[SceneBus], cells: &[SceneCell]) -> Vec<Tube> {
+    let mut links = BTreeMap::<(usize, u8), Vec<&SceneCell>>::new();
+    for cell in cells {
+        let chain = buses.get(cell.bus).map_or(0, |bus| bus.chain);
+        links.entry((chain, cell.row)).or_default().push(cell);
+    }
+    links.into_iter().filter_map(|((chain, row), cells)| tube(chain, row, &cells)).collect()
+}
+
+/// The cylinder of which these cells are best a part: its axis is at right angles to their normals, and what is left of
+/// their positions less the radius along the normal lies on a line. None where they face one way, as on a plate.
+#[expect(clippy::cast_precision_loss, reason = "a number of cells")]
+fn tube(chain: usize, row: u8, cells: &[&SceneCell]) -> Option<Tube> {
+    if cells.len() < TUBE_CELLS {
+        return None;
+    }
+    let count = cells.len() as f64;
+    let pairs: Vec<_> =
+        cells.iter().map(|cell| (Vector3::from(cell.position), Vector3::from(cell.normal))).collect();
+    let spread: Matrix3<f64> = pairs.iter().map(|(_, normal)| normal * normal.transpose()).sum();
+    let eigen = (spread / count).symmetric_eigen();
+    let mut values: Vec<_> = eigen.eigenvalues.iter().copied().zip(0..).collect();
+    values.sort_by(|one, other| one.0.total_cmp(&other.0));
+    let &[(along, column), (across, _), _] = values.as_slice() else { return None };
+    // Round about the axis: normals spread evenly over both directions at right angles to it.
+    if along > 0.1 || across < 0.2 {
+        return None;
+    }
+    let axis: Vector3<f64> = eigen.eigenvectors.column(column).into();
+    let flat = |vector: &Vector3<f64>| vector - axis * axis.dot(vector);
+    let [mean_at, mean_normal] = pairs
+        .iter()
+        .fold([Vector3::zeros(); 2], |[at, normal], (p, n)| [at + flat(p) / count, normal + flat(n) / count]);
+    let (mut both, mut square) = (0.0, 0.0);
+    for (position, normal) in &pairs {
+        let normal = flat(normal) - mean_normal;
+        both += (flat(position) - mean_at).dot(&normal);
+        square += normal.norm_squared();
+    }
+    let radius = both / square;
+    if !(0.005..0.5).contains(&radius) {
+        return None;
+    }
+    let middle = mean_at - mean_normal * radius;
+    let along = pairs.iter().map(|(position, _)| axis.dot(position));
+    let (from, to) =
+        along.fold((f64::INFINITY, f64::NEG_INFINITY), |(from, to), at| (from.min(at), to.max(at)));
+    let end = |at: f64| (middle + axis * at).into();
+    Some(Tube { chain, row, ends: [end(from - radius * 0.2), end(to + radius * 0.2)], radius: radius * 0.97 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn cells_around_a_link_lie_on_a_tube_and_those_on_a_plate_on_none() {
+        let skin = Skin::parse("ur5", include_str!("../../examples/ur5-253.toml")).unwrap();
+        let scene = Scene::of(&skin, true);
+        assert_eq!((scene.cells.len(), scene.joints.len(), scene.chains[0].rows.len()), (253, 6, 6));
+        assert!((0.02..0.035).contains(&scene.pitch), "{}", scene.pitch);
+        assert_eq!(scene.tubes.len(), 2, "upper arm and forearm");
+        for tube in &scene.tubes {
+            let of = |cell: &&SceneCell| cell.row == tube.row;
+            let [from, to] = tube.ends.map(Vector3::from);
+            let axis = (to - from).normalize();
+            for cell in scene.cells.iter().filter(of) {
+                let at = Vector3::from(cell.position) - from;
+                let off = (at - axis * axis.dot(&at)).norm();
+                assert!((off - tube.radius / 0.97).abs() < 0.005, "{off} {}", tube.radius);
+            }
+        }
+        let plate = scene.cells.iter().map(|cell| SceneCell { normal: [0.0, 0.0, 1.0], ..cell.clone() });
+        let plate: Vec<_> = plate.collect();
+        assert_eq!(tubes(&scene.buses, &plate), []);
+    }
+
+    #[test]
+    fn each_row_names_the_joint_that_moves_it() {
+        let skin = Skin::parse("ur5", include_str!("../../examples/ur5-253.toml")).unwrap();
+        let scene = Scene::of(&skin, false);
+        let joints: Vec<_> = scene.chains[0].rows.iter().map(|row| row.joint).collect();
+        assert_eq!(joints, (0..6).map(Some).collect::<Vec<_>>());
+    }
+}

@@ -1,0 +1,232 @@
+//! The shell: buses, clock, and the server in one loop.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant, SystemTime};
+
+use bench::listen::{open, send};
+use protocol::bus::{self, Bus, BusError, Inbox, Kinds};
+use protocol::can::Format;
+use protocol::id::Node;
+use protocol::message::{From, Message, SensorPage};
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+use crate::command::Command;
+use crate::live::Live;
+use crate::pressed::Pressed;
+use crate::scene::Scene;
+use crate::server::{Access, Counts, Server};
+
+/// From one snapshot to the next.
+const EVERY: Duration = Duration::from_millis(33);
+/// Snapshots from one text to the next.
+const SAID_EVERY: u64 = 6;
+/// How long a frame is waited for.
+const WAIT: Duration = Duration::from_millis(50);
+/// How long frames gather after the first one, so that one wake-up reads many.
+const GATHER: Duration = Duration::from_millis(8);
+/// A bus that cannot be opened is tried again after so long.
+const AGAIN: Duration = Duration::from_millis(200);
+
+/// What to show where.
+#[derive(Debug)]
+pub struct Options {
+    /// The skin.
+    pub skin: Skin,
+    /// Which kind each bus is.
+    pub kinds: Kinds,
+    /// Where embedded buses are, if not where they usually are.
+    pub directory: Option<PathBuf>,
+    /// Who may use it.
+    pub access: Access,
+    /// Whether a bus that is not there at the start is waited for.
+    pub patient: bool,
+}
+
+/// Why nothing can be shown.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// A bus cannot be opened.
+    #[error("{0}")]
+    Bus(BusError),
+    /// The address cannot be listened on.
+    #[error("--listen {listen}: {source}")]
+    Listen {
+        /// The address.
+        listen: std::net::SocketAddr,
+        /// Why.
+        source: std::io::Error,
+    },
+}
+
+/// One bus as its thread and the main one share it.
+#[derive(Debug)]
+struct Shared {
+    name: String,
+    format: Format,
+    bus: Mutex<Option<Arc<Bus>>>,
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Shows a skin until `stop`. `says` is told the page's address once it is served.
+///
+/// # Errors
+/// When the address cannot be listened on, or a bus cannot be opened at the start and is not waited for.
+pub fn serve(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Result<Counts, ServeError> {
+    let Options { skin, kinds, directory, access, patient } = options;
+    let (listen, may_act) = (access.listen, access.may_act);
+    let opened = |name: &str, format: Format| {
+        let options = bus::Options {
+            own_frames: true,
+            directory: directory.clone(),
+            receive_buffer: 8 << 20,
+            ..bus::Options::default()
+        };
+        open(name, kinds.of(name), Some(format), options).map(Arc::new)
+    };
+    let buses = skin.buses.iter().map(|bus| {
+        let first = match opened(&bus.name, bus.format) {
+            Ok(bus) => Some(bus),
+            Err(_) if patient => None,
+            Err(error) => return Err(ServeError::Bus(error)),
+        };
+        Ok(Shared { name: bus.name.clone(), format: bus.format, bus: Mutex::new(first) })
+    });
+    let buses: Vec<_> = buses.collect::<Result<_, _>>()?;
+    let scene = serde_json::to_string(&Scene::of(&skin, may_act)).unwrap_or_default();
+    let server = Server::start(access, scene).map_err(|source| ServeError::Listen { listen, source })?;
+    says(&server.url());
+    let live = Mutex::new(Live::new(skin));
+    thread::scope(|scope| {
+        for (index, shared) in buses.iter().enumerate() {
+            let (live, opened) = (&live, &opened);
+            scope.spawn(move || receive(index, shared, live, stop, opened));
+        }
+        publish(&live, &buses, &server, stop);
+    });
+    Ok(server.counts())
+}
+
+/// Receives on a bus, which is opened again when it is lost.
+fn receive(
+    index: usize,
+    shared: &Shared,
+    live: &Mutex<Live>,
+    stop: &AtomicBool,
+    opened: &impl Fn(&str, Format) -> Result<Arc<Bus>, BusError>,
+) {
+    let mut inbox = Inbox::new();
+    while !stop.load(Ordering::Relaxed) {
+        let bus = locked(&shared.bus).clone();
+        let Some(bus) = bus else {
+            match opened(&shared.name, shared.format) {
+                Ok(bus) => *locked(&shared.bus) = Some(bus),
+                Err(_) => {
+                    locked(live).set_bus(index, false, inbox.dropped().into());
+                    thread::sleep(AGAIN);
+                }
+            }
+            continue;
+        };
+        inbox.clear();
+        let heard = match bus.wait(Some(WAIT)) {
+            Ok(true) => {
+                thread::sleep(GATHER);
+                bus.receive(&mut inbox).map(|frames| frames > 0)
+            }
+            other => other,
+        };
+        match heard {
+            Ok(_) => {
+                let mut live = locked(live);
+                for received in inbox.frames() {
+                    live.frame(index, Micros(received.at_nanos / 1_000), &received.frame);
+                }
+                live.set_bus(index, true, inbox.dropped().into());
+            }
+            Err(error) => {
+                locked(live).set_bus(index, false, inbox.dropped().into());
+                if !error.may_pass() {
+                    *locked(&shared.bus) = None;
+                }
+                thread::sleep(AGAIN);
+            }
+        }
+    }
+}
+
+/// The time, on the clock of received frames.
+fn now() -> Micros {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    Micros(u64::try_from(since.as_micros()).unwrap_or(u64::MAX))
+}
+
+/// Snapshots for the pages, and their commands for the buses.
+fn publish(live: &Mutex<Live>, buses: &[Shared], server: &Server, stop: &AtomicBool) {
+    let mut pressed = Pressed::default();
+    let mut next = Instant::now();
+    let mut number = 0_u64;
+    while !stop.load(Ordering::Relaxed) {
+        for (page, command) in server.commands() {
+            obey(page, &command, &locked(live), &mut pressed, buses);
+        }
+        server.gone().into_iter().for_each(|page| pressed.release(page));
+        let now = now();
+        let due = {
+            let mut live = locked(live);
+            live.handle_time(now);
+            let due = pressed.due(now, |cell| live.latched(cell, now));
+            if server.pages() > 0 {
+                let snapshot = live.snapshot(now, &pressed);
+                let said = number.is_multiple_of(SAID_EVERY).then(|| {
+                    let text = |chosen| serde_json::to_string(&live.said(now, chosen)).unwrap_or_default();
+                    let chosen = server.chosen().into_iter();
+                    (
+                        text(None),
+                        chosen.map(|(page, cell)| (page, text(Some(cell)))).collect::<BTreeMap<_, _>>(),
+                    )
+                });
+                drop(live);
+                server.publish(snapshot, said);
+                number += 1;
+            }
+            due
+        };
+        for ((bus, node), sensors) in due {
+            let page = SensorPage::Skin(sensors);
+            say(buses.get(bus), &Message::Stimulus { to: Node::Cell(node), from: From::Next, page });
+        }
+        next = (next + EVERY).max(Instant::now());
+        thread::sleep(next.saturating_duration_since(Instant::now()).max(Duration::from_millis(1)));
+    }
+}
+
+fn obey(page: u64, command: &Command, live: &Live, pressed: &mut Pressed, buses: &[Shared]) {
+    let everywhere = |message: &Message| buses.iter().for_each(|bus| say(Some(bus), message));
+    match *command {
+        Command::Press { bus, node, force_n } => match live.may_press(bus, node) {
+            Some(cell) => pressed.press(page, cell, force_n),
+            None => pressed.release(page),
+        },
+        Command::Release => pressed.release(page),
+        Command::Halt => everywhere(&Message::Halt),
+        Command::Resume => everywhere(&Message::Resume),
+        // The server keeps these.
+        Command::Choose { .. } | Command::Unchoose => {}
+    }
+}
+
+/// Sends a message; a bus that does not take it is as one that loses it.
+fn say(shared: Option<&Shared>, message: &Message) {
+    let bus = shared.and_then(|shared| Some((locked(&shared.bus).clone()?, shared.format)));
+    if let Some((bus, format)) = bus {
+        let _ = send(&bus, message, format);
+    }
+}

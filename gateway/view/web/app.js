@@ -1,0 +1,153 @@
+// The page: holds the newest of everything, and draws when something changed.
+
+import { Camera } from "./camera.js";
+import { SHOWS, css, ramp } from "./colours.js";
+import { Link } from "./link.js";
+import { Picture } from "./picture.js";
+import { Plots, number } from "./plots.js";
+import { extent, frames } from "./robot.js";
+import { listen, pick } from "./touch.js";
+import * as words from "./words.js";
+
+const $ = (id) => document.getElementById(id);
+const canvas = $("picture"), camera = new Camera();
+let picture = null, scene = null, plots = null, snapshot = null, all = null, chosen = -1, pressed = -1, due = false;
+// For whoever looks from outside.
+window.skinbus = { frames: 0, snapshots: 0, get chosen() { return chosen; }, where };
+
+function message(text) {
+  $("message").textContent = text;
+  $("message").hidden = !text;
+}
+
+try {
+  picture = new Picture(canvas);
+} catch (error) {
+  message(`The picture cannot be drawn: ${error.message}. The tables beside it work.`);
+}
+
+const view = () => camera.matrix(canvas.clientWidth, canvas.clientHeight);
+
+function redraw() {
+  if (!due) { due = true; requestAnimationFrame(draw); }
+}
+
+function draw() {
+  due = false;
+  if (!scene || !snapshot) return;
+  if (picture) {
+    picture.update(snapshot.cells, SHOWS[$("shows").value], chosen);
+    picture.draw(view(), all);
+  }
+  plots.draw();
+  window.skinbus.frames++;
+}
+
+const name = (i) => (i < 0 ? "" : `${scene.buses[scene.cells[i].bus].name}:${scene.cells[i].node}`);
+
+function choose(i) {
+  if (i === chosen) return;
+  chosen = i;
+  words.chosen(name(i));
+  $("search").value = name(i);
+  $("hold").disabled = i < 0 || !scene.may_press;
+  link.send(i < 0 ? { do: "unchoose" } : { do: "choose", bus: scene.cells[i].bus, node: scene.cells[i].node });
+  redraw();
+}
+
+function press(i) {
+  choose(i);
+  if (!scene.may_press) return;
+  pressed = i;
+  link.send({ do: "press", bus: scene.cells[i].bus, node: scene.cells[i].node, force_n: Number($("force").value) });
+}
+
+function release() {
+  if (pressed < 0) return;
+  pressed = -1;
+  $("hold").setAttribute("aria-pressed", "false");
+  link.send({ do: "release" });
+}
+
+// The middle of a cell on the screen, in CSS pixels of the picture; null where it is not seen from its front.
+function where(i) {
+  const { width, height } = canvas.getBoundingClientRect();
+  for (let y = 0; y < height; y += 4) {
+    for (let x = 0; x < width; x += 4) if (pick(scene, all, camera, view(), width, height, x, y) === i) return [x, y];
+  }
+  return null;
+}
+
+const link = new Link({
+  scene(it) {
+    scene = it;
+    [chosen, pressed, snapshot] = [-1, -1, null];
+    document.title = `${scene.name}: skinbus view`;
+    $("name").textContent = scene.name;
+    plots = new Plots($("torques"), scene.joints);
+    words.chosen("");
+    words.link("connected");
+    for (const id of ["halt", "resume"]) $(id).disabled = !scene.may_press;
+    picture?.set(scene);
+  },
+  snapshot(it) {
+    snapshot = it;
+    all = frames(scene, it.joints.map((joint) => joint.position));
+    plots.push(it.time, it.joints);
+    window.skinbus.snapshots++;
+    redraw();
+  },
+  said(it) {
+    words.say(scene, it);
+    if (all) camera.fit(extent(scene, all));
+  },
+  closed() {
+    pressed = -1;
+    words.link("not connected: the bench has ended, or is not reachable", true);
+  },
+});
+
+listen(canvas, {
+  at: (x, y) => (scene && all ? pick(scene, all, camera, view(), canvas.clientWidth, canvas.clientHeight, x, y) : -1),
+  press,
+  release,
+  turn(dx, dy) { camera.turn(dx, dy); redraw(); },
+  zoom(by) { camera.nearer(by); redraw(); },
+  next(step) { if (scene) choose((chosen + step + scene.cells.length) % scene.cells.length); },
+  pressChosen() { if (chosen >= 0) press(chosen); },
+});
+
+$("force").oninput = () => {
+  $("newtons").textContent = `${Number($("force").value).toFixed(1)} N`;
+  if (pressed >= 0) press(pressed);
+};
+$("hold").onclick = () => {
+  if (pressed >= 0) return release();
+  press(chosen);
+  $("hold").setAttribute("aria-pressed", "true");
+};
+$("search").onchange = () => {
+  const text = $("search").value.trim();
+  const found = scene ? scene.cells.findIndex((cell, i) => name(i) === text || String(cell.node) === text) : -1;
+  $("search").setAttribute("aria-invalid", String(found < 0 && text !== ""));
+  if (found >= 0) choose(found);
+};
+$("halt").onclick = () => link.send({ do: "halt" });
+$("resume").onclick = () => link.send({ do: "resume" });
+window.addEventListener("blur", release);
+window.addEventListener("resize", redraw);
+
+function legend() {
+  const shows = SHOWS[$("shows").value], pen = $("ramp").getContext("2d"), { width, height } = $("ramp");
+  $("low").textContent = number(shows.low).replace(/\.0+$/, "");
+  $("high").textContent = `${number(shows.high).replace(/\.0+$/, "")} ${shows.unit}`;
+  for (let x = 0; x < width; x++) {
+    pen.fillStyle = `rgb(${ramp(x / (width - 1)).join(" ")})`;
+    pen.fillRect(x, 0, 1, height);
+  }
+  redraw();
+}
+$("shows").onchange = legend;
+legend();
+words.shapes(css);
+matchMedia("(prefers-color-scheme: dark)").onchange = () => { if (scene) picture?.colours(); words.shapes(css); redraw(); };

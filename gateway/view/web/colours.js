@@ -1,0 +1,31 @@
+// Colours for values: cividis, which people see alike whatever colours they see (Nunez, Anderton, Renslow 2018).
+
+const STOPS = [[0, 34, 78], [18, 53, 112], [59, 73, 108], [87, 93, 109], [112, 113, 115], [138, 134, 120], [165, 156, 116], [195, 179, 105], [225, 204, 85], [254, 232, 56]];
+
+export function ramp(share) {
+  const at = Math.min(1, Math.max(0, share)) * (STOPS.length - 1), i = Math.min(STOPS.length - 2, Math.floor(at));
+  return STOPS[i].map((v, k) => Math.round(v + (STOPS[i + 1][k] - v) * (at - i)));
+}
+
+// What cells can show: how a value is read from a snapshot's cell, its range, its unit.
+export const SHOWS = {
+  force: { of: (cell) => cell.force / 1000, low: 0, high: 10, unit: "N", rest: (v) => v <= 0 },
+  proximity: { of: (cell) => cell.proximity / 32768, low: 0, high: 1, unit: "", rest: (v) => v <= 0 },
+  temperature: { of: (cell) => cell.temperature / 100, low: 0, high: 60, unit: "°C", rest: () => false },
+};
+
+// What a cell's shape says, the most important first: the number is that of the shader.
+export const SHAPES = [
+  { shape: 1, is: (cell) => cell.status === 4, name: "silent", mark: "cross" },
+  { shape: 2, is: (cell) => cell.status === 0, name: "never heard", mark: "ring" },
+  { shape: 3, is: (cell) => (cell.flags & 1) !== 0, name: "no parameters", mark: "hole" },
+  { shape: 4, is: (cell) => (cell.flags & 2) !== 0, name: "other parameters", mark: "half" },
+  { shape: 5, is: (cell) => cell.status === 3, name: "stale: no answer", mark: "bar" },
+  { shape: 6, is: (cell) => (cell.flags & 8) !== 0, name: "halted", mark: "square" },
+  { shape: 0, is: () => true, name: "in order", mark: "" },
+];
+
+export const shapeOf = (cell) => SHAPES.find((it) => it.is(cell));
+
+export const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+export const rgb = (hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16));

@@ -1,0 +1,51 @@
+// The connection to the server: the scene, snapshots, words; and commands.
+
+export function decode(buffer) {
+  const data = new DataView(buffer), joints = data.getUint32(4, true), cells = data.getUint32(8, true);
+  if (buffer.byteLength !== 24 + 12 * joints + 8 * cells) throw new Error("a snapshot of another length");
+  const snapshot = { number: data.getUint32(0, true), time: data.getFloat64(16, true), joints: [], cells: [] };
+  for (let j = 0; j < joints; j++) {
+    const [position, distributed, central] = [0, 4, 8].map((at) => data.getFloat32(24 + 12 * j + at, true));
+    snapshot.joints.push({ position, distributed, central });
+  }
+  for (let c = 0, at = 24 + 12 * joints; c < cells; c++, at += 8) {
+    snapshot.cells.push({
+      status: data.getUint8(at), flags: data.getUint8(at + 1), force: data.getUint16(at + 2, true),
+      proximity: data.getUint16(at + 4, true), temperature: data.getInt16(at + 6, true),
+    });
+  }
+  return snapshot;
+}
+
+export class Link {
+  constructor(on) {
+    this.on = on;
+    this.wait = 250;
+    this.open();
+  }
+
+  open() {
+    const socket = new WebSocket(`ws://${location.host}/live${location.search}`);
+    socket.binaryType = "arraybuffer";
+    let scene = false;
+    socket.onopen = () => { this.wait = 250; };
+    socket.onmessage = ({ data }) => {
+      if (typeof data !== "string") return this.on.snapshot(decode(data));
+      const message = JSON.parse(data);
+      if (scene) return this.on.said(message);
+      scene = true;
+      this.on.scene(message);
+    };
+    // It may come back: a run that was started again listens at the same address.
+    socket.onclose = () => {
+      this.on.closed();
+      setTimeout(() => this.open(), this.wait);
+      this.wait = Math.min(4000, this.wait * 2);
+    };
+    this.socket = socket;
+  }
+
+  send(command) {
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(JSON.stringify(command));
+  }
+}

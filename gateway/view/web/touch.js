@@ -1,0 +1,68 @@
+// The pointer and the keys: turning, zooming, choosing and pressing.
+
+import { add, direction, dot, point, project } from "./math.js";
+
+// The cell under a place of the picture: the nearest one to the eye among those that are hit from their front.
+export function pick(scene, frames, camera, view, width, height, x, y) {
+  const eye = camera.eye();
+  let best = -1, nearest = Infinity;
+  scene.cells.forEach((cell, i) => {
+    const m = frames[scene.buses[cell.bus].chain][cell.row], at = point(m, cell.position);
+    if (dot(direction(m, cell.normal), add(eye, at, -1)) <= 0) return;
+    const seen = project(view, at, width, height);
+    if (!seen) return;
+    const radius = Math.max(6, scene.pitch * 0.56 / seen[2] * height / 2 * Math.min(2, 2 * width / height));
+    if (Math.hypot(seen[0] - x, seen[1] - y) <= radius && seen[2] < nearest) [best, nearest] = [i, seen[2]];
+  });
+  return best;
+}
+
+// Calls `on.at(x, y)` for the cell there, `on.press(cell)`, `on.release()`, `on.turn(dx, dy)`, `on.zoom(by)`.
+export function listen(canvas, on) {
+  const pointers = new Map();
+  let presses = false, apart = 0;
+  const place = (event) => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
+  const stop = () => { if (presses) { presses = false; on.release(); } };
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.focus({ preventScroll: true });
+    canvas.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, place(event));
+    if (pointers.size > 1) { stop(); apart = 0; return; }
+    const cell = event.button === 0 && !event.shiftKey ? on.at(...place(event)) : -1;
+    if (cell >= 0) { presses = true; on.press(cell); }
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const before = pointers.get(event.pointerId);
+    if (!before) return;
+    const now = place(event);
+    pointers.set(event.pointerId, now);
+    if (pointers.size === 2) {
+      const [a, b] = [...pointers.values()], far = Math.hypot(a[0] - b[0], a[1] - b[1]);
+      if (apart) on.zoom(far / apart);
+      apart = far;
+    } else if (presses) {
+      const cell = on.at(...now);
+      if (cell >= 0) on.press(cell);
+    } else {
+      on.turn(now[0] - before[0], now[1] - before[1]);
+    }
+  });
+  for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
+    canvas.addEventListener(name, (event) => { pointers.delete(event.pointerId); if (!pointers.size) stop(); apart = 0; });
+  }
+  canvas.addEventListener("wheel", (event) => { event.preventDefault(); on.zoom(Math.exp(-event.deltaY * 0.0015)); }, { passive: false });
+  canvas.addEventListener("keydown", (event) => {
+    const turns = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, -12], ArrowDown: [0, 12] };
+    const key = event.key;
+    if (turns[key]) on.turn(...turns[key]);
+    else if (key === "+" || key === "=") on.zoom(1.2);
+    else if (key === "-") on.zoom(1 / 1.2);
+    else if (key === "n" || key === "p") on.next(key === "n" ? 1 : -1);
+    else if (key === " ") { if (!event.repeat) on.pressChosen(); }
+    else if (key === "Escape") on.release();
+    else return;
+    event.preventDefault();
+  });
+  canvas.addEventListener("keyup", (event) => { if (event.key === " ") on.release(); });
+  canvas.addEventListener("blur", () => { stop(); on.release(); });
+}

@@ -1,0 +1,131 @@
+// What the page says in words: facts, buses, silent cells, the chosen cell.
+
+import { SHAPES } from "./colours.js";
+import { number } from "./plots.js";
+
+const $ = (id) => document.getElementById(id);
+
+export function element(tag, text, className) {
+  const it = document.createElement(tag);
+  if (text !== undefined) it.textContent = text;
+  if (className) it.className = className;
+  return it;
+}
+
+function table(rows) {
+  const it = element("table");
+  for (const [name, value, className] of rows) {
+    const row = element("tr"), head = element("th", name);
+    head.scope = "row";
+    row.append(head, element("td", value, className));
+    it.append(row);
+  }
+  return it;
+}
+
+function facts(pairs) {
+  $("facts").replaceChildren(...pairs.map(([name, value, className]) => {
+    const pair = element("div");
+    pair.append(element("dt", name), element("dd", value, className));
+    return pair;
+  }));
+}
+
+const percent = (share) => (share === null || share === undefined ? "–" : `${(share * 100).toFixed(share < 0.1 ? 1 : 0)} %`);
+
+export function say(scene, said) {
+  const sum = (of) => said.buses.reduce((all, bus) => all + of(bus), 0);
+  const [due, complete] = [sum((bus) => bus.epochs_due), sum((bus) => bus.epochs_complete)];
+  facts([
+    ["Cells", String(scene.cells.length)],
+    ["In contact", String(said.contacts)],
+    ["Silent", String(said.dead), said.dead ? "bad" : ""],
+    ["Epochs complete", due ? `${complete} of ${due}` : "–", complete < due ? "bad" : ""],
+    ...(said.halted ? [["Robot", "halted", "bad"]] : []),
+  ]);
+  $("buses").replaceChildren(...said.buses.flatMap((bus) => [
+    element("h3", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad"),
+    table([
+      ["Load of a real bus", percent(bus.load), bus.load > 1 ? "bad" : ""],
+      ["Replies in time", `${bus.in_time} of ${bus.due}`],
+      ["Late, missing", `${bus.late}, ${bus.missing}`, bus.late + bus.missing ? "bad" : ""],
+      ["Packets lost, damaged", `${bus.lost}, ${bus.rejected}`, bus.lost + bus.rejected ? "bad" : ""],
+      ["Saturated torques", String(bus.saturated), bus.saturated ? "bad" : ""],
+      ["Mean error", bus.error_nm === null ? "–" : `${bus.error_nm.toExponential(1)} Nm`],
+      ...(bus.dropped ? [["Frames not seen here", String(bus.dropped), "bad"]] : []),
+    ]),
+  ]));
+  $("dead").replaceChildren(said.dead_cells.length
+    ? table(said.dead_cells.map((cell) => [`${cell.bus}:${cell.node}`, `${cell.for_s.toFixed(0)} s`, "bad"]))
+    : element("p", "none", "faint"));
+  if (said.detail) detail(scene, said.detail);
+}
+
+function detail(scene, it) {
+  const joints = scene.chains[scene.buses[it.bus].chain].rows.filter((row) => row.joint !== null).map((row) => scene.joints[row.joint]);
+  const wrong = it.configuration[0] !== null && it.configuration[0] !== it.configuration[1];
+  const rows = [
+    ["Status", it.status, it.status === "dead" || it.status === "stale" ? "bad" : ""],
+    ["Serial number", String(it.serial)],
+    ["Configuration", wrong ? `${it.configuration[0]}, not ${it.configuration[1]}` : it.configuration[1], wrong ? "bad" : ""],
+    ["Force", `${it.force_n.toFixed(3)} N`],
+    ["Contact, N", it.contact_n.map((v) => v.toFixed(3)).join(" + ")],
+    ["Proximity", it.proximity.toFixed(3)],
+    ["Temperature", `${it.temperature_c.map((v) => v.toFixed(1)).join(", ")} °C`],
+    ["Replies in time", `${it.replies[1]} of ${it.replies[0]}`],
+    ["Packets lost, restarts", `${it.lost}, ${it.restarts}`, it.lost ? "bad" : ""],
+  ];
+  const parts = [table(rows)];
+  if (it.torque) {
+    const head = element("tr");
+    head.append(...["Joint", "word", "cell", "central", ""].map((text, i) => element(i ? "td" : "th", text, "faint")));
+    const torques = element("table");
+    torques.append(head);
+    it.torque.words.forEach((word, at) => {
+      const row = element("tr"), name = element("th", joints[at] ? joints[at].name : String(at + 1));
+      name.scope = "row";
+      row.append(name, element("td", String(word)), element("td", number(it.torque.distributed[at])),
+        element("td", it.torque.central ? number(it.torque.central[at]) : "–"), element("td", joints[at] ? joints[at].torque_unit : "", "faint"));
+      torques.append(row);
+    });
+    parts.push(element("h3", `Torque of epoch ${it.torque.epoch}${it.torque.saturated ? ", saturated" : ""}`), torques);
+  }
+  $("cell").replaceChildren(...parts);
+}
+
+export function chosen(name) {
+  $("cell-title").textContent = name ? `Cell ${name}` : "No cell chosen";
+  if (!name) $("cell").replaceChildren();
+}
+
+export function link(text, isBad) {
+  $("link").textContent = text;
+  $("link").className = isBad ? "bad" : "";
+}
+
+// The shapes of cells, as the picture draws them.
+export function shapes(css) {
+  const size = 48;
+  $("shapes").replaceChildren(...SHAPES.map(({ name, mark }) => {
+    const item = element("li"), canvas = element("canvas");
+    [canvas.width, canvas.height] = [size, size];
+    canvas.setAttribute("aria-hidden", "true");
+    const pen = canvas.getContext("2d"), r = size * 0.46;
+    pen.translate(size / 2, size / 2);
+    const hexagon = (k) => { pen.beginPath(); for (let i = 0; i < 6; i++) pen.lineTo(k * r * Math.cos(i * Math.PI / 3), k * r * Math.sin(i * Math.PI / 3)); pen.closePath(); };
+    hexagon(1);
+    pen.fillStyle = css("--unlit"); pen.fill();
+    pen.strokeStyle = css("--faint"); pen.lineWidth = 3; pen.stroke();
+    pen.fillStyle = pen.strokeStyle = css("--mark");
+    pen.lineWidth = 6;
+    const erase = () => { pen.globalCompositeOperation = "destination-out"; pen.fill(); pen.globalCompositeOperation = "source-over"; };
+    if (mark === "cross") { pen.beginPath(); for (const s of [1, -1]) { pen.moveTo(-r * 0.5, -s * r * 0.5); pen.lineTo(r * 0.5, s * r * 0.5); } pen.stroke(); }
+    if (mark === "ring") { hexagon(0.7); erase(); }
+    if (mark === "hole") { pen.beginPath(); pen.arc(0, 0, r * 0.4, 0, 7); erase(); }
+    if (mark === "half") { pen.fillRect(0, -r * 0.7, r * 0.6, r * 1.4); }
+    if (mark === "bar") { pen.fillRect(-r * 0.66, -r * 0.16, r * 1.32, r * 0.32); }
+    if (mark === "square") { pen.fillRect(-r * 0.34, -r * 0.34, r * 0.68, r * 0.68); }
+    item.append(canvas, element("span", name));
+    return item;
+  }));
+}

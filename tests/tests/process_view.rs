@@ -1,0 +1,308 @@
+//! `gateway view`: a page's WebSocket beside a real bench, and clients that mean no good.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+mod process;
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use process::{Place, Running, TIMEOUT, until};
+use serde_json::Value;
+use tungstenite::client::IntoClientRequest;
+use tungstenite::{Error, Message, WebSocket, client};
+
+/// Nothing happens by itself; the arm gives way.
+const QUIET: &str = "version = 1\nduration_s = 60.0\n\n[motion]\nkind = \"kinesthetic\"\n\
+                     start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
+
+/// A page, without the browser.
+struct Page {
+    socket: WebSocket<TcpStream>,
+    scene: Value,
+}
+
+/// A snapshot of six joints.
+struct Snapshot {
+    time: f64,
+    /// Position, distributed and central torque.
+    joints: Vec<[f32; 3]>,
+    /// Status, flags, force in mN.
+    cells: Vec<(u8, u8, u16)>,
+}
+
+/// Where the server of a run or a view says that it is: `127.0.0.1:8100`.
+fn address(said: &str) -> String {
+    let (_, rest) = said.split_once("view: http://").unwrap();
+    rest.split('/').next().unwrap().to_owned()
+}
+
+/// Asks to be a page, with these headers more or other ones.
+fn ask(address: &str, headers: &[(&'static str, &str)]) -> Result<(WebSocket<TcpStream>, u16), Error> {
+    let stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+    let mut request = format!("ws://{address}/live").into_client_request()?;
+    for (name, value) in headers {
+        request.headers_mut().insert(*name, value.parse().unwrap());
+    }
+    match client(request, stream) {
+        Ok((socket, response)) => Ok((socket, response.status().as_u16())),
+        Err(tungstenite::HandshakeError::Failure(error)) => Err(error),
+        Err(tungstenite::HandshakeError::Interrupted(_)) => panic!("no answer"),
+    }
+}
+
+impl Page {
+    fn new(address: &str) -> Self {
+        let (mut socket, _) = ask(address, &[("Origin", &format!("http://{address}"))]).unwrap();
+        let scene = serde_json::from_str(socket.read().unwrap().to_text().unwrap()).unwrap();
+        Self { socket, scene }
+    }
+
+    fn say(&mut self, command: &str) {
+        self.socket.send(Message::text(command)).unwrap();
+    }
+
+    fn press(&mut self, node: u8, force_n: f64) {
+        self.say(&format!(r#"{{"do":"press","bus":0,"node":{node},"force_n":{force_n}}}"#));
+    }
+
+    /// Waits for a snapshot at which this holds.
+    fn sees(&mut self, what: &str, mut is: impl FnMut(&Snapshot) -> bool) -> Snapshot {
+        let give_up = Instant::now() + TIMEOUT;
+        loop {
+            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
+            if let Message::Binary(bytes) = self.socket.read().unwrap() {
+                let snapshot = Snapshot::read(&bytes);
+                if is(&snapshot) {
+                    return snapshot;
+                }
+            }
+        }
+    }
+
+    /// Waits for words at which this holds.
+    fn hears(&mut self, what: &str, mut is: impl FnMut(&Value) -> bool) -> Value {
+        let give_up = Instant::now() + TIMEOUT;
+        loop {
+            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
+            if let Message::Text(text) = self.socket.read().unwrap() {
+                let said = serde_json::from_str(text.as_str()).unwrap();
+                if is(&said) {
+                    return said;
+                }
+            }
+        }
+    }
+}
+
+impl Snapshot {
+    fn read(bytes: &[u8]) -> Self {
+        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
+        let (joints, cells) = (word(4) as usize, word(8) as usize);
+        assert_eq!(bytes.len(), 24 + 12 * joints + 8 * cells);
+        let of_joint = |joint| [0, 4, 8].map(|at| f32::from_bits(word(24 + 12 * joint + at)));
+        let of_cell = |cell| {
+            let at = 24 + 12 * joints + 8 * cell;
+            (bytes[at], bytes[at + 1], u16::from_le_bytes([bytes[at + 2], bytes[at + 3]]))
+        };
+        Self {
+            time: f64::from_le_bytes(bytes[16..24].try_into().unwrap()),
+            joints: (0..joints).map(of_joint).collect(),
+            cells: (0..cells).map(of_cell).collect(),
+        }
+    }
+}
+
+/// A run that is watched, and where its page is.
+fn watched(place: &Place, cells: usize, more: &str) -> (Running, String) {
+    place.skin(cells);
+    place.scenario(QUIET);
+    let words = format!(
+        "run skin.toml --bus-kind embedded --scenario scenario.toml --view --summary run.json {more}"
+    );
+    let run = place.start("gateway", &words);
+    run.hears("view: http://");
+    let said = run.stderr();
+    (run, address(&said))
+}
+
+#[test]
+fn a_press_is_a_torque_and_a_release_takes_it_away() {
+    let place = Place::new();
+    let (run, address) = watched(&place, 12, "--candump run.log");
+    let mut page = Page::new(&address);
+    assert_eq!(page.scene["cells"].as_array().unwrap().len(), 12);
+    assert_eq!(
+        (&page.scene["may_press"], &page.scene["joints"][1]["torque_unit"]),
+        (&true.into(), &"Nm".into())
+    );
+    let rest = page.sees("all cells quiet", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    assert!(rest.cells.iter().all(|cell| cell.1 == 0 && cell.2 == 0));
+    page.say(r#"{"do":"choose","bus":0,"node":5}"#);
+    page.press(5, 6.0);
+    let pressed = page.sees("the torque of the cell", |it| it.joints.iter().any(|joint| joint[1] != 0.0));
+    assert_eq!((pressed.cells[4].1, pressed.cells[4].2), (16, 6_000), "pressed by a page, 6 N");
+    let both = page.sees("the central computation", |it| {
+        it.joints.iter().any(|joint| joint[1] != 0.0)
+            && it.joints.iter().all(|joint| (joint[1] - joint[2]).abs() < 0.01)
+    });
+    let said = page.hears("the cell in detail", |said| said["detail"]["torque"].is_object());
+    let detail = &said["detail"];
+    assert_eq!(
+        (&detail["node"], &detail["status"], &detail["force_n"]),
+        (&5.into(), &"active".into(), &6.0.into())
+    );
+    for (ours, central) in detail["torque"]["distributed"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .zip(detail["torque"]["central"].as_array().unwrap())
+    {
+        assert!((ours.as_f64().unwrap() - central.as_f64().unwrap()).abs() < 2e-3, "{detail}");
+    }
+    let start = rest.joints[1][0];
+    page.sees("the arm gives way", |it| (it.joints[1][0] - start).abs() > 0.01);
+    assert!(both.time >= rest.time);
+    page.say(r#"{"do":"release"}"#);
+    page.sees("no torque", |it| {
+        it.joints.iter().all(|joint| joint[1] == 0.0) && it.cells[4].0 == 1 && it.cells[4].1 == 0
+    });
+
+    // A page that goes takes its touch with it.
+    let mut other = Page::new(&address);
+    other.press(7, 3.0);
+    page.sees("a touch of the other page", |it| it.cells[6].2 == 3_000);
+    drop(other);
+    page.sees("that it is gone", |it| it.cells[6].2 == 0);
+    page.say(r#"{"do":"halt"}"#);
+    page.hears("the halt", |said| said["halted"] == true);
+    page.say(r#"{"do":"resume"}"#);
+    page.hears("the resume", |said| said["halted"] == false);
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    place.is_left_clean();
+    assert!(TcpStream::connect(&address).is_err(), "the page ends with its run");
+    // What the page pressed is on the bus as stimuli.
+    let log = place.read("run.log");
+    assert!(log.contains(" 705#") && log.contains(" 707#"), "stimuli of cells 5 and 7");
+}
+
+#[test]
+fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
+    let place = Place::new();
+    let (run, address) = watched(&place, 4, "");
+    let port = address.rsplit(':').next().unwrap();
+    let status = |headers: &[(&'static str, &str)]| match ask(&address, headers) {
+        Ok((_, status)) => status,
+        Err(Error::Http(response)) => response.status().as_u16(),
+        Err(error) => panic!("{error}"),
+    };
+    assert_eq!(status(&[]), 101, "a program of this machine's user");
+    assert_eq!(status(&[("Origin", "http://evil.example")]), 403);
+    assert_eq!(status(&[("Origin", "null")]), 403);
+    assert_eq!(status(&[("Host", &format!("evil.example:{port}"))]), 403);
+    let http = |request: String| {
+        let mut stream = TcpStream::connect(&address).unwrap();
+        stream.set_read_timeout(Some(TIMEOUT)).unwrap();
+        stream.write_all(request.as_bytes()).unwrap();
+        let mut answer = String::new();
+        match stream.read_to_string(&mut answer) {
+            Ok(_) => {}
+            Err(error) if error.kind() == ErrorKind::ConnectionReset => {}
+            Err(error) => panic!("{error}"),
+        }
+        answer
+    };
+    let get = |path: &str| http(format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n\r\n"));
+    let page = get("/");
+    assert!(
+        page.starts_with("HTTP/1.1 200 OK") && page.contains("Content-Security-Policy: default-src 'none'")
+    );
+    assert!(get("/app.js").contains("text/javascript") && get("/../Cargo.toml").starts_with("HTTP/1.1 404"));
+    assert_eq!(
+        http(format!("GET / HTTP/1.1\r\nHost: {address}\r\nX: {}\r\n\r\n", "x".repeat(20_000))),
+        "",
+        "a long head"
+    );
+
+    // One page reads nothing, one sends what it likes; a third one goes on.
+    let stalled = Page::new(&address);
+    let mut flood = Page::new(&address);
+    let flooding = std::thread::spawn(move || {
+        for number in 0..100_000_u32 {
+            let text = match number % 5 {
+                0 => "{\"do\":\"press\",\"bus\":9,\"node\":1,\"force_n\":1}".to_owned(),
+                1 => format!("{{\"do\":\"choose\",\"bus\":0,\"node\":{}}}", number % 256),
+                2 => "x".repeat(200),
+                3 => "{\"do\":\"press\",\"bus\":0,\"node\":2,\"force_n\":1e308}".to_owned(),
+                _ => "{\"do\":\"release\"}".to_owned(),
+            };
+            if flood.socket.send(Message::text(text)).is_err() {
+                break;
+            }
+        }
+    });
+    let mut page = Page::new(&address);
+    let mut seen = 0;
+    page.sees("snapshots during the flood", |_| {
+        seen += 1;
+        seen > 60
+    });
+    flooding.join().unwrap();
+    let mut too_long = Page::new(&address);
+    let _ = too_long.socket.send(Message::text(" ".repeat(2_000)));
+    until("the end of a page that says too much", || {
+        loop {
+            match too_long.socket.read() {
+                Ok(_) => {}
+                Err(Error::Io(error)) if error.kind() == ErrorKind::WouldBlock => return None,
+                Err(_) => return Some(()),
+            }
+        }
+    });
+    page.press(1, 2.0);
+    page.sees("a press as before", |it| {
+        it.cells[0].2 == 2_000 && it.joints.iter().any(|joint| joint[1] != 0.0)
+    });
+    drop(stalled);
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    let summary = place.summary();
+    assert!(summary.total("/buses/0/received") > 0);
+    place.is_left_clean();
+}
+
+#[test]
+fn pages_that_may_only_look_press_nothing_and_others_need_a_token() {
+    let place = Place::new();
+    place.skin(4);
+    place.scenario(QUIET);
+    let run = place.running_bench(30.0, "");
+    let view = place.start("gateway", "view skin.toml --bus-kind embedded --read-only");
+    view.hears("view: http://");
+    let mut page = Page::new(&address(&view.stderr()));
+    assert_eq!(page.scene["may_press"], false);
+    page.press(2, 5.0);
+    page.say(r#"{"do":"halt"}"#);
+    let mut seen = 0;
+    let last = page.sees("snapshots", |_| {
+        seen += 1;
+        seen > 30
+    });
+    assert!(last.cells.iter().all(|cell| cell.2 == 0 && cell.1 == 0));
+    view.signal(rustix::process::Signal::INT);
+    view.end().well();
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    for (words, expected) in [
+        ("--listen 0.0.0.0:0", "--listen 0.0.0.0:0: others than this machine may come there: give a --token"),
+        ("--listen 0.0.0.0:0 --token short", "a token has at least 16 letters or digits"),
+        ("--listen nowhere", "--listen"),
+        ("", "vcan0"),
+    ] {
+        let ended = place.start("gateway", &format!("view skin.toml --bus-kind embedded {words}")).end();
+        let said = ended.refusal(2);
+        assert!(said.contains(expected), "{words}: {said}");
+    }
+}
