@@ -14,15 +14,17 @@
 //!
 //! A contact pushes against the outward normal: force = -F_z * normal.
 
-use nalgebra::{IsometryMatrix3, Point3, Rotation3, Translation3, Vector3};
+use nalgebra::{IsometryMatrix3, Point3, Quaternion, Rotation3, Translation3, UnitQuaternion, Vector3};
 use protocol::fixed::{Q, Q1_14};
 use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, RowKind};
-use protocol::skin::{Cell, Chain, Skin};
+use protocol::skin::{Base, Cell, Chain, Skin};
 
 /// The reference for the cells of one chain. Cells are named by their index in [`Skin::cells`].
 #[derive(Clone, Debug)]
 pub struct Central {
+    /// From the robot's base to frame 0.
+    base: IsometryMatrix3<f64>,
     links: Vec<Link>,
     cells: Vec<Place>,
 }
@@ -82,7 +84,7 @@ impl Central {
             Place::new(cell, pose.position.map(Q::to_f64), pose.normal.map(Q::to_f64))
         });
         let cells = cells.collect();
-        Self { links, cells }
+        Self { base: base(skin), links, cells }
     }
 
     /// The reference on the numbers of the skin's file; of one chain, as above.
@@ -98,7 +100,7 @@ impl Central {
         };
         let cells = skin.cells.iter().map(|cell| Place::new(cell, cell.position, cell.normal));
         let links = skin.cells.first().map_or_else(Vec::new, |cell| rows(skin.chain(cell.bus)));
-        Self { links, cells: cells.collect() }
+        Self { base: base(skin), links, cells: cells.collect() }
     }
 
     /// Where all links are when the joints of the chain stand as these words say. Bounded work, no allocation.
@@ -135,7 +137,7 @@ impl Central {
 
     /// `place` gives the angle of a row and how far it slides.
     fn chain<T>(&self, joints: &[T], place: impl Fn(&Link, Option<&T>) -> (f64, f64)) -> Frames {
-        let mut tip = IsometryMatrix3::identity();
+        let mut tip = self.base;
         let mut frames = Frames { frames: [tip; MAX_ROWS + 1], kinds: [RowKind::Fixed; MAX_ROWS] };
         let mut joints = joints.iter();
         let each = frames.frames.iter_mut().skip(1).zip(&mut frames.kinds);
@@ -192,6 +194,14 @@ impl Central {
         }
         reference_torque
     }
+}
+
+/// Frame 0 of the chain that the cells sit on, seen from the robot's base.
+fn base(skin: &Skin) -> IsometryMatrix3<f64> {
+    let base = skin.cells.first().map_or_else(Base::default, |cell| skin.chain(cell.bus).base);
+    let [x, y, z, w] = base.orientation;
+    let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+    Translation3::from(base.position) * turn.to_rotation_matrix()
 }
 
 impl Frames {

@@ -254,9 +254,15 @@ impl Import<'_> {
         for chain in self.chains {
             let _ = write!(
                 out,
-                "\n[[robot.chain]]   # standard Denavit-Hartenberg, base to tip; m, rad\nname = {:?}\nrows = [\n",
+                "\n[[robot.chain]]   # standard Denavit-Hartenberg, base to tip; m, rad\nname = {:?}\n",
                 chain.tip
             );
+            let base = chain.below * chain.base;
+            let [position, turn] =
+                [base.translation.vector.as_slice(), base.rotation.coords.as_slice()].map(|all| {
+                    all.iter().map(|&value| format!("{:?}", tidy(value))).collect::<Vec<_>>().join(", ")
+                });
+            let _ = writeln!(out, "base = {{ position = [{position}], orientation = [{turn}] }}\nrows = [");
             let mut names = chain.joints.iter();
             for row in &chain.rows {
                 let joint = if row.kind == RowKind::Fixed { None } else { names.next() };

@@ -40,5 +40,5 @@ pub use error::{Problem, RobotError};
 pub use nalgebra::Isometry3;
 pub use protocol::parameters::RowKind;
 pub use protocol::skin::JointKind;
-pub use rows::{Row, frames};
+pub use rows::{Row, frames, pose_of};
 pub use urdf::{Geometry, Shape, Urdf};

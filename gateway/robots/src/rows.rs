@@ -2,9 +2,9 @@
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
-use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use protocol::parameters::RowKind;
-use protocol::skin::{ChainRow, DenavitHartenberg, JointKind};
+use protocol::skin::{Base, ChainRow, DenavitHartenberg, JointKind};
 
 /// Two axes whose angle has a smaller sine are parallel, and an angle that is nearer to a whole quarter turn is one: pi / 2
 /// written with 12 digits leaves 5e-12.
@@ -217,4 +217,11 @@ fn upright(angle: f64) -> f64 {
 fn quarter(angle: f64) -> f64 {
     let whole = (angle / FRAC_PI_2).round() * FRAC_PI_2;
     if (angle - whole).abs() < ANGLE_TOLERANCE { whole } else { angle }
+}
+
+/// Where a skin's chain begins, as a pose.
+#[must_use]
+pub fn pose_of(base: &Base) -> Isometry3<f64> {
+    let [x, y, z, w] = base.orientation;
+    Isometry3::from_parts(base.position.into(), UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)))
 }

@@ -9,7 +9,7 @@ use protocol::document;
 use protocol::parameters::RowKind;
 use protocol::skin::{Cell, Chain, ChainRow, Skin};
 use protocol::usage::{Failure, print};
-use robots::{Isometry3, Row, Urdf, frames};
+use robots::{Isometry3, Row, Urdf, frames, pose_of};
 
 use super::super::output::{Force, apart, note};
 use super::super::print::{count, words};
@@ -90,7 +90,7 @@ impl Robot {
         let position = |[min, max]: [f64; 2]| 0.0_f64.clamp(min, max);
         Self {
             positions: skin.robot.joints.iter().map(|joint| position(joint.limits)).collect(),
-            bases: vec![Isometry3::identity(); skin.robot.chains.len()],
+            bases: skin.robot.chains.iter().map(|chain| pose_of(&chain.base)).collect(),
             triangles: Vec::new(),
         }
     }

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Isometry3, Matrix3, Quaternion, UnitQuaternion, Vector3};
 use protocol::parameters::RowKind;
 use protocol::skin::{Chain, Skin};
 use serde::Serialize;
@@ -51,6 +51,8 @@ pub struct SceneJoint {
 pub struct SceneChain {
     /// Its name.
     pub name: String,
+    /// Frame 0 seen from the robot's base, as a matrix of 4 by 4 in columns.
+    pub base: Vec<f64>,
     /// Its rows, base to tip.
     pub rows: Vec<SceneRow>,
 }
@@ -160,7 +162,10 @@ fn chain(chain: &Chain) -> SceneChain {
         d: row.table.d,
         theta: row.table.theta_offset,
     });
-    SceneChain { name: chain.name.clone(), rows: rows.collect() }
+    let [x, y, z, w] = chain.base.orientation;
+    let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+    let base = Isometry3::from_parts(chain.base.position.into(), turn).to_homogeneous();
+    SceneChain { name: chain.name.clone(), base: base.as_slice().to_vec(), rows: rows.collect() }
 }
 
 /// The median distance from a cell to the nearest one of its link.

@@ -6,8 +6,6 @@ export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * 
 export const length = (a) => Math.hypot(a[0], a[1], a[2]);
 export const unit = (a) => { const l = length(a) || 1; return [a[0] / l, a[1] / l, a[2] / l]; };
 
-export const IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-
 export function times(a, b) {
   const out = new Array(16);
   for (let c = 0; c < 4; c++) {

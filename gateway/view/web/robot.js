@@ -1,11 +1,11 @@
 // Where the links of a robot are, and what they are drawn as.
 
-import { IDENTITY, add, cross, dot, length, point, row, times, unit } from "./math.js";
+import { add, cross, dot, length, point, row, times, unit } from "./math.js";
 
 // The frame of each row of each chain, that of the base first.
 export function frames(scene, positions) {
   return scene.chains.map((chain) => {
-    const all = [IDENTITY];
+    const all = [chain.base];
     for (const { joint, slides, a, alpha, d, theta } of chain.rows) {
       const q = joint === null ? 0 : positions[joint] ?? 0;
       all.push(times(all[all.length - 1], row(a, alpha, slides ? d + q : d, slides ? theta : theta + q)));

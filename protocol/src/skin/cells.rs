@@ -186,7 +186,7 @@ fn normal(at: &Place, raw: &raw::Cell) -> Checked<[f64; 3]> {
 }
 
 /// Parts of length one, exactly.
-fn unit<const N: usize>(at: &Place, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
+pub(super) fn unit<const N: usize>(at: &Place, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
     let length = parts.iter().map(|part| part * part).sum::<f64>().sqrt();
     if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
         let got = parts.map(|part| part.to_string()).join(", ");

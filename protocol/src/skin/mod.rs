@@ -22,7 +22,7 @@ use crate::packet::Length;
 use crate::parameters::{Contact, Events, Parameters, Pose, Row, Sensing};
 
 pub use reach::{REACH, reach};
-pub use robot::{Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
+pub use robot::{Base, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;
 
 /// The keys by which a skin is known from a scenario, and the other way round.

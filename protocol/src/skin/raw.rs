@@ -71,7 +71,17 @@ fn revolute() -> String {
 #[serde(deny_unknown_fields)]
 pub(super) struct Chain {
     pub(super) name: String,
+    pub(super) base: Option<Base>,
     pub(super) rows: Vec<Row>,
+}
+
+/// Where a chain begins.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Base {
+    #[serde(default)]
+    pub(super) position: [f64; 3],
+    pub(super) orientation: Option<[f64; 4]>,
 }
 
 /// A row of a chain; without a joint it is fixed.

@@ -4,6 +4,7 @@ use core::f64::consts::TAU;
 
 use serde::Deserialize;
 
+use super::cells::unit;
 use super::check::Checked;
 use super::raw;
 use crate::document::Place;
@@ -14,6 +15,8 @@ use crate::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 pub const MAX_ROBOT_JOINTS: usize = 32;
 /// Positions in m that a word holds: [-2, 2), less some steps for rounding.
 const SLIDE: f64 = 2.0 - 1e-3;
+/// How far a chain begins from the robot's base, in m.
+const FAR: f64 = 100.0;
 
 /// A tree of joints, as chains from its base that may share their first joints.
 #[derive(Clone, Debug, PartialEq)]
@@ -107,10 +110,27 @@ impl JointKind {
 pub struct Chain {
     /// Its name.
     pub name: String,
+    /// Where frame 0 of its table is, seen from the robot's base.
+    pub base: Base,
     /// Its joints as indices into [`Robot::joints`]; 1 to 14.
     pub joints: Vec<usize>,
     /// Its table, base to tip: a row for each joint, and fixed ones; at most 32.
     pub rows: Vec<ChainRow>,
+}
+
+/// A pose: where a chain begins. No cell computes with it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Base {
+    /// In m.
+    pub position: [f64; 3],
+    /// A unit quaternion: x, y, z, w.
+    pub orientation: [f64; 4],
+}
+
+impl Default for Base {
+    fn default() -> Self {
+        Self { position: [0.0; 3], orientation: [0.0, 0.0, 0.0, 1.0] }
+    }
 }
 
 /// One row of a chain's table.
@@ -208,7 +228,12 @@ fn serial(
     };
     let rows = rows.iter().zip(&all);
     let rows = rows.map(|(&table, &limits)| ChainRow { kind: RowKind::Revolute, table, limits });
-    let chain = Chain { name: "chain".to_owned(), joints: (0..count).collect(), rows: rows.collect() };
+    let chain = Chain {
+        name: "chain".to_owned(),
+        base: Base::default(),
+        joints: (0..count).collect(),
+        rows: rows.collect(),
+    };
     Ok(Robot { name, urdf: None, joints: all.iter().enumerate().map(joint).collect(), chains: vec![chain] })
 }
 
@@ -282,14 +307,34 @@ fn chains(at: &Place, raw: &[raw::Chain], joints: &[Joint]) -> Checked<Vec<Chain
     Ok(chains)
 }
 
+fn base(at: &Place, raw: &raw::Base) -> Checked<Base> {
+    if let Some((index, value)) =
+        raw.position.iter().enumerate().find(|(_, it)| it.is_nan() || it.abs() > FAR)
+    {
+        return Err(at
+            .key("position")
+            .nth(index)
+            .fault(value, format_args!("it must be within -{FAR} to {FAR} m")));
+    }
+    let orientation = raw.orientation.map(|it| unit(&at.key("orientation"), "quaternion", it));
+    Ok(Base {
+        position: raw.position,
+        orientation: orientation.unwrap_or_else(|| Ok(Base::default().orientation))?,
+    })
+}
+
 fn chain(at: &Place, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
     let count = raw.rows.len();
     if count > MAX_ROWS {
         let why = format!("a chain has at most {MAX_ROWS} rows");
         return Err(at.key("rows").fault(format_args!("{count} rows"), why));
     }
-    let mut chain =
-        Chain { name: raw.name.clone(), joints: Vec::new(), rows: Vec::with_capacity(raw.rows.len()) };
+    let mut chain = Chain {
+        name: raw.name.clone(),
+        base: raw.base.as_ref().map_or_else(|| Ok(Base::default()), |raw| base(&at.key("base"), raw))?,
+        joints: Vec::new(),
+        rows: Vec::with_capacity(raw.rows.len()),
+    };
     for (index, raw) in raw.rows.iter().enumerate() {
         let at = at.key("rows").nth(index);
         let table =

@@ -36,7 +36,9 @@ pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain,
     let behind = behind(&path, &[]);
     let carried = hanging.iter().map(|it| (it.link.clone(), carrier(&rows, &at_zero, &behind, it)));
     let carried: Vec<_> = carried.collect();
+    let below = urdf.pose(&root_name, &|joint| urdf.rest(joint))?;
     let mut chain = Chain {
+        below,
         root: root_name,
         tip: tip.to_owned(),
         joints,

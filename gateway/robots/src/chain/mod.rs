@@ -32,6 +32,8 @@ pub struct Chain {
     pub rows: Vec<Row>,
     /// From the root link's frame to frame 0, whose z axis is the first joint's.
     pub base: Isometry3<f64>,
+    /// From the URDF's root to the root link, with joints between at rest.
+    pub below: Isometry3<f64>,
     /// The largest difference between rows and URDF that was found, in m or rad.
     pub residual: f64,
     /// The links that move with the chain, the path's first.
