@@ -61,7 +61,7 @@ impl Fit {
                 let buses = chosen.into_iter().enumerate();
                 let fit = |(index, (format, rates))| fit::bus(&skin, index, format, rates, computation_ns);
                 let buses: Vec<BusFit> = buses.filter_map(fit).collect();
-                let whole = fit::fullest(buses.iter().cloned()).map(|it| fit::whole(&skin, &it));
+                let whole = fit::whole(&skin, &buses);
                 (buses, whole, Vec::new())
             }
         };

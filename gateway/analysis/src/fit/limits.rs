@@ -128,6 +128,27 @@ impl Need {
         Self { bandwidth: buses(most.bandwidth), deadline: buses(most.deadline), nodes: buses(most.nodes) }
     }
 
+    /// Those of two chains, which share no bus.
+    #[must_use]
+    pub fn with(self, other: Self) -> Self {
+        let sum = |one: Option<u32>, other: Option<u32>| Some(one? + other?);
+        let mut both = Self {
+            bandwidth: sum(self.bandwidth, other.bandwidth),
+            deadline: sum(self.deadline, other.deadline),
+            nodes: sum(self.nodes, other.nodes),
+        };
+        // Each chain may be bound by another limit.
+        let buses = sum(self.buses(), other.buses());
+        for limit in both.binding() {
+            *match limit {
+                Limit::Bandwidth => &mut both.bandwidth,
+                Limit::Deadline => &mut both.deadline,
+                Limit::Nodes => &mut both.nodes,
+            } = buses;
+        }
+        both
+    }
+
     /// In time, whatever the transceivers.
     #[must_use]
     pub fn in_time(&self) -> Option<u32> {

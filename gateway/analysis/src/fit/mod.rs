@@ -172,12 +172,15 @@ pub struct Spread {
     pub fullest: Rated,
 }
 
-/// Spreads all cells of a skin over more and more buses that are like the fullest one of it.
+/// Spreads all cells of a skin over more and more buses that are like the fullest one of it; of several chains only the number of
+/// buses is known. `None` without a bus.
 #[must_use]
-pub fn whole(skin: &Skin, fullest: &BusFit) -> Whole {
+pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<Whole> {
     let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
-    let need = Need::of(&fullest.most, cells);
-    let numbers = 1..=need.buses().unwrap_or(1);
+    let fullest = fullest(buses.iter())?;
+    let need = need(skin, buses);
+    let most = if carried(skin).count() > 1 { 0 } else { need.buses().unwrap_or(1) };
+    let numbers = 1..=most;
     // Of many only the informative ones: any number below the required one is too small.
     let is_shown =
         |buses: &u32| *buses <= 6 || Some(*buses) == need.in_time() || Some(*buses) == need.buses();
@@ -185,7 +188,32 @@ pub fn whole(skin: &Skin, fullest: &BusFit) -> Whole {
         .filter(is_shown)
         .map(|buses| (buses, fullest.rated.case.with_cells(cells.div_ceil(buses))))
         .map(|(buses, case)| Spread { buses, fullest: Rated::of(&case) });
-    Whole { cells, need, spread: spread.collect() }
+    Some(Whole { cells, need, spread: spread.collect() })
+}
+
+/// The chains that carry cells, each with their number.
+fn carried(skin: &Skin) -> impl Iterator<Item = (usize, u32)> {
+    let on = |cell: &protocol::skin::Cell| skin.buses.get(cell.bus).map(|bus| bus.chain);
+    let count = move |chain: usize| skin.cells.iter().filter(|cell| on(cell) == Some(chain)).count();
+    let chains = (0..skin.robot.chains.len()).map(move |chain| (chain, count(chain)));
+    chains
+        .filter(|(_, cells)| *cells > 0)
+        .map(|(chain, cells)| (chain, u32::try_from(cells).unwrap_or(u32::MAX)))
+}
+
+/// Buses that all cells of a skin need: for each chain as many as its cells need on buses like its fullest one, because a
+/// bus carries one chain.
+fn need(skin: &Skin, buses: &[BusFit]) -> Need {
+    let of_chain = |(chain, cells)| {
+        let chain_of = |bus: &&BusFit| {
+            let index = skin.bus_named(&bus.name)?;
+            skin.buses.get(index).map(|bus| bus.chain)
+        };
+        let fullest = fullest(buses.iter().filter(|bus| chain_of(bus) == Some(chain)))?;
+        Some(Need::of(&fullest.most, cells))
+    };
+    let none = Need { bandwidth: Some(0), deadline: Some(0), nodes: Some(0) };
+    carried(skin).filter_map(of_chain).reduce(Need::with).unwrap_or(none)
 }
 
 /// The skin at one format and its rates.
@@ -200,22 +228,20 @@ pub struct Row {
 /// Looks at the fullest bus of a skin at all common rates, or those of one format.
 #[must_use]
 pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<Row> {
-    let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
     let rows = COMMON.iter().filter(|it| format.is_none_or(|format| format == it.0));
     let row = |common: &Common| {
         let rates = common.rates()?;
-        let buses =
-            (0..skin.buses.len()).filter_map(|index| bus(skin, index, common.0, rates, computation_ns));
-        let fullest = fullest(buses)?;
-        let need = Need::of(&fullest.most, cells);
-        Some(Row { fullest, need })
+        let buses = (0..skin.buses.len()).map(|index| bus(skin, index, common.0, rates, computation_ns));
+        let buses: Vec<_> = buses.flatten().collect();
+        let fullest = fullest(buses.iter())?.clone();
+        Some(Row { fullest, need: need(skin, &buses) })
     };
     rows.filter_map(row).collect()
 }
 
 /// The bus with the highest load.
 #[must_use]
-pub fn fullest(buses: impl Iterator<Item = BusFit>) -> Option<BusFit> {
+pub fn fullest<'a>(buses: impl Iterator<Item = &'a BusFit>) -> Option<&'a BusFit> {
     buses.max_by(|one, other| one.rated.load.total().total_cmp(&other.rated.load.total()))
 }
 

@@ -144,7 +144,8 @@ fn every_hint_does_in_a_description_what_it_says() {
         let skin = skin(&other);
         let buses =
             (0..skin.buses.len()).filter_map(|index| bus(&skin, index, Format::Fd, rates, COMPUTATION_NS));
-        let after = fullest(buses).unwrap().rated;
+        let buses: Vec<_> = buses.collect();
+        let after = fullest(buses.iter()).unwrap().rated.clone();
         assert_eq!(after, hint.after, "{}", hint.change);
     }
 }
@@ -188,7 +189,7 @@ fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
 fn json_has_the_same_figures_and_null_where_there_is_no_bound() {
     let skin = skin(&text(&Target::default()));
     let fits = [fit(&skin, "1M/5M")];
-    let json = json(&skin, &fits, Some(&whole(&skin, &fits[0])), &[]);
+    let json = json(&skin, &fits, whole(&skin, &fits).as_ref(), &[]);
     let bus = &json["buses"][0];
     assert_eq!((bus["bus"].as_str(), bus["name"].as_str()), (Some("vcan0"), Some("1M/5M")));
     assert_eq!((bus["nominal"].as_u64(), bus["data"].as_u64()), (Some(1_000_000), Some(5_000_000)));
