@@ -85,20 +85,21 @@ impl Draft<'_> {
     fn worst(&self) -> Table {
         let cells = self.run.bus_figures.iter().enumerate().flat_map(|(bus, bus_figures)| {
             let described = self.run.skin.cells_of(bus);
-            bus_figures
-                .table
-                .cells()
-                .iter()
-                .zip(described)
-                .zip(&bus_figures.latency)
-                .map(move |((cell, described), latency)| (bus_figures, cell, described.joint, latency))
+            bus_figures.table.cells().iter().zip(described).zip(&bus_figures.latency).map(
+                move |((cell, described), latency)| {
+                    // As the robot numbers it.
+                    let joint =
+                        self.run.skin.joints_of(bus).nth(usize::from(described.joint).saturating_sub(1));
+                    (bus_figures, cell, joint.map_or(0, |(joint, _)| joint + 1), latency)
+                },
+            )
         });
         let mut cells: Vec<_> = cells.collect();
         cells.sort_by_key(|(_, cell, _, latency)| {
             let (replies, uplink) = (&cell.replies, cell.uplink());
             std::cmp::Reverse((replies.missing + replies.late, uplink.lost, uplink.restarts, latency.max))
         });
-        let row = |(bus_figures, cell, joint, latency): &(&LinkId, &Cell, u8, &Latency)| {
+        let row = |(bus_figures, cell, joint, latency): &(&LinkId, &Cell, usize, &Latency)| {
             let (mean, slowest) = if latency.count == 0 {
                 (f64::NAN, f64::NAN)
             } else {
