@@ -116,6 +116,11 @@ fn the_torque_of_a_torso_is_that_of_both_arms() {
     let torques = recorded.on("/two_arms/torques").last().unwrap();
     assert_eq!(numbers(&torques.value["distributed"]).len(), 12, "{}", torques.value);
 
+    // Two arms need two buses, whatever fits on one.
+    let fit: Value =
+        serde_json::from_str(&run(&place, "fit skin.toml --nominal 1M --data 5M --json").stdout).unwrap();
+    assert!(fit["whole"]["buses_needed"]["buses"].as_u64().unwrap() >= 2, "{}", fit["whole"]);
+
     let (ended, replayed) = place.replayed("run.mcap", "--expect --spawn --lockstep --speed 4");
     assert!(replayed.all_came_back(&ended) > 300);
     run(&place, "report run.mcap -o run.html");
@@ -160,6 +165,19 @@ fn a_joint_that_slides_has_its_own_units() {
     assert_eq!(numbers(&plain["values"]["torque_nm"])[0] * 4.0, sent[0]);
     let ended = place.start("gateway", "dump run.log --skin nowhere.toml").end();
     assert!(ended.refusal(2).contains("nowhere.toml"));
+
+    // The skin of another robot is named, and not believed.
+    fs::copy(example("panda.urdf"), place.path("panda.urdf")).unwrap();
+    run(&place, "skin import panda.urdf --tip hand -o other.toml");
+    let another =
+        "the joints on vcan0 are 8, and the skin's chain there has 7: it is the skin of another robot";
+    let ended = run(&place, "dump run.log --skin other.toml --json --kind torque --from 1");
+    assert!(ended.stderr.contains(another) && ended.stderr.lines().count() == 1, "{}", ended.stderr);
+    let raw: Value = serde_json::from_str(ended.stdout.lines().last().unwrap()).unwrap();
+    let same: Value = objects(&place, "dump run.log --json --kind torque --from 1").pop().unwrap();
+    assert_eq!(raw["values"], same["values"]);
+    let ended = place.start("gateway", "explain run.mcap --skin other.toml --epoch 3").end();
+    assert!(ended.refusal(1).contains(another), "{}", ended.stderr);
 }
 
 #[test]

@@ -191,7 +191,16 @@ fn a_skin_is_drawn_on_one_page() {
     fs::remove_file(place.path("arm.urdf")).unwrap();
     let ended = run(&place, "skin show skin.toml").well();
     assert!(ended.stderr.starts_with("the robot is not drawn: arm.urdf: No such file"), "{}", ended.stderr);
+    let with_urdf = drawn;
     let drawn = data(&ended.stdout);
+    // Where the chain begins is in the skin too.
+    for (one, other) in with_urdf["cells"].as_array().unwrap().iter().zip(drawn["cells"].as_array().unwrap())
+    {
+        for axis in 0..3 {
+            let [one, other] = [one, other].map(|cell| cell["position"][axis].as_f64().unwrap());
+            assert!((one - other).abs() < 2e-5, "{one} {other}");
+        }
+    }
     assert_eq!(drawn["triangles"].as_array().unwrap().len(), 0);
     assert!(!drawn["segments"].as_array().unwrap().is_empty());
     let ur5 = example("ur5-253.toml").display().to_string();

@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 use std::io::{self, Write};
 use std::sync::Arc;
 
+use analysis::explain::another_robot;
 use analysis::stats::{Report, Stats};
 use model::decode::pick::Pick;
 use model::decode::settle::Settler;
@@ -11,9 +12,12 @@ use model::decode::{Decoded, json};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};
 use protocol::id::Kind;
+use protocol::message::Message;
 use protocol::schema::Units;
 use protocol::skin::Skin;
 use protocol::time::Micros;
+
+use crate::output::note;
 
 /// Colours of a terminal.
 const DIM: &str = "\x1b[2m";
@@ -53,8 +57,8 @@ pub(super) struct Show<W> {
     /// The bus of the last frame, and its units.
     bus: Arc<str>,
     units: Units,
-    /// Those of the buses that a skin describes.
-    described: Vec<(String, Units)>,
+    /// Those of the buses that a skin describes, and how many joints their chains have.
+    described: Vec<(String, Units, usize)>,
     pick: Pick,
     /// Only traffic of touches.
     contact: bool,
@@ -86,7 +90,9 @@ impl<W: Write> Show<W> {
     /// Takes the units of the skin's buses; of others they stay the default. Before the first frame.
     pub(super) fn describe(&mut self, skin: &Skin) {
         let buses = skin.buses.iter().enumerate();
-        self.described = buses.map(|(index, bus)| (bus.name.clone(), Units::of(skin, index))).collect();
+        let described =
+            buses.map(|(index, bus)| (bus.name.clone(), Units::of(skin, index), skin.joints_of(index).len()));
+        self.described = described.collect();
     }
 
     /// Takes the next frame; it is shown once it is settled, if the filters select it.
@@ -94,8 +100,8 @@ impl<W: Write> Show<W> {
         let Record { time, interface, frame, direction } = *record;
         if *self.bus != *interface {
             self.bus = Arc::from(interface);
-            let described = self.described.iter().find(|(name, _)| name == interface);
-            self.units = described.map_or_else(Units::default, |(_, units)| *units);
+            let described = self.described.iter().find(|(name, ..)| name == interface);
+            self.units = described.map_or_else(Units::default, |(_, units, _)| *units);
         }
         let waiting = Waiting { time, bus: Arc::clone(&self.bus), units: self.units, frame, direction };
         self.settler.push(Micros(time.nanos / 1_000), interface, &frame, waiting);
@@ -124,6 +130,9 @@ impl<W: Write> Show<W> {
         while self.left > 0
             && let Some((Waiting { time, bus, units, frame, direction }, decoded)) = self.settler.pop()
         {
+            self.check_robot(&bus, &decoded);
+            let is_described = self.described.iter().any(|(name, ..)| **name == *bus);
+            let units = if is_described { units } else { Units::default() };
             self.show(&Record { time, interface: &bus, frame, direction }, &decoded, units)?;
         }
         Ok(())
@@ -132,6 +141,21 @@ impl<W: Write> Show<W> {
     /// Whether no more frames are to be shown.
     pub(super) const fn has_enough(&self) -> bool {
         self.left == 0
+    }
+
+    /// Joints of another number than the chain's: the skin is of another robot, and says nothing of this bus.
+    fn check_robot(&mut self, bus: &str, decoded: &Decoded) {
+        let Some(Message::Joints { joints, .. }) = decoded.message() else { return };
+        let came = usize::from(joints.in_use);
+        let is_other = |it: &(String, Units, usize)| it.0 == bus && it.2 != came;
+        if let Some(at) = self.described.iter().position(is_other) {
+            let (name, _, chain) = self.described.remove(at);
+            let another = another_robot(&name, came, chain);
+            note(format_args!(
+                "{another}; its torques are read as Q3.12 and joints as revolute from here on"
+            ));
+            self.bus = Arc::from("");
+        }
     }
 
     /// Shows a frame if the filters select it.

@@ -17,7 +17,7 @@ mod watch;
 
 pub use read::{Found, find};
 pub use row::{JACOBIAN_STEPS, Row, Verdict};
-pub use watch::{CellMoment, Moment, NotFound, Origin, Requested, Watch};
+pub use watch::{CellMoment, Moment, NotFound, Origin, Requested, Watch, another_robot};
 
 use protocol::fixed::{Q, is_saturated};
 use protocol::message::{SkinSensors, State};

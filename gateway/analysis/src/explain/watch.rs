@@ -75,6 +75,16 @@ pub enum NotFound {
         /// The skin's buses that are in the capture.
         buses: String,
     },
+    /// The joints are those of another robot.
+    #[error("{}", another_robot(bus, *came, *chain))]
+    Robot {
+        /// The bus.
+        bus: String,
+        /// Joints that came.
+        came: usize,
+        /// Joints of the skin's chain.
+        chain: usize,
+    },
     /// The epoch is not there, or not so often, or not so late.
     #[error("there are no joints {requested}; there are {runs}")]
     Epoch {
@@ -144,6 +154,8 @@ struct LinkId {
     since: u32,
     cells: PerCell<Cell>,
     runs: Vec<Run>,
+    /// The number of joints, where that is not the chain's.
+    other_joints: Option<usize>,
     /// Runs beyond those that are kept.
     further_runs: u64,
 }
@@ -237,6 +249,12 @@ impl<'a> Watch<'a> {
         if self.bus_watches.iter().all(|bus_watch| bus_watch.moment.is_none()) {
             let first = self.first.unwrap_or_default();
             let Some(bus_watch) = self.bus_watches.iter().find(|bus_watch| !bus_watch.runs.is_empty()) else {
+                for (index, (bus, watch)) in self.skin.buses.iter().zip(&self.bus_watches).enumerate() {
+                    if let Some(came) = watch.other_joints {
+                        let chain = self.skin.joints_of(index).len();
+                        return Err(NotFound::Robot { bus: bus.name.clone(), came, chain });
+                    }
+                }
                 return Err(NotFound::Joints { buses: names(true) });
             };
             let Requested { epoch, from_ns, occurrence } = self.requested;
@@ -255,6 +273,14 @@ impl<'a> Watch<'a> {
         }
         Ok(self.bus_watches.into_iter().map(|bus_watch| bus_watch.moment).collect())
     }
+}
+
+/// Says that a skin is of another robot than a bus' joints.
+#[must_use]
+pub fn another_robot(bus: &str, came: usize, chain: usize) -> String {
+    format!(
+        "the joints on {bus} are {came}, and the skin's chain there has {chain}: it is the skin of another robot, name the right one"
+    )
 }
 
 #[expect(clippy::cast_precision_loss, reason = "to be read")]
@@ -297,7 +323,10 @@ impl LinkId {
             Message::Resume => self.halted = false,
             // Other counts are not this robot's, and a cell drops joints of the last epoch.
             Message::Joints { epoch, joints } => {
-                if usize::from(joints.in_use) == robot && last != Some(epoch) {
+                let came = usize::from(joints.in_use);
+                if came != robot {
+                    self.other_joints = Some(came);
+                } else if last != Some(epoch) {
                     self.joints(nanos, after, epoch, joints, requested);
                 }
             }
