@@ -33,6 +33,8 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
         text += &positions(bus);
     }
     let cells = &explanation.cells;
+    let finest = TorqueFormat::default().name();
+    let is_finest = explanation.buses.iter().all(|bus| bus.torque_format == finest);
     match (what, cells.as_slice()) {
         (What::All | What::Cells, []) => text += "\nno cell was in contact, and none answered\n",
         (What::Joint, _) => text += &joint(cells),
@@ -41,14 +43,10 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
                 text += &every_step(cell, first);
             }
         }
-        (What::All, _) => {
-            let finest = TorqueFormat::default().name();
-            let is_finest = explanation.buses.iter().all(|bus| bus.torque_format == finest);
-            text += &one_line_each(cells, is_finest);
-        }
+        (What::All, _) => text += &one_line_each(cells, is_finest),
     }
     if what != What::Cells && !cells.is_empty() {
-        text += &totals(&explanation.total);
+        text += &totals(&explanation.total, is_finest);
     }
     if !explanation.missing.is_empty() {
         text += "\nnot known:\n";
@@ -330,8 +328,10 @@ fn joint_name(joint: u8, unit: &str) -> String {
     if unit == "Nm" { joint.to_string() } else { format!("{joint} ({unit})") }
 }
 
-fn totals(total: &[Total]) -> String {
-    let head = ["joint", "words", "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"];
+fn totals(total: &[Total], is_finest: bool) -> String {
+    // Words of a coarser format are added up in the steps of the finest one.
+    let words = if is_finest { "words" } else { "x 2^-12" };
+    let head = ["joint", words, "Nm", "products Nm", "central Nm", "difference", "unrounded Nm"];
     let lines = total.iter().map(|it| {
         let difference = match (it.open, it.saturated) {
             (0, 0) => format!("{:+.6}", it.difference_nm),
