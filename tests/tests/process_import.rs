@@ -276,6 +276,47 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
     }
 }
 
+#[test]
+fn each_covered_link_has_a_cell() {
+    let place = arm();
+    // A knob that is smaller than a cell, beside a link with room.
+    let knob = ARM.replace(
+        "<link name=\"bare\"/>",
+        "<link name=\"bare\"><visual><origin xyz=\"0 0 0.3\"/><geometry><sphere radius=\"0.003\"/></geometry></visual></link>",
+    );
+    place.write("arm.urdf", &knob);
+    let cover = |links: &str, more: &str| {
+        let mut command = place
+            .command("gateway", "skin import arm.urdf --tip bare --package arm_parts=parts --pitch 0.04");
+        command.args(["--cover", links]).args(more.split_whitespace()).output().unwrap()
+    };
+    let boxes = "--keep-out fore:-1,-1,-1,1,1,1";
+    for (links, more, expected) in [
+        (
+            "upper,bare",
+            "",
+            "gateway: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
+        ),
+        (
+            "bare",
+            "",
+            "gateway: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
+        ),
+        (
+            "upper,fore",
+            boxes,
+            "gateway: --cover fore: the boxes of --keep-out leave nothing of it: make them smaller",
+        ),
+    ] {
+        let output = cover(links, more);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!((output.status.code(), said.lines().count()), (Some(2), 1), "{said}");
+        assert!(said.starts_with(expected) && output.stdout.is_empty(), "{said}");
+    }
+    let [plain, blanks] = ["upper,fore", " upper, fore "].map(|links| cover(links, "").stdout);
+    assert!(!plain.is_empty() && plain == blanks, "blanks around names do not count");
+}
+
 /// 10 N on a cell 0.3 m above the shoulder, and 0.2 m in front of it.
 #[test]
 fn torques_of_a_force_are_computed_in_both_ways() {

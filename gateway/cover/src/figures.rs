@@ -16,15 +16,13 @@ pub(crate) fn figures(link: &Link, surface: &Surface<'_>, spots: &[Spot], pitch:
         })
     };
     let count = surface.samples.len();
+    let share = |samples: usize| if count == 0 { 0.0 } else { real(samples) / real(count) };
     Figures {
         name: link.name.clone(),
         cells: spots.len(),
         outer_area: real(count) * surface.share,
-        covered: if count == 0 {
-            0.0
-        } else {
-            real(surface.samples.iter().filter(covered).count()) / real(count)
-        },
+        kept_out: share(surface.samples.iter().filter(|sample| surface.keeps_out(&sample.point)).count()),
+        covered: share(surface.samples.iter().filter(covered).count()),
         spacing: spacing(spots, pitch),
         tilt: spots.iter().map(|spot| spot.tilt).fold(0.0, f64::max),
     }

@@ -140,6 +140,8 @@ pub struct Figures {
     pub cells: usize,
     /// Its outer surface, without what other links hide, in m².
     pub outer_area: f64,
+    /// How much of the outer surface is in keep-out boxes, 0 to 1; 0 when there is no outer surface.
+    pub kept_out: f64,
     /// How much of the outer surface, keep-out boxes included, is within one pitch of a cell on the same side, 0 to
     /// 1; 0 when there is no outer surface.
     pub covered: f64,

@@ -179,11 +179,16 @@ impl<'a> Surface<'a> {
 
     /// Whether neither a box nor another link keeps cells from a point.
     fn allowed(&self, point: &Point3<f64>) -> bool {
+        !self.keeps_out(point) && !self.others.near(point, self.clearance)
+    }
+
+    /// Whether a point is in a box that holds no cell.
+    pub(crate) fn keeps_out(&self, point: &Point3<f64>) -> bool {
         let inside = |keep_out: &&KeepOut| {
             let sides = keep_out.min.iter().zip(&keep_out.max);
             sides.zip(point.iter()).all(|((min, max), at)| (min..=max).contains(&at))
         };
-        !self.keep_out.iter().any(inside) && !self.others.near(point, self.clearance)
+        self.keep_out.iter().any(inside)
     }
 
     /// Means of normals below each sample, and whether there is enough surface below a cell.

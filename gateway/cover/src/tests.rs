@@ -217,7 +217,11 @@ fn keep_out_boxes_hold_no_cell() {
     let skin = covered(single(cube(0.2)), &options);
     assert!(skin.cells.iter().all(|cell| cell.position[2] < 0.05));
     assert!(skin.links[0].covered < 0.9, "the area in the box counts");
-    let other = Options { keep_out: vec![KeepOut { link: 1, ..keep_out }], ..options };
+    assert!((0.2..0.5).contains(&skin.links[0].kept_out), "{}", skin.links[0].kept_out);
+    let all = Options { keep_out: vec![KeepOut { min: [-1.0; 3], ..keep_out }], ..options };
+    let figures = &covered(single(cube(0.2)), &all).links[0];
+    assert!(figures.cells == 0 && figures.kept_out >= 1.0, "{figures:?}");
+    let other = Options { keep_out: vec![KeepOut { link: 1, ..keep_out }], ..all };
     assert_eq!(
         cover(&[single(cube(0.2))], &[], &other).unwrap_err().to_string(),
         "keep-out box 0: link 1 is none of the 1 covered ones; correct it"

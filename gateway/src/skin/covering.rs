@@ -15,7 +15,7 @@ use super::visuals::{Packages, Visuals};
 #[derive(Args, Debug)]
 pub(super) struct Covering {
     /// Cover these links with cells, on the meshes and shapes of their visuals; the other links are in the way
-    #[arg(long, value_name = "LINK,..", value_delimiter = ',', conflicts_with = "cells")]
+    #[arg(long, value_name = "LINK,..", value_delimiter = ',', value_parser = link, conflicts_with = "cells")]
     pub(super) cover: Vec<String>,
     /// From one cell's middle to the next one's in m, 0.001 to 1
     #[arg(long, value_name = "M", requires = "cover", default_value_t = 0.028, value_parser = pitch, allow_negative_numbers = true)]
@@ -50,6 +50,12 @@ fn pitch(text: &str) -> Result<f64, String> {
     pitch.ok_or_else(|| format!("a length from {MIN_PITCH} to {MAX_PITCH} m"))
 }
 
+/// A link's name, which has no blanks around it.
+#[expect(clippy::unnecessary_wraps, reason = "a parser of clap's")]
+fn link(text: &str) -> Result<String, String> {
+    Ok(text.trim().to_owned())
+}
+
 fn keep_out(text: &str) -> Result<KeptOut, String> {
     let parsed = || {
         let (link, numbers) = text.rsplit_once(':')?;
@@ -59,7 +65,7 @@ fn keep_out(text: &str) -> Result<KeptOut, String> {
         let [min @ .., x, y, z] = numbers.as_slice() else { return None };
         let (min, max) = (<[f64; 3]>::try_from(min).ok()?, [*x, *y, *z]);
         let is_box = min.iter().zip(&max).all(|(min, max)| min <= max);
-        is_box.then(|| KeptOut { link: link.to_owned(), min, max, text: text.to_owned() })
+        is_box.then(|| KeptOut { link: link.trim().to_owned(), min, max, text: text.to_owned() })
     };
     parsed().ok_or_else(|| {
         "a link, a colon, and six lengths in m: the min x, y, z of the box and the max".to_owned()
@@ -117,6 +123,9 @@ impl Covering {
                 .collect();
             let skin = cover(&own, &others, &self.options(&own))
                 .map_err(|error| Failure::usage(format!("--cover: {error}")))?;
+            if let Some(bare) = skin.links.iter().find(|figures| figures.cells == 0) {
+                return Err(Failure::usage(without_cells(bare)));
+            }
             covered.cells.extend(skin.cells.iter().map(|cell| CellOnLink {
                 link: own.get(cell.link).map_or_else(String::new, |link| link.name.clone()),
                 position: cell.position,
@@ -129,12 +138,6 @@ impl Covering {
             }));
             covered.figures.extend(skin.links);
             buses += skin.buses;
-        }
-        if covered.cells.is_empty() {
-            let links = list(&self.cover);
-            return Err(Failure::usage(format!(
-                "--cover: there is no room for a cell on {links}: lower the pitch, or choose other links"
-            )));
         }
         Ok(covered)
     }
@@ -195,9 +198,23 @@ impl Covering {
     }
 }
 
+/// Why a link has no cell, in a line.
+fn without_cells(Figures { name, outer_area, kept_out, .. }: &Figures) -> String {
+    let why = if *outer_area <= 0.0 {
+        "other links hide it all: leave the link out".to_owned()
+    } else if *kept_out >= 1.0 {
+        "the boxes of --keep-out leave nothing of it: make them smaller, or leave the link out".to_owned()
+    } else {
+        format!(
+            "there is no room for a cell on its {outer_area:.4} m2: lower the pitch, or leave the link out"
+        )
+    };
+    format!("--cover {name}: {why}")
+}
+
 /// How a link is covered, in a line.
 pub(super) fn reported(figures: &Figures) -> String {
-    let Figures { name, cells, outer_area, covered, spacing, tilt } = figures;
+    let Figures { name, cells, outer_area, kept_out: _, covered, spacing, tilt } = figures;
     let spacing =
         spacing.map_or_else(String::new, |metres| format!("; {:.1} mm from cell to cell", metres * 1e3));
     format!(
