@@ -1,5 +1,6 @@
 //! Arguments that several commands share, and how words become values.
 
+use std::fmt;
 use std::path::PathBuf;
 
 use clap::Args;
@@ -132,13 +133,23 @@ pub(crate) fn cell(text: &str) -> Result<Named, String> {
     }
 }
 
+impl fmt::Display for Named {
+    /// As it was given.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(bus) = &self.bus {
+            write!(f, "{bus}:")?;
+        }
+        self.node.fmt(f)
+    }
+}
+
 impl Named {
     /// The cell's index into [`Skin::cells`]; `option` names it in errors.
     pub(crate) fn find(&self, skin: &Skin, option: &str) -> Result<usize, Failure> {
         let Self { bus, node } = self;
         let names = || list(bus_names(skin));
-        if let Some(bus) = bus.as_ref().filter(|bus| skin.bus_named(bus).is_none()) {
-            return Err(Failure::usage(format!("{option} {bus}:{node}: the skin's buses are {}", names())));
+        if bus.as_ref().is_some_and(|bus| skin.bus_named(bus).is_none()) {
+            return Err(Failure::usage(format!("{option} {self}: the skin's buses are {}", names())));
         }
         let on = |name: &str| bus.as_ref().is_none_or(|bus| bus == name);
         let there: Vec<_> = skin

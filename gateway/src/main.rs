@@ -10,6 +10,7 @@ mod ack;
 mod arguments;
 mod buses;
 mod cells;
+mod columns;
 mod commission;
 mod convert;
 mod dbc;

@@ -10,13 +10,17 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
 use reference::Reference;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::arguments::{Named, cell};
+use super::columns::{Columns, Table};
 use super::print::{count, json_line, table};
 
 /// Bytes of a file of rows.
 const BATCH: u64 = 256 << 20;
+
+/// What stands in a line of it.
+const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: &[] };
 
 /// Compute the torques of a force on a cell: centrally, and as the cell's fixed-point code does
 ///
@@ -50,15 +54,6 @@ pub(crate) struct Torque {
     /// One JSON object a row
     #[arg(long)]
     json: bool,
-}
-
-/// A line of the file of rows.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Line {
-    cell: String,
-    force_n: f64,
-    q: String,
 }
 
 /// What comes out, in Nm, of prismatic joints in N.
@@ -108,20 +103,15 @@ impl<'a> Calculator<'a> {
     }
 
     fn batch(&self, path: &Path) -> Result<Vec<Row>, Failure> {
-        let file = path.display();
+        let file = path.display().to_string();
         let text = document::text_within(path, BATCH).map_err(Failure::usage)?;
-        let mut reader = csv::ReaderBuilder::new().trim(csv::Trim::All).from_reader(text.as_bytes());
+        let mut table = Table::new(&file, &text, COLUMNS)?;
         let mut rows = Vec::new();
-        for record in reader.deserialize::<Line>() {
-            let columns = "the columns are cell,force_n,q";
-            let Line { cell: text, force_n, q } =
-                record.map_err(|error| Failure::usage(format!("{file}: {error}; {columns}")))?;
+        while let Some(line) = table.row()? {
             let at = format!("{file}, row {}: cell", rows.len() + 1);
-            let named = cell(&text).map_err(|error| Failure::usage(format!("{at} {error}")))?;
-            rows.push(
-                self.row(&named, &at, force_n, &q)
-                    .map_err(|error| Failure::usage(format!("{at} {text}: {error}")))?,
-            );
+            let named = cell(line.text("cell")).map_err(|error| Failure::usage(format!("{at} {error}")))?;
+            let force = line.number("force_n")?;
+            rows.push(self.row(&named, &at, force, line.text("q")).map_err(Failure::usage)?);
         }
         if rows.is_empty() {
             return Err(Failure::usage(format!("{file}: there is no row in it: write a line for each")));
@@ -129,10 +119,15 @@ impl<'a> Calculator<'a> {
         Ok(rows)
     }
 
-    /// Both computations of one row, or why there is none.
+    /// Both computations of one row, or why there is none; `option` is what names the cell.
     fn row(&self, named: &Named, option: &str, force: f64, positions: &str) -> Result<Row, String> {
+        let index = named.find(self.skin, option).map_err(|failure| failure.to_string())?;
+        self.row_of(index, force, positions).map_err(|why| format!("{option} {named}: {why}"))
+    }
+
+    /// The same of the cell with this index.
+    fn row_of(&self, index: usize, force: f64, positions: &str) -> Result<Row, String> {
         let skin = self.skin;
-        let index = named.find(skin, option).map_err(|failure| failure.to_string())?;
         let Some(cell) = skin.cells.get(index) else { return Err("no such cell".to_owned()) };
         let joints: Vec<_> = skin.joints_of(cell.bus).map(|(_, joint)| joint).collect();
         if !(force.is_finite() && force >= 0.0) {

@@ -264,12 +264,24 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
     refused(&place, "skin import nowhere.urdf --tip a", "nowhere.urdf: No such file");
     let head = "link,px,py,pz,nx,ny,nz";
     for (text, expected) in [
-        ("link,px,py,pz,nx,ny,up\nfore,0,0,0,0,0,1\n".to_owned(), "cells.csv: line 2: "),
-        (format!("{head}\nfore,0,0,x,0,0,1\n"), "cells.csv: line 2: pz: "),
+        (
+            "link,px,py,pz,nx,ny,up\nfore,0,0,0,0,0,1\n".to_owned(),
+            "cells.csv: line 1: the first line must be the header link,px,py,pz,nx,ny,nz, with bus,node if they are \
+             given, and it is \"link,px,py,pz,nx,ny,up\": correct it",
+        ),
+        ("fore,0,0,0,0,0,1\n".to_owned(), "it is \"fore,0,0,0,0,0,1\": write the header above it"),
+        (format!("{head}\nfore,0,0,x,0,0,1\n"), "cells.csv: line 2: pz = \"x\": a finite number is needed"),
         (format!("{head}\nfore,0,0,0,0,0,1\nfourth,0,0,0,0,0,1\n"), "cells.csv: line 3: "),
         (format!("{head}\nfore,0,0,0,0,0,0\n"), "line 2: the normal"),
-        (format!("{head}\nfore,0,0\n"), "3 values where the first line has 7"),
+        (
+            format!("{head}\nfore,0,0\n"),
+            "cells.csv: line 2: 3 values: one is needed for each of the columns link, ",
+        ),
         (head.to_owned(), "there is no cell in it"),
+        (
+            format!("{head},bus,node\nfore,0,0,0,0,0,1,,300\n"),
+            "gateway: cells.csv: line 2: node = \"300\": 1 to 254 are possible",
+        ),
     ] {
         place.write("cells.csv", &text);
         refused(&place, "skin import arm.urdf --tip bare --cells cells.csv", expected);
@@ -360,15 +372,29 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         ("--cell 1 --joints 0,0.5", "--force"),
         ("--cell 1 --force 1 --joints 0,0.5 --batch rows.csv", "cannot be used with"),
         ("--batch nowhere.csv", "nowhere.csv: No such file"),
-        ("--batch cells.csv", "the columns are cell,force_n,q"),
+        (
+            "--batch cells.csv",
+            "cells.csv: line 1: the first line must be the header cell,force_n,q, and it is \"link,",
+        ),
     ] {
         refused(&place, &format!("torque skin.toml {words}"), expected);
     }
     for (text, expected) in [
         ("cell,force_n,q\n", "there is no row in it"),
-        ("cell,force_n,q\n7,1,0 0.5\n", "rows.csv, row 1: cell 7: "),
-        ("cell,force_n,q\n1,1,0\n", "rows.csv, row 1: cell 1: 1 position: one is needed"),
-        ("cell,force_n,q\n1,x,0 0.5\n", "the columns are cell,force_n,q"),
+        (
+            "cell,force_n,q\n7,1,0 0.5\n",
+            "gateway: rows.csv, row 1: cell 7: the skin has no such cell on vcan0",
+        ),
+        (
+            "cell,force_n,q\n1,1,0 0.5\nvcan5:1,1,0 0.5\n",
+            "gateway: rows.csv, row 2: cell vcan5:1: the skin's buses are vcan0",
+        ),
+        ("cell,force_n,q\n1,1,0\n", "gateway: rows.csv, row 1: cell 1: 1 position: one is needed"),
+        (
+            "cell,force_n,q\n1,x,0 0.5\n",
+            "gateway: rows.csv: line 2: force_n = \"x\": a finite number is needed",
+        ),
+        ("1,1,0 0.5\n2,1,0 0.5\n", "and it is \"1,1,0 0.5\": write the header above it"),
     ] {
         place.write("rows.csv", text);
         refused(&place, "torque skin.toml --batch rows.csv", expected);

@@ -4,10 +4,11 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use protocol::document;
+use protocol::id::CellId;
 use protocol::usage::{Failure, print};
 use robots::{CellOnLink, Chain, Import as Described, Urdf};
-use serde::Deserialize;
 
+use super::super::columns::{Columns, Table};
 use super::super::output::{Force, apart, note};
 use super::super::print::{count, list};
 use super::super::robot_file::path_from;
@@ -54,22 +55,9 @@ pub(super) struct Import {
     force: Force,
 }
 
-/// A line of the file of cells.
-#[derive(Debug, Deserialize)]
-#[serde(deny_unknown_fields)]
-struct Line {
-    link: String,
-    px: f64,
-    py: f64,
-    pz: f64,
-    nx: f64,
-    ny: f64,
-    nz: f64,
-    #[serde(default)]
-    bus: Option<String>,
-    #[serde(default)]
-    node: Option<u8>,
-}
+/// What stands in a line of the file of cells.
+const COLUMNS: Columns =
+    Columns { needed: &["link", "px", "py", "pz", "nx", "ny", "nz"], optional: &["bus", "node"] };
 
 impl Import {
     pub(super) fn run(self) -> Result<(), Failure> {
@@ -150,49 +138,28 @@ fn text(path: &Path) -> Result<String, Failure> {
 
 /// The cells of a file.
 fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
-    let file = path.display();
+    let file = path.display().to_string();
     let text = text(path)?;
-    let mut reader =
-        csv::ReaderBuilder::new().trim(csv::Trim::All).comment(Some(b'#')).from_reader(text.as_bytes());
-    let headers = reader.headers().map_err(|error| Failure::usage(format!("{file}: {error}")))?.clone();
+    let mut table = Table::new(&file, &text, COLUMNS)?;
     let mut cells = Vec::new();
-    for record in reader.records() {
-        let wrong = |error: csv::Error| {
-            let line = error.position().map_or(0, csv::Position::line);
-            #[expect(clippy::wildcard_enum_match_arm, reason = "the others are said as they are")]
-            let what = match error.kind() {
-                csv::ErrorKind::Deserialize { err, .. } => {
-                    let column = err.field().and_then(|field| headers.get(usize::try_from(field).ok()?));
-                    let column = column.map_or_else(String::new, |column| format!("{column}: "));
-                    format!("{column}{}", err.kind())
-                }
-                csv::ErrorKind::UnequalLengths { expected_len, len, .. } => {
-                    format!("{} where the first line has {expected_len}", count(*len, "value"))
-                }
-                _ => error.to_string(),
-            };
-            let columns = "the columns are link,px,py,pz,nx,ny,nz and, if given, bus,node";
-            Failure::usage(format!("{file}: line {line}: {what}; {columns}"))
+    while let Some(row) = table.row()? {
+        let vector =
+            |[x, y, z]: [&str; 3]| Ok::<_, Failure>([row.number(x)?, row.number(y)?, row.number(z)?]);
+        let node = match row.text("node") {
+            "" => None,
+            text => {
+                let node = text.parse().ok().and_then(|node| CellId::new(node).ok());
+                let wrong = || row.wrong("node", "1 to 254 are possible; an empty one gets a free node");
+                Some(node.ok_or_else(wrong)?.get())
+            }
         };
-        let record = record.map_err(wrong)?;
-        let line = record.position().map_or(0, csv::Position::line);
-        let Line { link, px, py, pz, nx, ny, nz, bus, node } =
-            record.deserialize(Some(&headers)).map_err(wrong)?;
-        let numbers = [px, py, pz, nx, ny, nz];
-        if let Some(number) = numbers.iter().find(|number| !number.is_finite()) {
-            return Err(Failure::usage(format!(
-                "{file}: line {line}: {number} is no position: it must be finite"
-            )));
-        }
-        let bus = bus.filter(|bus| !bus.is_empty());
-        let line = usize::try_from(line).unwrap_or_default();
         cells.push(CellOnLink {
-            link,
-            position: [px, py, pz],
-            normal: [nx, ny, nz],
-            bus,
+            link: row.text("link").to_owned(),
+            position: vector(["px", "py", "pz"])?,
+            normal: vector(["nx", "ny", "nz"])?,
+            bus: Some(row.text("bus").to_owned()).filter(|bus| !bus.is_empty()),
             node,
-            line,
+            line: row.line,
             ..CellOnLink::default()
         });
     }
