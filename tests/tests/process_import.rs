@@ -278,13 +278,53 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
             "cells.csv: line 2: 3 values: one is needed for each of the columns link, ",
         ),
         (head.to_owned(), "there is no cell in it"),
+        // What only the skin's check knows, by the line of the file.
+        (
+            format!("# mine\n{head}\nfore,0,0,0,0,0,1\n\nfore,3,0,0,0,0,1\n"),
+            "gateway: cells.csv: line 5: position px,py,pz = 3,0,0 of link \"fore\" can come 3.",
+        ),
         (
             format!("{head},bus,node\nfore,0,0,0,0,0,1,,300\n"),
             "gateway: cells.csv: line 2: node = \"300\": 1 to 254 are possible",
         ),
+        (
+            format!("{head},bus,node\nfore,0,0,0,0,0,1,,\nupper,0,0,0,0,0,1,,1\n"),
+            "gateway: cells.csv: line 3: node 1 of bus \"vcan0\" is that of line 2 already",
+        ),
+        (
+            format!("{head},bus\nfore,0,0,0,0,0,1,my bus\n"),
+            "gateway: cells.csv: line 2: bus \"my bus\": its name has 1 to 15 letters",
+        ),
     ] {
         place.write("cells.csv", &text);
         refused(&place, "skin import arm.urdf --tip bare --cells cells.csv", expected);
+    }
+}
+
+/// A torso with several arms of 12 joints each.
+#[test]
+fn a_robot_has_at_most_32_joints() {
+    let place = Place::new();
+    let mut inner = "<link name=\"torso\"/>".to_owned();
+    for arm in ["a", "b", "c"] {
+        for joint in 1..=12 {
+            let below = if joint == 1 { "torso".to_owned() } else { format!("{arm}{}", joint - 1) };
+            inner += &format!(
+                "<link name=\"{arm}{joint}\"/><joint name=\"j{arm}{joint}\" type=\"revolute\"><parent link=\"{below}\"/>\
+                 <child link=\"{arm}{joint}\"/><origin xyz=\"0 0 0.1\"/><axis xyz=\"0 1 0\"/><limit lower=\"-1\" \
+                 upper=\"1\" velocity=\"1\" effort=\"9\"/></joint>"
+            );
+        }
+    }
+    place.write("arms.urdf", &format!("<robot name=\"arms\">{inner}</robot>"));
+    place.write("cells.csv", "link,px,py,pz,nx,ny,nz\na12,0,0,0,0,0,1\nb12,0,0,0,0,0,1\n");
+    for cells in ["", " --cells cells.csv"] {
+        refused(
+            &place,
+            &format!("skin import arms.urdf --tip a12 --tip b12 --tip c12{cells}"),
+            "gateway: arms.urdf: 36 joints move between the root and the tips; a robot has 1 to 32: give fewer --tip",
+        );
+        run(&place, &format!("skin import arms.urdf --tip a12 --tip b12{cells}")).well();
     }
 }
 

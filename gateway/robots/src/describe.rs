@@ -9,9 +9,10 @@
 use core::fmt::Write;
 
 use nalgebra::{Point3, Vector3};
+use protocol::bus::is_plain;
 use protocol::document::DocumentError;
 use protocol::parameters::RowKind;
-use protocol::skin::{JointKind, Skin};
+use protocol::skin::{JointKind, MAX_ROBOT_JOINTS, REACH, Skin, reach};
 use thiserror::Error;
 
 use crate::chain::{Chain, Joint};
@@ -62,8 +63,16 @@ pub struct Import<'a> {
 /// Why there is no skin.
 #[derive(Debug, Error)]
 pub enum ImportError {
+    /// The chains have too many joints together.
+    #[error(
+        "{count} joints move between the root and the tips; a robot has 1 to {MAX_ROBOT_JOINTS}: give fewer --tip"
+    )]
+    Joints {
+        /// How many.
+        count: usize,
+    },
     /// A link that carries a cell.
-    #[error("line {line}: {error}")]
+    #[error("{}{error}", at(*line))]
     Link {
         /// The line of the file of cells.
         line: usize,
@@ -71,7 +80,7 @@ pub enum ImportError {
         error: RobotError,
     },
     /// A normal without a direction.
-    #[error("line {line}: the normal nx,ny,nz = {x},{y},{z} has no direction: it must be longer than 0")]
+    #[error("{}the normal nx,ny,nz = {x},{y},{z} has no direction: it must be longer than 0", at(*line))]
     Normal {
         /// The line of the file of cells.
         line: usize,
@@ -84,7 +93,8 @@ pub enum ImportError {
     },
     /// One bus for cells of two chains.
     #[error(
-        "line {line}: bus {bus:?} carries chain {first:?} already, and this cell sits on chain {second:?}: name another bus"
+        "{}bus {bus:?} carries chain {first:?} already, and this cell sits on chain {second:?}: name another bus",
+        at(*line)
     )]
     Bus {
         /// The line of the file of cells.
@@ -97,16 +107,101 @@ pub enum ImportError {
         second: String,
     },
     /// A bus has no number left.
-    #[error("line {line}: bus {bus:?} has no node id left: it has 254")]
+    #[error("{}bus {bus:?} has no node id left: it has 254", at(*line))]
     Full {
         /// The line of the file of cells.
         line: usize,
         /// The bus.
         bus: String,
     },
-    /// What came out is no skin.
-    #[error(transparent)]
-    Skin(#[from] DocumentError),
+    /// Two cells with the same node.
+    #[error("{}node {node} of bus {bus:?} is that of line {first} already: give it another one, or none", at(*line))]
+    Taken {
+        /// The line of the file of cells.
+        line: usize,
+        /// The bus.
+        bus: String,
+        /// The node.
+        node: u8,
+        /// The line of the cell that has it.
+        first: usize,
+    },
+    /// No interface can have the name.
+    #[error("{}bus {bus:?}: its name has 1 to 15 letters, digits, `-`, `_` or `.`, and does not begin with `.`", at(*line))]
+    BusName {
+        /// The line of the file of cells.
+        line: usize,
+        /// The bus.
+        bus: String,
+    },
+    /// A cell that is too far away.
+    #[error(
+        "{}position px,py,pz = {x},{y},{z} of link {link:?} can come {reach:.3} m from a joint; less than {REACH} m is \
+         possible: correct it, or choose a root nearer to the link",
+        at(*line)
+    )]
+    Reach {
+        /// The line of the file of cells.
+        line: usize,
+        /// The link.
+        link: String,
+        /// Its x in the link's frame, in m.
+        x: f64,
+        /// Its y.
+        y: f64,
+        /// Its z.
+        z: f64,
+        /// In m.
+        reach: f64,
+    },
+    /// The skin's check refuses cells or buses.
+    #[error("{}{what}", at(*line))]
+    Cells {
+        /// The line of the file of cells, 0 for all of it.
+        line: usize,
+        /// What it says.
+        what: String,
+    },
+    /// The skin's check refuses the robot.
+    #[error("{what}")]
+    Robot {
+        /// What it says.
+        what: String,
+    },
+}
+
+impl ImportError {
+    /// Whether the cells are wrong, and not the robot.
+    #[must_use]
+    pub const fn is_of_cells(&self) -> bool {
+        !matches!(self, Self::Joints { .. } | Self::Robot { .. })
+    }
+
+    /// What the check of the skin's text says, by the lines of the cells: nobody sees that text.
+    fn of_check(error: DocumentError, cells: &[CellOnLink], buses: &[Bus]) -> Self {
+        let DocumentError::Wrong { what, .. } = error else { return Self::Robot { what: error.to_string() } };
+        let lines_of_buses = || buses.iter().map(|bus| bus.line);
+        let found =
+            numbered(&what, "cell").map(|(index, rest)| (cells.get(index).map(|cell| cell.line), rest));
+        let found =
+            found.or_else(|| numbered(&what, "bus").map(|(index, rest)| (lines_of_buses().nth(index), rest)));
+        match found {
+            Some((line, rest)) => Self::Cells { line: line.unwrap_or_default(), what: rest.to_owned() },
+            None if what.starts_with("bus = ") => Self::Cells { line: 0, what },
+            None => Self::Robot { what },
+        }
+    }
+}
+
+/// Number and key of `cell[3].node = 7: ...`.
+fn numbered<'a>(what: &'a str, table: &str) -> Option<(usize, &'a str)> {
+    let (number, rest) = what.strip_prefix(table)?.strip_prefix('[')?.split_once(']')?;
+    Some((number.parse().ok()?, rest.trim_start_matches('.')))
+}
+
+/// The line of a cell in an error; cells that no file names have none.
+fn at(line: usize) -> String {
+    if line == 0 { String::new() } else { format!("line {line}: ") }
 }
 
 /// A cell with its place on a chain.
@@ -125,7 +220,10 @@ struct Placed<'a> {
 struct Bus {
     name: String,
     chain: usize,
-    taken: Vec<u8>,
+    /// The line of its first cell.
+    line: usize,
+    /// Nodes, and the lines of their cells.
+    taken: Vec<(u8, usize)>,
     /// Whether it was named, or comes from the count of cells.
     named: bool,
 }
@@ -137,13 +235,19 @@ impl Import<'_> {
     /// When a cell sits on a link that no chain moves, or has no direction, or there is no room on its bus, or what comes
     /// out is no skin.
     pub fn toml(&self) -> Result<String, ImportError> {
+        let count = self.joints().len();
+        if count > MAX_ROBOT_JOINTS {
+            return Err(ImportError::Joints { count });
+        }
         let on_tips: Vec<_> = self.chains.iter().map(on_tip).collect();
         let cells = if self.cells.is_empty() { &on_tips } else { self.cells };
         let mut buses: Vec<Bus> = Vec::new();
         let placed = cells.iter().map(|cell| self.place(cell, &mut buses)).collect::<Result<Vec<_>, _>>()?;
         let text = self.text(&buses, &placed);
-        Skin::parse("imported skin", &text)?;
-        Ok(text)
+        match Skin::parse("imported skin", &text) {
+            Ok(_) => Ok(text),
+            Err(error) => Err(ImportError::of_check(error, cells, &buses)),
+        }
     }
 
     /// The first chain whose link it is, and its bus.
@@ -160,7 +264,7 @@ impl Import<'_> {
                 Err(error) => refused = refused.or(Some(error)),
             }
         }
-        let (chain, frame) = match (found, refused) {
+        let (owner, frame) = match (found, refused) {
             (Some(found), _) => found,
             (None, Some(error)) => return Err(ImportError::Link { line, error }),
             (None, None) => unreachable!("an import has a chain"),
@@ -172,13 +276,27 @@ impl Import<'_> {
             return Err(ImportError::Normal { line, x, y, z });
         };
         let position = frame.frame * Point3::from(cell.position);
-        let bus = self.bus(cell, chain, buses)?;
+        let rows = self.chains.get(owner).map(Chain::chain_rows).unwrap_or_default();
+        let reach = reach(rows.get(..frame.row).unwrap_or_default(), position.into());
+        if reach.is_nan() || reach >= REACH {
+            let ([x, y, z], link) = (cell.position, cell.link.clone());
+            return Err(ImportError::Reach { line, link, x, y, z, reach });
+        }
+        let bus = self.bus(cell, owner, buses)?;
         let Some(there) = buses.get_mut(bus) else { unreachable!("just found") };
-        let next = || (1..=254).find(|node| !there.taken.contains(node));
-        let full = ImportError::Full { line, bus: there.name.clone() };
-        let node = cell.node.or_else(next).ok_or(full)?;
-        there.taken.push(node);
-        let (joint, row) = (frame.joint, frame.row);
+        let holder = |node: u8| there.taken.iter().find(|(taken, _)| *taken == node).map(|(_, line)| *line);
+        let node = match cell.node.map(|node| (node, holder(node))) {
+            Some((node, None)) => node,
+            Some((node, Some(first))) => {
+                return Err(ImportError::Taken { line, bus: there.name.clone(), node, first });
+            }
+            None => match (1..=254).find(|node| holder(*node).is_none()) {
+                Some(node) => node,
+                None => return Err(ImportError::Full { line, bus: there.name.clone() }),
+            },
+        };
+        there.taken.push((node, line));
+        let (chain, joint, row) = (owner, frame.joint, frame.row);
         Ok(Placed { cell, bus, node, chain, joint, row, position: position.into(), normal: normal.into() })
     }
 
@@ -197,7 +315,10 @@ impl Import<'_> {
                     _ => Ok(index),
                 };
             }
-            buses.push(Bus { name: named.clone(), chain, taken: Vec::new(), named: true });
+            if !is_plain(named) || named.starts_with('.') {
+                return Err(ImportError::BusName { line: cell.line, bus: named.clone() });
+            }
+            buses.push(Bus { name: named.clone(), chain, line: cell.line, taken: Vec::new(), named: true });
             return Ok(buses.len() - 1);
         }
         let has_room = |bus: &Bus| bus.chain == chain && !bus.named && bus.taken.len() < CELLS_OF_A_BUS;
@@ -207,7 +328,8 @@ impl Import<'_> {
         let free = (0..)
             .map(|number| format!("vcan{number}"))
             .find(|name| buses.iter().all(|bus| bus.name != *name));
-        buses.push(Bus { name: free.unwrap_or_default(), chain, taken: Vec::new(), named: false });
+        let name = free.unwrap_or_default();
+        buses.push(Bus { name, chain, line: cell.line, taken: Vec::new(), named: false });
         Ok(buses.len() - 1)
     }
 

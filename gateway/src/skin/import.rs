@@ -6,7 +6,7 @@ use clap::Args;
 use protocol::document;
 use protocol::id::CellId;
 use protocol::usage::{Failure, print};
-use robots::{CellOnLink, Chain, Import as Described, Urdf};
+use robots::{CellOnLink, Chain, Import as Described, ImportError, Urdf};
 
 use super::super::columns::{Columns, Table};
 use super::super::output::{Force, apart, note};
@@ -86,9 +86,9 @@ impl Import {
             chains: &chains,
             cells: &cells,
         };
-        let wrong = |error: robots::ImportError| match &self.cells {
-            Some(path) => Failure::usage(format!("{}: {error}", path.display())),
-            None => Failure::usage(format!("{file}: {error}")),
+        let wrong = |error: ImportError| match &self.cells {
+            Some(path) if error.is_of_cells() => Failure::usage(format!("{}: {error}", path.display())),
+            Some(_) | None => Failure::usage(format!("{file}: {error}")),
         };
         let skin = import.toml().map_err(wrong)?;
         match &self.output {

@@ -1,6 +1,6 @@
 //! What is refused, and in which words.
 
-use robots::{Chain, Urdf};
+use robots::{CellOnLink, Chain, Import, Urdf};
 
 use crate::written::{Written, robot, wrap};
 
@@ -213,4 +213,31 @@ fn chains_that_are_too_long() {
     );
     assert_eq!(good(&reaching(0.8), "l3").rows.len(), 3);
     assert_eq!(good(&reaching(0.74), "l4").rows.len(), 3);
+}
+
+#[test]
+fn what_the_skins_check_refuses_has_the_line_of_its_cell() {
+    let urdf = Urdf::parse("t.urdf", &robot(&[Written::hinge([0.0, 0.0, 0.1], [0.0; 3])])).unwrap();
+    let chains = [urdf.chain(None, "l1").unwrap()];
+    let refused = |cells: &[CellOnLink]| {
+        let import = Import { name: "t", command: "", urdf: None, chains: &chains, cells };
+        let error = import.toml().unwrap_err();
+        assert!(error.is_of_cells());
+        error.to_string()
+    };
+    let cell = |line: usize, bus: Option<String>, node: Option<u8>| CellOnLink {
+        link: "l1".to_owned(),
+        normal: [0.0, 0.0, 1.0],
+        bus,
+        node,
+        line,
+        ..CellOnLink::default()
+    };
+    let nodes = [cell(2, None, Some(1)), cell(5, None, Some(255))];
+    assert_eq!(
+        refused(&nodes),
+        "line 5: node = 255: a cell's node is 1 to 254; further cells need another bus"
+    );
+    let buses: Vec<_> = (2..67).map(|line| cell(line, Some(format!("b{line}")), None)).collect();
+    assert_eq!(refused(&buses), "bus = 65 buses: a skin has at most 64 buses");
 }
