@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::{ArgGroup, Args};
 use model::central::Central;
+use model::scenario::MAX_FORCE_N;
 use protocol::document;
 use protocol::fixed::{Q1_14, is_saturated};
 use protocol::parameters::MAX_JOINTS;
@@ -25,7 +26,8 @@ const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: 
 /// Compute the torques of a force on a cell: centrally, and as the cell's fixed-point code does
 ///
 /// The central computation is that of the run's comparison, in double precision with the numbers of the skin's file. The
-/// cell's is the code that a cell runs, on the words of its parameters and of the joints' positions.
+/// cell's is the code that a cell runs, on the words of its parameters and of the joints' positions. Positions are within
+/// the limits that the skin gives its joints, those of continuous joints too.
 #[derive(Args, Debug)]
 #[command(group = ArgGroup::new("what").required(true).args(["cell", "batch"]),
     after_help = "ROWS.csv has a line for each row, positions with spaces between them:
@@ -42,10 +44,10 @@ pub(crate) struct Torque {
     /// The cell: its node id, or BUS:NODE
     #[arg(long, value_name = "CELL", value_parser = cell, requires_all = ["force", "joints"])]
     cell: Option<Named>,
-    /// The force against its outward normal in N
+    /// The force against its outward normal in N, 0 to 95.997: the range of three contact words
     #[arg(long, value_name = "N", requires = "cell", allow_negative_numbers = true)]
     force: Option<f64>,
-    /// The positions of its chain's joints, rad or m, with spaces between them
+    /// The positions of its chain's joints within their limits, rad or m, with spaces between them
     #[arg(long, value_name = "POSITIONS", requires = "cell", allow_hyphen_values = true)]
     joints: Option<String>,
     /// Many rows from a file
@@ -130,9 +132,10 @@ impl<'a> Calculator<'a> {
         let skin = self.skin;
         let Some(cell) = skin.cells.get(index) else { return Err("no such cell".to_owned()) };
         let joints: Vec<_> = skin.joints_of(cell.bus).map(|(_, joint)| joint).collect();
-        if !(force.is_finite() && force >= 0.0) {
+        if !(0.0..=MAX_FORCE_N).contains(&force) {
             return Err(format!(
-                "force {force} N: a force presses against the outward normal, with 0 N or more"
+                "force {force} N: a force presses against the outward normal with 0 to {MAX_FORCE_N:.3} N, the range of \
+                 three contact words"
             ));
         }
         let given: Vec<&str> = positions.split([' ', ',']).filter(|text| !text.is_empty()).collect();
@@ -152,6 +155,13 @@ impl<'a> Calculator<'a> {
                     joint.kind.unit()
                 ));
             };
+            let ([min, max], unit) = (joint.limits, joint.kind.unit());
+            if !(min..=max).contains(&position) {
+                return Err(format!(
+                    "position {text} {unit}: {} may go from {min:.4} to {max:.4} {unit}",
+                    joint.name
+                ));
+            }
             q.push(position);
             *word = nearest;
         }

@@ -409,6 +409,11 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         ("--cell 1 --force 1 --joints 0", "one is needed for each of the chain's 2 joints, shoulder, elbow"),
         ("--cell 1 --force 1 --joints 0,x", "position \"x\" of elbow: a number in rad is needed"),
         ("--cell 1 --force -1 --joints 0,0.5", "force -1 N: a force presses against the outward normal"),
+        ("--cell 1 --force 95.998 --joints 0,0.5", "gateway: --cell 1: force 95.998 N: "),
+        (
+            "--cell vcan0:1 --force 1 --joints -1.1,0.5",
+            "gateway: --cell vcan0:1: position -1.1 rad: shoulder may go from -1.0000 to 2.0000 rad",
+        ),
         ("--cell 1 --joints 0,0.5", "--force"),
         ("--cell 1 --force 1 --joints 0,0.5 --batch rows.csv", "cannot be used with"),
         ("--batch nowhere.csv", "nowhere.csv: No such file"),
@@ -435,8 +440,31 @@ fn torques_of_a_force_are_computed_in_both_ways() {
             "gateway: rows.csv: line 2: force_n = \"x\": a finite number is needed",
         ),
         ("1,1,0 0.5\n2,1,0 0.5\n", "and it is \"1,1,0 0.5\": write the header above it"),
+        (
+            "cell,force_n,q\n1,1,0 0.5\nvcan0:2,96,0 0.5\n",
+            "gateway: rows.csv, row 2: cell vcan0:2: force 96 N: a force presses against the outward normal with 0 to \
+             95.997 N, the range of three contact words",
+        ),
+        (
+            "cell,force_n,q\n2,1,0 0.4\n",
+            "gateway: rows.csv, row 1: cell 2: position 0.4 rad: elbow may go from 0.5000 to 1.5000 rad",
+        ),
     ] {
         place.write("rows.csv", text);
         refused(&place, "torque skin.toml --batch rows.csv", expected);
+    }
+
+    // The ends of what is possible; of a joint that turns without end, half a turn each way.
+    place.write("rows.csv", "# ends\ncell,force_n,q\n1,0,-1 0.5\n1,95.9970703125,2 1.5\n");
+    run(&place, "torque skin.toml --batch rows.csv").well();
+    let endless = ARM.replacen("revolute", "continuous", 1).replacen("revolute", "prismatic", 1);
+    place.write("arm.urdf", &endless.replace("\"0.5\" upper=\"1.5\"", "\"0\" upper=\"0.5\""));
+    run(&place, "skin import arm.urdf --tip bare -o skin.toml --force").well();
+    run(&place, "torque skin.toml --cell 1 --force 1 --joints -3.14159,0.5").well();
+    for (joints, expected) in [
+        ("3.15,0", "position 3.15 rad: shoulder may go from -3.1416 to 3.1416 rad"),
+        ("0,0.6", "position 0.6 m: elbow may go from 0.0000 to 0.5000 m"),
+    ] {
+        refused(&place, &format!("torque skin.toml --cell 1 --force 1 --joints {joints}"), expected);
     }
 }

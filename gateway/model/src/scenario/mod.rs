@@ -17,7 +17,7 @@ use protocol::fixed::{Q1_14, Q9_6};
 use protocol::skin::{KEYS, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::{Micros, Span};
 
-pub use touches::{Stimulus, Touches, contact_words};
+pub use touches::{MAX_FORCE_N, Stimulus, Touches, contact_words};
 
 /// How long a run takes in which nothing happens, unless it is told.
 pub const IDLE: Span = Span::from_millis(10_000);

@@ -214,7 +214,7 @@ impl Touch {
 }
 
 /// The maximum force of three contact words together, in N.
-pub(super) const MAX_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
+pub const MAX_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
 
 /// The three contact words of a force in N, as equal as they can be: they add up exactly to the force
 /// rounded to a word's step. Outside of their range they saturate.
