@@ -1,5 +1,6 @@
 //! `gateway torque`.
 
+use core::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 
 use clap::{ArgGroup, Args};
@@ -8,7 +9,7 @@ use model::scenario::MAX_FORCE_N;
 use protocol::document;
 use protocol::fixed::{Q1_14, is_saturated};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::Skin;
+use protocol::skin::{JointKind, Skin};
 use protocol::usage::{Failure, print};
 use reference::Reference;
 use serde::Serialize;
@@ -26,8 +27,8 @@ const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: 
 /// Compute the torques of a force on a cell: centrally, and as the cell's fixed-point code does
 ///
 /// The central computation is that of the run's comparison, in double precision with the numbers of the skin's file. The
-/// cell's is the code that a cell runs, on the words of its parameters and of the joints' positions. Positions are within
-/// the limits that the skin gives its joints, those of continuous joints too.
+/// cell's is the code that a cell runs, on the words of its parameters and of the joints' positions. Positions of sliding
+/// joints are within their limits, angles within a turn each way or their limits, if those are wider.
 #[derive(Args, Debug)]
 #[command(group = ArgGroup::new("what").required(true).args(["cell", "batch"]),
     after_help = "ROWS.csv has a line for each row, positions with spaces between them:
@@ -47,7 +48,7 @@ pub(crate) struct Torque {
     /// The force against its outward normal in N, 0 to 95.997: the range of three contact words
     #[arg(long, value_name = "N", requires = "cell", allow_negative_numbers = true)]
     force: Option<f64>,
-    /// The positions of its chain's joints within their limits, rad or m, with spaces between them
+    /// The positions of its chain's joints, rad or m, with spaces between them
     #[arg(long, value_name = "POSITIONS", requires = "cell", allow_hyphen_values = true)]
     joints: Option<String>,
     /// Many rows from a file
@@ -156,9 +157,14 @@ impl<'a> Calculator<'a> {
                 ));
             };
             let ([min, max], unit) = (joint.limits, joint.kind.unit());
+            // Angles beyond the limits mean something all the same, but degrees do not.
+            let [min, max] = match joint.kind {
+                JointKind::Prismatic => [min, max],
+                JointKind::Revolute => [min.min(-TAU), max.max(TAU)],
+            };
             if !(min..=max).contains(&position) {
                 return Err(format!(
-                    "position {text} {unit}: {} may go from {min:.4} to {max:.4} {unit}",
+                    "position {text} {unit}: {} takes {min:.4} to {max:.4} {unit}",
                     joint.name
                 ));
             }

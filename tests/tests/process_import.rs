@@ -411,8 +411,8 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         ("--cell 1 --force -1 --joints 0,0.5", "force -1 N: a force presses against the outward normal"),
         ("--cell 1 --force 95.998 --joints 0,0.5", "gateway: --cell 1: force 95.998 N: "),
         (
-            "--cell vcan0:1 --force 1 --joints -1.1,0.5",
-            "gateway: --cell vcan0:1: position -1.1 rad: shoulder may go from -1.0000 to 2.0000 rad",
+            "--cell vcan0:1 --force 1 --joints 45,0.5",
+            "gateway: --cell vcan0:1: position 45 rad: shoulder takes -6.2832 to 6.2832 rad",
         ),
         ("--cell 1 --joints 0,0.5", "--force"),
         ("--cell 1 --force 1 --joints 0,0.5 --batch rows.csv", "cannot be used with"),
@@ -446,24 +446,24 @@ fn torques_of_a_force_are_computed_in_both_ways() {
              95.997 N, the range of three contact words",
         ),
         (
-            "cell,force_n,q\n2,1,0 0.4\n",
-            "gateway: rows.csv, row 1: cell 2: position 0.4 rad: elbow may go from 0.5000 to 1.5000 rad",
+            "cell,force_n,q\n2,1,0 -6.3\n",
+            "gateway: rows.csv, row 1: cell 2: position -6.3 rad: elbow takes -6.2832 to 6.2832 rad",
         ),
     ] {
         place.write("rows.csv", text);
         refused(&place, "torque skin.toml --batch rows.csv", expected);
     }
 
-    // The ends of what is possible; of a joint that turns without end, half a turn each way.
-    place.write("rows.csv", "# ends\ncell,force_n,q\n1,0,-1 0.5\n1,95.9970703125,2 1.5\n");
+    // The ends of what is possible.
+    place.write("rows.csv", "# ends\ncell,force_n,q\n1,0,-6.28 0.5\n1,95.9970703125,2 6.28\n");
     run(&place, "torque skin.toml --batch rows.csv").well();
     let endless = ARM.replacen("revolute", "continuous", 1).replacen("revolute", "prismatic", 1);
     place.write("arm.urdf", &endless.replace("\"0.5\" upper=\"1.5\"", "\"0\" upper=\"0.5\""));
     run(&place, "skin import arm.urdf --tip bare -o skin.toml --force").well();
     run(&place, "torque skin.toml --cell 1 --force 1 --joints -3.14159,0.5").well();
     for (joints, expected) in [
-        ("3.15,0", "position 3.15 rad: shoulder may go from -3.1416 to 3.1416 rad"),
-        ("0,0.6", "position 0.6 m: elbow may go from 0.0000 to 0.5000 m"),
+        ("-6.3,0", "position -6.3 rad: shoulder takes -6.2832 to 6.2832 rad"),
+        ("0,0.6", "position 0.6 m: elbow takes 0.0000 to 0.5000 m"),
     ] {
         refused(&place, &format!("torque skin.toml --cell 1 --force 1 --joints {joints}"), expected);
     }
