@@ -13,7 +13,7 @@ const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), camera = new Camera();
 let picture = null, scene = null, plots = null, snapshot = null, all = null, chosen = -1, pressed = -1, due = false;
 // For whoever looks from outside.
-window.skinbus = { frames: 0, snapshots: 0, get chosen() { return chosen; }, where };
+window.skinbus = { frames: 0, snapshots: 0, where, joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
 
 function message(text) {
   $("message").textContent = text;

@@ -160,7 +160,7 @@ impl Topics {
             let (force, proximity) = sensors.map_or((f32::NAN, f32::NAN), |sensors| {
                 (central.force(cell, &sensors) as f32, sensors.proximity.to_f64() as f32)
             });
-            ContactState { node, force, proximity, status: number(status) }
+            ContactState { node, force, proximity, status: status.number() }
         }));
         let nanos = touched.at_nanos;
         let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells };
@@ -189,16 +189,6 @@ fn message<'a>(interface: &'a str, seen: &Seen) -> Record<'a> {
     let time = Timestamp { nanos: seen.at_nanos, nine_digits: true };
     let direction = Some(if seen.own { Direction::Sent } else { Direction::Received });
     Record { time, interface, frame: seen.frame, direction }
-}
-
-const fn number(status: Status) -> u8 {
-    match status {
-        Status::Unknown => 0,
-        Status::Quiet => 1,
-        Status::Active => 2,
-        Status::Stale => 3,
-        Status::Dead => 4,
-    }
 }
 
 fn timing(nanos: u64, timed: &Timed) -> LoopTiming {

@@ -43,6 +43,12 @@ impl Status {
             Self::Dead => "dead",
         }
     }
+
+    /// The number that recordings and snapshots use.
+    #[must_use]
+    pub const fn number(self) -> u8 {
+        self as u8
+    }
 }
 
 /// What a cell has sent since it was requested.

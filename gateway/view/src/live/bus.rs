@@ -205,7 +205,7 @@ impl LiveBus {
             let [f0, f1, ..] = force.to_le_bytes();
             let [p0, p1, ..] = proximity.to_le_bytes();
             let [t0, t1, ..] = warmth.to_le_bytes();
-            [number(status), flags, f0, f1, p0, p1, t0, t1]
+            [status.number(), flags, f0, f1, p0, p1, t0, t1]
         });
         bytes.collect()
     }
@@ -215,15 +215,4 @@ impl LiveBus {
 #[expect(clippy::cast_possible_truncation, reason = "within 17 bits")]
 fn whole(value: f64, min: f64, max: f64) -> i32 {
     value.round().clamp(min, max) as i32
-}
-
-/// The number of a status in a snapshot.
-const fn number(status: Status) -> u8 {
-    match status {
-        Status::Unknown => 0,
-        Status::Quiet => 1,
-        Status::Active => 2,
-        Status::Stale => 3,
-        Status::Dead => 4,
-    }
 }
