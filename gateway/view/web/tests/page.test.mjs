@@ -1,0 +1,121 @@
+// The page's modules without a browser: node --test gateway/view/web/tests/
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { Camera } from "../camera.js";
+import { SHAPES, ramp, shapeOf } from "../colours.js";
+import { decode } from "../link.js";
+import { cross, dot, look, perspective, point, project, row, times, unit } from "../math.js";
+import { cylinders, extent, frames, triangles } from "../robot.js";
+import { pick } from "../touch.js";
+import { number } from "../plots.js";
+
+const close = (a, b, within = 1e-9) => a.forEach((v, i) => assert.ok(Math.abs(v - b[i]) < within, `${a} ${b}`));
+const IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
+
+// A UR5: a, alpha, d of each row, as its maker publishes them.
+const UR5 = [[0, Math.PI / 2, 0.089159], [-0.425, 0, 0], [-0.39225, 0, 0], [0, Math.PI / 2, 0.10915], [0, -Math.PI / 2, 0.09465], [0, 0, 0.0823]];
+const scene = (cells = [], tubes = []) => ({
+  joints: UR5.map((_, i) => ({ name: `joint${i + 1}`, unit: "rad", torque_unit: "Nm" })),
+  chains: [{ name: "chain", base: IDENTITY, rows: UR5.map(([a, alpha, d], joint) => ({ joint, slides: false, a, alpha, d, theta: 0 })) }],
+  buses: [{ name: "vcan0", chain: 0 }], cells, tubes, pitch: 0.028, may_press: true,
+});
+const cell = (row, position, normal) => ({ bus: 0, node: 1, row, joint: row, position, normal, neighbors: [], root: false });
+
+test("the tool of a UR5 is where its maker's table puts it", () => {
+  const tip = (q) => point(frames(scene(), q)[0][6], [0, 0, 0]);
+  close(tip([0, 0, 0, 0, 0, 0]), [-0.81725, -0.19145, -0.005491], 1e-6);
+  // The base turned by a quarter turn, and by a whole one.
+  close(tip([Math.PI / 2, 0, 0, 0, 0, 0]), [0.19145, -0.81725, -0.005491], 1e-6);
+  close(tip([2 * Math.PI, 0, 0, 0, 0, 0]), tip([0, 0, 0, 0, 0, 0]), 1e-9);
+});
+
+test("a joint that slides moves along its axis, a fixed row does not move, and a base counts", () => {
+  const base = times(IDENTITY, [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 5, 0, 0, 1]);
+  const rows = [{ joint: 0, slides: true, a: 0, alpha: 0, d: 0.3, theta: 0 }, { joint: null, slides: false, a: 0.1, alpha: 0, d: 0, theta: 0 }];
+  const all = frames({ chains: [{ base, rows }] }, [0.2]);
+  close(point(all[0][2], [0, 0, 0]), [5, 0.1, 0.5]);
+});
+
+test("links are cylinders with normals that point outward", () => {
+  const all = cylinders(scene());
+  assert.ok(all.length >= 8 && all.every((it) => it.radius > 0 && it.radius < 0.11));
+  const flat = triangles({ from: [0, 0, 0], to: [0, 0, 1], radius: 0.5 });
+  for (let k = 0; k < flat.length; k += 18) {
+    const [a, b, c] = [0, 6, 12].map((at) => flat.slice(k + at, k + at + 3));
+    const facing = cross([0, 1, 2].map((i) => b[i] - a[i]), [0, 1, 2].map((i) => c[i] - a[i]));
+    assert.ok(dot(facing, flat.slice(k + 3, k + 6)) > 0, "the corners turn left, seen from outside");
+  }
+});
+
+test("a link beside the line of its table is drawn where its cells are", () => {
+  const tube = { chain: 0, row: 2, ends: [[0.4, 0, 0.14], [0.02, 0, 0.14]], radius: 0.07 };
+  const at = cylinders(scene([], [tube])).filter((it) => it.row === 2);
+  assert.ok(at.some((it) => Math.abs(it.from[2] - 0.14) < 1e-9 && Math.abs(it.to[2] - 0.14) < 1e-9));
+});
+
+test("a snapshot is read as the server writes it", () => {
+  const data = new DataView(new ArrayBuffer(24 + 12 * 2 + 8));
+  [7, 2, 1].forEach((v, i) => data.setUint32(4 * i, v, true));
+  data.setFloat64(16, 1.5, true);
+  [0.5, 1, 2, -0.5, -1, -2].forEach((v, i) => data.setFloat32(24 + 4 * i, v, true));
+  [4, 16].forEach((v, i) => data.setUint8(48 + i, v));
+  data.setUint16(50, 6000, true);
+  data.setUint16(52, 16384, true);
+  data.setInt16(54, -150, true);
+  assert.deepEqual(decode(data.buffer), {
+    number: 7, time: 1.5, joints: [{ position: 0.5, distributed: 1, central: 2 }, { position: -0.5, distributed: -1, central: -2 }],
+    cells: [{ status: 4, flags: 16, force: 6000, proximity: 16384, temperature: -150 }],
+  });
+  assert.throws(() => decode(data.buffer.slice(0, 50)));
+});
+
+test("a cell's shape says the worst about it, and each shape is another", () => {
+  const of = (status, flags) => shapeOf({ status, flags }).name;
+  assert.equal(of(2, 0), "in order");
+  assert.equal(of(4, 3), "silent");
+  assert.equal(of(0, 0), "never heard");
+  assert.equal(of(1, 1 | 2), "no parameters");
+  assert.equal(of(1, 2 | 8), "other parameters");
+  assert.equal(of(3, 8), "stale: no answer");
+  assert.equal(of(1, 8 | 16), "halted");
+  assert.equal(new Set(SHAPES.map((it) => it.shape)).size, SHAPES.length);
+});
+
+test("colours grow lighter with the value, and values beyond the range have its ends", () => {
+  const light = (share) => { const [r, g, b] = ramp(share); return 0.3 * r + 0.6 * g + 0.1 * b; };
+  for (let share = 0.05; share <= 1; share += 0.05) assert.ok(light(share) > light(share - 0.05));
+  assert.deepEqual([ramp(-1), ramp(9)], [ramp(0), ramp(1)]);
+});
+
+test("the nearest cell that faces the eye is picked", () => {
+  const cells = [cell(1, [0, 0, 0.1], [0, 0, 1]), cell(1, [0, 0, 0.3], [0, 0, 1]), cell(1, [0, 0, 0.5], [0, 0, -1])];
+  const it = { ...scene(cells), chains: [{ base: IDENTITY, rows: [{ joint: null, slides: false, a: 0, alpha: 0, d: 0, theta: 0 }] }] };
+  const all = frames(it, []), eye = [0.001, 0, 2];
+  const view = times(perspective(2, 1, 0.05, 20), look(eye, [0, 0, 0]));
+  const camera = { eye: () => eye };
+  assert.equal(pick(it, all, camera, view, 400, 400, 200, 200), 1);
+  assert.equal(pick(it, all, camera, view, 400, 400, 20, 20), -1);
+  assert.equal(project(view, [0, 0, 3], 400, 400), null, "behind the eye");
+});
+
+test("the camera shows all of the robot until somebody moves it", () => {
+  const it = scene(), all = frames(it, [0.3, -1.2, 1, -1.4, -1.5, 0.2]), camera = new Camera();
+  const { middle, size } = extent(it, all);
+  camera.fit({ middle, size });
+  for (const m of all[0]) {
+    for (const [w, h] of [[1000, 800], [390, 500]]) {
+      const [x, y] = project(camera.matrix(w, h), point(m, [0, 0, 0]), w, h);
+      assert.ok(x > 0 && x < w && y > 0 && y < h, `${x} ${y}`);
+    }
+  }
+  camera.turn(10, 10);
+  camera.fit({ middle: [9, 9, 9], size: 1 });
+  assert.deepEqual(camera.middle, middle);
+});
+
+test("numbers are short", () => {
+  assert.deepEqual([0, 0.12345, -1.5, 12.34, -250.4].map(number), ["0.0000", "0.1235", "−1.50", "12.3", "−250"]);
+  close(unit([0, 3, 4]), [0, 0.6, 0.8]);
+  close(row(1, 0, 2, 0).slice(12), [1, 0, 2, 1]);
+});

@@ -1,0 +1,106 @@
+//! The page of `gateway run --view` in a real browser: a click presses a cell, and the arm gives way.
+//!
+//! `tests/tools/install` makes the browser ready; `tests/tools/run` does that, and then runs this.
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::print_stdout,
+    clippy::wildcard_enum_match_arm,
+    reason = "a test may stop, and its figures are what it is about"
+)]
+
+#[path = "process/browser.rs"]
+mod browser;
+mod process;
+
+use browser::Browser;
+use process::Place;
+use process::log::Log;
+use protocol::can::Format;
+use protocol::message::{Message, SensorPage};
+
+const QUIET: &str = "version = 1\nduration_s = 60.0\n\n[motion]\nkind = \"kinesthetic\"\n\
+                     start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
+
+/// The text of an element.
+fn text(browser: &mut Browser, id: &str) -> String {
+    browser.value(&format!("document.getElementById('{id}').textContent")).as_str().unwrap().to_owned()
+}
+
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
+    let place = Place::new();
+    place.skin(24);
+    place.scenario(QUIET);
+    let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --view --candump run.log";
+    let run = place.start("gateway", words);
+    run.hears("view: http://");
+    let said = run.stderr();
+    let url = said.split("view: ").nth(1).unwrap().split_whitespace().next().unwrap().to_owned();
+    let mut browser = Browser::new(1400, 900);
+    browser.scheme("light");
+    browser.open(&url);
+    browser.until("window.skinbus && window.skinbus.frames > 3");
+    browser.until("document.getElementById('facts').textContent.includes('Cells24')");
+
+    // A cell that is seen from its front.
+    let found = browser.until(
+        "(() => { for (let i = 0; i < 24; i++) { const at = window.skinbus.where(i); if (at) return [i, ...at]; } return null; })()",
+    );
+    let number = |value: &serde_json::Value| value.as_f64().unwrap();
+    let stage = browser.value("(() => { const b = document.getElementById('picture').getBoundingClientRect(); return [b.x, b.y]; })()");
+    let at = [number(&stage[0]) + number(&found[1]), number(&stage[1]) + number(&found[2])];
+    let before = browser.value("window.skinbus.joints()");
+    browser.mouse("mousePressed", at);
+    browser.until("document.getElementById('facts').textContent.includes('In contact1')");
+    browser.until("document.getElementById('cell').textContent.includes('Torque of epoch')");
+    assert!(text(&mut browser, "cell").contains("active"));
+    let moved = format!("window.skinbus.joints().some((q, i) => Math.abs(q - {before}[i]) > 0.01)");
+    browser.until(&moved);
+    browser.mouse("mouseReleased", at);
+    browser.until("document.getElementById('facts').textContent.includes('In contact0')");
+
+    // The same with the keyboard, on the next cell.
+    browser.key("keyDown", "n");
+    browser.key("keyDown", " ");
+    browser.until("document.getElementById('facts').textContent.includes('In contact1')");
+    browser.key("keyUp", " ");
+    browser.until("document.getElementById('facts').textContent.includes('In contact0')");
+
+    for (width, scheme) in [(1400, "dark"), (390, "light"), (390, "dark")] {
+        browser.resize(width, 844);
+        browser.scheme(scheme);
+        browser.until(&format!("document.documentElement.scrollWidth <= {width}"));
+    }
+    let host = url.trim_end_matches('/').to_owned();
+    let outside: Vec<_> = browser
+        .requests()
+        .into_iter()
+        .filter(|it| !it.starts_with(&host) && !it.starts_with("data:"))
+        .collect();
+    assert_eq!(outside, Vec::<&str>::new(), "the page asks for nothing outside");
+    assert_eq!(browser.complaints(), Vec::<&serde_json::Value>::new());
+    drop(browser);
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+
+    // On the bus the first torque follows the first stimulus within three epochs.
+    let log = Log::read(&place.read("run.log"), Format::Fd);
+    let node = u8::try_from(found[0].as_u64().unwrap()).unwrap() + 1;
+    let (mut pressed, mut epochs, mut answered) = (false, 0, false);
+    for (message, _) in &log.messages {
+        match message {
+            Message::Stimulus { page: SensorPage::Skin(_), .. } => pressed = true,
+            Message::Joints { .. } if pressed && !answered => epochs += 1,
+            Message::Torque { from, torque, .. } if from.get() == node && !torque.is_zero() => {
+                answered = true
+            }
+            _ => {}
+        }
+    }
+    println!("the torque came {epochs} epochs after the stimulus");
+    assert!(answered && epochs <= 3, "{epochs} epochs");
+    place.is_left_clean();
+}
