@@ -17,6 +17,8 @@ impl Draft<'_> {
         let pairs = motion.distributed.iter().zip(&motion.central).enumerate();
         let figures = pairs.map(|(joint, (distributed, central))| {
             let name = self.joint(joint);
+            let name =
+                name.strip_prefix("joint ").map_or_else(|| name.clone(), |number| format!("Joint {number}"));
             let title = format!("{name}: sum of the cells' torques, and the central computation");
             let axis = match self.run.skin.robot.joints.get(joint).map(|joint| joint.kind) {
                 Some(kind @ JointKind::Prismatic) => Axis::new("force", kind.torque_unit()),
