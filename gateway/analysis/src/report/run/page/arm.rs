@@ -90,10 +90,13 @@ impl Draft<'_> {
         let joints = single.enumerate().map(|(joint, (single, whole))| row(self.joint(joint), single, whole));
         let all = row("all".to_owned(), &accuracy.single, &accuracy.whole);
         let [single, whole] = [paper::SINGLE_NM, paper::SUMMED_NM].map(number);
+        let slides = skin.robot.joints.iter().any(|joint| joint.kind == JointKind::Prismatic);
+        let slides = if slides { " (N where the joint slides)" } else { "" };
         let papers = ["paper", &single, "", "", &whole, "", ""].map(str::to_owned).into();
         Some(Table::new(
-            "Absolute errors in Nm (N where the joint slides), joint by joint: single cells where the joint carries them, and the \
-             whole skin's sum",
+            format!(
+                "Absolute errors in Nm{slides}, joint by joint: single cells where the joint carries them, and the whole skin's sum"
+            ),
             ["", "single cells: mean", "max", "torques", "whole skin: mean", "max", "epochs"],
             joints.chain([all, papers]),
         ))
