@@ -146,7 +146,11 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
     ] {
         let quantile = |name: &str| number(summary.figure(&format!("/loop/{key}/{name}")));
         let expected = ["p50", "p90", "p99", "max"].map(quantile);
-        assert_eq!(row(control, name)[..4], expected, "{key}");
+        for (shown, expected) in row(control, name)[..4].iter().zip(&expected) {
+            // Of three digits the last one may be rounded either way: 2.385 is between two.
+            let [shown, expected] = [shown, expected].map(|text| text.parse::<f64>().unwrap());
+            assert!((shown - expected).abs() <= 0.01 * expected, "{key}: {shown} {expected}");
+        }
         assert_eq!(row(control, name)[4], counted(&format!("/loop/{key}/count")));
     }
     let losses = page.sections.iter().find(|section| section.name == "losses").unwrap();
