@@ -28,8 +28,13 @@ try {
 
 const view = () => camera.matrix(canvas.clientWidth, canvas.clientHeight);
 
+// As long as a picture took, there is none after it: where it is drawn in software, a bench on the same machine needs the
+// processor too.
+let cost = 0, drawn = 0;
 function redraw() {
-  if (!due) { due = true; requestAnimationFrame(draw); }
+  if (due) return;
+  due = true;
+  setTimeout(() => requestAnimationFrame(draw), Math.max(0, drawn + 2 * cost - performance.now()));
 }
 
 function draw() {
@@ -41,6 +46,8 @@ function draw() {
   }
   plots.draw();
   window.skinbus.frames++;
+  drawn = performance.now();
+  requestAnimationFrame(() => { cost = Math.min(500, performance.now() - drawn); });
 }
 
 const name = (i) => (i < 0 ? "" : `${scene.buses[scene.cells[i].bus].name}:${scene.cells[i].node}`);
