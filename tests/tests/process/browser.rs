@@ -21,7 +21,7 @@ use crate::process::TIMEOUT;
 
 /// A page in a browser of its own.
 pub(crate) struct Browser {
-    child: Child,
+    _process: Process,
     _profile: TempDir,
     socket: WebSocket<TcpStream>,
     number: u64,
@@ -29,10 +29,13 @@ pub(crate) struct Browser {
     pub(crate) events: Vec<Value>,
 }
 
-impl Drop for Browser {
+/// The browser's process, which ends with this.
+struct Process(Child);
+
+impl Drop for Process {
     fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        let _ = self.0.kill();
+        let _ = self.0.wait();
     }
 }
 
@@ -56,14 +59,18 @@ impl Browser {
             .stderr(Stdio::piped())
             .spawn()
             .expect("chromium is missing: tests/tools/install makes it ready");
-        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
+        let stderr = child.stderr.take().unwrap();
+        // From here on it ends, whatever fails.
+        let process = Process(child);
+        let mut lines = BufReader::new(stderr).lines();
         let said = lines
             .find_map(|line| line.unwrap().strip_prefix("DevTools listening on ws://").map(str::to_owned));
         // Whatever it says later must not fill the pipe.
         std::thread::spawn(move || lines.for_each(drop));
         let address = said.expect("the browser ended").split('/').next().unwrap().to_owned();
         let socket = connect(&page(&address));
-        let mut browser = Self { child, _profile: profile, socket, number: 0, events: Vec::new() };
+        let mut browser =
+            Self { _process: process, _profile: profile, socket, number: 0, events: Vec::new() };
         for domain in ["Runtime", "Log", "Network", "Page"] {
             browser.call(&format!("{domain}.enable"), &json!({}));
         }
