@@ -6,9 +6,10 @@ mod table;
 use std::io::{self, BufWriter, IsTerminal, Write};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use analysis::stats::Report;
+use bench::listen::now;
 use clap::Args;
 use model::decode::pick::{self, Pick, Selector};
 use protocol::bus::Options;
@@ -17,7 +18,6 @@ use protocol::candump::{Record, Timestamp};
 use protocol::id::Node;
 use protocol::skin::Skin;
 use protocol::stop::{self, Stoppable};
-use protocol::time::Micros;
 use protocol::usage::{Failure, print, written};
 use serde::Serialize;
 use trace::capture::{Entry, Extras, NoteKind, Reader, Topic};
@@ -248,12 +248,6 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> R
 
 /// How often waiting first segments are checked for their timeout.
 const SETTLE: Duration = Duration::from_millis(20);
-
-/// The time, on the clock of received frames.
-fn now() -> Micros {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-    Micros(u64::try_from(since.as_micros()).unwrap_or(u64::MAX))
-}
 
 /// Shows a bus until a signal, or until it is closed.
 fn live(

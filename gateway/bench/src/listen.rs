@@ -8,6 +8,8 @@ use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::time::Micros;
 
+use crate::run::realtime::wall;
+
 /// Opens a bus for frames of this format; with `None` for FD frames, or for classic frames alone where its interface
 /// takes no others.
 ///
@@ -21,6 +23,12 @@ pub fn open(name: &str, kind: Choice, format: Option<Format>, options: Options) 
         }
         opened => opened,
     }
+}
+
+/// The time, on the clock of received frames.
+#[must_use]
+pub fn now() -> Micros {
+    Micros(wall() / 1_000)
 }
 
 /// Sends one packet in frames of this format.

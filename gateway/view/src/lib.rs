@@ -19,5 +19,12 @@ pub mod serve;
 pub mod server;
 mod web;
 
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
 pub use live::Live;
 pub use scene::Scene;
+
+/// What a mutex holds, also after a thread that held it has panicked.
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}

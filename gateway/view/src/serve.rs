@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
-use bench::listen::{open, send};
+use bench::listen::{now, open, send};
 use protocol::bus::{self, Bus, BusError, Inbox, Kinds};
 use protocol::can::Format;
 use protocol::id::Node;
@@ -17,6 +17,7 @@ use protocol::time::Micros;
 
 use crate::command::Command;
 use crate::live::Live;
+use crate::locked;
 use crate::pressed::Pressed;
 use crate::scene::Scene;
 use crate::server::{Access, Counts, Server};
@@ -69,10 +70,6 @@ struct Shared {
     name: String,
     format: Format,
     bus: Mutex<Option<Arc<Bus>>>,
-}
-
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Shows a skin until `stop`. `says` is told the page's address once it is served.
@@ -160,12 +157,6 @@ fn receive(
             }
         }
     }
-}
-
-/// The time, on the clock of received frames.
-fn now() -> Micros {
-    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-    Micros(u64::try_from(since.as_micros()).unwrap_or(u64::MAX))
 }
 
 /// Snapshots for the pages, and their commands for the buses.

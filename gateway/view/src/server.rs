@@ -11,11 +11,14 @@ use std::io;
 use std::net::{SocketAddr, TcpListener};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
+use tungstenite::{Bytes, Utf8Bytes};
+
 use crate::command::Command;
+use crate::locked;
 
 /// Clients at the same time.
 const CLIENTS: usize = 16;
@@ -47,11 +50,11 @@ pub struct Counts {
 /// The newest of everything.
 #[derive(Debug, Default)]
 struct Newest {
-    snapshot: Arc<Vec<u8>>,
+    snapshot: Bytes,
     number: u64,
     /// For pages without a chosen cell, and for those with one.
-    said: Arc<str>,
-    own: BTreeMap<u64, Arc<str>>,
+    said: Utf8Bytes,
+    own: BTreeMap<u64, Utf8Bytes>,
     said_number: u64,
 }
 
@@ -79,10 +82,6 @@ pub struct Server {
     shared: Arc<Shared>,
     commands: Receiver<(u64, Command)>,
     address: SocketAddr,
-}
-
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 impl Server {
@@ -129,10 +128,9 @@ impl Server {
 
     /// A new snapshot, and now and then what is said beside it: for pages without a chosen cell, and for the others.
     pub fn publish(&self, snapshot: Vec<u8>, said: Option<(String, BTreeMap<u64, String>)>) {
-        let snapshot = Arc::new(snapshot);
         let mut newest = locked(&self.shared.newest);
         newest.number += 1;
-        newest.snapshot = snapshot;
+        newest.snapshot = snapshot.into();
         if let Some((said, own)) = said {
             newest.said_number += 1;
             newest.said = said.into();

@@ -261,6 +261,16 @@ impl Table {
         self.root_totals.as_ref().map(|root_totals| (root_totals.counts, root_totals.contributions))
     }
 
+    /// The account of what was due and what has come, of all cells together: of replies, or of cells in sums.
+    #[must_use]
+    pub fn replies(&self) -> Replies {
+        let Some(root_totals) = &self.root_totals else {
+            return Replies::total(self.cells.iter().map(|cell| cell.replies));
+        };
+        let Contributions { due, in_time, late, missing, .. } = root_totals.contributions;
+        Replies { due, in_time, late, missing, ..Replies::default() }
+    }
+
     /// How often parents of cells changed, by the cells' own counters.
     #[must_use]
     pub fn parent_changes(&self) -> u64 {

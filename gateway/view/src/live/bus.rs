@@ -65,8 +65,6 @@ impl LiveBus {
     pub(super) fn new(skin: &Skin, bus: usize) -> Self {
         let mut table = Table::new(skin, bus);
         table.set_comparing(true);
-        let roots: Vec<_> = table.cells().iter().filter(|cell| cell.root).map(|cell| cell.node).collect();
-        roots.into_iter().for_each(|root| table.set_feeds(root, true));
         let described = skin.buses.get(bus);
         let cells = table.cells().len();
         Self {
@@ -187,8 +185,8 @@ impl LiveBus {
 
     /// Each cell's bytes in a snapshot.
     pub(super) fn shown(&self, now: Micros) -> Vec<[u8; 8]> {
-        let cells = self.table.statuses(now).zip(self.table.sensors(now)).enumerate();
-        let bytes = cells.map(|(place, ((cell, status), (sensors, _)))| {
+        let cells = self.table.cells().iter().zip(self.table.sensors(now)).enumerate();
+        let bytes = cells.map(|(place, (cell, (sensors, status)))| {
             let view = CellView::of(cell, status);
             let flags = [
                 (view.unconfigured, flag::UNCONFIGURED),

@@ -1,6 +1,6 @@
 //! What changes more slowly, as JSON for the page.
 
-use model::table::{Event, Replies, Status};
+use model::table::{Event, Status};
 use protocol::fixed::is_saturated;
 use protocol::id::CellId;
 use protocol::time::Micros;
@@ -150,8 +150,9 @@ impl Live {
     fn detail(&self, index: usize, node: u8, now: Micros) -> Option<Detail> {
         let bus = self.buses.get(index)?;
         let place = bus.place(CellId::new(node.into()).ok()?)?;
-        let (cell, status) = bus.table.statuses(now).nth(place)?;
-        let sensors = bus.table.sensors(now).nth(place)?.0.unwrap_or_default();
+        let cell = bus.table.cells().get(place)?;
+        let (sensors, status) = bus.table.sensors(now).nth(place)?;
+        let sensors = sensors.unwrap_or_default();
         let force_n = bus.central.force(place, &sensors);
         let torque = bus.last.get(place).copied().flatten().map(|(epoch, words)| {
             let words = words.as_slice();
@@ -193,16 +194,7 @@ impl LiveBus {
     fn said(&self) -> BusSaid {
         let counters = self.table.counters();
         let uplink = self.table.uplink();
-        let account = match self.table.sums() {
-            Some((_, cells)) => Replies {
-                due: cells.due,
-                in_time: cells.in_time,
-                late: cells.late,
-                missing: cells.missing,
-                ..Replies::default()
-            },
-            None => Replies::total(self.table.cells().iter().map(|cell| cell.replies)),
-        };
+        let account = self.table.replies();
         let accuracy = self.table.accuracy();
         let errors = if self.sums { accuracy.sums } else { accuracy.single };
         BusSaid {

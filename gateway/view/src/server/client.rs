@@ -6,11 +6,12 @@ use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use tungstenite::protocol::WebSocketConfig;
-use tungstenite::{Bytes, Error, Message, WebSocket, accept_with_config};
+use tungstenite::{Error, Message, WebSocket, accept_with_config};
 
+use super::Shared;
 use super::request::{LONGEST, Request};
-use super::{Shared, locked};
 use crate::command::{self, Command};
+use crate::locked;
 use crate::web;
 
 /// How long a client may take for its request, and to take in what it is sent.
@@ -144,17 +145,17 @@ fn talk(socket: &mut WebSocket<Begun>, page: u64, shared: &Shared) -> Result<(),
     while !shared.stop.load(Ordering::Relaxed) {
         let (snapshot, said) = {
             let newest = locked(&shared.newest);
-            let snapshot = (newest.number != sent).then(|| newest.snapshot.as_ref().clone());
+            let snapshot = (newest.number != sent).then(|| newest.snapshot.clone());
             let own = newest.own.get(&page).unwrap_or(&newest.said);
-            let said = (newest.said_number != said_number).then(|| own.to_string());
+            let said = (newest.said_number != said_number).then(|| own.clone());
             (sent, said_number) = (newest.number, newest.said_number);
             (snapshot, said)
         };
         if let Some(snapshot) = snapshot {
-            socket.send(Message::Binary(Bytes::from(snapshot)))?;
+            socket.send(Message::Binary(snapshot))?;
         }
         if let Some(said) = said {
-            socket.send(Message::text(said))?;
+            socket.send(Message::Text(said))?;
         }
         for _ in 0..AT_ONCE {
             match socket.read() {

@@ -9,7 +9,7 @@ use protocol::wire_time::Bits;
 use crate::fit::rates::Chosen;
 use crate::report::thin::{Binned, Thinned};
 use model::decode::{Decoded, Decoder};
-use model::table::{Contributions, Replies, Table};
+use model::table::{Replies, Table};
 use trace::capture::Latched;
 
 /// Time is let pass for the cells as often as a receiver does it.
@@ -80,10 +80,6 @@ impl LinkId {
     pub(super) fn new(skin: &Skin, bus: usize, rates: Chosen) -> Self {
         let mut table = Table::new(skin, bus);
         table.set_comparing(true);
-        let roots: Vec<_> = table.cells().iter().filter(|cell| cell.root).map(|cell| cell.node).collect();
-        for root in roots {
-            table.set_feeds(root, true);
-        }
         let described = skin.buses.get(bus);
         Self {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
@@ -164,11 +160,7 @@ impl LinkId {
 
     /// What is due and what has come of it, all epochs together.
     pub(super) fn account(&self) -> Replies {
-        let Some((_, cells)) = self.table.sums() else {
-            return Replies::total(self.table.cells().iter().map(|cell| cell.replies));
-        };
-        let Contributions { due, in_time, late, missing, .. } = cells;
-        Replies { due, in_time, late, missing, ..Replies::default() }
+        self.table.replies()
     }
 
     /// Errors compared so far, and their sum.
