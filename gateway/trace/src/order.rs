@@ -30,7 +30,7 @@ pub struct Ordered<T> {
 }
 
 /// Merges buses by time.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Order<T> {
     /// Those that wait, by their time, or that of a frame before them on their bus when that was later, and by where
     /// they stood in the capture: their own time, and what they are.

@@ -15,11 +15,13 @@ pub mod log;
 mod magic;
 mod mcap;
 mod parts;
+mod places;
 mod reader;
 
 pub use extras::{Extras, Latched, SKIN, Topic};
 pub use mcap::ORIGIN;
 pub use parts::{Part, PartsError};
+pub use places::{Place, Places};
 pub use reader::{CaptureError, Format, Reader};
 
 pub use crate::note::{Note, NoteKind};

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::fmt;
 use std::fs::File;
-use std::io::{self, Read, Seek};
+use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
@@ -12,6 +12,7 @@ use super::log::LogReader;
 use super::magic::{self, Kind};
 use super::mcap::{Fault, McapReader, ORIGIN, SOURCE, State};
 use super::parts::{self, Part, PartsError};
+use super::places::{Place, Places};
 use super::{Entry, Extras, Item, Through};
 use crate::container::Damage;
 
@@ -71,6 +72,8 @@ pub struct Reader {
     /// Whether messages of all topics are requested.
     others: bool,
     entries: u64,
+    /// Which of the parts it is, from 0.
+    part: usize,
     /// Parts that follow.
     rest: VecDeque<PathBuf>,
     through: Through,
@@ -174,7 +177,6 @@ impl Reader {
     }
 
     fn open_parts(paths: &[PathBuf], through: Through, others: bool) -> Result<Self, CaptureError> {
-        let is_input = |path: &PathBuf| path.as_os_str() == "-";
         if let [one] = paths
             && is_input(one)
         {
@@ -182,21 +184,24 @@ impl Reader {
             let source = Source::begin(&name, io::stdin(), State::new(others, None))?;
             return Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), through, others));
         }
-        let ordered = match paths {
-            [] | [_] => paths.to_vec(),
-            _ => {
-                let part = |path: &PathBuf| match is_input(path) {
-                    true => Err(PartsError::StandardInput.into()),
-                    false => Ok(Part::of(path, Self::open(path)?.extras())?),
-                };
-                parts::ordered(paths.iter().map(part).collect::<Result<_, CaptureError>>()?)?
-            }
-        };
+        let ordered = Self::ordered(paths)?;
         let name = parts::title(&ordered);
         let mut rest = VecDeque::from(ordered);
         let first = rest.pop_front().ok_or(PartsError::None)?;
         let opened = Source::open(&first, &through, State::new(others, None))?;
         Ok(Self::begin(name, opened, rest, through, others))
+    }
+
+    /// The parts of a recording in their order.
+    pub(super) fn ordered(paths: &[PathBuf]) -> Result<Vec<PathBuf>, CaptureError> {
+        if let [] | [_] = paths {
+            return Ok(paths.to_vec());
+        }
+        let part = |path: &PathBuf| match is_input(path) {
+            true => Err(PartsError::StandardInput.into()),
+            false => Ok(Part::of(path, Self::open(path)?.extras())?),
+        };
+        Ok(parts::ordered(paths.iter().map(part).collect::<Result<_, CaptureError>>()?)?)
     }
 
     fn begin(
@@ -206,7 +211,7 @@ impl Reader {
         through: Through,
         others: bool,
     ) -> Self {
-        Self { name, file, source, others, entries: 0, rest, through, is_unfinished: false }
+        Self { name, file, source, others, entries: 0, part: 0, rest, through, is_unfinished: false }
     }
 
     /// What it is called: its name, or those of its first and last part.
@@ -218,6 +223,7 @@ impl Reader {
     /// Goes on with the part that follows; whether there is one.
     fn go_on(&mut self) -> Result<bool, CaptureError> {
         let Some(path) = self.rest.pop_front() else { return Ok(false) };
+        self.part += 1;
         let mut before = self.extras().clone();
         if let Some(what) = before.unfinished.as_mut().filter(|_| !self.is_unfinished) {
             *what = format!("{}: {what}", self.file);
@@ -226,6 +232,53 @@ impl Reader {
         let state = State::new(self.others, Some(before));
         (self.file, self.source) = Source::open(&path, &self.through, state)?;
         Ok(true)
+    }
+
+    /// Where its next entry is. Of an input that cannot be gone back in it is of no use.
+    #[must_use]
+    pub const fn place(&self) -> Place {
+        let (offset, line, skip) = match &self.source {
+            Source::Log(log) => (log.offset(), log.lines(), 0),
+            Source::Mcap(mcap) => {
+                let (offset, skip) = mcap.anchor();
+                (offset, 0, skip)
+            }
+        };
+        Place { part: self.part, offset, line, skip }
+    }
+
+    /// Goes to a place of the same capture; what comes next is the entry there.
+    ///
+    /// # Errors
+    /// When it cannot be read, or is damaged: then nothing more comes.
+    pub fn go_to(&mut self, places: &Places, place: Place) -> Result<(), CaptureError> {
+        let Some(path) = places.path(place.part) else { return Ok(()) };
+        if self.part != place.part || place.offset == 0 {
+            let before = (place.part > 0).then(|| self.extras().clone());
+            (self.file, self.source) = Source::open(path, &self.through, State::new(self.others, before))?;
+            self.part = place.part;
+            self.rest = places.behind(place.part).cloned().collect();
+        }
+        let name = self.file.clone();
+        let failed = |source| CaptureError::Io { name: name.clone(), source };
+        if place.offset > 0 {
+            let mut file = File::open(path).map_err(failed)?;
+            file.seek(SeekFrom::Start(place.offset)).map_err(failed)?;
+            let input = (self.through)(file);
+            let empty = Source::Log(LogReader::new(&[], Box::new(io::empty())));
+            self.source = match std::mem::replace(&mut self.source, empty) {
+                Source::Log(_) => Source::Log(LogReader::at((place.offset, place.line), input)),
+                Source::Mcap(mcap) => {
+                    let mut state = mcap.into_state();
+                    places.describe(place.part, &mut state).map_err(|fault| fault.of(&name, self.entries))?;
+                    Source::Mcap(Box::new(McapReader::at(place.offset, input, state)))
+                }
+            };
+        }
+        for _ in 0..place.skip {
+            self.next_item()?;
+        }
+        Ok(())
     }
 
     /// What it is written in.
@@ -312,7 +365,7 @@ impl Reader {
 
 impl Fault {
     /// As an error of a file of which so many entries have been read.
-    fn of(self, name: &str, entries: u64) -> CaptureError {
+    pub(super) fn of(self, name: &str, entries: u64) -> CaptureError {
         let name = name.to_owned();
         match self {
             Self::Io(source) => CaptureError::Io { name, source },
@@ -322,10 +375,14 @@ impl Fault {
 }
 
 /// Whether a file is an MCAP recording; its place is its beginning.
-fn is_mcap(file: &mut File) -> io::Result<bool> {
+pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
     let (kind, _) = magic::look(file)?;
     file.rewind()?;
     Ok(kind == Kind::Mcap)
+}
+
+fn is_input(path: &Path) -> bool {
+    path.as_os_str() == "-"
 }
 
 /// Files as they are.

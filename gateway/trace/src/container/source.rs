@@ -42,6 +42,11 @@ impl<R: Read> Source<R> {
         Self { input, body: Vec::new(), read: 0, attachments, checksum }
     }
 
+    /// The same in the middle of a file, behind so many bytes.
+    pub fn at(read: u64, input: R, attachments: u64) -> Self {
+        Self { read, checksum: None, ..Self::new(input, attachments) }
+    }
+
     /// Takes the magic bytes of the beginning or the end into [`Source::body`]; whether they are there.
     ///
     /// # Errors

@@ -22,6 +22,8 @@ pub(crate) struct LogReader {
     /// What of the buffer is not used up.
     rest: Range<usize>,
     at_end: bool,
+    /// Bytes that came from the input, with those before the place where it began.
+    taken: u64,
     /// Lines so far.
     lines: u64,
     /// The time of the last frame.
@@ -32,11 +34,22 @@ impl LogReader {
     /// Goes on behind `head`, which has been read already.
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>) -> Self {
         let mut buffer = vec![0; CHUNK];
+        let taken = head.len() as u64;
         let head = head.strip_prefix(BYTE_ORDER_MARK).unwrap_or(head);
         for (to, from) in buffer.iter_mut().zip(head) {
             *to = *from;
         }
-        Self { input, buffer, rest: 0..head.len(), at_end: false, lines: 0, nanos: 0 }
+        Self { input, buffer, rest: 0..head.len(), at_end: false, taken, lines: 0, nanos: 0 }
+    }
+
+    /// Goes on behind so many bytes and lines, which have been passed over.
+    pub(crate) fn at((bytes, lines): (u64, u64), input: Box<dyn Read + Send>) -> Self {
+        Self { taken: bytes, lines, ..Self::new(&[], input) }
+    }
+
+    /// Bytes of the input that are used up.
+    pub(crate) const fn offset(&self) -> u64 {
+        self.taken - (self.rest.end - self.rest.start) as u64
     }
 
     pub(crate) const fn lines(&self) -> u64 {
@@ -119,6 +132,7 @@ impl LogReader {
             let room = self.buffer.get_mut(kept..).unwrap_or_default();
             let got = read_some(&mut self.input, room)?;
             rest = kept..kept + got;
+            self.taken += got as u64;
             if got == 0 {
                 self.at_end = true;
                 self.rest = rest;
@@ -136,6 +150,7 @@ impl LogReader {
         let room = self.buffer.get_mut(self.rest.end..).unwrap_or_default();
         let got = read_some(&mut self.input, room)?;
         self.rest.end += got;
+        self.taken += got as u64;
         self.at_end = got == 0;
         Ok(got)
     }

@@ -22,6 +22,8 @@ pub(crate) struct McapReader {
     state: State,
     /// What was read when it was opened: the first requested message, or why there is none.
     first: Option<Result<Target, Fault>>,
+    /// Where the record begins from which the next messages are, and how many of its messages were given out.
+    anchor: (u64, u32),
 }
 
 /// Where a reader is in its file.
@@ -38,10 +40,27 @@ impl McapReader {
     pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, state: State) -> Self {
         let input = BufReader::with_capacity(PIECE, Cursor::new(head.to_vec()).chain(input));
         let (source, chunk) = (Source::new(input, KEPT as u64), Chunk::default());
-        let mut reader = Self { source, chunk, place: Place::Magic, state, first: None };
+        let mut reader = Self { source, chunk, place: Place::Magic, state, first: None, anchor: (0, 0) };
         // What stands before the first message is known from the beginning.
         reader.first = reader.advance().transpose();
         reader
+    }
+
+    /// Goes on at a record, which begins behind so many bytes, with what is known of the file.
+    pub(crate) fn at(bytes: u64, input: Box<dyn Read + Send>, state: State) -> Self {
+        let input = BufReader::with_capacity(PIECE, Cursor::new(Vec::new()).chain(input));
+        let (source, chunk) = (Source::at(bytes, input, KEPT as u64), Chunk::default());
+        Self { source, chunk, place: Place::Records, state, first: None, anchor: (bytes, 0) }
+    }
+
+    pub(crate) fn into_state(self) -> State {
+        self.state
+    }
+
+    /// Where the record begins from which the next message is, unless it is from a later one, and how many of its
+    /// messages come before.
+    pub(crate) const fn anchor(&self) -> (u64, u32) {
+        self.anchor
     }
 
     pub(crate) const fn extras(&self) -> &Extras {
@@ -63,6 +82,7 @@ impl McapReader {
             None => self.advance()?,
         };
         let Some(Target { channel, log_time, in_chunk }) = target else { return Ok(None) };
+        self.anchor.1 += 1;
         let body = if in_chunk { self.chunk.body() } else { self.source.body() };
         let Ok(Record::Message { data, .. }) = parse(op::MESSAGE, body) else { return Ok(None) };
         Ok(Some(self.state.item(channel, log_time, data)))
@@ -85,7 +105,8 @@ impl McapReader {
 
     /// Reads on by a record.
     fn step(&mut self) -> Result<Option<Target>, Fault> {
-        let Self { source, chunk, place, state, .. } = self;
+        let Self { source, chunk, place, state, anchor, .. } = self;
+        let began = source.read();
         match place {
             Place::Over => {}
             Place::Magic => {
@@ -102,7 +123,7 @@ impl McapReader {
             Place::Records => match source.next()? {
                 Framed::Record(op::CHUNK) => {
                     chunk.unpack(source.body(), source.read())?;
-                    *place = Place::InChunk;
+                    (*place, *anchor) = (Place::InChunk, (began, 0));
                 }
                 Framed::Record(op::DATA_END) => {
                     let found = source.data_checksum();
@@ -117,7 +138,13 @@ impl McapReader {
                     *place = Place::Over;
                     self.take_magic()?;
                 }
-                Framed::Record(opcode) => return state.take(opcode, source.body(), false),
+                Framed::Record(opcode) => {
+                    let target = state.take(opcode, source.body(), false)?;
+                    if target.is_some() {
+                        *anchor = (began, 0);
+                    }
+                    return Ok(target);
+                }
                 Framed::Long(op::ATTACHMENT, _) => state.attachment(source.attachment_name(), &[]),
                 Framed::Long(_, bytes) => {
                     return Err(Damage::Long { what: "record", bytes, limit: LONGEST }.into());

@@ -48,7 +48,7 @@ pub(crate) struct State {
 
 /// A requested message; its content is the record that was read last.
 #[derive(Clone, Copy)]
-pub(super) struct Target {
+pub(crate) struct Target {
     pub(super) channel: u16,
     pub(super) log_time: u64,
     pub(super) in_chunk: bool,
@@ -140,7 +140,7 @@ impl State {
     }
 
     /// Takes a record.
-    pub(super) fn take(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<Target>, Fault> {
+    pub(crate) fn take(&mut self, opcode: u8, body: &[u8], in_chunk: bool) -> Result<Option<Target>, Fault> {
         match parse(opcode, body)? {
             Raw::Schema { id, name, .. } => {
                 if self.schemas.get(&id).is_none_or(|known| known != name) {

@@ -1,0 +1,214 @@
+//! Where in a capture a reader can go on, so that a moment is found without reading all that is before it.
+//!
+//! ```text
+//!   MCAP:  heads of chunks ─────────────────┐
+//!                                           ├──> Places ── before(time) ──> Place ──> Reader::go_to
+//!   log:   a line of each piece of the file ┘
+//! ```
+
+use std::fs::File;
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+use ::mcap::records::op;
+use protocol::candump::{Line, parse_bytes};
+
+use super::log::LONGEST as LONGEST_LINE;
+use super::mcap::{Fault, State};
+use super::reader::is_mcap;
+use super::{CaptureError, Reader};
+use crate::container::{LONGEST_DESCRIPTION, MAGIC, find};
+use crate::order::WINDOW_NS;
+
+/// Bytes from one place of a file to the next.
+const PIECE: u64 = 64 << 10;
+/// Bytes of descriptions that are kept of a part.
+const DESCRIPTIONS: usize = 16 << 20;
+/// Bytes of a log's end among which its last frame is looked for.
+const END: u64 = 4 * LONGEST_LINE as u64;
+
+/// Where in a capture an entry is.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Place {
+    /// Which part, from 0.
+    pub(super) part: usize,
+    /// Bytes of the part before the record or the line.
+    pub(super) offset: u64,
+    /// Lines before it, where they were counted.
+    pub(super) line: u64,
+    /// Entries of the record before it.
+    pub(super) skip: u32,
+}
+
+/// Some places of a capture, by time.
+#[derive(Debug)]
+pub struct Places {
+    parts: Vec<Part>,
+    /// In their order, each with the latest time of all that stands before the next one, in ns since 1970.
+    marks: Vec<(u64, Place)>,
+    piece: u64,
+}
+
+#[derive(Debug)]
+struct Part {
+    path: PathBuf,
+    /// Records of the summary that say what the messages are: operation codes and contents.
+    descriptions: Vec<(u8, Vec<u8>)>,
+}
+
+impl Places {
+    /// Those of one file, or of the parts of one recording in any order. Reads of each only what says when it was written.
+    ///
+    /// # Errors
+    /// When a file cannot be read or gone back in, or they are not parts of one recording.
+    pub fn of(paths: &[PathBuf]) -> Result<Self, CaptureError> {
+        Self::apart(paths, PIECE)
+    }
+
+    /// The same with a place for each so many bytes.
+    fn apart(paths: &[PathBuf], piece: u64) -> Result<Self, CaptureError> {
+        let mut places = Self { parts: Vec::new(), marks: Vec::new(), piece };
+        for path in Reader::ordered(paths)? {
+            let name = path.display().to_string();
+            places.add(&path).map_err(|source| CaptureError::Io { name, source })?;
+        }
+        Ok(places)
+    }
+
+    /// The latest time in the capture, in ns since 1970, as its places say; 0 of an empty one.
+    #[must_use]
+    pub fn latest(&self) -> u64 {
+        self.marks.last().map_or(0, |(latest, _)| *latest)
+    }
+
+    /// The last place that has nothing of this time or later before it.
+    #[must_use]
+    pub fn before(&self, nanos: u64) -> Place {
+        let at = self.marks.partition_point(|(latest, _)| *latest < nanos);
+        self.marks.get(at).or_else(|| self.marks.last()).map(|(_, place)| *place).unwrap_or_default()
+    }
+
+    pub(super) fn path(&self, part: usize) -> Option<&Path> {
+        self.parts.get(part).map(|part| part.path.as_path())
+    }
+
+    /// The parts behind one.
+    pub(super) fn behind(&self, part: usize) -> impl Iterator<Item = &PathBuf> {
+        self.parts.iter().skip(part + 1).map(|part| &part.path)
+    }
+
+    /// Says to the state of a reader what the messages of a part are.
+    pub(super) fn describe(&self, part: usize, state: &mut State) -> Result<(), Fault> {
+        for (opcode, body) in self.parts.get(part).into_iter().flat_map(|part| &part.descriptions) {
+            state.take(*opcode, body, false)?;
+        }
+        Ok(())
+    }
+
+    fn add(&mut self, path: &Path) -> io::Result<()> {
+        let mut file = File::open(path)?;
+        if !file.metadata()?.is_file() {
+            let why = "it is no regular file, and cannot be gone back in: write it to a file first";
+            return Err(io::Error::new(io::ErrorKind::NotSeekable, why));
+        }
+        self.parts.push(Part { path: path.to_owned(), descriptions: Vec::new() });
+        if is_mcap(&mut file)? { self.add_mcap(file) } else { self.add_log(file) }
+    }
+
+    /// A place in the last part, if the one before it is far enough away; everything before the next one is at `latest`
+    /// or earlier.
+    fn mark(&mut self, offset: u64, latest: u64) {
+        let part = self.parts.len() - 1;
+        let latest = latest.max(self.latest());
+        match self.marks.last_mut() {
+            Some((of, place)) if place.part == part && offset - place.offset < self.piece => *of = latest,
+            _ => self.marks.push((latest, Place { part, offset, ..Place::default() })),
+        }
+    }
+
+    fn add_mcap(&mut self, file: File) -> io::Result<()> {
+        const TARGET: &[u8] = &[op::CHUNK, op::MESSAGE, op::SCHEMA, op::CHANNEL, op::FOOTER];
+        // Most of what is passed over is longer than this.
+        let mut from = BufReader::with_capacity(4 << 10, file);
+        from.seek(SeekFrom::Start(MAGIC.len() as u64))?;
+        let mut described = 0;
+        while let Some((opcode, length)) = find(&mut from, TARGET)? {
+            let at = from.stream_position()? - 9;
+            let mut head = Vec::new();
+            let kept = match opcode {
+                op::FOOTER => break,
+                op::CHUNK => 16,
+                op::MESSAGE => 14,
+                _ => length.min(LONGEST_DESCRIPTION as u64),
+            };
+            (&mut from).take(kept.min(length)).read_to_end(&mut head)?;
+            let rest = i64::try_from(length.saturating_sub(kept));
+            if head.len() as u64 != kept || !rest.is_ok_and(|rest| from.seek_relative(rest).is_ok()) {
+                break;
+            }
+            let time = |at: usize| {
+                let bytes = head.get(at..at + 8).and_then(|bytes| bytes.try_into().ok());
+                bytes.map_or(0, u64::from_le_bytes)
+            };
+            match opcode {
+                op::CHUNK => self.mark(at, time(8)),
+                op::MESSAGE => self.mark(at, time(6)),
+                _ => {
+                    described += head.len();
+                    if let Some(part) = self.parts.last_mut().filter(|_| described <= DESCRIPTIONS) {
+                        part.descriptions.push((opcode, head));
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// A line of every piece. Its neighbours of other buses may be older and newer by the window of the order.
+    fn add_log(&mut self, mut file: File) -> io::Result<()> {
+        let length = file.metadata()?.len();
+        let mut last = 0;
+        let mut at = 0;
+        while at < length {
+            let found = line_at(&mut file, at)?;
+            if let Some((offset, nanos)) = found.filter(|_| at > 0) {
+                self.mark(last, nanos.saturating_add(WINDOW_NS));
+                last = offset;
+            }
+            at += self.piece;
+        }
+        let mut end = Vec::new();
+        file.seek(SeekFrom::Start(length.saturating_sub(END)))?;
+        (&mut file).take(END).read_to_end(&mut end)?;
+        let latest = end.split(|&byte| byte == b'\n').filter_map(time_of).max();
+        self.mark(last, latest.unwrap_or(0));
+        Ok(())
+    }
+}
+
+/// The first frame of a log at this place or behind it: where its line begins, and its time.
+fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, u64)>> {
+    file.seek(SeekFrom::Start(at))?;
+    let mut piece = Vec::new();
+    file.take(2 * LONGEST_LINE as u64).read_to_end(&mut piece)?;
+    let mut from = at;
+    // Within a line, unless it is the first one.
+    for (number, line) in piece.split_inclusive(|&byte| byte == b'\n').enumerate() {
+        let text = line.trim_ascii_end();
+        if let Some(nanos) = time_of(text).filter(|_| number > 0 || at == 0) {
+            return Ok(Some((from, nanos)));
+        }
+        from += line.len() as u64;
+    }
+    Ok(None)
+}
+
+fn time_of(line: &[u8]) -> Option<u64> {
+    match parse_bytes(line.trim_ascii_end()) {
+        Ok(Line::Frame(record)) => Some(record.time.nanos),
+        Ok(_) | Err(_) => None,
+    }
+}
+
+#[cfg(test)]
+mod tests;

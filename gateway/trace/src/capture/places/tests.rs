@@ -1,0 +1,115 @@
+use super::*;
+use crate::capture::log::{Digits, Style};
+use crate::capture::{Entry, Format, convert::Output};
+use protocol::can::Frame;
+use protocol::candump::{Record, Timestamp};
+
+const COUNT: u32 = 20_000;
+const MS: u64 = 1_000_000;
+
+/// A capture of two buses whose frames are read in turn, up to 0.3 s late.
+fn capture(path: &Path, format: Format) {
+    let style = Style { digits: Digits::Nine, ..Style::default() };
+    let mut out = Output::new(File::create(path).unwrap(), format, style).unwrap();
+    for number in 0..COUNT {
+        let burst = u64::from(number / 300);
+        let (interface, nanos) = match number % 300 {
+            first @ 0..150 => ("can0", burst * 300 * MS + u64::from(first) * 2 * MS),
+            second => ("can1", burst * 300 * MS + u64::from(second - 150) * 2 * MS + MS),
+        };
+        let frame = Frame::classic(0x123, &number.to_be_bytes()).unwrap();
+        let time = Timestamp { nanos: 1_700_000_000_000_000_000 + nanos, nine_digits: true };
+        out.write(&Entry::Frame(Record { time, interface, frame, direction: None })).unwrap();
+    }
+    out.finish().unwrap();
+}
+
+/// Number and time of the next frames.
+fn next(reader: &mut Reader, count: usize) -> Vec<(u32, u64)> {
+    let mut all = Vec::new();
+    while let Some(entry) = reader.next().unwrap() {
+        let Entry::Frame(record) = entry else { continue };
+        all.push((u32::from_be_bytes(record.frame.data().try_into().unwrap()), record.time.nanos));
+        if all.len() == count {
+            break;
+        }
+    }
+    all
+}
+
+#[test]
+fn a_reader_goes_on_where_it_was_and_no_moment_is_before_its_place() {
+    let folder = tempfile::tempdir().unwrap();
+    for format in [Format::Candump, Format::Mcap] {
+        let path = folder.path().join(format!("{format:?}"));
+        capture(&path, format);
+        let paths = [path];
+        let places = Places::of(&paths).unwrap();
+        assert!(places.marks.len() > 3, "{format:?}: {}", places.marks.len());
+        let mut reader = Reader::open_all(&paths).unwrap();
+        let (mut here, mut all) = (Vec::new(), Vec::new());
+        loop {
+            here.push(reader.place());
+            let Some(&one) = next(&mut reader, 1).first() else { break };
+            all.push(one);
+        }
+        assert_eq!(all.len(), COUNT as usize);
+        assert!(places.latest() >= all.last().unwrap().1, "{format:?}");
+        for from in (0..all.len()).step_by(997) {
+            reader.go_to(&places, here[from]).unwrap();
+            let count = 900.min(all.len() - from);
+            assert_eq!(next(&mut reader, count), all[from..from + count], "{format:?} {from}");
+        }
+        reader.go_to(&places, here[COUNT as usize]).unwrap();
+        assert_eq!(next(&mut reader, 1), []);
+        for at in (0..all.len()).step_by(311) {
+            let nanos = all[at].1;
+            reader.go_to(&places, places.before(nanos)).unwrap();
+            let (first, _) = next(&mut reader, 1)[0];
+            let earliest = all.iter().position(|(_, time)| *time >= nanos).unwrap();
+            assert!(first as usize <= earliest, "{format:?}: {first} {earliest}");
+            assert!(earliest - (first as usize) < 6_000, "{format:?}: {first} {earliest}");
+        }
+    }
+}
+
+#[test]
+fn messages_outside_chunks_and_files_without_an_end_have_places() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("loose.mcap");
+    let mut writer =
+        ::mcap::WriteOptions::new().use_chunks(false).create(File::create(&path).unwrap()).unwrap();
+    let schema = writer.add_schema("can_msgs/msg/Frame", "ros2msg", b"").unwrap();
+    let channel = writer.add_channel(schema, "/can0", "cdr", &Default::default()).unwrap();
+    for number in 0..3_000_u64 {
+        let header = ::mcap::records::MessageHeader {
+            channel_id: channel,
+            sequence: 0,
+            log_time: number,
+            publish_time: number,
+        };
+        writer.write_to_known_channel(&header, &[0; 40]).unwrap();
+    }
+    drop(writer);
+    let whole = Places::apart(std::slice::from_ref(&path), 1_000).unwrap();
+    assert!(whole.marks.len() > 100 && whole.latest() == 2_999);
+    let bytes = std::fs::read(&path).unwrap();
+    std::fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
+    let cut = Places::apart(&[path], 1_000).unwrap();
+    assert!(cut.marks.len() > 40 && (1_000..2_000).contains(&cut.latest()), "{}", cut.latest());
+}
+
+#[test]
+fn what_cannot_be_gone_back_in_is_named() {
+    let error = Places::of(&[PathBuf::from("/dev/null")]).unwrap_err().to_string();
+    assert!(error.starts_with("/dev/null: it is no regular file"), "{error}");
+    let folder = tempfile::tempdir().unwrap();
+    for (name, bytes) in
+        [("empty", &b""[..]), ("text", b"nothing\n"), ("head", MAGIC), ("cut", b"\x89MCAP0\r\n\x06\xFF")]
+    {
+        let path = folder.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        let places = Places::of(&[path]).unwrap();
+        assert_eq!((places.latest(), places.before(5).offset), (0, 0), "{name}");
+    }
+}
