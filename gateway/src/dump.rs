@@ -24,7 +24,9 @@ use trace::capture::{Entry, Extras, NoteKind, Reader, Topic};
 
 use self::show::{How, Show};
 use super::arguments::{BusKind, Word, nanos, one_of};
-use super::input::{self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame, place, stopped};
+use super::input::{
+    self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame, place, skin_beside, stopped,
+};
 use super::output;
 use super::print::{json, list};
 
@@ -130,12 +132,9 @@ impl Dump {
             let mut reader = captures(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
             if self.skin.is_none() && !self.stats {
-                match reader.extras().skin() {
-                    None => {}
-                    Some(Ok(skin)) => show.describe(&skin),
-                    Some(Err(error)) => output::note(format_args!(
-                        "{title}, {error}; torques are read as Q3.12 and joints as revolute: name the skin with --skin"
-                    )),
+                let instead = "torques are read as Q3.12 and joints as revolute: name the skin with --skin";
+                if let Some(skin) = skin_beside(&reader, instead) {
+                    show.describe(&skin);
                 }
             }
             let done = captured(&mut reader, &mut show, self.strict);

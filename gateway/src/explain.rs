@@ -10,9 +10,10 @@ use protocol::packet::Epoch;
 use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
 use serde::Serialize;
-use trace::capture::{Format, Reader};
+use trace::capture::Reader;
 
 use super::arguments::{Named, cell, nanos};
+use super::input::skin_of;
 use super::output;
 use super::print::json;
 
@@ -67,7 +68,7 @@ impl Explain {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let skin = match &self.skin {
             Some(path) => Skin::read(path).map_err(Failure::usage)?,
-            None => attached(&self.files)?,
+            None => skin_of(&self.files)?,
         };
         self.check(&skin)?;
         let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
@@ -118,31 +119,5 @@ impl Explain {
             )));
         }
         self.cell.as_ref().map_or(Ok(()), |cell| cell.find(skin, "--cell").map(|_| ()))
-    }
-}
-
-/// The skin that a recording has with it.
-fn attached(files: &[PathBuf]) -> Result<Skin, Failure> {
-    if files.iter().any(|file| file.as_os_str() == "-") {
-        return Err(Failure::usage("standard input is read once: name the skin with --skin"));
-    }
-    if let Some(pipe) =
-        files.iter().find(|file| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
-    {
-        return Err(Failure::usage(format!(
-            "{} is no regular file and is read once: name the skin with --skin",
-            pipe.display()
-        )));
-    }
-    let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
-    // It may stand behind the frames.
-    while reader.format() == Format::Mcap
-        && reader.extras().skin().is_none()
-        && reader.next().map_err(Failure::run)?.is_some()
-    {}
-    let name = reader.name();
-    match reader.extras().skin() {
-        Some(skin) => skin.map_err(|error| Failure::usage(format!("{name}, {error}"))),
-        None => Err(Failure::usage(format!("{name} has no skin in it: name one with --skin"))),
     }
 }

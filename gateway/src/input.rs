@@ -12,6 +12,7 @@ use bench::listen::{self, Listener};
 use bench::signals::caught;
 use protocol::bus::{Bus, BusError, Choice, Options, Received};
 use protocol::can::{self, EXTENDED_MASK};
+use protocol::skin::Skin;
 use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -46,6 +47,39 @@ pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
         ));
     }
     Failure::usage(format!("there is no file {name}, and as a bus: {error}"))
+}
+
+/// The skin that a recording has with it.
+pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
+    if files.iter().any(|file| file.as_os_str() == "-") {
+        return Err(Failure::usage("standard input is read once: name the skin with --skin"));
+    }
+    if let Some(pipe) =
+        files.iter().find(|file| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir()))
+    {
+        return Err(Failure::usage(format!(
+            "{} is no regular file and is read once: name the skin with --skin",
+            pipe.display()
+        )));
+    }
+    let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
+    // It may stand behind the frames.
+    while reader.format() == Format::Mcap
+        && reader.extras().skin().is_none()
+        && reader.next().map_err(Failure::run)?.is_some()
+    {}
+    let name = reader.name();
+    match reader.extras().skin() {
+        Some(skin) => skin.map_err(|error| Failure::usage(format!("{name}, {error}"))),
+        None => Err(Failure::usage(format!("{name} has no skin in it: name one with --skin"))),
+    }
+}
+
+/// The skin that a reader has found so far; without one that can be read, `instead` is said.
+pub(crate) fn skin_beside(reader: &Reader, instead: &str) -> Option<Skin> {
+    let name = reader.name();
+    let skin = reader.extras().skin()?;
+    skin.inspect_err(|error| output::note(format_args!("{name}, {error}; {instead}"))).ok()
 }
 
 /// What a capture is written in.

@@ -19,7 +19,7 @@ use trace::capture::{Entry, Format, NoteKind, Reader};
 
 use self::show::write_frames;
 use super::arguments::{BusKind, nanos};
-use super::input::{self, LOOK, Missing, ReceiveEnd, captures, is_file, place, stopped};
+use super::input::{self, LOOK, Missing, ReceiveEnd, captures, is_file, place, skin_beside, stopped};
 use super::output;
 use super::print::list;
 
@@ -110,7 +110,7 @@ impl ShadowCommand {
         let (mut shadow, taken) = if self.are_captures(&name)? {
             let reader = captures(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
-            let mut shadow = self.shadow(skin.or_else(|| attached(&reader)))?;
+            let mut shadow = self.shadow(skin.or_else(|| skin_beside(&reader, "name one with --skin")))?;
             for before in &reader.extras().latched {
                 shadow.latched(&before.bus, before.nanos, &before.frame);
             }
@@ -236,14 +236,6 @@ fn wait(receive_ends: &[ReceiveEnd]) -> Result<(), Failure> {
         Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
         Err(errno) => Err(Failure::run(io::Error::from(errno))),
     }
-}
-
-/// The skin that is attached to a recording.
-fn attached(reader: &Reader) -> Option<Skin> {
-    let name = reader.name();
-    let skin = reader.extras().skin()?;
-    skin.inspect_err(|error| output::note(format_args!("{name}: the attached {error}; name one with --skin")))
-        .ok()
 }
 
 /// Takes in a capture, and reports what is missing of it.
