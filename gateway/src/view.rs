@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,30 +12,45 @@ use bench::run;
 use clap::Args;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
+use trace::capture::{Entry, Format, Reader};
+use view::play::{self, play};
 use view::serve::{Options, serve};
 use view::server::Access;
 
-use super::arguments::{BusKinds, bus_names};
-use super::input::stopped;
+use super::arguments::{BusKinds, bus_names, nanos};
+use super::input::{skin_of, stopped};
 use super::output::note;
 
+/// Lines among which a candump log has a frame.
+const LINES: u32 = 1_000;
 /// Where a page is served unless it is told.
 const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 
-/// Show a skin live in a browser, and press its cells with the mouse
+/// Show a skin in a browser, live or recorded, and press its cells with the mouse
 ///
 /// Listens to the buses of a bench or of a robot, and serves one page that draws the arm and its cells: coloured by force,
 /// proximity or temperature, their state by their shape, each joint's torque beside the central computation. A click presses
-/// a cell with a stimulus, if it is in test mode. The page needs no network but this server, which only answers this
-/// machine, unless --listen names another address; then each request needs the --token. It ends with Ctrl-C.
+/// a cell with a stimulus, if it is in test mode. Of a recording the same page plays, scrubs, steps by epoch, and goes to
+/// the next touch, loss, silent cell or halt. The page needs no network but this server, which only answers this machine,
+/// unless --listen names another address; then each request needs the --token. It ends with Ctrl-C.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway demo --view
   gateway view gateway/examples/ur5-253.toml --bus-kind embedded
+  gateway view run.mcap run-*.mcap --at 12.5
+  gateway view run.log --skin skin.toml
   gateway view skin.toml --listen 0.0.0.0:8100 --token $(openssl rand -hex 16) --read-only")]
 pub(crate) struct View {
-    /// The skin's description
-    skin: PathBuf,
+    /// A skin's description, whose buses are listened to; or a candump log or MCAP recording, or all parts of a split one in
+    /// any order
+    #[arg(required = true, value_name = "SKIN|FILE")]
+    sources: Vec<PathBuf>,
+    /// The skin of a recording; else the one in it
+    #[arg(long, value_name = "SKIN")]
+    skin: Option<PathBuf>,
+    /// Stay at so many seconds after the first frame of a recording, instead of playing it
+    #[arg(long, value_name = "S", value_parser = nanos)]
+    at: Option<u64>,
     /// The address of the page; port 0 is any that is free
     #[arg(long, value_name = "ADDRESS:PORT", default_value_t = LISTEN)]
     listen: SocketAddr,
@@ -65,22 +80,82 @@ fn token(text: &str) -> Result<String, String> {
 
 impl View {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let skin = Skin::read(&self.skin).map_err(Failure::usage)?;
         if !self.listen.ip().is_loopback() && self.token.is_none() {
             return Err(Failure::usage(format!(
                 "--listen {}: others than this machine may come there: give a --token, or listen on 127.0.0.1",
                 self.listen
             )));
         }
+        let is_recording = self.is_recording()?;
+        let access = Access {
+            listen: self.listen,
+            may_act: !self.read_only && !is_recording,
+            may_play: is_recording,
+            token: self.token.clone(),
+        };
+        let says = |url: &str| note(format_args!("view: {url}"));
+        if is_recording { self.recorded(access, says) } else { self.live(access, says) }
+    }
+
+    /// The skin of buses.
+    fn live(self, access: Access, says: impl FnOnce(&str)) -> Result<(), Failure> {
+        let [skin] = self.sources.as_slice() else {
+            return Err(Failure::usage(
+                "several files are the parts of one recording, and a skin is shown alone",
+            ));
+        };
+        if self.skin.is_some() || self.at.is_some() {
+            let why = "is of a recording, and this is a skin, whose buses are listened to";
+            return Err(Failure::usage(format!("{}: --skin or --at {why}", skin.display())));
+        }
+        let skin = Skin::read(skin).map_err(Failure::usage)?;
         let kinds = self.kinds.of(bus_names(&skin))?;
-        let access = Access { listen: self.listen, may_act: !self.read_only, token: self.token };
         let stop = stopped()?;
         if self.of_run {
             end_with_input(&stop);
         }
         let options = Options { skin, kinds, directory: None, access, patient: self.wait };
-        serve(options, &stop, |url| note(format_args!("view: {url}"))).map_err(Failure::usage)?;
+        serve(options, &stop, says).map_err(Failure::usage)?;
         Ok(())
+    }
+
+    /// A recording.
+    fn recorded(self, access: Access, says: impl FnOnce(&str)) -> Result<(), Failure> {
+        let skin = match &self.skin {
+            Some(path) => Skin::read(path).map_err(Failure::usage)?,
+            None => skin_of(&self.sources)?,
+        };
+        #[expect(clippy::cast_precision_loss, reason = "to the µs")]
+        let at_s = self.at.map(|nanos| nanos as f64 / 1e9);
+        let stop = stopped()?;
+        play(play::Options { paths: self.sources, skin, access, at_s }, &stop, says)
+            .map_err(Failure::usage)?;
+        Ok(())
+    }
+
+    /// Whether it is a recording, by what is in it, and not a skin.
+    fn is_recording(&self) -> Result<bool, Failure> {
+        let first = self.sources.first().map_or(Path::new(""), PathBuf::as_path);
+        if !first.exists() {
+            return Err(Failure::usage(format!(
+                "there is no file {}: name a skin, whose buses are listened to, or a recording",
+                first.display()
+            )));
+        }
+        if first.metadata().is_ok_and(|about| !about.is_file()) {
+            let what = "is no regular file: name a skin, whose buses are listened to, or a recording";
+            return Err(Failure::usage(format!("{} {what}", first.display())));
+        }
+        let mut reader = Reader::open(first).map_err(Failure::usage)?;
+        let mut lines = 0;
+        while reader.format() == Format::Candump && lines < LINES {
+            match reader.next().map_err(Failure::usage)? {
+                Some(Entry::Frame(_)) => return Ok(true),
+                Some(Entry::Note(_)) => lines += 1,
+                None => return Ok(false),
+            }
+        }
+        Ok(reader.format() == Format::Mcap)
     }
 }
 

@@ -71,6 +71,12 @@ impl<T> Order<T> {
         if waits { None } else { self.pop_last() }
     }
 
+    /// Whether none waits.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+
     /// The next one, when the capture has no more.
     pub fn pop_last(&mut self) -> Option<Ordered<T>> {
         let ((key, _), (nanos, item)) = self.waiting.pop_first()?;

@@ -2,6 +2,8 @@
 
 use serde::Deserialize;
 
+use crate::tape::EventKind;
+
 /// A message of the page.
 #[derive(Clone, Debug, Deserialize, PartialEq)]
 #[serde(tag = "do", rename_all = "lowercase", deny_unknown_fields)]
@@ -22,14 +24,46 @@ pub enum Command {
     /// Resumes all cells.
     Resume,
     /// Asks for the details of a cell with each snapshot.
-    Choose {
-        /// Its bus.
-        bus: usize,
-        /// Its node id.
-        node: u8,
-    },
+    Choose(Chosen),
     /// Asks for no details any more.
     Unchoose,
+    /// Plays a recording.
+    Play {
+        /// How many seconds of it pass in one.
+        speed: f64,
+    },
+    /// Stays where it is.
+    Pause,
+    /// Goes to a position.
+    Seek {
+        /// In s since the first frame.
+        at_s: f64,
+    },
+    /// Goes by one epoch.
+    Step {
+        /// To the next one, else the one before.
+        forward: bool,
+    },
+    /// Goes to an event.
+    Jump {
+        /// Of this kind.
+        to: EventKind,
+        /// To the next one, else the one before.
+        forward: bool,
+    },
+}
+
+/// What a page asks about.
+#[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq)]
+#[serde(deny_unknown_fields)]
+pub struct Chosen {
+    /// The cell's bus, as an index into the skin's.
+    pub bus: usize,
+    /// Its node id.
+    pub node: u8,
+    /// A frame of it, by its number.
+    #[serde(default)]
+    pub frame: Option<u64>,
 }
 
 /// The longest message of a page, in bytes.
@@ -48,7 +82,16 @@ impl Command {
     /// Whether it changes what cells do.
     #[must_use]
     pub const fn acts(&self) -> bool {
-        !matches!(self, Self::Choose { .. } | Self::Unchoose)
+        matches!(self, Self::Press { .. } | Self::Release | Self::Halt | Self::Resume)
+    }
+
+    /// Whether it is about the position in a recording.
+    #[must_use]
+    pub const fn plays(&self) -> bool {
+        matches!(
+            self,
+            Self::Play { .. } | Self::Pause | Self::Seek { .. } | Self::Step { .. } | Self::Jump { .. }
+        )
     }
 }
 

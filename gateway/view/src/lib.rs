@@ -12,11 +12,15 @@
 //! [`live`], [`pressed`], [`scene`] and [`command`] have no socket and no clock; [`server`] and [`serve`] are the shell.
 
 pub mod command;
+pub mod index;
 pub mod live;
+pub mod play;
+pub mod player;
 pub mod pressed;
 pub mod scene;
 pub mod serve;
 pub mod server;
+pub mod tape;
 mod web;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};

@@ -1,20 +1,23 @@
 //! What is known of a skin from what its buses carry.
 
 mod bus;
+mod recent;
 mod said;
 
+use model::table::Status;
 use protocol::can::Frame;
 use protocol::id::CellId;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
 use self::bus::LiveBus;
+pub use self::recent::{FrameSaid, Recent, Why};
 pub use self::said::{Answer, BusSaid, Dead, Detail, Said};
 use crate::pressed::{Place, Pressed};
 use protocol::message::SkinSensors;
 
 /// A skin as its buses say.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Live {
     skin: Skin,
     buses: Vec<LiveBus>,
@@ -23,6 +26,9 @@ pub struct Live {
     number: u32,
     /// When the first frame came.
     began: Option<Micros>,
+    /// The bus whose joints count as epochs: the first one that has some.
+    clock: Option<usize>,
+    recent: Recent,
 }
 
 /// Flags of a cell in a snapshot.
@@ -44,7 +50,14 @@ impl Live {
             let place = next.get_mut(cell.bus).map_or(0, |next| std::mem::replace(next, *next + 1));
             (cell.bus, place)
         });
-        Self { places: places.collect(), skin, buses, number: 0, began: None }
+        let recent = Recent::new(&skin);
+        Self { places: places.collect(), skin, buses, number: 0, began: None, clock: None, recent }
+    }
+
+    /// The same; times are said since then.
+    #[must_use]
+    pub fn since(skin: Skin, began: Micros) -> Self {
+        Self { began: Some(began), ..Self::new(skin) }
     }
 
     /// The skin.
@@ -53,12 +66,69 @@ impl Live {
         &self.skin
     }
 
-    /// A frame stood on a bus.
-    pub fn frame(&mut self, bus: usize, at: Micros, frame: &Frame) {
-        self.began.get_or_insert(at);
-        if let Some(bus) = self.buses.get_mut(bus) {
-            bus.frame(at, frame);
+    /// Takes what was latched when a recording began, as frames with their buses; no account counts it.
+    pub fn begin<'a>(&mut self, at: Micros, latched: impl Iterator<Item = (usize, &'a Frame)>) {
+        for (index, frame) in latched {
+            if let Some(bus) = self.buses.get_mut(index) {
+                bus.frame(at, frame);
+                self.recent.push(at, index, frame);
+            }
         }
+        self.buses.iter_mut().for_each(LiveBus::begin_accounts);
+    }
+
+    /// A frame stood on a bus; whether an epoch begins with it.
+    pub fn frame(&mut self, bus: usize, at: Micros, frame: &Frame) -> bool {
+        self.began.get_or_insert(at);
+        let Some(of) = self.buses.get_mut(bus) else { return false };
+        let joints = of.frame(at, frame);
+        self.recent.push(at, bus, frame);
+        if joints {
+            self.clock = Some(self.clock.map_or(bus, |clock| clock.min(bus)));
+        }
+        joints && self.clock == Some(bus)
+    }
+
+    /// Forgets the frames of the last seconds.
+    pub fn forget_recent(&mut self) {
+        self.recent.forget();
+    }
+
+    /// What has been lost on each bus so far, of any reason, and whether it is halted.
+    pub fn losses(&self) -> impl Iterator<Item = (u64, bool)> {
+        self.buses.iter().map(|bus| (bus.losses(), bus.halted))
+    }
+
+    /// Each bus' cells: whether each is touched, by its sensors or else by its torque, and whether it is dead.
+    pub fn touched(&self, now: Micros) -> impl Iterator<Item = (usize, CellId, [bool; 2])> {
+        self.buses.iter().enumerate().flat_map(move |(index, bus)| {
+            let cells = bus.table.cells().iter().zip(bus.table.sensors(now)).enumerate();
+            cells.map(move |(place, (cell, (sensors, status)))| {
+                let is_active = matches!(status, Status::Active | Status::Stale);
+                let touched = sensors.map_or(is_active, |sensors| bus.central.force(place, &sensors) > 0.0);
+                (index, cell.node, [touched, status == Status::Dead])
+            })
+        })
+    }
+
+    /// Distributed and central torque of each joint of the robot in the last epoch that is over, in Nm or N.
+    #[must_use]
+    pub fn torques(&self) -> Vec<[f64; 2]> {
+        self.rows().into_iter().map(|[_, distributed, central]| [distributed, central]).collect()
+    }
+
+    /// Position, distributed and central torque of each joint of the robot.
+    fn rows(&self) -> Vec<[f64; 3]> {
+        let mut rows = vec![[0.0_f64; 3]; self.skin.robot.joints.len()];
+        for (index, bus) in self.buses.iter().enumerate() {
+            for ((place, (joint, _)), torque) in self.skin.joints_of(index).enumerate().zip(bus.torques()) {
+                let Some([position, distributed, central]) = rows.get_mut(joint) else { continue };
+                *position = bus.position(place).unwrap_or(*position);
+                *distributed += torque.0;
+                *central += torque.1;
+            }
+        }
+        rows
     }
 
     /// Whether a bus is open and works, and how many frames were not received.
@@ -94,7 +164,7 @@ impl Live {
     /// | 4 | its number, u32 |
     /// | 4 | joints J of the robot, u32 |
     /// | 4 | cells, u32 |
-    /// | 4 | 0 |
+    /// | 4 | 0: a snapshot |
     /// | 8 | seconds since the first frame, f64 |
     /// | 12 J | of each joint position (rad or m), distributed torque, central torque (Nm or N), f32 |
     /// | 8 for each cell | status u8, flags u8, force mN u16, proximity 2^-15 u16, temperature 0.01 °C i16 |
@@ -110,16 +180,7 @@ impl Live {
             bytes.extend(word.to_le_bytes());
         }
         bytes.extend(self.seconds(now).to_le_bytes());
-        let mut rows = vec![[0.0_f64; 3]; joints];
-        for (index, bus) in self.buses.iter().enumerate() {
-            for ((place, (joint, _)), torque) in self.skin.joints_of(index).enumerate().zip(bus.torques()) {
-                let Some([position, distributed, central]) = rows.get_mut(joint) else { continue };
-                *position = bus.position(place).unwrap_or(*position);
-                *distributed += torque.0;
-                *central += torque.1;
-            }
-        }
-        for value in rows.into_iter().flatten() {
+        for value in self.rows().into_iter().flatten() {
             #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
             bytes.extend((value as f32).to_le_bytes());
         }

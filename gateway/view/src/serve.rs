@@ -18,6 +18,7 @@ use protocol::time::Micros;
 use crate::command::Command;
 use crate::live::Live;
 use crate::locked;
+use crate::player::PlayError;
 use crate::pressed::Pressed;
 use crate::scene::Scene;
 use crate::server::{Access, Counts, Server};
@@ -54,6 +55,9 @@ pub enum ServeError {
     /// A bus cannot be opened.
     #[error("{0}")]
     Bus(BusError),
+    /// The recording cannot be played.
+    #[error(transparent)]
+    Play(#[from] PlayError),
     /// The address cannot be listened on.
     #[error("--listen {listen}: {source}")]
     Listen {
@@ -209,8 +213,14 @@ fn obey(page: u64, command: &Command, live: &Live, pressed: &mut Pressed, buses:
         Command::Release => pressed.release(page),
         Command::Halt => everywhere(&Message::Halt),
         Command::Resume => everywhere(&Message::Resume),
-        // The server keeps these.
-        Command::Choose { .. } | Command::Unchoose => {}
+        // The server keeps these, and there is nothing to be played.
+        Command::Choose(_)
+        | Command::Unchoose
+        | Command::Play { .. }
+        | Command::Pause
+        | Command::Seek { .. }
+        | Command::Step { .. }
+        | Command::Jump { .. } => {}
     }
 }
 

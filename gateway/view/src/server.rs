@@ -17,7 +17,7 @@ use std::time::Duration;
 
 use tungstenite::{Bytes, Utf8Bytes};
 
-use crate::command::Command;
+use crate::command::{Chosen, Command};
 use crate::locked;
 
 /// Clients at the same time.
@@ -32,6 +32,8 @@ pub struct Access {
     pub listen: SocketAddr,
     /// Whether pages may press cells, halt and resume.
     pub may_act: bool,
+    /// Whether there is a recording that pages may play.
+    pub may_play: bool,
     /// What every request has to carry, where others than this machine may come.
     pub token: Option<String>,
 }
@@ -52,6 +54,9 @@ pub struct Counts {
 struct Newest {
     snapshot: Bytes,
     number: u64,
+    /// What was before the first snapshot behind a jump, and how many there were.
+    history: Bytes,
+    jumps: u64,
     /// For pages without a chosen cell, and for those with one.
     said: Utf8Bytes,
     own: BTreeMap<u64, Utf8Bytes>,
@@ -66,7 +71,7 @@ struct Shared {
     port: u16,
     scene: String,
     newest: Mutex<Newest>,
-    chosen: Mutex<BTreeMap<u64, (usize, u8)>>,
+    chosen: Mutex<BTreeMap<u64, Chosen>>,
     gone: Mutex<Vec<u64>>,
     commands: SyncSender<(u64, Command)>,
     stop: AtomicBool,
@@ -126,6 +131,13 @@ impl Server {
         format!("http://{}/{token}", self.address)
     }
 
+    /// What is to be known before the next snapshot.
+    pub fn publish_history(&self, history: Vec<u8>) {
+        let mut newest = locked(&self.shared.newest);
+        newest.jumps += 1;
+        newest.history = history.into();
+    }
+
     /// A new snapshot, and now and then what is said beside it: for pages without a chosen cell, and for the others.
     pub fn publish(&self, snapshot: Vec<u8>, said: Option<(String, BTreeMap<u64, String>)>) {
         let mut newest = locked(&self.shared.newest);
@@ -151,7 +163,7 @@ impl Server {
 
     /// The cells that pages have chosen.
     #[must_use]
-    pub fn chosen(&self) -> BTreeMap<u64, (usize, u8)> {
+    pub fn chosen(&self) -> BTreeMap<u64, Chosen> {
         locked(&self.shared.chosen).clone()
     }
 

@@ -15,6 +15,9 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
         "/plots.js" => (SCRIPT, include_bytes!("../web/plots.js")),
         "/words.js" => (SCRIPT, include_bytes!("../web/words.js")),
         "/touch.js" => (SCRIPT, include_bytes!("../web/touch.js")),
+        "/dom.js" => (SCRIPT, include_bytes!("../web/dom.js")),
+        "/time.js" => (SCRIPT, include_bytes!("../web/time.js")),
+        "/frames.js" => (SCRIPT, include_bytes!("../web/frames.js")),
         "/link.js" => (SCRIPT, include_bytes!("../web/link.js")),
         _ => return None,
     })
@@ -24,7 +27,7 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
 mod tests {
     use super::*;
 
-    const FILES: [&str; 12] = [
+    const FILES: [&str; 15] = [
         "/",
         "/style.css",
         "/app.js",
@@ -36,6 +39,9 @@ mod tests {
         "/plots.js",
         "/words.js",
         "/touch.js",
+        "/dom.js",
+        "/time.js",
+        "/frames.js",
         "/link.js",
     ];
 

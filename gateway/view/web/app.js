@@ -2,9 +2,11 @@
 
 import { Camera } from "./camera.js";
 import { SHOWS, css, ramp } from "./colours.js";
+import { hold } from "./frames.js";
 import { Link } from "./link.js";
 import { Picture } from "./picture.js";
 import { Plots, number } from "./plots.js";
+import { TimeBar } from "./time.js";
 import { extent, frames } from "./robot.js";
 import { listen, pick } from "./touch.js";
 import * as words from "./words.js";
@@ -104,8 +106,10 @@ const link = new Link({
     window.skinbus.snapshots++;
     redraw();
   },
+  history(it) { plots.replace(it); },
   said(it) {
-    words.say(scene, it);
+    words.say(scene, it, ask);
+    time.say(it.playback);
     if (all) camera.fit(extent(scene, all));
   },
   closed() {
@@ -113,6 +117,13 @@ const link = new Link({
     words.link("not connected: the bench has ended, or is not reachable", true);
   },
 });
+
+const time = new TimeBar($("time"), (command) => link.send(command));
+
+// Asks why the torque in a frame of the chosen cell is what it is; for another cell, for none.
+function ask(frame) {
+  link.send({ do: "choose", bus: scene.cells[chosen].bus, node: scene.cells[chosen].node, frame });
+}
 
 listen(canvas, {
   at: (x, y) => (scene && all ? pick(scene, all, camera, view(), canvas.clientWidth, canvas.clientHeight, x, y) : -1),
@@ -139,6 +150,7 @@ $("search").onchange = () => {
   $("search").setAttribute("aria-invalid", String(found < 0 && text !== ""));
   if (found >= 0) choose(found);
 };
+$("hold-frames").onclick = () => hold($("hold-frames").getAttribute("aria-pressed") !== "true");
 $("halt").onclick = () => link.send({ do: "halt" });
 $("resume").onclick = () => link.send({ do: "resume" });
 window.addEventListener("blur", release);

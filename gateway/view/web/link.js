@@ -17,6 +17,23 @@ export function decode(buffer) {
   return snapshot;
 }
 
+// The torques before a position that was gone to.
+export function decodeHistory(buffer) {
+  const data = new DataView(buffer), joints = data.getUint32(4, true), moments = data.getUint32(8, true);
+  if (buffer.byteLength !== 16 + moments * (8 + 8 * joints)) throw new Error("a history of another length");
+  const all = [];
+  for (let i = 0, at = 16; i < moments; i++, at += 8 + 8 * joints) {
+    const torques = [];
+    for (let j = 0; j < joints; j++) {
+      torques.push({ distributed: data.getFloat32(at + 8 + 8 * j, true), central: data.getFloat32(at + 12 + 8 * j, true) });
+    }
+    all.push({ time: data.getFloat64(at, true), joints: torques });
+  }
+  return all;
+}
+
+const isHistory = (buffer) => new DataView(buffer).getUint32(12, true) === 1;
+
 export class Link {
   constructor(on) {
     this.on = on;
@@ -30,7 +47,7 @@ export class Link {
     let scene = false;
     socket.onopen = () => { this.wait = 250; };
     socket.onmessage = ({ data }) => {
-      if (typeof data !== "string") return this.on.snapshot(decode(data));
+      if (typeof data !== "string") return isHistory(data) ? this.on.history(decodeHistory(data)) : this.on.snapshot(decode(data));
       const message = JSON.parse(data);
       if (scene) return this.on.said(message);
       scene = true;

@@ -28,6 +28,12 @@ export class Plots {
     });
   }
 
+  // Begins anew with what was before.
+  replace(history) {
+    for (const row of this.rows) row.points.length = 0;
+    for (const { time, joints } of history) this.push(time, joints);
+  }
+
   draw() {
     const [line, faint, distributed, central] = ["--line", "--faint", "--distributed", "--central"].map(css);
     for (const { canvas, value, unit, points } of this.rows) {

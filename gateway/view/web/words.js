@@ -1,16 +1,11 @@
 // What the page says in words: facts, buses, silent cells, the chosen cell.
 
 import { SHAPES } from "./colours.js";
+import { element } from "./dom.js";
+import { forget, frames } from "./frames.js";
 import { number } from "./plots.js";
 
 const $ = (id) => document.getElementById(id);
-
-export function element(tag, text, className) {
-  const it = document.createElement(tag);
-  if (text !== undefined) it.textContent = text;
-  if (className) it.className = className;
-  return it;
-}
 
 function table(rows) {
   const it = element("table");
@@ -33,7 +28,7 @@ function facts(pairs) {
 
 const percent = (share) => (share === null || share === undefined ? "–" : `${(share * 100).toFixed(share < 0.1 ? 1 : 0)} %`);
 
-export function say(scene, said) {
+export function say(scene, said, ask) {
   const sum = (of) => said.buses.reduce((all, bus) => all + of(bus), 0);
   const [due, complete] = [sum((bus) => bus.epochs_due), sum((bus) => bus.epochs_complete)];
   facts([
@@ -58,10 +53,10 @@ export function say(scene, said) {
   $("dead").replaceChildren(said.dead_cells.length
     ? table(said.dead_cells.map((cell) => [`${cell.bus}:${cell.node}`, `${cell.for_s.toFixed(0)} s`, "bad"]))
     : element("p", "none", "faint"));
-  if (said.detail) detail(scene, said.detail);
+  if (said.detail) detail(scene, said.detail, ask);
 }
 
-function detail(scene, it) {
+function detail(scene, it, ask) {
   const joints = scene.chains[scene.buses[it.bus].chain].rows.filter((row) => row.joint !== null).map((row) => scene.joints[row.joint]);
   const wrong = it.configuration[0] !== null && it.configuration[0] !== it.configuration[1];
   const rows = [
@@ -91,11 +86,13 @@ function detail(scene, it) {
     parts.push(element("h3", `Torque of epoch ${it.torque.epoch}${it.torque.saturated ? ", saturated" : ""}`), torques);
   }
   $("cell").replaceChildren(...parts);
+  frames(it.frames, it.why, ask);
 }
 
 export function chosen(name) {
   $("cell-title").textContent = name ? `Cell ${name}` : "No cell chosen";
   if (!name) $("cell").replaceChildren();
+  forget();
 }
 
 export function link(text, isBad) {

@@ -71,7 +71,7 @@ struct Cell {
 }
 
 /// The packets of one bus that are latched.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Latched {
     /// Packets so far.
     places: u64,

@@ -163,7 +163,7 @@ impl Traffic {
 }
 
 /// Classifies frames, and reassembles segments.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Decoder {
     format: Option<Format>,
     buses: Vec<Bus>,
@@ -172,7 +172,7 @@ pub struct Decoder {
 }
 
 /// A bus as it is followed.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Bus {
     name: String,
     /// Another one than that of any bus before it.

@@ -79,7 +79,7 @@ struct Halt {
 }
 
 /// One cell.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Cell {
     /// Its node id.
     pub node: CellId,

@@ -112,7 +112,7 @@ pub enum Notice {
 }
 
 /// The state of one bus.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Table {
     carried: Carried,
     safety: Safety,
@@ -141,7 +141,7 @@ pub struct Table {
 }
 
 /// What the bus carries.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct Carried {
     format: Format,
     /// How long joints, torques and sums are.

@@ -120,7 +120,7 @@ impl Expected {
 }
 
 /// The sums of a bus.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default)]
 pub(super) struct RootTotals {
     /// Newest first.
     epochs: [Option<Open>; LATEST + 1],

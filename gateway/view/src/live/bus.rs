@@ -36,7 +36,7 @@ struct Load {
     share: Option<f64>,
 }
 
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct LiveBus {
     pub(super) name: String,
     pub(super) table: Table,
@@ -88,7 +88,8 @@ impl LiveBus {
         }
     }
 
-    pub(super) fn frame(&mut self, at: Micros, frame: &Frame) {
+    /// A frame; whether it is joints, which begin an epoch.
+    pub(super) fn frame(&mut self, at: Micros, frame: &Frame) -> bool {
         let decoded = self.decoder.decode(at, &self.name, frame);
         let message = decoded.message().copied();
         if !matches!(decoded, Decoded::Wire(..)) && !matches!(message, Some(Message::Stimulus { .. })) {
@@ -116,6 +117,18 @@ impl LiveBus {
         }
         // Whoever sent them, joints open an epoch.
         self.table.handle_frame(at, joints, frame, &mut |_| None);
+        joints
+    }
+
+    /// What came so far does not count.
+    pub(super) fn begin_accounts(&mut self) {
+        self.table.begin_accounts();
+    }
+
+    /// All that was lost so far, for any reason.
+    pub(super) fn losses(&self) -> u64 {
+        let (replies, uplink) = (self.table.replies(), self.table.uplink());
+        replies.late + replies.missing + uplink.lost + uplink.rejected + self.dropped
     }
 
     /// Before the next joints: what has come for the last ones, and what the central computation says of them.

@@ -6,8 +6,10 @@ use protocol::id::CellId;
 use protocol::time::Micros;
 use serde::Serialize;
 
-use super::Live;
 use super::bus::LiveBus;
+use super::{FrameSaid, Live, Why};
+use crate::command::Chosen;
+use crate::player::Playback;
 
 /// Dead cells that are named.
 const NAMED: usize = 20;
@@ -29,6 +31,8 @@ pub struct Said {
     pub buses: Vec<BusSaid>,
     /// The cell that the page has chosen.
     pub detail: Option<Detail>,
+    /// Where in a recording this is.
+    pub playback: Option<Playback>,
 }
 
 /// A cell that fell silent.
@@ -104,6 +108,10 @@ pub struct Detail {
     pub lost: u64,
     /// Restarts.
     pub restarts: u32,
+    /// The newest frames from it and to it, the newest first.
+    pub frames: Vec<FrameSaid>,
+    /// Why the torque in the chosen frame is what it is, while that is kept.
+    pub why: Option<Why>,
 }
 
 /// A torque of a cell.
@@ -124,7 +132,7 @@ pub struct Answer {
 impl Live {
     /// What is to be said now.
     #[must_use]
-    pub fn said(&self, now: Micros, chosen: Option<(usize, u8)>) -> Said {
+    pub fn said(&self, now: Micros, chosen: Option<Chosen>) -> Said {
         let (mut contacts, mut dead, mut dead_cells) = (0, 0, Vec::new());
         for bus in &self.buses {
             for ((cell, status), since) in bus.table.statuses(now).zip(&bus.dead_since) {
@@ -143,13 +151,16 @@ impl Live {
             dead_cells,
             halted: self.buses.iter().any(|bus| bus.halted),
             buses: self.buses.iter().map(LiveBus::said).collect(),
-            detail: chosen.and_then(|(bus, node)| self.detail(bus, node, now)),
+            detail: chosen.and_then(|chosen| self.detail(chosen, now)),
+            playback: None,
         }
     }
 
-    fn detail(&self, index: usize, node: u8, now: Micros) -> Option<Detail> {
+    fn detail(&self, chosen: Chosen, now: Micros) -> Option<Detail> {
+        let Chosen { bus: index, node, frame } = chosen;
         let bus = self.buses.get(index)?;
-        let place = bus.place(CellId::new(node.into()).ok()?)?;
+        let id = CellId::new(node.into()).ok()?;
+        let place = bus.place(id)?;
         let cell = bus.table.cells().get(place)?;
         let (sensors, status) = bus.table.sensors(now).nth(place)?;
         let sensors = sensors.unwrap_or_default();
@@ -186,6 +197,8 @@ impl Live {
             replies: [cell.replies.due, cell.replies.in_time],
             lost: uplink.lost,
             restarts: uplink.restarts,
+            frames: self.recent.of_cell(&self.skin, (index, id), |at| self.seconds(at)),
+            why: frame.and_then(|frame| self.recent.why(&self.skin, frame)),
         })
     }
 }

@@ -1,6 +1,7 @@
 //! Frames made here, and what is known after them.
 
 use super::*;
+use crate::command::Chosen;
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
 use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, State};
@@ -92,15 +93,15 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!((cell(6)[0], cell(6)[1]), (1, flag::OTHER_CONFIGURATION), "quiet, with another configuration");
     assert_eq!(cell(7)[0], 0, "never heard");
 
-    let said = bench.live.said(bench.now, Some((0, 5)));
+    let said = bench.live.said(bench.now, Some(Chosen { bus: 0, node: 5, frame: None }));
     assert_eq!((said.contacts, said.dead, said.halted, said.buses[0].due), (1, 0, false, 2));
     let detail = said.detail.unwrap();
     let answer = detail.torque.unwrap();
     assert_eq!((answer.epoch, answer.words[..2].to_vec(), detail.serial), (2, vec![100, -200], 100_005));
     let exact = answer.central.unwrap();
     assert!((exact[0] - f64::from(central)).abs() < 1e-6, "the only cell in contact: {exact:?} {central}");
-    assert_eq!(bench.live.said(bench.now, Some((0, 254))).detail, None);
-    assert_eq!(bench.live.said(bench.now, Some((7, 1))).detail, None);
+    assert_eq!(bench.live.said(bench.now, Some(Chosen { bus: 0, node: 254, frame: None })).detail, None);
+    assert_eq!(bench.live.said(bench.now, Some(Chosen { bus: 7, node: 1, frame: None })).detail, None);
 }
 
 #[test]

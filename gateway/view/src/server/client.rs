@@ -141,18 +141,19 @@ fn live(begun: Begun, page: u64, shared: &Shared) -> io::Result<()> {
 fn talk(socket: &mut WebSocket<Begun>, page: u64, shared: &Shared) -> Result<(), Error> {
     socket.send(Message::text(shared.scene.as_str()))?;
     socket.get_ref().stream.set_read_timeout(Some(LOOK))?;
-    let (mut sent, mut said_number) = (0, 0);
+    let (mut sent, mut said_number, mut jumps) = (0, 0, 0);
     while !shared.stop.load(Ordering::Relaxed) {
-        let (snapshot, said) = {
+        let (history, snapshot, said) = {
             let newest = locked(&shared.newest);
+            let history = (newest.jumps != jumps).then(|| newest.history.clone());
             let snapshot = (newest.number != sent).then(|| newest.snapshot.clone());
             let own = newest.own.get(&page).unwrap_or(&newest.said);
             let said = (newest.said_number != said_number).then(|| own.clone());
-            (sent, said_number) = (newest.number, newest.said_number);
-            (snapshot, said)
+            (sent, said_number, jumps) = (newest.number, newest.said_number, newest.jumps);
+            (history, snapshot, said)
         };
-        if let Some(snapshot) = snapshot {
-            socket.send(Message::Binary(snapshot))?;
+        for bytes in [history, snapshot].into_iter().flatten() {
+            socket.send(Message::Binary(bytes))?;
         }
         if let Some(said) = said {
             socket.send(Message::Text(said))?;
@@ -181,7 +182,8 @@ fn take(text: &str, page: u64, shared: &Shared) {
     match Command::parse(text) {
         None => ignore(),
         Some(command) if command.acts() && !shared.access.may_act => ignore(),
-        Some(Command::Choose { bus, node }) => _ = locked(&shared.chosen).insert(page, (bus, node)),
+        Some(command) if command.plays() && !shared.access.may_play => ignore(),
+        Some(Command::Choose(chosen)) => _ = locked(&shared.chosen).insert(page, chosen),
         Some(Command::Unchoose) => _ = locked(&shared.chosen).remove(&page),
         Some(command) => {
             if shared.commands.try_send((page, command)).is_err() {

@@ -81,7 +81,12 @@ mod tests {
     use proptest::prelude::*;
 
     fn access(listen: &str, token: Option<&str>) -> Access {
-        Access { listen: listen.parse().unwrap(), may_act: true, token: token.map(str::to_owned) }
+        Access {
+            listen: listen.parse().unwrap(),
+            may_act: true,
+            may_play: false,
+            token: token.map(str::to_owned),
+        }
     }
 
     fn is_allowed(head: &str, access: &Access) -> bool {

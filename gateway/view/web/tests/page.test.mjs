@@ -4,11 +4,12 @@ import { test } from "node:test";
 
 import { Camera } from "../camera.js";
 import { SHAPES, ramp, shapeOf } from "../colours.js";
-import { decode } from "../link.js";
+import { decode, decodeHistory } from "../link.js";
 import { cross, dot, look, perspective, point, project, row, times, unit } from "../math.js";
 import { cylinders, extent, frames, triangles } from "../robot.js";
 import { pick } from "../touch.js";
 import { number } from "../plots.js";
+import { clock, requested } from "../time.js";
 
 const close = (a, b, within = 1e-9) => a.forEach((v, i) => assert.ok(Math.abs(v - b[i]) < within, `${a} ${b}`));
 const IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
@@ -118,4 +119,23 @@ test("numbers are short", () => {
   assert.deepEqual([0, 0.12345, -1.5, 12.34, -250.4].map(number), ["0.0000", "0.1235", "−1.50", "12.3", "−250"]);
   close(unit([0, 3, 4]), [0, 0.6, 0.8]);
   close(row(1, 0, 2, 0).slice(12), [1, 0, 2, 1]);
+});
+
+test("what was before a position is read as the server writes it", () => {
+  const data = new DataView(new ArrayBuffer(16 + 2 * (8 + 8)));
+  [3, 1, 2, 1].forEach((v, i) => data.setUint32(4 * i, v, true));
+  data.setFloat64(16, 1.5, true);
+  data.setFloat32(24, 0.25, true);
+  data.setFloat32(28, 0.5, true);
+  data.setFloat64(32, 1.75, true);
+  const all = decodeHistory(data.buffer);
+  assert.deepEqual(all[0], { time: 1.5, joints: [{ distributed: 0.25, central: 0.5 }] });
+  assert.equal(all[1].time, 1.75);
+  assert.throws(() => decodeHistory(data.buffer.slice(0, 40)));
+});
+
+test("times are said as clocks, and an address asks for one", () => {
+  assert.deepEqual([0, 8.3, 64.9551, 3599.9999, 3600, 86400.5].map(clock),
+    ["0:00.000", "0:08.300", "1:04.955", "1:00:00.000", "1:00:00.000", "24:00:00.500"]);
+  assert.deepEqual(["#at=12.5", "#at=0", "#at=", "#at=-1", "#at=1e9", "#cell=1", ""].map(requested), [12.5, 0, null, null, null, null, null]);
 });

@@ -1,0 +1,187 @@
+//! The frames of the last seconds, in words, and why a torque among them is what it is.
+
+use std::collections::VecDeque;
+
+use analysis::explain::{CellExplained, Requested, Watch, explain};
+use bench::record::force::{Latched, Seen};
+use model::decode::settle::Settler;
+use model::decode::{Decoded, Decoder};
+use protocol::can::Frame;
+use protocol::id::{CellId, Kind, Node};
+use protocol::message::Message;
+use protocol::packet::data_id;
+use protocol::schema::Units;
+use protocol::skin::Skin;
+use protocol::time::Micros;
+use serde::Serialize;
+
+/// How long frames are kept, in µs.
+const KEPT_US: u64 = 3_000_000;
+/// Frames that are kept.
+const FRAMES: usize = 65_536;
+/// Frames of a cell that are named.
+const NAMED: usize = 8;
+/// The joints that a torque answers came no longer before it, in ns.
+const BEFORE_NS: u64 = 500_000_000;
+
+/// The frames of the last seconds of all buses.
+#[derive(Clone, Debug)]
+pub struct Recent {
+    frames: VecDeque<Kept>,
+    /// Frames so far.
+    count: u64,
+    /// What was latched on each bus before the oldest frame that is kept.
+    latched: Vec<Latched>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Kept {
+    at: Micros,
+    bus: usize,
+    frame: Frame,
+}
+
+/// A frame in words.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct FrameSaid {
+    /// Its number, by which the page asks for more.
+    pub number: u64,
+    /// Seconds since the first frame.
+    pub at_s: f64,
+    /// The frame as candump writes it.
+    pub frame: String,
+    /// Verdict and meaning, as `gateway dump` has them.
+    pub said: String,
+    /// Whether it is a torque, which can be explained.
+    pub is_torque: bool,
+}
+
+/// Why a torque is what it is.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Why {
+    /// The frame's number.
+    pub number: u64,
+    /// The epoch of its joints.
+    pub epoch: u8,
+    /// The cell's steps.
+    pub cell: Option<CellExplained>,
+    /// What is not known, a line each.
+    pub missing: Vec<String>,
+}
+
+impl Recent {
+    pub(super) fn new(skin: &Skin) -> Self {
+        let latched = skin.buses.iter().map(|_| Latched::default()).collect();
+        Self { frames: VecDeque::new(), count: 0, latched }
+    }
+
+    pub(super) fn push(&mut self, at: Micros, bus: usize, frame: &Frame) {
+        self.frames.push_back(Kept { at, bus, frame: *frame });
+        self.count += 1;
+        while self.frames.len() > FRAMES
+            || self.frames.front().is_some_and(|first| at.since(first.at).0 > KEPT_US)
+        {
+            self.drop_first();
+        }
+    }
+
+    /// What they say stays.
+    pub(super) fn forget(&mut self) {
+        while !self.frames.is_empty() {
+            self.drop_first();
+        }
+        self.frames.shrink_to_fit();
+    }
+
+    fn drop_first(&mut self) {
+        let Some(Kept { at, bus, frame }) = self.frames.pop_front() else { return };
+        if let Some(latched) = self.latched.get_mut(bus) {
+            latched.take(Seen { at_nanos: at.0 * 1_000, own: false, frame });
+        }
+    }
+
+    /// The newest frames from and to a cell, the newest first; `seconds` gives a time since the first frame.
+    pub(super) fn of_cell(
+        &self,
+        skin: &Skin,
+        (bus, node): (usize, CellId),
+        seconds: impl Fn(Micros) -> f64,
+    ) -> Vec<FrameSaid> {
+        let format = skin.buses.get(bus).map(|bus| bus.format);
+        let mut settler = Settler::new(format);
+        for (number, kept) in (self.first_number()..).zip(&self.frames).filter(|(_, kept)| kept.bus == bus) {
+            let Ok(id) = data_id(&kept.frame) else { continue };
+            // Commands say how long torques are.
+            let is_command = id.kind == Kind::Command;
+            if is_command || Node::from_byte(id.node) == Node::Cell(node) {
+                settler.push(kept.at, "", &kept.frame, (number, *kept, is_command));
+            }
+        }
+        settler.finish();
+        let units = Units::of(skin, bus);
+        let mut all = VecDeque::new();
+        while let Some(((number, kept, is_command), decoded)) = settler.pop() {
+            if is_command {
+                continue;
+            }
+            if all.len() == NAMED {
+                all.pop_back();
+            }
+            all.push_front(FrameSaid {
+                number,
+                at_s: seconds(kept.at),
+                frame: kept.frame.to_string(),
+                said: decoded.in_units(units).to_string(),
+                is_torque: matches!(decoded, Decoded::Message(Message::Torque { .. })),
+            });
+        }
+        all.into()
+    }
+
+    /// Why the torque in a frame is what it is, while the frame is kept.
+    pub(super) fn why(&self, skin: &Skin, number: u64) -> Option<Why> {
+        let place = usize::try_from(number.checked_sub(self.first_number())?).ok()?;
+        let asked = self.frames.get(place)?;
+        let mut decoder = Decoder::new(None);
+        let mut found = None;
+        for kept in self.frames.iter().take(place + 1).filter(|kept| kept.bus == asked.bus) {
+            found = decoder.decode(kept.at, "", &kept.frame).message().copied();
+        }
+        let Some(Message::Torque { from, epoch, .. }) = found else { return None };
+        let first = self.frames.front()?.at;
+        let from_ns = (asked.at.since(first).0 * 1_000).saturating_sub(BEFORE_NS);
+        let mut watch = Watch::new(skin, Requested { epoch, from_ns, occurrence: 1 });
+        let mut decoder = Decoder::new(None);
+        let name = |bus: usize| skin.buses.get(bus).map_or("", |bus| bus.name.as_str());
+        for (bus, latched) in self.latched.iter().enumerate() {
+            for seen in latched.frames() {
+                let at = Micros(seen.at_nanos / 1_000);
+                if let Decoded::Message(message) = decoder.decode(at, name(bus), &seen.frame) {
+                    watch.begin(seen.at_nanos, name(bus), &message);
+                }
+            }
+        }
+        for kept in &self.frames {
+            let decoded = decoder.decode(kept.at, name(kept.bus), &kept.frame);
+            if watch.take(kept.at.0 * 1_000, name(kept.bus), decoded.message()) {
+                break;
+            }
+        }
+        let said = match watch.moments() {
+            Ok(moments) => explain(skin, &moments),
+            Err(error) => {
+                return Some(Why { number, epoch: epoch.0, cell: None, missing: vec![error.to_string()] });
+            }
+        };
+        let bus = name(asked.bus);
+        let cell = said.cells.into_iter().find(|cell| cell.bus == bus && cell.node == from.get());
+        let here = [format!("{bus} {from}:"), format!("{bus}:"), format!("{bus} answers")];
+        let missing = said.missing.into_iter();
+        let missing = missing.filter(|line| here.iter().any(|here| line.starts_with(here))).collect();
+        Some(Why { number, epoch: epoch.0, cell, missing })
+    }
+
+    fn first_number(&self) -> u64 {
+        self.count - self.frames.len() as u64
+    }
+}

@@ -1,0 +1,145 @@
+//! The shell of a recording: its player, a thread for its index, and the server.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use protocol::skin::Skin;
+use trace::capture::Reader;
+
+use crate::command::Command;
+use crate::player::{PlayError, Player};
+use crate::pressed::Pressed;
+use crate::scene::Scene;
+use crate::serve::ServeError;
+use crate::server::{Access, Counts, Server};
+use crate::tape::EventKind;
+
+/// From one snapshot to the next.
+const EVERY: Duration = Duration::from_millis(33);
+/// Snapshots from one text to the next.
+const SAID_EVERY: u64 = 6;
+/// Parts of the time line in which events are marked.
+const PARTS: u16 = 600;
+
+/// What to play where.
+#[derive(Debug)]
+pub struct Options {
+    /// A candump log, or the parts of an MCAP recording.
+    pub paths: Vec<PathBuf>,
+    /// The skin that it is of.
+    pub skin: Skin,
+    /// Who may use it.
+    pub access: Access,
+    /// Where to stay at first, in s since the first frame; else it plays from there.
+    pub at_s: Option<f64>,
+}
+
+/// Plays a recording until `stop`. `says` is told the page's address once it is served.
+///
+/// # Errors
+/// When the address cannot be listened on, or the recording cannot be read.
+pub fn play(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Result<Counts, ServeError> {
+    let Options { paths, skin, access, at_s } = options;
+    let listen = access.listen;
+    let mut player = Player::open(&paths, skin.clone())?;
+    let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
+    let scene = serde_json::to_string(&Scene::of(&skin, false)).unwrap_or_default();
+    let server = Server::start(access, scene).map_err(|source| ServeError::Listen { listen, source })?;
+    says(&server.url());
+    let (index, origin) = (player.index(), player.origin());
+    thread::scope(|scope| {
+        scope.spawn(move || index.build(reader, skin, origin, stop));
+        match at_s {
+            Some(at_s) => player.seek(at_s).map_err(PlayError::from)?,
+            None => player.play(1.0),
+        }
+        publish(&mut player, &server, stop);
+        Ok::<_, ServeError>(())
+    })?;
+    Ok(server.counts())
+}
+
+/// The player's position for the pages, and their commands for the player.
+fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
+    let nobody = Pressed::default();
+    let (mut next, mut before) = (Instant::now(), Instant::now());
+    let (mut number, mut jumps) = (0_u64, u64::MAX);
+    let mut marks = (usize::MAX, BTreeMap::new());
+    while !stop.load(Ordering::Relaxed) {
+        let mut failed = None;
+        let commands: Vec<_> = server.commands().map(|(_, command)| command).collect();
+        let mut is_changed = !commands.is_empty();
+        for (place, command) in commands.iter().enumerate() {
+            // Of positions one after the other, as a slider gives them, only the last counts.
+            let is_passed = matches!(commands.get(place + 1), Some(Command::Seek { .. }));
+            if matches!(command, Command::Seek { .. }) && is_passed {
+                continue;
+            }
+            failed = obey(player, command).err().or(failed);
+        }
+        let elapsed = std::mem::replace(&mut before, Instant::now()).elapsed();
+        match player.pass(elapsed) {
+            Ok(changed) => is_changed |= changed,
+            Err(error) => failed = Some(error.to_string()),
+        }
+        if let Some(failed) = failed {
+            player.fail(failed);
+        }
+        if server.pages() > 0 {
+            let now = player.now();
+            if jumps != player.jumps() {
+                jumps = player.jumps();
+                server.publish_history(player.history());
+            }
+            let said = number.is_multiple_of(SAID_EVERY).then(|| {
+                let playback = player.said();
+                if marks.0 != playback.events {
+                    let kinds = [EventKind::Touch, EventKind::Loss, EventKind::Silence, EventKind::Halt];
+                    marks = (playback.events, kinds.map(|kind| (kind, player.marks(kind, PARTS))).into());
+                }
+                let live = player.live();
+                let text = |chosen| {
+                    let mut said = live.said(now, chosen);
+                    said.playback = Some(playback.clone().marked(marks.1.clone()));
+                    serde_json::to_string(&said).unwrap_or_default()
+                };
+                let chosen = server.chosen().into_iter();
+                (text(None), chosen.map(|(page, cell)| (page, text(Some(cell)))).collect())
+            });
+            if is_changed || said.is_some() {
+                server.publish(player.live().snapshot(now, &nobody), said);
+            }
+            number += 1;
+        }
+        next = (next + EVERY).max(Instant::now());
+        thread::sleep(next.saturating_duration_since(Instant::now()).max(Duration::from_millis(1)));
+    }
+}
+
+/// Does what a page asks for.
+fn obey(player: &mut Player, command: &Command) -> Result<(), String> {
+    let done = match *command {
+        Command::Play { speed } => {
+            player.play(speed);
+            Ok(())
+        }
+        Command::Pause => {
+            player.pause();
+            Ok(())
+        }
+        Command::Seek { at_s } => player.seek(at_s),
+        Command::Step { forward } => player.step(forward),
+        Command::Jump { to, forward } => player.jump(to, forward).map(|_| ()),
+        // Nothing can be pressed in a recording, and the server keeps the others.
+        Command::Press { .. }
+        | Command::Release
+        | Command::Halt
+        | Command::Resume
+        | Command::Choose(_)
+        | Command::Unchoose => Ok(()),
+    };
+    done.map_err(|error| error.to_string())
+}

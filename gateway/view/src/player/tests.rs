@@ -1,0 +1,233 @@
+//! A recording made here: at every moment, reached on whatever way, a player knows what all frames up to it say.
+
+use std::io::Write;
+
+use super::*;
+use crate::command::Chosen;
+use crate::pressed::Pressed;
+use proptest::prelude::*;
+use protocol::can::Format;
+use protocol::candump::{Record, Timestamp};
+use protocol::fixed::{Q1_14, Q5_10};
+use protocol::id::{CellId, Node};
+use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::packet::Epoch;
+
+/// When its first frame came, in ns since 1970.
+const BEGAN: u64 = 1_700_000_000_000_000_000;
+const MS: u64 = 1_000_000;
+/// Its length in ms, and the time of an epoch.
+const LENGTH_MS: u64 = 40_000;
+const EPOCH_MS: u64 = 16;
+const CELLS: u8 = 24;
+
+fn skin() -> Skin {
+    Skin::parse("ur5", include_str!("../../../examples/ur5-253.toml")).unwrap()
+}
+
+/// A log of 24 cells: cell 5 is touched from 6 s to 9 s and from 30 s on, cell 7 falls silent at 20 s, replies are missing
+/// at 12 s, and the robot is halted from 25 s to 26 s.
+fn log(skin: &Skin) -> Vec<u8> {
+    let mut out = Vec::new();
+    let mut say = |ms: u64, micros: u64, message: &Message| {
+        for frame in message.encode().frames(Format::Fd) {
+            let time = Timestamp { nanos: BEGAN + ms * MS + micros * 1_000, nine_digits: false };
+            let record = Record { time, interface: "vcan0", frame, direction: None };
+            writeln!(out, "{record}").unwrap();
+        }
+    };
+    let cell = |node: u8| CellId::new(node.into()).unwrap();
+    let mut sent = [0_u16; 256];
+    for ms in 0..LENGTH_MS {
+        for node in (1..=CELLS).filter(|node| ms % 250 == u64::from(*node) * 10) {
+            if node == 7 && ms >= 20_000 {
+                continue;
+            }
+            let state = State(0x1000 | State::CONFIGURED.0 | State::TEST_MODE.0 | 2 << 8);
+            let configuration = skin.parameters(&skin.cells[usize::from(node) - 1]).hash();
+            let serial = 100_000 + u32::from(node);
+            let sent = sent[usize::from(node)].to_le_bytes()[0].into();
+            let heartbeat = Heartbeat { serial, configuration, state, sent, ..Heartbeat::default() };
+            let page = NetworkPage::Heartbeat(heartbeat);
+            say(ms, 3, &Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(0), page });
+        }
+        let force = |n: f64| {
+            let sensors = SkinSensors { contact: [Q5_10::nearest(n); 3], ..SkinSensors::default() };
+            Message::Stimulus { to: Node::Cell(cell(5)), from: From::Next, page: SensorPage::Skin(sensors) }
+        };
+        match ms {
+            6_000 | 30_000 => say(ms, 7, &force(1.0)),
+            9_000 => say(ms, 7, &force(0.0)),
+            25_000 => say(ms, 8, &Message::Halt),
+            26_000 => say(ms, 8, &Message::Resume),
+            _ => {}
+        }
+        if ms % EPOCH_MS == 0 {
+            let epoch = Epoch((ms / EPOCH_MS).to_le_bytes()[0]);
+            let mut positions = [Q1_14::ZERO; protocol::parameters::MAX_JOINTS];
+            positions[0] = Q1_14::from_radians(f64::from(u32::try_from(ms).unwrap()) * 5e-5).unwrap();
+            positions[1] = Q1_14::from_radians(-1.2).unwrap();
+            say(ms, 10, &Message::Joints { epoch, joints: Joints { positions, in_use: 6 } });
+            let touched = (6_016..9_000).contains(&ms) || ms >= 30_016;
+            if touched && !(12_000..12_200).contains(&ms) {
+                sent[5] += 1;
+                let torque = [(ms % 97) as i16, -200, 0, 0, 0, 0].into();
+                say(ms, 900, &Message::Torque { from: cell(5), epoch, torque });
+            }
+        }
+    }
+    out
+}
+
+/// What a page would show, without what counts the snapshots.
+fn shown(tape: &mut Live, now: Micros) -> (Vec<u8>, String) {
+    let said = tape.said(now, Some(Chosen { bus: 0, node: 5, frame: None }));
+    (tape.snapshot(now, &Pressed::default()).split_off(4), serde_json::to_string(&said).unwrap())
+}
+
+/// The same by reading all from the beginning.
+fn straight(bytes: &[u8], skin: &Skin, until: u64) -> (Vec<u8>, String) {
+    let mut reader = Reader::from_read("log", std::io::Cursor::new(bytes.to_vec())).unwrap();
+    let mut tape = Tape::new(skin.clone(), BEGAN + 10_000);
+    loop {
+        match tape.step(until) {
+            Step::Hungry => tape.feed(&mut reader).unwrap(),
+            Step::There | Step::Over => break,
+            Step::Looked | Step::Applied { .. } => {}
+        }
+    }
+    shown(tape.live_mut(), Micros(until / 1_000))
+}
+
+struct Bench {
+    _folder: tempfile::TempDir,
+    paths: [PathBuf; 1],
+    skin: Skin,
+    bytes: Vec<u8>,
+}
+
+impl Bench {
+    fn new() -> Self {
+        let skin = skin();
+        let bytes = log(&skin);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run.log");
+        std::fs::write(&path, &bytes).unwrap();
+        Self { _folder: folder, paths: [path], skin, bytes }
+    }
+
+    fn player(&self) -> Player {
+        Player::open(&self.paths, self.skin.clone()).unwrap()
+    }
+
+    fn build(&self, player: &Player) {
+        let reader = Reader::open_all(&self.paths).unwrap();
+        player.index().build(reader, self.skin.clone(), player.origin(), &false.into());
+    }
+}
+
+#[test]
+fn events_are_found_and_gone_to() {
+    let bench = Bench::new();
+    let mut player = bench.player();
+    bench.build(&player);
+    let mut at = |kind, forward| {
+        assert!(player.jump(kind, forward).unwrap(), "{kind:?}");
+        player.said().at_s
+    };
+    let near = |found: f64, expected: f64| (expected..expected + 0.06).contains(&found);
+    assert!(near(at(EventKind::Touch, true), 6.0));
+    assert!(near(at(EventKind::Touch, true), 30.0));
+    assert!(near(at(EventKind::Touch, false), 6.0));
+    assert!(near(at(EventKind::Halt, true), 25.0));
+    let silent = at(EventKind::Silence, false);
+    assert!((20.3..20.8).contains(&silent), "{silent}");
+    assert!(!player.jump(EventKind::Silence, true).unwrap(), "only one cell falls silent");
+    assert_eq!(player.marks(EventKind::Touch, 100), [15, 75]);
+    let said = player.said();
+    assert!((39.9..40.1).contains(&said.of_s) && said.read == 1.0 && said.others == 0);
+}
+
+#[test]
+fn an_epoch_forth_and_back_is_where_it_began() {
+    let bench = Bench::new();
+    let mut player = bench.player();
+    bench.build(&player);
+    player.seek(7.0).unwrap();
+    player.play(1.0);
+    player.step(true).unwrap();
+    let first = player.said();
+    assert!(!first.playing && (first.at_s - 7.008).abs() < 1e-4, "{}", first.at_s);
+    player.step(true).unwrap();
+    assert!((player.said().at_s - 7.024).abs() < 1e-4);
+    player.step(false).unwrap();
+    assert_eq!(player.said().at_s, first.at_s);
+    player.seek(0.0).unwrap();
+    player.step(false).unwrap();
+    assert!(player.said().at_s < 0.001);
+    player.seek(1e300).unwrap();
+    player.step(true).unwrap();
+    assert!(player.said().at_s >= 39.9);
+}
+
+#[test]
+fn time_passes_at_its_speed_and_ends_with_the_recording() {
+    let bench = Bench::new();
+    let mut player = bench.player();
+    bench.build(&player);
+    player.play(2.0);
+    assert!(player.pass(Duration::from_millis(500)).unwrap());
+    assert!((player.said().at_s - 1.0).abs() < 1e-6);
+    player.play(f64::NAN);
+    assert_eq!(player.said().speed, 1.0);
+    player.play(1e9);
+    assert_eq!(player.said().speed, 100.0);
+    player.pass(Duration::from_secs(1)).unwrap();
+    assert!(!player.said().playing, "it is over");
+    assert!(!player.pass(Duration::from_secs(1)).unwrap());
+    let history = player.history();
+    let moments = u32::from_le_bytes(history[8..12].try_into().unwrap()) as usize;
+    assert!((300..=625).contains(&moments), "{moments}");
+    assert_eq!(history.len(), 16 + moments * (8 + 8 * 6));
+}
+
+#[test]
+fn what_is_not_known_yet_is_said_and_is_exact_later() {
+    let bench = Bench::new();
+    let mut player = bench.player();
+    player.seek(35.0).unwrap();
+    assert!(!player.said().exact);
+    let now = player.now();
+    let glance = player.live().said(now, None);
+    assert!(glance.contacts <= 1 && glance.buses[0].epochs_due < 250, "the last seconds");
+    bench.build(&player);
+    assert!(player.pass(Duration::ZERO).unwrap() && player.said().exact);
+    let (now, until) = (player.now(), BEGAN + 10_000 + 35_000 * MS);
+    assert_eq!(shown(player.live(), now), straight(&bench.bytes, &bench.skin, until));
+}
+
+#[test]
+fn a_recording_without_frames_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("empty.log");
+    std::fs::write(&path, "nothing\n").unwrap();
+    let error = Player::open(&[path], skin()).unwrap_err().to_string();
+    assert!(error.ends_with("empty.log: there is no frame in it"), "{error}");
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(6))]
+    #[test]
+    fn every_way_to_a_moment_shows_the_same(moves in proptest::collection::vec(0_u64..40_000_000, 1..5)) {
+        let bench = Bench::new();
+        let mut player = bench.player();
+        bench.build(&player);
+        for micros in moves {
+            #[expect(clippy::cast_precision_loss)]
+            player.seek(micros as f64 / 1e6).unwrap();
+            let now = player.now();
+            let expected = straight(&bench.bytes, &bench.skin, player.at);
+            prop_assert_eq!(shown(player.live(), now), expected);
+        }
+    }
+}

@@ -1,0 +1,137 @@
+// The time line of a recording: its position, what happens in it, and the commands that move in it.
+
+import { css } from "./colours.js";
+import { element } from "./dom.js";
+
+const KINDS = { touch: "Touch", loss: "Loss", silence: "Silent cell", halt: "Halt" };
+const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 20];
+const PARTS = 600;
+
+// Minutes, seconds and thousandths of a time in s; hours where there are any.
+export function clock(seconds) {
+  const ms = Math.round(Math.max(0, seconds) * 1000), two = (v) => String(v).padStart(2, "0");
+  const [h, m, s] = [Math.floor(ms / 3600000), Math.floor(ms / 60000) % 60, Math.floor(ms / 1000) % 60];
+  return `${h ? `${h}:${two(m)}` : m}:${two(s)}.${String(ms % 1000).padStart(3, "0")}`;
+}
+
+// What a fragment of the address asks for, as `#at=12.5`: a position in s, or none.
+export function requested(fragment) {
+  const found = /^#at=(\d+(?:\.\d+)?)$/.exec(fragment);
+  return found ? Number(found[1]) : null;
+}
+
+export class TimeBar {
+  constructor(box, send) {
+    Object.assign(this, { box, send, playback: null, dragged: null, marked: "" });
+    const button = (text, label, click) => {
+      const it = element("button", text);
+      it.type = "button";
+      it.title = label;
+      it.setAttribute("aria-label", label);
+      it.onclick = click;
+      return it;
+    };
+    this.play = button("Play", "Play", () => this.toggle());
+    this.back = button("−1", "The epoch before", () => send({ do: "step", forward: false }));
+    this.forth = button("+1", "The next epoch", () => send({ do: "step", forward: true }));
+    this.speed = element("select");
+    this.speed.setAttribute("aria-label", "Speed");
+    for (const speed of SPEEDS) {
+      const it = element("option", `${speed} ×`);
+      it.value = String(speed);
+      this.speed.append(it);
+    }
+    this.speed.value = "1";
+    this.speed.onchange = () => { if (this.playback?.playing) send({ do: "play", speed: Number(this.speed.value) }); };
+    this.kind = element("select");
+    this.kind.setAttribute("aria-label", "Event to go to");
+    for (const [kind, name] of Object.entries(KINDS)) {
+      const it = element("option", name);
+      it.value = kind;
+      this.kind.append(it);
+    }
+    const jump = (forward) => () => send({ do: "jump", to: this.kind.value, forward });
+    this.last = button("◂", "The event before", jump(false));
+    this.next = button("▸", "The next event", jump(true));
+    this.slider = element("input");
+    Object.assign(this.slider, { type: "range", min: 0, max: 1, step: "any", value: 0 });
+    this.slider.setAttribute("aria-label", "Position");
+    this.slider.oninput = () => { this.dragged = Number(this.slider.value); send({ do: "seek", at_s: this.dragged }); this.words(); };
+    this.slider.onchange = () => { this.dragged = null; };
+    this.marks = element("canvas");
+    this.marks.setAttribute("role", "img");
+    this.at = element("output");
+    this.state = element("p", "", "faint");
+    const part = (className, ...children) => {
+      const it = element("div", undefined, className);
+      it.append(...children);
+      return it;
+    };
+    const line = part("line", this.marks, this.slider), moves = part("moves", this.play, this.back, this.forth, this.speed);
+    const row = part("controls", moves, this.at, part("moves", this.kind, this.last, this.next), this.state);
+    box.append(line, row);
+    window.addEventListener("hashchange", () => this.follow());
+    window.addEventListener("resize", () => { this.marked = ""; });
+  }
+
+  toggle() {
+    const { playing, at_s, of_s } = this.playback;
+    if (playing) return this.send({ do: "pause" });
+    if (at_s >= of_s) this.send({ do: "seek", at_s: 0 });
+    this.send({ do: "play", speed: Number(this.speed.value) });
+  }
+
+  // Goes where the address says.
+  follow() {
+    const at = requested(location.hash);
+    if (at === null || !this.playback) return;
+    this.send({ do: "pause" });
+    this.send({ do: "seek", at_s: at });
+  }
+
+  say(playback) {
+    const first = !this.playback && playback;
+    this.playback = playback;
+    this.box.hidden = !playback;
+    document.body.classList.toggle("recorded", Boolean(playback));
+    if (!playback) return;
+    document.getElementById("press-title").textContent = "Choose";
+    if (first) this.follow();
+    this.play.textContent = playback.playing ? "Pause" : "Play";
+    this.play.setAttribute("aria-label", playback.playing ? "Pause" : "Play");
+    this.slider.max = String(playback.of_s);
+    if (this.dragged === null) this.slider.value = String(playback.at_s);
+    this.words();
+    this.draw();
+    const has = (playback.marks[this.kind.value] ?? []).length > 0;
+    for (const it of [this.last, this.next]) it.disabled = !has;
+  }
+
+  words() {
+    const { at_s, of_s, read, exact, failed, others } = this.playback;
+    this.at.textContent = `${clock(this.dragged ?? at_s)} of ${clock(of_s)}`;
+    this.slider.setAttribute("aria-valuetext", this.at.textContent);
+    this.state.className = failed ? "bad" : "faint";
+    this.state.textContent = failed ?? (read < 1 ? `${Math.floor(read * 100)} % read${exact ? "" : "; counts are of the last seconds only"}`
+      : others ? `${others} frames are of buses that the skin does not have` : "");
+  }
+
+  // What happens when, a row for each kind.
+  draw() {
+    const { marks, read } = this.playback, w = this.marks.clientWidth, state = `${w} ${read} ${JSON.stringify(marks)}`;
+    if (state === this.marked || !w) return;
+    this.marked = state;
+    const kinds = Object.keys(KINDS), ratio = Math.min(2, window.devicePixelRatio || 1), h = 4 * kinds.length;
+    [this.marks.width, this.marks.height] = [Math.round(w * ratio), h * ratio];
+    const pen = this.marks.getContext("2d");
+    pen.scale(ratio, ratio);
+    pen.fillStyle = css("--line");
+    pen.fillRect(0, 0, w * read, h);
+    kinds.forEach((kind, row) => {
+      pen.fillStyle = css(kind === "touch" ? "--distributed" : kind === "loss" ? "--central" : "--alarm");
+      for (const part of marks[kind] ?? []) pen.fillRect(part / PARTS * w, row * 4, Math.max(1.5, w / PARTS), 3);
+    });
+    const said = kinds.filter((kind) => (marks[kind] ?? []).length).map((kind) => KINDS[kind].toLowerCase());
+    this.marks.setAttribute("aria-label", said.length ? `Rows: ${said.join(", ")}` : "Nothing happens so far");
+  }
+}
