@@ -5,127 +5,10 @@ mod process;
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
-use std::time::{Duration, Instant};
 
-use process::{Place, Running, TIMEOUT, until};
-use serde_json::Value;
-use tungstenite::client::IntoClientRequest;
-use tungstenite::{Error, Message, WebSocket, client};
-
-/// Nothing happens by itself; the arm gives way.
-const QUIET: &str = "version = 1\nduration_s = 60.0\n\n[motion]\nkind = \"kinesthetic\"\n\
-                     start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
-
-/// A page, without the browser.
-struct Page {
-    socket: WebSocket<TcpStream>,
-    scene: Value,
-}
-
-/// A snapshot of six joints.
-struct Snapshot {
-    time: f64,
-    /// Position, distributed and central torque.
-    joints: Vec<[f32; 3]>,
-    /// Status, flags, force in mN.
-    cells: Vec<(u8, u8, u16)>,
-}
-
-/// Where the server of a run or a view says that it is: `127.0.0.1:8100`.
-fn address(said: &str) -> String {
-    let (_, rest) = said.split_once("view: http://").unwrap();
-    rest.split('/').next().unwrap().to_owned()
-}
-
-/// Asks to be a page, with these headers more or other ones.
-fn ask(address: &str, headers: &[(&'static str, &str)]) -> Result<(WebSocket<TcpStream>, u16), Error> {
-    let stream = TcpStream::connect(address).unwrap();
-    stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
-    let mut request = format!("ws://{address}/live").into_client_request()?;
-    for (name, value) in headers {
-        request.headers_mut().insert(*name, value.parse().unwrap());
-    }
-    match client(request, stream) {
-        Ok((socket, response)) => Ok((socket, response.status().as_u16())),
-        Err(tungstenite::HandshakeError::Failure(error)) => Err(error),
-        Err(tungstenite::HandshakeError::Interrupted(_)) => panic!("no answer"),
-    }
-}
-
-impl Page {
-    fn new(address: &str) -> Self {
-        let (mut socket, _) = ask(address, &[("Origin", &format!("http://{address}"))]).unwrap();
-        let scene = serde_json::from_str(socket.read().unwrap().to_text().unwrap()).unwrap();
-        Self { socket, scene }
-    }
-
-    fn say(&mut self, command: &str) {
-        self.socket.send(Message::text(command)).unwrap();
-    }
-
-    fn press(&mut self, node: u8, force_n: f64) {
-        self.say(&format!(r#"{{"do":"press","bus":0,"node":{node},"force_n":{force_n}}}"#));
-    }
-
-    /// Waits for a snapshot at which this holds.
-    fn sees(&mut self, what: &str, mut is: impl FnMut(&Snapshot) -> bool) -> Snapshot {
-        let give_up = Instant::now() + TIMEOUT;
-        loop {
-            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
-            if let Message::Binary(bytes) = self.socket.read().unwrap() {
-                let snapshot = Snapshot::read(&bytes);
-                if is(&snapshot) {
-                    return snapshot;
-                }
-            }
-        }
-    }
-
-    /// Waits for words at which this holds.
-    fn hears(&mut self, what: &str, mut is: impl FnMut(&Value) -> bool) -> Value {
-        let give_up = Instant::now() + TIMEOUT;
-        loop {
-            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
-            if let Message::Text(text) = self.socket.read().unwrap() {
-                let said = serde_json::from_str(text.as_str()).unwrap();
-                if is(&said) {
-                    return said;
-                }
-            }
-        }
-    }
-}
-
-impl Snapshot {
-    fn read(bytes: &[u8]) -> Self {
-        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
-        let (joints, cells) = (word(4) as usize, word(8) as usize);
-        assert_eq!(bytes.len(), 24 + 12 * joints + 8 * cells);
-        let of_joint = |joint| [0, 4, 8].map(|at| f32::from_bits(word(24 + 12 * joint + at)));
-        let of_cell = |cell| {
-            let at = 24 + 12 * joints + 8 * cell;
-            (bytes[at], bytes[at + 1], u16::from_le_bytes([bytes[at + 2], bytes[at + 3]]))
-        };
-        Self {
-            time: f64::from_le_bytes(bytes[16..24].try_into().unwrap()),
-            joints: (0..joints).map(of_joint).collect(),
-            cells: (0..cells).map(of_cell).collect(),
-        }
-    }
-}
-
-/// A run that is watched, and where its page is.
-fn watched(place: &Place, cells: usize, more: &str) -> (Running, String) {
-    place.skin(cells);
-    place.scenario(QUIET);
-    let words = format!(
-        "run skin.toml --bus-kind embedded --scenario scenario.toml --view --summary run.json {more}"
-    );
-    let run = place.start("gateway", &words);
-    run.hears("view: http://");
-    let said = run.stderr();
-    (run, address(&said))
-}
+use process::page::{Page, QUIET, address, ask, watched};
+use process::{Place, TIMEOUT, until};
+use tungstenite::{Error, Message};
 
 #[test]
 fn a_press_is_a_torque_and_a_release_takes_it_away() {
@@ -280,8 +163,7 @@ fn pages_that_may_only_look_press_nothing_and_others_need_a_token() {
     place.scenario(QUIET);
     let run = place.running_bench(30.0, "");
     let view = place.start("gateway", "view skin.toml --bus-kind embedded --read-only");
-    view.hears("view: http://");
-    let mut page = Page::new(&address(&view.stderr()));
+    let mut page = Page::new(&address(&view));
     assert_eq!(page.scene["may_press"], false);
     page.press(2, 5.0);
     page.say(r#"{"do":"halt"}"#);

@@ -17,11 +17,9 @@ mod process;
 use browser::Browser;
 use process::Place;
 use process::log::Log;
+use process::page::watched;
 use protocol::can::Format;
 use protocol::message::{Message, SensorPage};
-
-const QUIET: &str = "version = 1\nduration_s = 60.0\n\n[motion]\nkind = \"kinesthetic\"\n\
-                     start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
 
 /// The text of an element.
 fn text(browser: &mut Browser, id: &str) -> String {
@@ -32,13 +30,8 @@ fn text(browser: &mut Browser, id: &str) -> String {
 #[ignore = "needs tests/tools/install"]
 fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     let place = Place::new();
-    place.skin(24);
-    place.scenario(QUIET);
-    let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --view --candump run.log";
-    let run = place.start("gateway", words);
-    run.hears("view: http://");
-    let said = run.stderr();
-    let url = said.split("view: ").nth(1).unwrap().split_whitespace().next().unwrap().to_owned();
+    let (run, address) = watched(&place, 24, "--candump run.log");
+    let url = format!("http://{address}/");
     let mut browser = Browser::new(1400, 900);
     browser.scheme("light");
     browser.open(&url);

@@ -14,6 +14,7 @@
 pub(crate) mod buses;
 pub(crate) mod external;
 pub(crate) mod log;
+pub(crate) mod page;
 mod place;
 pub(crate) mod replay;
 mod running;
