@@ -164,8 +164,12 @@ fn talk(socket: &mut WebSocket<Begun>, page: u64, shared: &Shared) -> Result<(),
                 Ok(Message::Close(_)) => return Ok(()),
                 Ok(Message::Binary(_)) => _ = shared.ignored.fetch_add(1, Ordering::Relaxed),
                 Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_)) => {}
+                // A program that was stopped goes on with an interrupted call.
                 Err(Error::Io(error))
-                    if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) =>
+                    if matches!(
+                        error.kind(),
+                        ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted
+                    ) =>
                 {
                     break;
                 }
