@@ -26,17 +26,37 @@ fn text(browser: &mut Browser, id: &str) -> String {
     browser.value(&format!("document.getElementById('{id}').textContent")).as_str().unwrap().to_owned()
 }
 
+/// Where the page is, as a run says.
+fn url(said: &str) -> String {
+    said.split("view: ").nth(1).unwrap().split_whitespace().next().unwrap().to_owned()
+}
+
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     let place = Place::new();
+<<<<<<< HEAD
     let (run, address) = watched(&place, 24, "--candump run.log");
     let url = format!("http://{address}/");
+=======
+    place.skin(24);
+    place.scenario(QUIET);
+    let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --view --candump run.log";
+    let run = place.start("gateway", words);
+    run.hears("view: http://");
+    let url = url(&run.stderr());
+>>>>>>> 70a4e63 (view: draw three times as fast in software, and only what changed)
     let mut browser = Browser::new(1400, 900);
     browser.scheme("light");
     browser.open(&url);
     browser.until("window.skinbus && window.skinbus.frames > 3");
     browser.until("document.getElementById('facts').textContent.includes('Cells24')");
+
+    // Here the processor draws: it says so, and draws sharp what stands still.
+    assert_eq!(browser.value("document.getElementById('software').hidden"), false);
+    browser.until(
+        "(() => { const c = document.getElementById('picture'); return c.width === 2 * c.clientWidth; })()",
+    );
 
     // A cell that is seen from its front.
     let found = browser.until(
@@ -95,5 +115,37 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     }
     println!("the torque came {epochs} epochs after the stimulus");
     assert!(answered && epochs <= 3, "{epochs} epochs");
+    place.is_left_clean();
+}
+
+/// Prints how often the page draws an arm that moves, beside the 253 processes of its cells.
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn a_page_in_software_draws_an_arm_that_moves() {
+    let place = Place::new();
+    place.skin(253);
+    place.scenario(
+        "version = 1\nduration_s = 120.0\n\n[motion]\nkind = \"sine\"\nstart_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n\
+         amplitude_rad = [0.5, 0.3, 0.4, 0.3, 0.2, 0.2]\nperiod_s = 10.0\n",
+    );
+    let run = place.start("gateway", "run skin.toml --bus-kind embedded --scenario scenario.toml --view");
+    run.hears("view: http://");
+    let url = url(&run.stderr());
+    let mut browser = Browser::new(1400, 900);
+    browser.open(&url);
+    browser.until("window.skinbus && window.skinbus.frames > 10");
+    let count = |browser: &mut Browser| {
+        let counts = browser.value("[window.skinbus.frames, window.skinbus.snapshots]");
+        [0, 1].map(|at| counts[at].as_f64().unwrap())
+    };
+    let (from, began) = (count(&mut browser), std::time::Instant::now());
+    std::thread::sleep(std::time::Duration::from_secs(8));
+    let (to, passed) = (count(&mut browser), began.elapsed().as_secs_f64());
+    let [frames, snapshots] = [0, 1].map(|at| (to[at] - from[at]) / passed);
+    println!("{frames:.1} frames/s of {snapshots:.1} snapshots/s");
+    assert!(frames > 0.0 && snapshots > 0.0);
+    drop(browser);
+    run.signal(rustix::process::Signal::INT);
+    run.end();
     place.is_left_clean();
 }

@@ -11,6 +11,8 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
         "/robot.js" => (SCRIPT, include_bytes!("../web/robot.js")),
         "/picture.js" => (SCRIPT, include_bytes!("../web/picture.js")),
         "/camera.js" => (SCRIPT, include_bytes!("../web/camera.js")),
+        "/gl.js" => (SCRIPT, include_bytes!("../web/gl.js")),
+        "/pace.js" => (SCRIPT, include_bytes!("../web/pace.js")),
         "/colours.js" => (SCRIPT, include_bytes!("../web/colours.js")),
         "/plots.js" => (SCRIPT, include_bytes!("../web/plots.js")),
         "/words.js" => (SCRIPT, include_bytes!("../web/words.js")),
@@ -27,7 +29,7 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
 mod tests {
     use super::*;
 
-    const FILES: [&str; 15] = [
+    const FILES: [&str; 17] = [
         "/",
         "/style.css",
         "/app.js",
@@ -35,6 +37,8 @@ mod tests {
         "/robot.js",
         "/picture.js",
         "/camera.js",
+        "/gl.js",
+        "/pace.js",
         "/colours.js",
         "/plots.js",
         "/words.js",

@@ -4,6 +4,8 @@ import { Camera } from "./camera.js";
 import { SHOWS, css, ramp } from "./colours.js";
 import { hold } from "./frames.js";
 import { Link } from "./link.js";
+import { point, project } from "./math.js";
+import { Pace, STILL_MS } from "./pace.js";
 import { Picture } from "./picture.js";
 import { Plots, number } from "./plots.js";
 import { TimeBar } from "./time.js";
@@ -13,7 +15,7 @@ import * as words from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), camera = new Camera();
-let picture = null, scene = null, plots = null, snapshot = null, all = null, chosen = -1, pressed = -1, due = false;
+let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, chosen = -1, pressed = -1, due = false;
 // For whoever looks from outside.
 window.skinbus = { frames: 0, snapshots: 0, where, joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
 
@@ -30,26 +32,34 @@ try {
 
 const view = () => camera.matrix(canvas.clientWidth, canvas.clientHeight);
 
-// As long as a picture took, there is none after it: where it is drawn in software, a bench on the same machine needs the
-// processor too.
-let cost = 0, drawn = 0;
+const pace = new Pace(picture?.software ?? false);
+$("software").hidden = !pace.software;
+let later = 0;
 function redraw() {
   if (due) return;
   due = true;
-  setTimeout(() => requestAnimationFrame(draw), Math.max(0, drawn + 2 * cost - performance.now()));
+  setTimeout(() => requestAnimationFrame(() => draw(false)), pace.wait(performance.now()));
 }
 
-function draw() {
+function draw(still) {
   due = false;
   if (!scene || !snapshot) return;
-  if (picture) {
-    picture.update(snapshot.cells, SHOWS[$("shows").value], chosen);
-    picture.draw(view(), all);
+  const began = performance.now(), news = said;
+  if (news) {
+    said = null;
+    words.say(scene, news, ask);
+    plots.draw();
+    camera.fit(extent(scene, all));
   }
-  plots.draw();
+  picture?.update(snapshot.cells, SHOWS[$("shows").value], chosen);
+  const drew = picture?.draw(view(), all, pace.ratio(window.devicePixelRatio || 1, still)) ?? false;
+  if (!drew && !news) return;
   window.skinbus.frames++;
-  drawn = performance.now();
-  requestAnimationFrame(() => { cost = Math.min(500, performance.now() - drawn); });
+  pace.drew(began, performance.now());
+  requestAnimationFrame(() => pace.ready(performance.now()));
+  if (!drew || still || !pace.software) return;
+  clearTimeout(later);
+  later = setTimeout(() => requestAnimationFrame(() => draw(true)), STILL_MS);
 }
 
 const name = (i) => (i < 0 ? "" : `${scene.buses[scene.cells[i].bus].name}:${scene.cells[i].node}`);
@@ -80,17 +90,15 @@ function release() {
 
 // The middle of a cell on the screen, in CSS pixels of the picture; null where it is not seen from its front.
 function where(i) {
-  const { width, height } = canvas.getBoundingClientRect();
-  for (let y = 0; y < height; y += 4) {
-    for (let x = 0; x < width; x += 4) if (pick(scene, all, camera, view(), width, height, x, y) === i) return [x, y];
-  }
-  return null;
+  const { width, height } = canvas.getBoundingClientRect(), cell = scene.cells[i];
+  const at = project(view(), point(all[scene.buses[cell.bus].chain][cell.row], cell.position), width, height)?.slice(0, 2);
+  return at && pick(scene, all, camera, view(), width, height, ...at) === i ? at : null;
 }
 
 const link = new Link({
   scene(it) {
     scene = it;
-    [chosen, pressed, snapshot] = [-1, -1, null];
+    [chosen, pressed, snapshot, said] = [-1, -1, null, null];
     document.title = `${scene.name}: skinbus view`;
     $("name").textContent = scene.name;
     plots = new Plots($("torques"), scene.joints);
@@ -108,9 +116,9 @@ const link = new Link({
   },
   history(it) { plots.replace(it); },
   said(it) {
-    words.say(scene, it, ask);
+    said = it;
     time.say(it.playback);
-    if (all) camera.fit(extent(scene, all));
+    redraw();
   },
   closed() {
     pressed = -1;

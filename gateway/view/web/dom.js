@@ -6,3 +6,17 @@ export function element(tag, text, className) {
   if (className) it.className = className;
   return it;
 }
+
+// Makes what is shown in a box equal to these elements, and touches nothing that is equal already: drawing text again is dear in
+// software, and would take the mark from whoever is copying it.
+export function show(box, fresh) {
+  while (box.childNodes.length > fresh.length) box.lastChild.remove();
+  fresh.forEach((it, at) => {
+    const old = box.childNodes[at];
+    if (!old) return box.append(it);
+    if (old.isEqualNode(it)) return;
+    const same = old.nodeName === it.nodeName && old.className === it.className && old.firstElementChild && it.firstElementChild;
+    if (same) show(old, [...it.childNodes]);
+    else old.replaceWith(it);
+  });
+}

@@ -3,16 +3,10 @@
 export function decode(buffer) {
   const data = new DataView(buffer), joints = data.getUint32(4, true), cells = data.getUint32(8, true);
   if (buffer.byteLength !== 24 + 12 * joints + 8 * cells) throw new Error("a snapshot of another length");
-  const snapshot = { number: data.getUint32(0, true), time: data.getFloat64(16, true), joints: [], cells: [] };
+  const snapshot = { number: data.getUint32(0, true), time: data.getFloat64(16, true), joints: [], cells: new Uint32Array(buffer, 24 + 12 * joints, 2 * cells) };
   for (let j = 0; j < joints; j++) {
     const [position, distributed, central] = [0, 4, 8].map((at) => data.getFloat32(24 + 12 * j + at, true));
     snapshot.joints.push({ position, distributed, central });
-  }
-  for (let c = 0, at = 24 + 12 * joints; c < cells; c++, at += 8) {
-    snapshot.cells.push({
-      status: data.getUint8(at), flags: data.getUint8(at + 1), force: data.getUint16(at + 2, true),
-      proximity: data.getUint16(at + 4, true), temperature: data.getInt16(at + 6, true),
-    });
   }
   return snapshot;
 }
@@ -33,6 +27,12 @@ export function decodeHistory(buffer) {
 }
 
 const isHistory = (buffer) => new DataView(buffer).getUint32(12, true) === 1;
+
+// A cell of a snapshot, which has two words of it.
+export function cellOf(words, i) {
+  const [low, high] = [words[2 * i], words[2 * i + 1]];
+  return { status: low & 255, flags: low >> 8 & 255, force: low >>> 16, proximity: high & 65535, temperature: high >> 16 };
+}
 
 export class Link {
   constructor(on) {

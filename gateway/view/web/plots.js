@@ -42,7 +42,8 @@ export class Plots {
       const [time, now, exact] = points[points.length - 1];
       value.textContent = `${number(now)} ${unit}, off ${number(now - exact)}`;
       if (canvas.width !== Math.round(w * ratio)) { canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio); }
-      const pen = canvas.getContext("2d");
+      // In memory: small lines are drawn sooner by the processor than by WebGL in software.
+      const pen = canvas.getContext("2d", { willReadFrequently: true });
       pen.setTransform(ratio, 0, 0, ratio, 0, 0);
       pen.clearRect(0, 0, w, h);
       let high = 0.01;

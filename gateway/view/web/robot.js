@@ -45,6 +45,25 @@ function near([from, to], p) {
   return add(from, along, dot(along, add(p, from, -1)));
 }
 
+// For each cell a cell that it is wired to and that is in its frame, as an index; -1 where there is none.
+export function neighbors(scene) {
+  const at = new Map(scene.cells.map((cell, i) => [cell.bus * 256 + cell.node, i]));
+  return scene.cells.map((cell) => {
+    const near = cell.neighbors.map((node) => at.get(cell.bus * 256 + node)).find((i) => scene.cells[i]?.row === cell.row);
+    return near ?? -1;
+  });
+}
+
+// The axes of a cell's hexagon, whose first corner is on x: neighbors lie beyond its sides.
+export function axes(scene, nearest, i) {
+  const { position, normal } = scene.cells[i], other = scene.cells[nearest[i]];
+  const flat = (v) => add(v, normal, -dot(v, normal));
+  const toward = other ? flat(add(other.position, position, -1)) : [0, 0, 0];
+  const side = length(toward) > 1e-9 ? unit(toward) : unit(cross(normal, Math.abs(normal[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0]));
+  const x = add(side.map((v) => v * Math.cos(Math.PI / 6)), cross(normal, side), 0.5);
+  return [x, cross(normal, x)];
+}
+
 const SIDES = 20;
 
 // Triangles of a cylinder with closed ends: positions and normals.

@@ -1,7 +1,7 @@
 // What the page says in words: facts, buses, silent cells, the chosen cell.
 
 import { SHAPES } from "./colours.js";
-import { element } from "./dom.js";
+import { element, show } from "./dom.js";
 import { forget, frames } from "./frames.js";
 import { number } from "./plots.js";
 
@@ -19,7 +19,7 @@ function table(rows) {
 }
 
 function facts(pairs) {
-  $("facts").replaceChildren(...pairs.map(([name, value, className]) => {
+  show($("facts"), pairs.map(([name, value, className]) => {
     const pair = element("div");
     pair.append(element("dt", name), element("dd", value, className));
     return pair;
@@ -38,7 +38,7 @@ export function say(scene, said, ask) {
     ["Epochs complete", due ? `${complete} of ${due}` : "–", complete < due ? "bad" : ""],
     ...(said.halted ? [["Robot", "halted", "bad"]] : []),
   ]);
-  $("buses").replaceChildren(...said.buses.flatMap((bus) => [
+  show($("buses"), said.buses.flatMap((bus) => [
     element("h3", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad"),
     table([
       ["Load of a real bus", percent(bus.load), bus.load > 1 ? "bad" : ""],
@@ -50,9 +50,9 @@ export function say(scene, said, ask) {
       ...(bus.dropped ? [["Frames not seen here", String(bus.dropped), "bad"]] : []),
     ]),
   ]));
-  $("dead").replaceChildren(said.dead_cells.length
+  show($("dead"), [said.dead_cells.length
     ? table(said.dead_cells.map((cell) => [`${cell.bus}:${cell.node}`, `${cell.for_s.toFixed(0)} s`, "bad"]))
-    : element("p", "none", "faint"));
+    : element("p", "none", "faint")]);
   if (said.detail) detail(scene, said.detail, ask);
 }
 
@@ -85,7 +85,7 @@ function detail(scene, it, ask) {
     });
     parts.push(element("h3", `Torque of epoch ${it.torque.epoch}${it.torque.saturated ? ", saturated" : ""}`), torques);
   }
-  $("cell").replaceChildren(...parts);
+  show($("cell"), parts);
   frames(it.frames, it.why, ask);
 }
 

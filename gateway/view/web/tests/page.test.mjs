@@ -4,9 +4,10 @@ import { test } from "node:test";
 
 import { Camera } from "../camera.js";
 import { SHAPES, ramp, shapeOf } from "../colours.js";
-import { decode, decodeHistory } from "../link.js";
+import { cellOf, decode, decodeHistory } from "../link.js";
 import { cross, dot, look, perspective, point, project, row, times, unit } from "../math.js";
-import { cylinders, extent, frames, triangles } from "../robot.js";
+import { Pace, SOFTWARE_HZ } from "../pace.js";
+import { axes, cylinders, extent, frames, neighbors, triangles } from "../robot.js";
 import { pick } from "../touch.js";
 import { number } from "../plots.js";
 import { clock, requested } from "../time.js";
@@ -64,10 +65,12 @@ test("a snapshot is read as the server writes it", () => {
   data.setUint16(50, 6000, true);
   data.setUint16(52, 16384, true);
   data.setInt16(54, -150, true);
-  assert.deepEqual(decode(data.buffer), {
+  const { cells, ...rest } = decode(data.buffer);
+  assert.deepEqual(rest, {
     number: 7, time: 1.5, joints: [{ position: 0.5, distributed: 1, central: 2 }, { position: -0.5, distributed: -1, central: -2 }],
-    cells: [{ status: 4, flags: 16, force: 6000, proximity: 16384, temperature: -150 }],
   });
+  assert.equal(cells.length, 2);
+  assert.deepEqual(cellOf(cells, 0), { status: 4, flags: 16, force: 6000, proximity: 16384, temperature: -150 });
   assert.throws(() => decode(data.buffer.slice(0, 50)));
 });
 
@@ -138,4 +141,34 @@ test("times are said as clocks, and an address asks for one", () => {
   assert.deepEqual([0, 8.3, 64.9551, 3599.9999, 3600, 86400.5].map(clock),
     ["0:00.000", "0:08.300", "1:04.955", "1:00:00.000", "1:00:00.000", "24:00:00.500"]);
   assert.deepEqual(["#at=12.5", "#at=0", "#at=", "#at=-1", "#at=1e9", "#cell=1", ""].map(requested), [12.5, 0, null, null, null, null, null]);
+});
+
+test("a hexagon has its sides toward its neighbors, and lies in its cell's plane", () => {
+  const cells = [cell(1, [0, 0, 0], [0, 0, 1]), { ...cell(1, [0.02, 0.01, 0.005], [0, 0, 1]), node: 2 }, { ...cell(2, [1, 0, 0], [1, 0, 0]), node: 3 }];
+  cells[0].neighbors = [3, 2];
+  const it = scene(cells), nearest = neighbors(it);
+  assert.deepEqual(nearest, [1, -1, -1], "one in another frame is none");
+  for (const i of [0, 1, 2]) {
+    const [x, y] = axes(it, nearest, i);
+    close([dot(x, y), dot(x, cells[i].normal), dot(x, x), dot(y, y)], [0, 0, 1, 1]);
+    close(cross(x, y), cells[i].normal);
+  }
+  const [x] = axes(it, nearest, 0);
+  assert.ok(Math.abs(dot(x, unit([0.02, 0.01, 0])) - Math.cos(Math.PI / 6)) < 1e-9);
+});
+
+test("a frame is followed by as long a pause as it took, and software has a limit and is sharp when it stands still", () => {
+  const pace = new Pace(false);
+  assert.equal(pace.wait(1000), 0);
+  pace.drew(1000, 1010);
+  pace.ready(1040);
+  assert.equal(pace.wait(1040), 30);
+  pace.ready(9999);
+  assert.equal(pace.wait(1040), 970, "a page that was hidden is not slow for ever");
+  const soft = new Pace(true);
+  soft.drew(1000, 1001);
+  soft.ready(1002);
+  assert.ok(Math.abs(soft.wait(1002) - (1000 / SOFTWARE_HZ - 2)) < 1e-9);
+  assert.deepEqual([soft.ratio(1, false), soft.ratio(3, false), soft.ratio(1, true)], [1, 1, 2]);
+  assert.deepEqual([pace.ratio(1, false), pace.ratio(3, true)], [1, 2]);
 });

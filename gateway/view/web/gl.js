@@ -1,0 +1,49 @@
+// What WebGL2 is asked for: a context, programs, buffers.
+
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
+
+// A context, and whether the processor draws in it: then edges are not smoothed, which costs it most.
+export function context(canvas) {
+  // Without transparency the browser need not mix the picture with the page below it.
+  const plain = { alpha: false, antialias: false };
+  let gl = canvas.getContext("webgl2", { ...plain, antialias: true, failIfMajorPerformanceCaveat: true });
+  let software = !gl;
+  gl ??= canvas.getContext("webgl2", plain);
+  if (!gl) throw new Error("WebGL2 is not available");
+  const name = gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER;
+  software ||= SOFTWARE.test(gl.getParameter(name));
+  return { gl, software };
+}
+
+// A program of a vertex and a fragment shader, with the places of its uniforms.
+export function program(gl, sources) {
+  const it = gl.createProgram();
+  [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER].forEach((type, at) => {
+    const shader = gl.createShader(type);
+    gl.shaderSource(shader, `#version 300 es\nprecision highp float;\n${sources[at]}`);
+    gl.compileShader(shader);
+    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+    gl.attachShader(it, shader);
+  });
+  gl.linkProgram(it);
+  if (!gl.getProgramParameter(it, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(it));
+  const places = { program: it };
+  for (let i = 0; i < gl.getProgramParameter(it, gl.ACTIVE_UNIFORMS); i++) {
+    const { name } = gl.getActiveUniform(it, i);
+    places[name] = gl.getUniformLocation(it, name);
+  }
+  return places;
+}
+
+// A buffer of floats for the vertex array that is bound; layout: [attribute, how many floats] in their order.
+export function floats(gl, data, layout) {
+  const stride = layout.reduce((sum, [, n]) => sum + n, 0) * 4;
+  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
+  let offset = 0;
+  for (const [at, n] of layout) {
+    gl.enableVertexAttribArray(at);
+    gl.vertexAttribPointer(at, n, gl.FLOAT, false, stride, offset);
+    offset += n * 4;
+  }
+}
