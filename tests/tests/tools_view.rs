@@ -17,7 +17,7 @@ mod process;
 use browser::Browser;
 use process::Place;
 use process::log::Log;
-use process::page::watched;
+use process::page::{address, watched};
 use protocol::can::Format;
 use protocol::message::{Message, SensorPage};
 
@@ -26,26 +26,12 @@ fn text(browser: &mut Browser, id: &str) -> String {
     browser.value(&format!("document.getElementById('{id}').textContent")).as_str().unwrap().to_owned()
 }
 
-/// Where the page is, as a run says.
-fn url(said: &str) -> String {
-    said.split("view: ").nth(1).unwrap().split_whitespace().next().unwrap().to_owned()
-}
-
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     let place = Place::new();
-<<<<<<< HEAD
     let (run, address) = watched(&place, 24, "--candump run.log");
     let url = format!("http://{address}/");
-=======
-    place.skin(24);
-    place.scenario(QUIET);
-    let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --view --candump run.log";
-    let run = place.start("gateway", words);
-    run.hears("view: http://");
-    let url = url(&run.stderr());
->>>>>>> 70a4e63 (view: draw three times as fast in software, and only what changed)
     let mut browser = Browser::new(1400, 900);
     browser.scheme("light");
     browser.open(&url);
@@ -129,8 +115,7 @@ fn a_page_in_software_draws_an_arm_that_moves() {
          amplitude_rad = [0.5, 0.3, 0.4, 0.3, 0.2, 0.2]\nperiod_s = 10.0\n",
     );
     let run = place.start("gateway", "run skin.toml --bus-kind embedded --scenario scenario.toml --view");
-    run.hears("view: http://");
-    let url = url(&run.stderr());
+    let url = format!("http://{}/", address(&run));
     let mut browser = Browser::new(1400, 900);
     browser.open(&url);
     browser.until("window.skinbus && window.skinbus.frames > 10");

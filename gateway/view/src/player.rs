@@ -43,7 +43,7 @@ pub struct Player {
     playing: bool,
     speed: f64,
     history: VecDeque<Sample>,
-    /// Counts positions that were gone to: then plots begin anew.
+    /// Counts positions that were gone to: then plots begin again.
     jumps: u64,
     /// Why the last position cannot be shown.
     failed: Option<String>,
@@ -211,7 +211,7 @@ impl Player {
     /// When it cannot be read there.
     pub fn seek(&mut self, at_s: f64) -> Result<(), CaptureError> {
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates")]
-        let since = (at_s.max(0.0) * 1e9) as u64;
+        let since = (at_s.max(0.0) * 1e9).round() as u64;
         self.go_to(self.origin.saturating_add(since))
     }
 

@@ -74,7 +74,10 @@ impl Page {
         let give_up = Instant::now() + TIMEOUT;
         loop {
             assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
-            if let Message::Binary(bytes) = self.socket.read().unwrap() {
+            // What was before a position is no snapshot.
+            if let Message::Binary(bytes) = self.socket.read().unwrap()
+                && bytes[12] == 0
+            {
                 let snapshot = Snapshot::read(&bytes);
                 if is(&snapshot) {
                     return snapshot;
