@@ -8,6 +8,7 @@
 //! | [`central`] | torques computed centrally, in double precision |
 //! | [`network`] | the tree of cells, compared with the skin |
 //! | [`commission`], [`listing`] | which cells are on a bus; node ids and configuration for them |
+//! | [`surface`] | the surface that a link's cells lie on, and that laid flat |
 //! | [`repeat`] | requests that are repeated until they are confirmed |
 //! | [`scenario`], [`generate`] | what a run does, and skins made from a recipe |
 
@@ -20,6 +21,7 @@ pub mod network;
 pub mod quantiles;
 pub mod repeat;
 pub mod scenario;
+pub mod surface;
 pub mod table;
 #[doc(hidden)]
 pub mod testing;

@@ -2,13 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::{Isometry3, Matrix3, Quaternion, UnitQuaternion, Vector3};
+use model::surface::Cylinder;
+use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
 use protocol::parameters::RowKind;
 use protocol::skin::{Chain, Skin};
 use serde::Serialize;
 
-/// The smallest number of cells on a link to which a tube is fitted.
-const TUBE_CELLS: usize = 6;
 /// Of more cells, the pitch is taken from about so many.
 const ASKED: usize = 200;
 /// The pitch of a skin of single cells, in m.
@@ -192,46 +191,13 @@ fn tubes(buses: &[SceneBus], cells: &[SceneCell]) -> Vec<Tube> {
     links.into_iter().filter_map(|((chain, row), cells)| tube(chain, row, &cells)).collect()
 }
 
-/// The cylinder of which these cells are best a part: its axis is at right angles to their normals, and what is left of
-/// their positions less the radius along the normal lies on a line. None where they face one way, as on a plate.
-#[expect(clippy::cast_precision_loss, reason = "a number of cells")]
+/// The cylinder about these cells, a little longer and thinner, so that it is below them.
 fn tube(chain: usize, row: u8, cells: &[&SceneCell]) -> Option<Tube> {
-    if cells.len() < TUBE_CELLS {
-        return None;
-    }
-    let count = cells.len() as f64;
-    let pairs: Vec<_> =
-        cells.iter().map(|cell| (Vector3::from(cell.position), Vector3::from(cell.normal))).collect();
-    let spread: Matrix3<f64> = pairs.iter().map(|(_, normal)| normal * normal.transpose()).sum();
-    let eigen = (spread / count).symmetric_eigen();
-    let mut values: Vec<_> = eigen.eigenvalues.iter().copied().zip(0..).collect();
-    values.sort_by(|one, other| one.0.total_cmp(&other.0));
-    let &[(along, column), (across, _), _] = values.as_slice() else { return None };
-    // Round about the axis: normals spread evenly over both directions at right angles to it.
-    if along > 0.1 || across < 0.2 {
-        return None;
-    }
-    let axis: Vector3<f64> = eigen.eigenvectors.column(column).into();
-    let flat = |vector: &Vector3<f64>| vector - axis * axis.dot(vector);
-    let [mean_at, mean_normal] = pairs
-        .iter()
-        .fold([Vector3::zeros(); 2], |[at, normal], (p, n)| [at + flat(p) / count, normal + flat(n) / count]);
-    let (mut both, mut square) = (0.0, 0.0);
-    for (position, normal) in &pairs {
-        let normal = flat(normal) - mean_normal;
-        both += (flat(position) - mean_at).dot(&normal);
-        square += normal.norm_squared();
-    }
-    let radius = both / square;
-    if !(0.005..0.5).contains(&radius) {
-        return None;
-    }
-    let middle = mean_at - mean_normal * radius;
-    let along = pairs.iter().map(|(position, _)| axis.dot(position));
-    let (from, to) =
-        along.fold((f64::INFINITY, f64::NEG_INFINITY), |(from, to), at| (from.min(at), to.max(at)));
-    let end = |at: f64| (middle + axis * at).into();
-    Some(Tube { chain, row, ends: [end(from - radius * 0.2), end(to + radius * 0.2)], radius: radius * 0.97 })
+    let placed: Vec<_> = cells.iter().map(|cell| (cell.position, cell.normal)).collect();
+    let cylinder = Cylinder::fit(&placed)?;
+    let ([from, to], radius) = (cylinder.along, cylinder.radius);
+    let ends = [from - radius * 0.2, to + radius * 0.2].map(|along| cylinder.at(along));
+    Some(Tube { chain, row, ends, radius: radius * 0.97 })
 }
 
 #[cfg(test)]
