@@ -222,7 +222,7 @@ fn tell(page: &Page, report: &Path) -> Result<(), Failure> {
     let mut rows = Rows::new("", "here", "paper, bar");
     for section in &page.sections {
         rows.section(&section.title, "", "");
-        for Finding { what, paper, ours, bar, verdict } in &section.findings {
+        for Finding { what, paper, ours, bar, verdict, .. } in &section.findings {
             let beside = [paper.as_ref().map(|paper| format!("paper {paper}")), bar.clone()];
             let beside = beside.into_iter().flatten().collect::<Vec<_>>().join("; ");
             let verdict = match verdict {

@@ -75,7 +75,7 @@ impl Report {
         if let Some(missing) = &report.missing {
             note(format_args!("gateway: {}: {missing}", report.name));
         }
-        let figures: usize = report.page.sections.iter().map(|section| section.figures.len()).sum();
+        let figures = drawings(&report.page).count();
         let beside =
             self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
         print(&format!("{}: {figures} figures{beside}\n", output.display()))
@@ -95,8 +95,11 @@ fn refused(error: ReportError) -> Failure {
 
 /// Each figure's file name and drawing.
 fn drawings(page: &Page) -> impl Iterator<Item = (String, String)> {
-    let figures = page.sections.iter().flat_map(|section| &section.figures);
-    figures.map(|figure| (format!("{}.svg", figure.name), svg::draw(figure)))
+    page.sections.iter().flat_map(|section| {
+        let cells = section.drawings.iter().map(|drawing| (drawing.name(), svg::draw_cells(drawing)));
+        let figures = section.figures.iter().map(|figure| (figure.name.as_str(), svg::draw(figure)));
+        cells.chain(figures).map(|(name, drawing)| (format!("{name}.svg"), drawing))
+    })
 }
 
 /// Makes a folder; whether it was not there.

@@ -4,7 +4,9 @@ use std::fmt;
 
 use serde::Serialize;
 
-pub use super::finding::{Finding, Quantity, Verdict, number};
+pub use super::finding::{Finding, Quantity, Verdict};
+pub use super::number::{number, quantity};
+pub use super::skin::{Drawing, Legend, Map, Panel, Spot, Strip, StripGroup, StripRow};
 
 /// A whole page.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -28,6 +30,8 @@ pub struct Section {
     pub title: String,
     /// Paragraphs before the figures.
     pub text: Vec<String>,
+    /// What is drawn of cells, before the figures.
+    pub drawings: Vec<Drawing>,
     /// What is drawn.
     pub figures: Vec<Figure>,
     /// Numbers beside the paper's.
@@ -47,6 +51,13 @@ impl Section {
     #[must_use]
     pub fn text(mut self, paragraph: impl Into<String>) -> Self {
         self.text.push(paragraph.into());
+        self
+    }
+
+    /// The same with more drawings of cells.
+    #[must_use]
+    pub fn drawings(mut self, drawings: impl IntoIterator<Item = Drawing>) -> Self {
+        self.drawings.extend(drawings);
         self
     }
 
@@ -89,6 +100,19 @@ pub struct Figure {
     pub series: Vec<Series>,
     /// Places to look at.
     pub marks: Vec<Mark>,
+    /// A second diagram below it, with the same axis to the right.
+    pub below: Option<Below>,
+}
+
+/// A lower diagram: what belongs to the upper one on a scale of its own.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Below {
+    /// Upwards.
+    pub y: Axis,
+    /// What is drawn, as in a [`Figure`].
+    pub series: Vec<Series>,
+    /// Places to look at.
+    pub marks: Vec<Mark>,
 }
 
 impl Figure {
@@ -126,6 +150,13 @@ impl Figure {
     #[must_use]
     pub fn marks(mut self, marks: impl IntoIterator<Item = Mark>) -> Self {
         self.marks.extend(marks);
+        self
+    }
+
+    /// The same with a diagram below it.
+    #[must_use]
+    pub fn below(mut self, below: Below) -> Self {
+        self.below = Some(below);
         self
     }
 }
@@ -273,9 +304,18 @@ pub struct Table {
     pub head: Vec<String>,
     /// As many cells in each row as there are headings. What reads as a number stands to the right.
     pub rows: Vec<Vec<String>>,
+    /// Whether the last column holds commands.
+    pub commands: bool,
 }
 
 impl Table {
+    /// The same, with commands in the last column.
+    #[must_use]
+    pub const fn of_commands(mut self) -> Self {
+        self.commands = true;
+        self
+    }
+
     /// A table of some columns.
     #[must_use]
     pub fn new<const N: usize>(
@@ -284,6 +324,6 @@ impl Table {
         rows: impl IntoIterator<Item: Into<Vec<String>>>,
     ) -> Self {
         let rows = rows.into_iter().map(Into::into).collect();
-        Self { title: title.into(), head: head.map(str::to_owned).into(), rows }
+        Self { title: title.into(), head: head.map(str::to_owned).into(), rows, commands: false }
     }
 }

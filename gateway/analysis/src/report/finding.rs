@@ -1,8 +1,10 @@
-//! Numbers that were found, how they compare, and how they are written.
+//! Numbers that were found, and how they compare.
 
 use std::fmt;
 
 use serde::Serialize;
+
+use super::number::{interval, quantity};
 
 /// A result beside the paper's number.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -15,6 +17,12 @@ pub struct Finding {
     pub ours: Quantity,
     /// What it must reach, in words: `at most 0.005 Nm`.
     pub bar: Option<String>,
+    /// What it is rated against, when that is no bar, or why it is not rated: `below the paper's`.
+    pub against: Option<String>,
+    /// Where the bar comes from: an option, the skin's file, a default.
+    pub origin: Option<String>,
+    /// A command that shows where it comes from.
+    pub command: Option<String>,
     /// How the two compare.
     pub verdict: Verdict,
 }
@@ -23,21 +31,30 @@ impl Finding {
     /// A number of which less is better, beside the paper's: within 5 % of that it is the same.
     #[must_use]
     pub fn less_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
-        let finding = Self::stated(what, ours).beside(paper);
+        let finding = Self::stated(what, ours).beside(paper).against("below the paper's");
         Self { verdict: Verdict::less_is_better(paper, finding.ours.value), ..finding }
     }
 
     /// A number of which more is better, beside the paper's: within 5 % of that it is the same.
     #[must_use]
     pub fn more_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
-        let finding = Self::stated(what, ours).beside(paper);
+        let finding = Self::stated(what, ours).beside(paper).against("above the paper's");
         Self { verdict: Verdict::less_is_better(finding.ours.value, paper), ..finding }
     }
 
     /// A number for information, not rated.
     #[must_use]
     pub fn stated(what: impl Into<String>, ours: impl Into<Quantity>) -> Self {
-        Self { what: what.into(), paper: None, ours: ours.into(), bar: None, verdict: Verdict::Stated }
+        Self {
+            what: what.into(),
+            paper: None,
+            ours: ours.into(),
+            bar: None,
+            against: None,
+            origin: None,
+            command: None,
+            verdict: Verdict::Stated,
+        }
     }
 
     /// The same beside the paper's in the same unit, where neither more nor less is better.
@@ -47,12 +64,33 @@ impl Finding {
         self
     }
 
+    /// The same with what it is rated against, or why it is not rated.
+    #[must_use]
+    pub fn against(mut self, what: impl Into<String>) -> Self {
+        self.against = Some(what.into());
+        self
+    }
+
+    /// The same with where its bar comes from.
+    #[must_use]
+    pub fn from(mut self, origin: impl Into<String>) -> Self {
+        self.origin = Some(origin.into());
+        self
+    }
+
+    /// The same with a command that shows where it comes from, if there is one.
+    #[must_use]
+    pub fn look(mut self, command: Option<String>) -> Self {
+        self.command = command;
+        self
+    }
+
     /// The same, rated by a limit in its own unit.
     #[must_use]
     pub fn at_most(self, limit: f64) -> Self {
-        let unit = if self.ours.unit.is_empty() { String::new() } else { format!(" {}", self.ours.unit) };
         let kept = self.ours.value <= limit;
-        self.must(format!("at most {limit}{unit}"), kept)
+        let bar = format!("at most {}", quantity(limit, &self.ours.unit));
+        self.must(bar, kept)
     }
 
     /// The same, rated by a requirement: met is [`Verdict::Better`].
@@ -146,42 +184,8 @@ impl From<f64> for Quantity {
 
 impl fmt::Display for Quantity {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&number(self.value))?;
-        if let Some(half) = self.plus_minus {
-            write!(f, " ± {}", number(half))?;
-        }
-        if self.unit.is_empty() { Ok(()) } else { write!(f, "\u{a0}{}", self.unit) }
+        f.write_str(&interval(self.value, self.plus_minus, &self.unit))
     }
-}
-
-/// A number for people: whole ones below a million as they are, else at most three significant digits; very
-/// small and very large ones by a power of ten; what is not finite is a dash.
-///
-/// ```
-/// # use analysis::report::figure::number;
-/// assert_eq!(number(24_364.0), "24364");
-/// assert_eq!(number(0.005_4), "0.0054");
-/// assert_eq!(number(6.25e-5), "6.25e-5");
-/// assert_eq!(number(1_919.4), "1919");
-/// ```
-#[must_use]
-pub fn number(value: f64) -> String {
-    let size = value.abs();
-    if !value.is_finite() {
-        return "–".to_owned();
-    }
-    if size < 1e6 && (value - value.round()).abs() < 1e-12 * size.max(1e-300) || size == 0.0 {
-        return format!("{:.0}", value + 0.0);
-    }
-    if !(1e-4..1e6).contains(&size) {
-        let text = format!("{value:.2e}");
-        let Some((digits, exponent)) = text.split_once('e') else { return text };
-        return format!("{}e{exponent}", digits.trim_end_matches('0').trim_end_matches('.'));
-    }
-    let digits = [(100.0, 0), (10.0, 1), (1.0, 2), (0.1, 3), (0.01, 4), (0.001, 5)];
-    let digits = digits.iter().find(|(from, _)| size >= *from).map_or(6, |(_, digits)| *digits);
-    let text = format!("{value:.digits$}");
-    if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
 }
 
 #[cfg(test)]
@@ -203,24 +207,5 @@ mod tests {
         );
         assert_eq!(less(f64::NAN), Verdict::Stated);
         assert_eq!(Finding::stated("", quantity(0.0)).must("none", true).verdict, Verdict::Better);
-    }
-
-    #[test]
-    fn numbers_have_three_digits_and_no_more_zeros_than_they_need() {
-        for (value, text) in [
-            (0.0, "0"),
-            (-0.0, "0"),
-            (1.0, "1"),
-            (999_999.0, "999999"),
-            (2.5e7, "2.5e7"),
-            (0.012_345, "0.0123"),
-            (0.1, "0.1"),
-            (-12.349, "-12.3"),
-            (1.5e-7, "1.5e-7"),
-            (5e-5, "5e-5"),
-            (f64::NAN, "–"),
-        ] {
-            assert_eq!(number(value), text);
-        }
     }
 }

@@ -10,8 +10,10 @@
 
 pub mod figure;
 mod finding;
+mod number;
 pub mod page;
 pub mod run;
 mod scale;
+mod skin;
 pub mod svg;
 pub mod thin;

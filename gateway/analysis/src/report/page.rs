@@ -62,6 +62,13 @@ fn section(out: &mut String, section: &Section) {
     if !section.findings.is_empty() {
         findings(out, &section.findings);
     }
+    for drawing in &section.drawings {
+        let (name, title) = (svg::escaped(drawing.name()), svg::escaped(drawing.title()));
+        let _ = writeln!(out, "<figure class=\"wide\" id=\"{name}\">");
+        out.push_str(&svg::inline_cells(drawing, svg::natural(Size::Wide).0, "desk"));
+        out.push_str(&svg::inline_cells(drawing, svg::natural(Size::Half).0, "hand"));
+        let _ = writeln!(out, "<figcaption>{title}</figcaption>\n</figure>");
+    }
     if !section.figures.is_empty() {
         out.push_str("<div class=\"figures\">\n");
         for part in &section.figures {
@@ -78,11 +85,11 @@ fn section(out: &mut String, section: &Section) {
 fn figure(out: &mut String, figure: &Figure) {
     let class = if figure.size == Size::Wide { "wide" } else { "half" };
     let _ = writeln!(out, "<figure class=\"{class}\" id=\"{}\">", svg::escaped(&figure.name));
-    let natural = svg::natural(figure.size);
+    let natural = svg::height(figure, figure.size);
     if figure.size == Size::Wide {
         // Letters that can be read across a desk are too small in the hand: a phone gets a drawing of its own.
         out.push_str(&svg::inline(figure, natural, "desk"));
-        out.push_str(&svg::inline(figure, svg::natural(Size::Half), "hand"));
+        out.push_str(&svg::inline(figure, svg::height(figure, Size::Half), "hand"));
     } else {
         out.push_str(&svg::inline(figure, natural, "both"));
     }
@@ -94,10 +101,10 @@ const NUMBER: &str = " class=\"n\"";
 
 fn findings(out: &mut String, findings: &[Finding]) {
     let paper = findings.iter().any(|finding| finding.paper.is_some());
-    let bar = findings.iter().any(|finding| finding.bar.is_some());
-    let shown = [true, paper, true, bar, paper || bar];
+    let limit = findings.iter().any(|finding| finding.bar.is_some() || finding.against.is_some());
+    let shown = [true, paper, true, limit, paper || limit];
     out.push_str("<div class=\"scroll\"><table class=\"findings\">\n<thead>");
-    let head = [("figure", ""), ("paper", NUMBER), ("here", NUMBER), ("must be", ""), ("", "")];
+    let head = [("figure", ""), ("paper", NUMBER), ("here", NUMBER), ("limit", ""), ("", "")];
     row(out, "th", some(head, shown));
     out.push_str("</thead>\n<tbody>\n");
     for finding in findings {
@@ -109,16 +116,22 @@ fn findings(out: &mut String, findings: &[Finding]) {
             (Verdict::Worse, Some(_)) => ("worse", "✗ does not hold"),
             (Verdict::Stated, _) => ("stated", ""),
         };
+        let origin = finding.origin.as_ref().map(|origin| format!(" ({origin})")).unwrap_or_default();
+        let limit = finding.bar.as_ref().or(finding.against.as_ref());
+        let limit = limit.map(|limit| format!("{limit}{origin}")).unwrap_or_default();
         let papers = finding.paper.as_ref().map(ToString::to_string).unwrap_or_default();
-        let cells: [(&str, &str); 5] = [
-            (&finding.what, ""),
+        let command = finding.command.as_deref().map(svg::escaped);
+        let command = command.map_or_else(String::new, |command| format!("<br/><code>{command}</code>"));
+        let _ = write!(out, "<tr><td>{}{command}</td>", svg::escaped(&finding.what));
+        let cells: [(&str, &str); 4] = [
             (&papers, " class=\"n\" data-head=\"paper\""),
             (&finding.ours.to_string(), " class=\"n\" data-head=\"here\""),
-            (finding.bar.as_deref().unwrap_or_default(), " class=\"bar\" data-head=\"must be\""),
+            (&limit, " class=\"bar\" data-head=\"limit\""),
             (verdict, &format!(" class=\"verdict {class}\"")),
         ];
-        row(out, "td", some(cells, shown));
-        out.push('\n');
+        let [_, paper, ours, limit, verdict] = shown;
+        self::cells(out, "td", some(cells, [paper, ours, limit, verdict]));
+        out.push_str("</tr>\n");
     }
     out.push_str("</tbody>\n</table></div>\n");
 }
@@ -135,7 +148,14 @@ fn table(out: &mut String, table: &Table) {
     row(out, "th", table.head.iter().map(String::as_str).zip(classes()));
     out.push_str("</thead>\n<tbody>\n");
     for cells in &table.rows {
-        row(out, "td", cells.iter().map(String::as_str).zip(classes()));
+        match cells.split_last() {
+            Some((command, cells)) if table.commands => {
+                out.push_str("<tr>");
+                self::cells(out, "td", cells.iter().map(String::as_str).zip(classes()));
+                let _ = write!(out, "<td><code>{}</code></td></tr>", svg::escaped(command));
+            }
+            _ => row(out, "td", cells.iter().map(String::as_str).zip(classes())),
+        }
         out.push('\n');
     }
     out.push_str("</tbody>\n</table></div>\n");
@@ -149,10 +169,14 @@ fn some<T, const N: usize>(cells: [T; N], shown: [bool; N]) -> impl Iterator<Ite
 /// A row of a table: the text of each cell, and its attributes.
 fn row<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
     out.push_str("<tr>");
+    self::cells(out, tag, cells);
+    out.push_str("</tr>");
+}
+
+fn cells<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
     for (text, attributes) in cells {
         let _ = write!(out, "<{tag}{attributes}>{}</{tag}>", svg::escaped(text));
     }
-    out.push_str("</tr>");
 }
 
 /// Whether a column holds numbers, and stands to the right.
@@ -178,7 +202,7 @@ mod tests {
             x: Axis::new("time", "s"),
             y: Axis::new("torque", "Nm"),
             series: series.clone(),
-            marks: Vec::new(),
+            ..Figure::default()
         };
         let nm = |value| Quantity::new(value, "Nm");
         let section = |name: &str| Section {
@@ -190,17 +214,27 @@ mod tests {
                 figure(&format!("{name}-half"), Size::Half),
             ],
             findings: vec![
-                Finding::less_is_better("error", 0.0054, nm(6.3e-5)),
-                Finding::stated("slope", nm(0.25).plus_minus(0.5)).must("below 1 Nm", false),
+                Finding::less_is_better("error", 0.0054, nm(6.3e-5)).look(Some("look <here>".to_owned())),
+                Finding::stated("slope", nm(0.25).plus_minus(0.5)).must("below 1 Nm", false).from("--limit"),
             ],
-            tables: vec![Table {
-                title: "cells".to_owned(),
-                head: vec!["cell".to_owned(), "late".to_owned()],
-                rows: vec![
-                    vec!["vcan0 1".to_owned(), "12".to_owned()],
-                    vec!["vcan0 2".to_owned(), "–".to_owned()],
-                ],
-            }],
+            tables: vec![
+                Table {
+                    title: "cells".to_owned(),
+                    head: vec!["cell".to_owned(), "late".to_owned()],
+                    rows: vec![
+                        vec!["vcan0 1".to_owned(), "12".to_owned()],
+                        vec!["vcan0 2".to_owned(), "–".to_owned()],
+                    ],
+                    ..Table::default()
+                },
+                Table::new(
+                    "moments",
+                    ["at", "look"],
+                    [["2 s".to_owned(), "gateway view 'a b' --at 2".to_owned()]],
+                )
+                .of_commands(),
+            ],
+            ..Section::default()
         };
         Page {
             title: "A page & more".to_owned(),
@@ -237,12 +271,20 @@ mod tests {
             assert_eq!(names.iter().filter(|name| **name == to).count(), 1, "{to}");
         }
         let rows: Vec<_> = all("tr").into_iter().map(text).collect();
-        assert!(rows.contains(&"error0.0054\u{a0}Nm6.3e-5\u{a0}Nm✓ better".to_owned()), "{rows:?}");
-        assert!(rows.contains(&"slope0.25 ± 0.5\u{a0}Nmbelow 1 Nm✗ does not hold".to_owned()), "{rows:?}");
+        assert!(
+            rows.contains(&"errorlook <here>5.4\u{a0}mNm63\u{a0}µNmbelow the paper's✓ better".to_owned()),
+            "{rows:?}"
+        );
+        assert!(
+            rows.contains(&"slope250 ± 500\u{a0}mNmbelow 1 Nm (--limit)✗ does not hold".to_owned()),
+            "{rows:?}"
+        );
         let right: Vec<_> =
             all("td").into_iter().filter(|cell| cell.attribute("class") == Some("n")).map(text).collect();
         assert!(right.contains(&"12".to_owned()) && right.contains(&"–".to_owned()));
         assert!(!right.contains(&"vcan0 1".to_owned()));
+        let commands: Vec<_> = all("code").into_iter().map(text).collect();
+        assert_eq!(commands[..2], ["look <here>", "gateway view 'a b' --at 2"]);
         assert!(text(all("footer")[0]).contains("gateway run 'a' > b"));
     }
 }

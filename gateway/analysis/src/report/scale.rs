@@ -4,7 +4,8 @@ use std::ops::Range;
 
 use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 
-use super::figure::{Axis, Scale};
+use super::figure::{Axis, Scale, quantity};
+use super::number::{Fitted, fitted, known};
 
 /// One axis with its ends.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -12,6 +13,8 @@ pub(crate) struct Span {
     from: f64,
     to: f64,
     scale: Scale,
+    /// The axis' unit, where it takes prefixes.
+    unit: Option<&'static str>,
 }
 
 impl Span {
@@ -27,7 +30,23 @@ impl Span {
         });
         let is_fit = usable(&from) && usable(&to) && from < to;
         let (from, to) = if is_fit { (from, to) } else { wider((from, to), scale, room) };
-        Self { from, to, scale }
+        Self { from, to, scale, unit: known(&axis.unit) }
+    }
+
+    /// The unit of a linear axis with the prefix for its ends.
+    fn fitted(&self) -> Option<Fitted> {
+        let unit = self.unit.filter(|_| self.scale == Scale::Linear)?;
+        fitted(self.from.abs().max(self.to.abs()), unit)
+    }
+
+    /// What stands beside the axis: what it counts, and in what, unless each tick has its unit.
+    pub(crate) fn title(&self, axis: &Axis) -> String {
+        let unit = match (self.fitted(), self.unit) {
+            (Some(fitted), _) => fitted.unit,
+            (None, Some(_)) => String::new(),
+            (None, None) => axis.unit.clone(),
+        };
+        Axis { unit, ..Axis::new(&axis.caption, "") }.to_string()
     }
 
     /// Where a value stands: 0 at the axis' beginning, 1 at its end; not a number where it cannot stand.
@@ -57,15 +76,16 @@ impl Span {
 
     /// How a tick is written: with the digits that distinguish neighbours.
     pub(crate) fn caption(&self, tick: f64, most: usize) -> String {
-        let size = self.from.abs().max(self.to.abs());
+        let factor = self.fitted().map_or(1.0, |fitted| fitted.factor);
+        let size = self.from.abs().max(self.to.abs()) * factor;
         match self.scale {
-            Scale::Log if (0.01..1e5).contains(&tick) => format!("{}", round(tick)),
-            Scale::Log => power(tick),
-            Scale::Linear if !(1e-3..1e6).contains(&size) => power(tick),
+            Scale::Log if (0.01..1e5).contains(&tick) && self.unit.is_none() => format!("{}", round(tick)),
+            Scale::Log => self.unit.map_or_else(|| power(tick), |unit| quantity(tick, unit)),
+            Scale::Linear if !(1e-3..1e6).contains(&size) => power(tick * factor),
             Scale::Linear => {
-                let step = step(self.from, self.to, most);
+                let step = step(self.from, self.to, most) * factor;
                 let digits = (0..9).find(|digits| step * 10_f64.powi(*digits) > 0.999).unwrap_or(9);
-                format!("{:.*}", usize::try_from(digits).unwrap_or(0), tick + 0.0)
+                format!("{:.*}", usize::try_from(digits).unwrap_or(0), tick * factor + 0.0)
             }
         }
     }
@@ -186,6 +206,22 @@ fn raised(digit: char) -> char {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    #[test]
+    fn an_axis_has_the_prefix_that_fits_its_ends_or_the_unit_at_each_tick() {
+        let axis = Axis::new("error", "Nm").between(-2e-4, 3e-4);
+        let span = Span::new(&axis, [].into_iter(), 0.0);
+        assert_eq!((span.title(&axis), span.caption(1e-4, 5)), ("error (µNm)".to_owned(), "100".to_owned()));
+        let axis = Axis::new("time", "µs").between(5.0, 2_000.0).log();
+        let span = Span::new(&axis, [].into_iter(), 0.0);
+        let words = [5.0, 1_000.0].map(|tick| span.caption(tick, 5));
+        assert_eq!(
+            (span.title(&axis), words),
+            ("time".to_owned(), ["5\u{a0}µs", "1\u{a0}ms"].map(str::to_owned))
+        );
+        let axis = Axis::new("position", "rad").between(0.0, 2.0);
+        assert_eq!(Span::new(&axis, [].into_iter(), 0.0).title(&axis), "position (rad)");
+    }
 
     fn span(from: f64, to: f64, scale: Scale) -> Span {
         Span::new(&Axis { scale, ..Axis::default() }.between(from, to), [].into_iter(), 0.0)

@@ -3,6 +3,11 @@
 //! Colours stand in the drawing as they are on paper, so that every program shows it; and each has a class beside it,
 //! by which [`dark()`] gives it another one on a dark screen.
 
+mod cells;
+mod colour;
+
+pub use cells::{draw as draw_cells, inline as inline_cells};
+
 use std::fmt::Write as _;
 
 use plotters::chart::{ChartBuilder, ChartContext};
@@ -14,12 +19,14 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use plotters_svg::SVGBackend;
 
-use super::figure::{Figure, Mark, On, Series, Shape, Size};
+use super::figure::{Axis, Figure, Mark, On, Series, Shape, Size};
 use super::scale::Span;
 use super::thin::thinned;
 
 /// How many units of the drawing are one pixel of its natural size: places are whole units.
 const UNIT: i32 = 8;
+/// How high a diagram below another one is, in pixels.
+const BELOW: u32 = 150;
 /// Of letters, in pixels.
 const LETTERS: f64 = 13.0;
 /// The widths of lines in units. Plotters would draw each dash as a line of its own, which of a noisy curve are
@@ -59,6 +66,7 @@ pub fn dark() -> String {
     for (_, class, colour) in CLASSES {
         let _ = write!(rules, ".{class}-f{{fill:{colour}}}.{class}-s{{stroke:{colour}}}");
     }
+    colour::dark(&mut rules);
     rules.push('}');
     rules
 }
@@ -72,10 +80,17 @@ pub const fn natural(size: Size) -> (u32, u32) {
     }
 }
 
+/// The same with what a diagram below another one takes.
+#[must_use]
+pub(crate) const fn height(figure: &Figure, size: Size) -> (u32, u32) {
+    let (width, height) = natural(size);
+    (width, if figure.below.is_some() { height + BELOW } else { height })
+}
+
 /// A file of its own, for a paper or a document.
 #[must_use]
 pub fn draw(figure: &Figure) -> String {
-    let (width, height) = natural(figure.size);
+    let (width, height) = height(figure, figure.size);
     let style = format!("<style>{}</style>\n", dark());
     let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
     document(figure, (width, height), &attributes, &style)
@@ -145,29 +160,77 @@ type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
 type Chart<'a, 'b> = ChartContext<'b, SVGBackend<'a>, Cartesian2d<Span, Span>>;
 type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
 
+/// One of a figure's diagrams.
+#[derive(Clone, Copy)]
+struct Diagram<'a> {
+    axes: (&'a Axis, &'a Axis),
+    /// The same fitted to what is drawn.
+    x: Span,
+    y: Span,
+    series: &'a [Series],
+    marks: &'a [Mark],
+    /// Whether the axis to the right has its words.
+    is_lowest: bool,
+}
+
+impl<'a> Diagram<'a> {
+    fn of(figure: &'a Figure) -> Vec<Self> {
+        let upper = (&figure.y, figure.series.as_slice(), figure.marks.as_slice());
+        let lower = figure.below.as_ref().map(|it| (&it.y, it.series.as_slice(), it.marks.as_slice()));
+        let drawn = || std::iter::once(upper).chain(lower);
+        let points = || drawn().flat_map(|(_, series, _)| series).flat_map(|series| &series.points);
+        let marks =
+            |marks: &'a [Mark], on| marks.iter().filter(move |mark| mark.on == on).map(|mark| mark.at);
+        let across = points().filter(|point| point.1.is_finite()).map(|point| point.0);
+        let x = Span::new(&figure.x, across.chain(marks(&figure.marks, On::X)), 0.0);
+        let count = drawn().count();
+        let diagrams = drawn().enumerate().map(|(at, (axis, series, of_marks))| {
+            let up = series.iter().flat_map(|series| &series.points).map(|point| point.1);
+            let y = Span::new(axis, up.chain(marks(of_marks, On::Y)), 0.06);
+            Self { axes: (&figure.x, axis), x, y, series, marks: of_marks, is_lowest: at + 1 == count }
+        });
+        diagrams.collect()
+    }
+
+    /// The most ticks upwards in so many units.
+    const fn ticks(height: u32) -> usize {
+        let ticks = (height / pixels(42)) as usize;
+        if ticks < 3 { 3 } else { ticks }
+    }
+
+    /// Letters of the widest caption upwards.
+    fn letters(&self, height: u32) -> usize {
+        let most = Self::ticks(height);
+        let ticks = self.y.ticks(most).into_iter();
+        ticks.map(|tick| self.y.caption(tick, most).chars().count()).max().unwrap_or(1)
+    }
+}
+
 fn drawing_of(figure: &Figure, area: &Area<'_>) -> Drawn {
-    let all = || figure.series.iter().flat_map(|series| &series.points);
-    let marks = |on| figure.marks.iter().filter(move |mark| mark.on == on).map(|mark| mark.at);
-    let x = Span::new(
-        &figure.x,
-        all().filter(|point| point.1.is_finite()).map(|point| point.0).chain(marks(On::X)),
-        0.0,
-    );
-    let y = Span::new(&figure.y, all().map(|point| point.1).chain(marks(On::Y)), 0.06);
+    let diagrams = Diagram::of(figure);
+    let (_, height) = area.dim_in_pixel();
+    let (upper, lower) = match figure.below {
+        Some(_) => area.split_vertically(height.saturating_sub(pixels(BELOW))),
+        None => area.split_vertically(height),
+    };
+    let areas = [upper, lower];
+    let digits = diagrams.iter().zip(&areas).map(|(diagram, area)| diagram.letters(area.dim_in_pixel().1));
+    // Both begin at one place.
+    let left = pixels(34) + in_pixels(0.62 * LETTERS * digits.max().unwrap_or(1) as f64).unsigned_abs();
+    diagrams.iter().zip(&areas).try_for_each(|(diagram, area)| diagram_of(diagram, area, left))
+}
 
+fn diagram_of(diagram: &Diagram<'_>, area: &Area<'_>, left: u32) -> Drawn {
+    let Diagram { axes, x, y, series, marks, is_lowest } = *diagram;
     let (width, height) = area.dim_in_pixel();
-    let (x_most, y_most) = ((width / pixels(80)) as usize, (height / pixels(42)) as usize);
-    let digits =
-        y.ticks(y_most).iter().map(|tick| y.caption(*tick, y_most).chars().count()).max().unwrap_or(1);
-    let left = pixels(34) + in_pixels(0.62 * LETTERS * digits as f64).unsigned_abs();
-
-    let rows = legend(figure, width);
+    let (x_most, y_most) = ((width / pixels(80)) as usize, Diagram::ticks(height));
+    let rows = legend(series, width);
     let top = pixels(8) + pixels(20) * u32::try_from(rows.len()).unwrap_or(0);
     let (above, below) = area.split_vertically(top);
     let mut chart = ChartBuilder::on(&below)
         .margin_right(pixels(24))
         .margin_top(pixels(4))
-        .x_label_area_size(pixels(44))
+        .x_label_area_size(pixels(if is_lowest { 44 } else { 12 }))
         .y_label_area_size(left)
         .build_cartesian_2d(x, y)?;
     chart
@@ -181,17 +244,17 @@ fn drawing_of(figure: &Figure, area: &Area<'_>) -> Drawn {
         .label_style(letters(&INK, LETTERS))
         .axis_desc_style(letters(&INK, LETTERS))
         .set_all_tick_mark_size(pixels(5))
-        .x_label_formatter(&|tick| x.caption(*tick, x_most))
+        .x_label_formatter(&|tick| if is_lowest { x.caption(*tick, x_most) } else { String::new() })
         .y_label_formatter(&|tick| y.caption(*tick, y_most))
-        .x_desc(figure.x.to_string())
-        .y_desc(figure.y.to_string())
+        .x_desc(if is_lowest { x.title(axes.0) } else { String::new() })
+        .y_desc(y.title(axes.1))
         .draw()?;
     let (columns, lines) = chart.plotting_area().dim_in_pixel();
     let grain = (columns / UNIT.unsigned_abs(), lines / UNIT.unsigned_abs());
-    for (series, colour) in figure.series.iter().zip(colours()) {
+    for (series, colour) in series.iter().zip(colours()) {
         series_of(&mut chart, series, colour, (&x, &y), grain)?;
     }
-    for mark in &figure.marks {
+    for mark in marks {
         mark_of(&mut chart, mark, (&x, &y))?;
     }
     for (row, entries) in (0..).zip(&rows) {
@@ -335,8 +398,8 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Dr
 }
 
 /// Rows of the legend: where each entry begins, its series and its colour.
-fn legend(figure: &Figure, width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
-    let named = figure.series.iter().zip(colours()).filter(|(series, _)| !series.caption.is_empty());
+fn legend(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
+    let named = series.iter().zip(colours()).filter(|(series, _)| !series.caption.is_empty());
     let mut rows: Vec<Vec<_>> = Vec::new();
     let mut at = i32::MAX;
     for (series, colour) in named {

@@ -191,6 +191,8 @@ pub(super) struct SumError {
     /// Epochs in a row, and their errors together.
     epochs: u32,
     sum: [f64; MAX_JOINTS],
+    /// The errors of the epoch that was compared last.
+    pub(super) last: Option<[f64; MAX_JOINTS]>,
 }
 
 impl SumError {
@@ -208,12 +210,14 @@ impl SumError {
             self.saturated += expected.joints as u64;
             return self.interrupt();
         }
-        let errors =
-            words.iter().zip(expected.torque).map(|(&word, torque)| f64::from(word) / 256.0 - torque);
-        for (sum, error) in self.sum.iter_mut().zip(errors).take(expected.joints) {
-            self.each.add(error);
-            *sum += error;
+        let mut errors = [0.0; MAX_JOINTS];
+        let compared = errors.iter_mut().zip(words).zip(expected.torque).zip(&mut self.sum);
+        for (((error, &word), torque), sum) in compared.take(expected.joints) {
+            *error = f64::from(word) / 256.0 - torque;
+            self.each.add(*error);
+            *sum += *error;
         }
+        self.last = Some(errors);
         self.epochs += 1;
         if self.epochs == AVERAGED {
             let sums = self.sum;

@@ -127,9 +127,18 @@ impl Table {
             return self.counters.epoch(due, complete);
         }
         self.counters.epoch(before.due > 0, before.in_time == before.due);
-        if self.comparing && before.due > 0 && before.in_time == before.due {
+        let is_compared = self.comparing && before.due > 0 && before.in_time == before.due;
+        self.difference = is_compared.then_some(before.error);
+        if is_compared {
             self.accuracy.whole_skin(before.error.get(..self.carried.joints).unwrap_or_default());
         }
+    }
+
+    /// Of the epoch that was closed last: the distributed torque of the whole bus less the central one, in Nm or N by joint
+    /// of the chain, without saturated words; `None` where it was not compared, or not all that was due came in time.
+    #[must_use]
+    pub fn difference(&self) -> Option<[f64; MAX_JOINTS]> {
+        self.root_totals.as_ref().map_or(self.difference, |root_totals| root_totals.error.last)
     }
 
     /// Releases torques that have decayed in the loop while no joints were on the bus, so that they do not come back.

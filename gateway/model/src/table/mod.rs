@@ -136,6 +136,8 @@ pub struct Table {
     snapshot: Snapshot,
     counters: Counters,
     accuracy: Accuracy,
+    /// Of the epoch that was closed last, see [`Table::difference`].
+    difference: Option<[f64; MAX_JOINTS]>,
     last_reply: Histogram<u64>,
     notices: VecDeque<Notice>,
 }
@@ -191,6 +193,7 @@ impl Table {
             snapshot,
             counters: Counters::default(),
             accuracy: Accuracy::default(),
+            difference: None,
             last_reply: histogram(),
             notices: VecDeque::new(),
         }

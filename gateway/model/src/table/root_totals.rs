@@ -186,6 +186,7 @@ impl RootTotals {
     /// The next joints are on the bus, or none follow: how many were due in the newest epoch, and whether all
     /// of them came in time.
     pub(super) fn close(&mut self) -> (bool, bool) {
+        self.error.last = None;
         let Some(Some(open)) = self.epochs.first_mut() else { return (false, false) };
         open.in_time = Some(open.came);
         let complete = open.came >= open.due;

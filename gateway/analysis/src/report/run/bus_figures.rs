@@ -1,13 +1,16 @@
 //! Figures from the frames of one bus: the same accounts that the gateway kept, epoch by epoch.
 
 use protocol::candump::{Direction, Record};
-use protocol::message::Message;
+use protocol::message::{Message, SensorPage};
 use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
+use super::moments::Moments;
+use super::touched::Touched;
 use crate::fit::rates::Chosen;
 use crate::report::thin::{Binned, Thinned};
+use model::central::Central;
 use model::decode::{Decoded, Decoder};
 use model::table::{Replies, Table};
 use trace::capture::Latched;
@@ -33,6 +36,8 @@ struct Open {
     before: Replies,
     /// Errors compared before it, and their sum.
     errors: (u64, f64),
+    /// Packets of cells that were lost before it.
+    lost: u64,
     /// Its slowest reply, in µs.
     slowest: Option<u64>,
 }
@@ -48,6 +53,8 @@ pub(super) struct Lines {
     pub(super) slowest: Thinned,
     /// Mean absolute error of the whole bus' torque in an epoch that all answered, in Nm.
     pub(super) error: Thinned,
+    /// By joint of the chain: distributed less central torque of an epoch that all answered, in Nm or N.
+    pub(super) difference: Vec<Thinned>,
 }
 
 /// One bus.
@@ -55,6 +62,14 @@ pub(super) struct Lines {
 pub(super) struct LinkId {
     pub(super) name: String,
     pub(super) table: Table,
+    /// What its cells make of their sensors.
+    central: Central,
+    /// By place among the bus' cells: the force in N that a cell reported last, for those that measure.
+    measured: Vec<Option<f64>>,
+    pub(super) touched: Touched,
+    pub(super) moments: Moments,
+    /// When the whole bus' torque was farthest from the central one, and by how much.
+    pub(super) farthest: Option<(f64, f64)>,
     /// Whether cells answer with sums.
     pub(super) sums: bool,
     decoder: Decoder,
@@ -68,6 +83,8 @@ pub(super) struct LinkId {
     pub(super) joints: Option<(f64, f64, u64)>,
     /// The bit rates of a real bus in its place.
     pub(super) rates: Chosen,
+    /// Where they come from; none where they are common ones.
+    pub(super) rates_from: Option<&'static str>,
     /// Seconds that it would carry what it has to.
     pub(super) load: Binned,
     /// The same with what only a bench sends.
@@ -77,22 +94,31 @@ pub(super) struct LinkId {
 }
 
 impl LinkId {
-    pub(super) fn new(skin: &Skin, bus: usize, rates: Chosen) -> Self {
+    pub(super) fn new(skin: &Skin, bus: usize, (rates, rates_from): (Chosen, Option<&'static str>)) -> Self {
         let mut table = Table::new(skin, bus);
         table.set_comparing(true);
         let described = skin.buses.get(bus);
         Self {
             name: described.map(|bus| bus.name.clone()).unwrap_or_default(),
             latency: vec![Latency::default(); table.cells().len()],
+            measured: vec![None; table.cells().len()],
+            central: Central::new(&skin.part_on(bus)),
+            touched: Touched::new(skin, bus),
+            moments: Moments::default(),
+            farthest: None,
             table,
             sums: described.is_some_and(|bus| bus.reply != Reply::Torque),
             decoder: Decoder::new(described.map(|bus| bus.format)),
             open: None,
             looked: Micros(0),
-            lines: Lines::default(),
+            lines: Lines {
+                difference: vec![Thinned::default(); skin.joints_of(bus).len()],
+                ..Lines::default()
+            },
             frames: 0,
             joints: None,
             rates,
+            rates_from,
             load: Binned::default(),
             load_of_all: Binned::default(),
             dropped: 0,
@@ -117,12 +143,15 @@ impl LinkId {
         if now.0 >= self.looked.0 + LOOK_US {
             self.looked = now;
             self.table.handle_time(now);
-            self.table.notices().for_each(drop);
+            for notice in self.table.notices() {
+                self.moments.notice(at, notice);
+            }
         }
         let own = record.direction == Some(Direction::Sent);
         let decoded = self.decoder.decode(now, &self.name, &record.frame);
         if let Decoded::Message(message) = &decoded {
             self.answer(now, message);
+            self.measure(message);
         }
         let seconds = Bits::of(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
         self.load_of_all.add(at, seconds);
@@ -158,6 +187,26 @@ impl LinkId {
         }
     }
 
+    /// What a cell measures, if this is its sensors page.
+    fn measure(&mut self, message: &Message) {
+        let Message::Sensors { from, page: SensorPage::Skin(skin), .. } = message else { return };
+        let Some(place) = self.table.cells().iter().position(|cell| cell.node == *from) else { return };
+        if let Some(measured) = self.measured.get_mut(place) {
+            *measured = Some(self.central.force(place, skin));
+        }
+    }
+
+    /// The force on each cell since the newest joints: by its stimuli, or as it measures it.
+    fn forces(&mut self, at: f64) {
+        let (table, central, measured) = (&self.table, &self.central, &self.measured);
+        let sensors = table.sensors(self.looked).zip(table.cells()).zip(measured).enumerate();
+        let forces = sensors.map(|(place, (((sensors, _), cell), measured))| {
+            let stimulated = sensors.map(|sensors| central.force(place, &sensors));
+            stimulated.or_else(|| measured.filter(|_| cell.measures() == Some(true)))
+        });
+        self.touched.joints(at, forces);
+    }
+
     /// What is due and what has come of it, all epochs together.
     pub(super) fn account(&self) -> Replies {
         self.table.replies()
@@ -175,15 +224,20 @@ impl LinkId {
         let (first, _, count) = self.joints.unwrap_or((at, at, 0));
         self.joints = Some((first, at, count + 1));
         let (due, before, errors) = self.close();
-        self.open = Some(Open { number, at, due, before, errors, slowest: None });
+        let lost = self.table.uplink().lost;
+        self.open = Some(Open { number, at, due, before, errors, lost, slowest: None });
+        self.forces(at);
     }
 
     /// Ends the epoch that is open: what has become due since, and what there is now.
     fn close(&mut self) -> (u64, Replies, (u64, f64)) {
         let (account, errors) = (self.account(), self.errors());
-        let Some(Open { at, due, before, errors: errors_before, slowest, .. }) = self.open.take() else {
+        let Some(Open { at, due, before, errors: errors_before, lost, slowest, .. }) = self.open.take()
+        else {
             return (account.due, account, errors);
         };
+        let packets = self.table.uplink().lost.saturating_sub(lost);
+        self.moments.epoch(at, &before, &account, packets);
         let compared = errors.0.saturating_sub(errors_before.0);
         let error = (errors.1 - errors_before.1).max(0.0) / compared as f64;
         let lines = &mut self.lines;
@@ -193,6 +247,16 @@ impl LinkId {
         lines.missing.push(at, account.missing.saturating_sub(before.missing) as f64);
         lines.slowest.push(at, slowest.map_or(f64::NAN, |took| took as f64 * 1e-3));
         lines.error.push(at, if compared > 0 { error } else { f64::NAN });
+        let difference = self.table.difference();
+        for error in difference.iter().flatten().map(|error| error.abs()) {
+            if error > self.farthest.map_or(0.0, |(_, farthest)| farthest) {
+                self.farthest = Some((at, error));
+            }
+        }
+        for (joint, line) in lines.difference.iter_mut().enumerate() {
+            let of_joint = difference.as_ref().and_then(|difference| difference.get(joint));
+            line.push(at, of_joint.copied().unwrap_or(f64::NAN));
+        }
         (account.due.saturating_sub(before.due), account, errors)
     }
 
@@ -200,5 +264,6 @@ impl LinkId {
     pub(super) fn finish(&mut self) {
         self.table.finish();
         self.close();
+        self.touched.finish();
     }
 }

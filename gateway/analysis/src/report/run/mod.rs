@@ -12,8 +12,10 @@
 //! real bus is that of `gateway shadow` for the same recording.
 
 mod bus_figures;
+mod moments;
 mod motion;
 mod page;
+mod touched;
 
 use std::path::PathBuf;
 
@@ -90,6 +92,17 @@ pub struct Options {
 }
 
 impl Options {
+    /// Where a bus' rates come from: the options' names, or the skin's key; none where they are common ones.
+    fn origin(&self, bus: &Bus) -> Option<&'static str> {
+        match (self.nominal, self.data, bus.bitrate) {
+            (Some(_), Some(_), _) => Some("--nominal, --data"),
+            (Some(_), None, _) => Some("--nominal"),
+            (None, Some(_), _) => Some("--data"),
+            (None, None, Some(_)) => Some("skin: bitrate"),
+            (None, None, None) => None,
+        }
+    }
+
     /// The bit rates that a bus' load is reckoned with.
     fn rates(&self, bus: &Bus) -> Result<Chosen, ReportError> {
         let rates = Requested { nominal: self.nominal, data: self.data }.of_bus(bus);
@@ -140,6 +153,7 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), R
     let name = items.name().to_owned();
     // What stands before the first message is known when it is open.
     let mut run = Run::begin(&name, bytes.unwrap_or(0), items.extras(), options)?;
+    run.files = paths.iter().map(|path| path.display().to_string()).collect();
     let damaged = loop {
         match items.next_item() {
             Ok(Some(item)) => run.take(&item),
@@ -180,8 +194,12 @@ struct Run {
     metadata: Vec<(String, Vec<(String, String)>)>,
     /// The topics of joints and of torques.
     topics: [String; 2],
+    /// Its files, in the order in which they were named.
+    files: Vec<String>,
     /// When the first message was, in ns since 1970.
     began: Option<u64>,
+    /// When the first frame was, in s after the first message.
+    first_frame: Option<f64>,
     motion: Motion,
     bus_figures: Vec<LinkId>,
     shadow: Shadow,
@@ -203,7 +221,8 @@ impl Run {
         let skin = skin.map_err(|error| foreign(format!("the attached {error}")))?;
         let layout = Layout::new(&skin);
         let buses = skin.buses.iter().enumerate();
-        let bus_figures = buses.map(|(at, bus)| Ok(LinkId::new(&skin, at, options.rates(bus)?)));
+        let bus_figures =
+            buses.map(|(at, bus)| Ok(LinkId::new(&skin, at, (options.rates(bus)?, options.origin(bus)))));
         let mut bus_figures = bus_figures.collect::<Result<Vec<_>, ReportError>>()?;
         let mut shadow = shadow(&skin, &bus_figures);
         for before in &extras.latched {
@@ -220,7 +239,9 @@ impl Run {
             bytes,
             metadata: extras.metadata.clone(),
             skin,
+            files: Vec::new(),
             began: None,
+            first_frame: None,
             bus_figures,
             shadow,
             backlog: 0,
@@ -233,6 +254,7 @@ impl Run {
         match item {
             Item::Entry(Entry::Frame(record)) => {
                 let at = self.seconds(record.time.nanos);
+                self.first_frame.get_or_insert(at);
                 match self.skin.bus_named(record.interface).and_then(|bus| self.bus_figures.get_mut(bus)) {
                     Some(bus_figures) => {
                         bus_figures.frame(at, record);

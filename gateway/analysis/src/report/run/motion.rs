@@ -28,6 +28,8 @@ pub(super) struct Motion {
     /// The first and the last tick, in s.
     pub(super) first: Option<f64>,
     pub(super) last: f64,
+    /// When most ticks were skipped at once, and how many.
+    pub(super) skip: Option<(f64, u64)>,
     /// When what changed.
     pub(super) turns: Vec<(f64, &'static str)>,
     number: Option<u64>,
@@ -91,6 +93,9 @@ impl Motion {
         self.first.get_or_insert(at);
         self.last = self.last.max(at);
         self.counts.take(timing, self.number.replace(timing.tick));
+        if timing.skipped > self.skip.map_or(0, |(_, skipped)| skipped) {
+            self.skip = Some((at, timing.skipped));
+        }
         self.contributing.push(at, timing.contributing.into());
         self.late.push(at, timing.late_us);
         self.took.push(at, timing.took_us);

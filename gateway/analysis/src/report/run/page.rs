@@ -3,11 +3,14 @@
 mod arm;
 mod bus;
 mod formats;
+mod moments;
+mod skin;
 
 use super::Run;
 use super::bus_figures::LinkId;
+use super::moments::Loss;
 use crate::paper;
-use crate::report::figure::{Axis, Figure, Finding, Mark, Page, Section, Series, Shape, number};
+use crate::report::figure::{Axis, Figure, Finding, Mark, Page, Section, Series, Shape, number, quantity};
 use crate::report::thin::Thinned;
 use model::table::{Accuracy, Uplink};
 
@@ -28,20 +31,20 @@ struct Draft<'a> {
 pub(super) fn page(run: &Run, command: &str, missing: Option<&str>) -> Page {
     let draft = Draft { run, zero: run.motion.first.unwrap_or(0.0) };
     let (skin, motion) = (&run.skin, &run.motion);
-    let seconds = number((motion.seconds() * 100.0).round() / 100.0);
+    let seconds = quantity((motion.seconds() * 100.0).round() / 100.0, "s");
     let mut intro = format!(
-        "A run of {} with {} cells on {} and {seconds} s of its {} Hz control loop, from the recording {}. \
+        "A run of {} with {} cells on {} and {seconds} of its {} control loop, from the recording {}. \
          Times count from the first tick.",
         skin.name,
         skin.cells.len(),
         several(skin.buses.len(), "bus", "buses"),
-        number(skin.timing.control_hz),
+        quantity(skin.timing.control_hz, "Hz"),
         run.name,
     );
     if let Some(missing) = missing {
         intro = format!("Not all of the run is here: {missing}. {intro}");
     }
-    let mut sections = vec![draft.summary()];
+    let mut sections = vec![draft.summary(), draft.skin()];
     if motion.counts.ticks > 0 {
         sections.extend([draft.torque(), draft.motion(), draft.cells(), draft.cycle()]);
     }
@@ -87,14 +90,17 @@ impl Draft<'_> {
             .map(|bus_figures| bus_figures.table.accuracy())
             .reduce(Accuracy::with);
         let accuracy = accuracy.unwrap_or_default();
-        for (what, theirs, errors) in [
-            ("torques of single cells, loaded joints", paper::SINGLE_NM, accuracy.single),
-            ("the whole skin's torque, all joints", paper::SUMMED_NM, accuracy.whole),
-            ("sums along the tree, loaded joints", paper::SUMMED_NM, accuracy.sums),
+        let farthest = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.farthest);
+        let farthest = farthest.max_by(|one, other| one.1.total_cmp(&other.1)).map(|(at, _)| self.look(at));
+        for (what, theirs, errors, is_whole) in [
+            ("torques of single cells, loaded joints", paper::SINGLE_NM, accuracy.single, false),
+            ("the whole skin's torque, all joints", paper::SUMMED_NM, accuracy.whole, true),
+            ("sums along the tree, loaded joints", paper::SUMMED_NM, accuracy.sums, true),
         ] {
             let finding = |mean| {
                 let what = format!("{what}: mean absolute error");
                 Finding::less_is_better(what, theirs, (mean, "Nm"))
+                    .look(farthest.clone().filter(|_| is_whole))
             };
             findings.extend(errors.mean().map(finding));
         }
@@ -124,32 +130,56 @@ impl Draft<'_> {
                 let finding = Finding::stated("joints", hertz(count, last - first));
                 findings.push(finding.beside(PAPER_BROADCAST_HZ));
             }
-            findings.push(none("ticks skipped".to_owned(), motion.counts.skipped));
+            let skipped = none("ticks skipped".to_owned(), motion.counts.skipped);
+            findings.push(skipped.look(motion.skip.map(|(at, _)| self.look(at))));
         }
         let accounts = self.run.bus_figures.iter().map(LinkId::account);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
         if due > 0 {
             let what = format!("replies not there before the next joints, of {due} that were due");
-            findings.push(none(what, due - in_time));
+            let period = 1.0 / skin.timing.broadcast_hz();
+            let bar = format!("none after {}", quantity(period, "s"));
+            let late = due - in_time;
+            let finding = Finding::stated(what, late as f64).must(bar, late == 0);
+            let worst = self.worst_loss(|loss| loss.late + loss.missing);
+            findings.push(finding.from("skin: joint_broadcast_hz").look(worst));
         }
         findings.extend(self.beyond_range());
         findings.extend(self.fits());
         let uplink: Uplink = self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
-        findings.push(none("packets of cells lost, by their own count".to_owned(), uplink.lost));
+        let lost = none("packets of cells lost, by their own count".to_owned(), uplink.lost);
+        findings.push(lost.look(self.worst_loss(|loss| loss.packets)));
         Section::new("summary", "In numbers").findings(findings).text(
             "Beside the paper's numbers (Efficient Distributed Torque Computation for Large Scale Robot Skin). Within \
-             5 % of the paper's, a number is the same.",
+             5 % of the paper's, a number is the same. A command shows the recording where the number is worst.",
         )
     }
+
+    /// The command for the loss with most of what a count names.
+    fn worst_loss(&self, of: impl Fn(&Loss) -> u64) -> Option<String> {
+        let all = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.moments.worst(&of));
+        all.max_by_key(|loss| of(loss)).map(|loss| self.look(loss.seconds.0))
+    }
+}
+
+/// A figure without series that have no point; none where there is nothing to show.
+fn shown(mut figure: Figure) -> Option<Figure> {
+    figure.series.retain(|series| series.points.iter().any(|(x, y)| x.is_finite() && y.is_finite()));
+    (!figure.series.is_empty()).then_some(figure)
 }
 
 /// What must not be there at all.
 fn none(what: String, count: u64) -> Finding {
-    Finding::stated(what, count as f64).must("none", count == 0)
+    Finding::stated(what, count as f64).must("none", count == 0).from("default")
 }
 
 fn several(count: usize, one: &str, more: &str) -> String {
     format!("{count} {}", if count == 1 { one } else { more })
+}
+
+/// A time in µs as the recording's metadata has it.
+fn micros(text: &str) -> String {
+    text.parse().map_or_else(|_| text.to_owned(), |micros| quantity(micros, "µs"))
 }
 
 /// What it came about with.
@@ -159,7 +189,8 @@ fn facts(run: &Run, command: &str) -> Vec<(String, String)> {
     let began = program("began_ns").parse().map_or_else(|_| "unknown".to_owned(), utc);
     let idle = run.fact("machine", "idle_late_p50_us").map(|idle| {
         let (p99, max) = (machine("idle_late_p99_us"), machine("idle_late_max_us"));
-        format!("woke a thread {idle} µs late (median), 99 % within {p99} µs, at most {max} µs")
+        let [idle, p99, max] = [idle, p99, max].map(micros);
+        format!("woke a thread {idle} late (median), 99 % within {p99}, at most {max}")
     });
     let clock = format!(
         "{}, of {}; wall clock in steps of {} ns",

@@ -2,37 +2,26 @@
 
 use hdrhistogram::Histogram;
 
-use super::Draft;
+use super::super::bus_figures::LinkId;
+use super::{Draft, micros, shown};
 use crate::paper;
-use crate::report::figure::{Axis, Figure, Mark, Section, Shape, Table, number};
+use crate::report::figure::{Axis, Below, Figure, Mark, Section, Shape, Table, quantity};
 use crate::report::thin::Thinned;
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Errors};
-use protocol::skin::JointKind;
+use protocol::fixed::TorqueFormat;
+use protocol::skin::{JointKind, Reply};
 
 impl Draft<'_> {
     /// The paper's Fig. 6.
     pub(super) fn torque(&self) -> Section {
-        let motion = &self.run.motion;
-        let pairs = motion.distributed.iter().zip(&motion.central).enumerate();
-        let figures = pairs.map(|(joint, (distributed, central))| {
-            let name = self.joint(joint);
-            let name =
-                name.strip_prefix("joint ").map_or_else(|| name.clone(), |number| format!("Joint {number}"));
-            let title = format!("{name}: sum of the cells' torques, and the central computation");
-            let axis = match self.run.skin.robot.joints.get(joint).map(|joint| joint.kind) {
-                Some(kind @ JointKind::Prismatic) => Axis::new("force", kind.torque_unit()),
-                Some(JointKind::Revolute) | None => Axis::new("torque", JointKind::Revolute.torque_unit()),
-            };
-            self.figure(format!("torque-joint{}", joint + 1), title, axis)
-                .half()
-                .series([self.line("distributed", distributed)])
-                .draw("central", Shape::Dashed, self.points(central))
-        });
+        let joints = 0..self.run.skin.robot.joints.len();
+        let (loaded, free): (Vec<_>, Vec<_>) = joints.partition(|joint| self.is_loaded(*joint));
         let errors: Vec<_> =
             self.run.bus_figures.iter().filter(|bus_figures| bus_figures.lines.error.count() > 0).collect();
         let error = (!errors.is_empty()).then(|| {
-            let papers = |format: &str, mean| Mark::y(mean, format!("paper, {format}: {} Nm", number(mean)));
+            let papers =
+                |format: &str, mean| Mark::y(mean, format!("paper, {format}: {}", quantity(mean, "Nm")));
             let title = "Mean absolute error of an epoch that all cells answered in time";
             self.figure("torque-error", title, Axis::new("error", "Nm").log())
                 .series(
@@ -42,14 +31,83 @@ impl Draft<'_> {
                 )
                 .marks([papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)])
         });
-        let mut section = Section::new("torque", "Distributed and central torque").text(
-            "The curves hold what has come at each tick: while a touch changes they differ by what is on its way. The \
-             errors below compare like with like: each torque with the central computation for the joints that it answers.",
+        let mut section = Section::new("torque", "Torque, and its difference from the central one").text(
+            "The upper curve is the sum of what has come at each tick. The difference below it compares like with like, once \
+             an epoch: what all cells answered to these joints, less the central computation for them; an epoch without an \
+             answer in time is a gap. Dotted: one step of the torque words.",
         );
+        if !free.is_empty() {
+            let names: Vec<_> = free.iter().map(|joint| self.joint(*joint)).collect();
+            section = section.text(format!(
+                "No torque, distributed or central, on {}: no cell that was touched loads them.",
+                names.join(", ")
+            ));
+        }
         if let Some(advice) = self.advice() {
             section = section.text(advice);
         }
+        let figures = loaded.into_iter().map(|joint| self.torque_of(joint));
         section.figures(figures.chain(error)).tables(self.errors()).tables(self.formats())
+    }
+
+    /// The buses whose cells may load a joint, each with the joint's place in its chain.
+    fn buses_of(&self, joint: usize) -> impl Iterator<Item = (usize, usize, &LinkId)> {
+        self.run.bus_figures.iter().enumerate().filter_map(move |(bus, bus_figures)| {
+            let place = self.run.skin.joints_of(bus).position(|(of_chain, _)| of_chain == joint)?;
+            Some((bus, place, bus_figures))
+        })
+    }
+
+    /// One step of the torque words of a bus, in Nm or N.
+    fn step(&self, bus: usize) -> f64 {
+        let bus = self.run.skin.buses.get(bus);
+        let format = bus.map_or_else(TorqueFormat::default, |bus| match bus.reply {
+            Reply::Torque => bus.torque_format,
+            Reply::Sum { .. } => TorqueFormat::Q7_8,
+        });
+        format.step()
+    }
+
+    /// Whether a joint had any torque, to half a step of the words.
+    fn is_loaded(&self, joint: usize) -> bool {
+        let step = self.buses_of(joint).map(|(bus, ..)| self.step(bus)).fold(f64::INFINITY, f64::min);
+        let largest = |line: Option<&Thinned>| {
+            let points = line.map(Thinned::points).unwrap_or_default();
+            points.iter().map(|point| point.1.abs()).fold(0.0, f64::max)
+        };
+        let motion = &self.run.motion;
+        let ticks = [motion.distributed.get(joint), motion.central.get(joint)];
+        let epochs =
+            self.buses_of(joint).map(|(_, place, bus_figures)| bus_figures.lines.difference.get(place));
+        ticks.into_iter().chain(epochs).any(|line| largest(line) >= step * 0.5)
+    }
+
+    /// The torque on one joint, and below it what that differs by.
+    fn torque_of(&self, joint: usize) -> Figure {
+        let name = self.joint(joint);
+        let name =
+            name.strip_prefix("joint ").map_or_else(|| name.clone(), |number| format!("Joint {number}"));
+        let title =
+            format!("{name}: sum of the cells' torques, and its difference from the central computation");
+        let kind = self.run.skin.robot.joints.get(joint).map_or(JointKind::Revolute, |joint| joint.kind);
+        let quantity = if kind == JointKind::Prismatic { "force" } else { "torque" };
+        let unit = kind.torque_unit();
+        let distributed = self.run.motion.distributed.get(joint).map(|line| self.line("", line));
+        let of_bus = |(_, place, bus_figures): (usize, usize, &LinkId)| {
+            let line = bus_figures.lines.difference.get(place)?;
+            (line.count() > 0).then(|| self.line(self.named(bus_figures), line))
+        };
+        let series: Vec<_> = self.buses_of(joint).filter_map(of_bus).collect();
+        let figure = self
+            .figure(format!("torque-joint{}", joint + 1), title, Axis::new(quantity, unit))
+            .half()
+            .series(distributed);
+        if series.is_empty() {
+            return figure;
+        }
+        let step = self.buses_of(joint).map(|(bus, ..)| self.step(bus)).fold(0.0, f64::max);
+        let marks = vec![Mark::y(step, "one step"), Mark::y(-step, "")];
+        figure.below(Below { y: Axis::new("difference", unit), series, marks })
     }
 
     /// A joint as the skin's file names it; with its number where that is no part of the name.
@@ -59,6 +117,12 @@ impl Draft<'_> {
             Some(joint) if joint.name != format!("joint{number}") => format!("{number} {}", joint.name),
             Some(_) | None => format!("joint {number}"),
         }
+    }
+
+    /// The unit of torques on all joints together.
+    pub(super) fn torque_unit(&self) -> &'static str {
+        let slides = self.run.skin.robot.joints.iter().any(|joint| joint.kind == JointKind::Prismatic);
+        if slides { "Nm or N" } else { JointKind::Revolute.torque_unit() }
     }
 
     /// Errors joint by joint.
@@ -77,26 +141,25 @@ impl Draft<'_> {
             accuracy = accuracy.with(here);
         }
         let single = by_joint.iter().map(|[single, whole]| (single, whole));
-        let text = |errors: &Errors| {
-            let mean = number(errors.mean().unwrap_or(f64::NAN));
-            [mean, number(errors.max()), errors.count().to_string()]
+        let text = |errors: &Errors, unit: &str| {
+            let mean = quantity(errors.mean().unwrap_or(f64::NAN), unit);
+            [mean, quantity(errors.max(), unit), errors.count().to_string()]
         };
-        let row = |name: String, single: &Errors, whole: &Errors| {
-            [name].into_iter().chain(text(single)).chain(text(whole)).collect::<Vec<_>>()
+        let row = |name: String, unit: &str, single: &Errors, whole: &Errors| {
+            [name].into_iter().chain(text(single, unit)).chain(text(whole, unit)).collect::<Vec<_>>()
         };
         if accuracy.single.count() == 0 {
             return None;
         }
-        let joints = single.enumerate().map(|(joint, (single, whole))| row(self.joint(joint), single, whole));
-        let all = row("all".to_owned(), &accuracy.single, &accuracy.whole);
-        let [single, whole] = [paper::SINGLE_NM, paper::SUMMED_NM].map(number);
-        let slides = skin.robot.joints.iter().any(|joint| joint.kind == JointKind::Prismatic);
-        let slides = if slides { " (N where the joint slides)" } else { "" };
+        let joints =
+            single.zip(&skin.robot.joints).enumerate().map(|(joint, ((single, whole), described))| {
+                row(self.joint(joint), described.kind.torque_unit(), single, whole)
+            });
+        let all = row("all".to_owned(), self.torque_unit(), &accuracy.single, &accuracy.whole);
+        let [single, whole] = [paper::SINGLE_NM, paper::SUMMED_NM].map(|mean| quantity(mean, "Nm"));
         let papers = ["paper", &single, "", "", &whole, "", ""].map(str::to_owned).into();
         Some(Table::new(
-            format!(
-                "Absolute errors in Nm{slides}, joint by joint: single cells where the joint carries them, and the whole skin's sum"
-            ),
+            "Absolute errors, joint by joint: single cells where the joint carries them, and the whole skin's sum",
             ["", "single cells: mean", "max", "torques", "whole skin: mean", "max", "epochs"],
             joints.chain([all, papers]),
         ))
@@ -117,7 +180,13 @@ impl Draft<'_> {
                 figure("velocities", "Joint velocities", Axis::new("velocity", speed), &motion.velocity),
             ]
         });
-        Section::new("motion", "The arm").figures(figures)
+        let (still, figures): (Vec<_>, Vec<_>) = figures.partition(is_zero);
+        let section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
+        if still.is_empty() {
+            section
+        } else {
+            section.text("The arm stood still: these velocities were 0 throughout.")
+        }
     }
 
     /// Joints that share a figure: those of one kind that a chain adds to the chains before it.
@@ -145,7 +214,12 @@ impl Draft<'_> {
             .draw("in the torque", Shape::Steps, self.points(&motion.contributing))
             .draw("in contact, by the central computation", Shape::Steps, self.points(&motion.active))
             .marks(self.marks());
-        Section::new("cells", "Active cells").figures([figure])
+        let section = Section::new("cells", "Active cells");
+        if is_zero(&figure) {
+            section.text("No cell was in contact.")
+        } else {
+            section.figures(shown(figure))
+        }
     }
 
     /// The paper's Fig. 8.
@@ -169,20 +243,26 @@ impl Draft<'_> {
         let rows = rows.into_iter().map(|(name, times)| (name, times.histogram()));
         let row = |(name, histogram): (&str, &Histogram<u64>)| {
             let Quantiles { p50, p90, p99, max, count } = Quantiles::of(histogram, 1e-3);
-            let values = [p50, p90, p99, max].map(number);
+            let values = [p50, p90, p99, max].map(|micros| quantity(micros, "µs"));
             [name.to_owned()].into_iter().chain(values).chain([count.to_string()]).collect::<Vec<_>>()
         };
         let mut rows: Vec<_> = rows.filter(|(_, histogram)| !histogram.is_empty()).map(row).collect();
         let idle = ["idle_late_p50_us", "idle_late_p99_us", "idle_late_max_us"]
             .map(|key| self.run.fact("machine", key));
         if let [Some(p50), Some(p99), Some(max)] = idle {
-            let cells = ["the idle machine's thread woke late", p50, "", p99, max, ""];
-            rows.push(cells.map(str::to_owned).into());
+            let [p50, p99, max] = [p50, p99, max].map(micros);
+            let name = "the idle machine's thread woke late".to_owned();
+            rows.push(vec![name, p50, String::new(), p99, max, String::new()]);
         }
-        let head = ["µs", "median", "90 %", "99 %", "max", "values"];
+        let head = ["", "median", "90 %", "99 %", "max", "values"];
         Section::new("cycle", "Cycle times")
             .text("The distributed computation has no part in a tick: the sum is kept while replies come.")
-            .figures(figures)
+            .figures(figures.into_iter().filter_map(shown))
             .tables([Table::new("The control loop", head, rows)])
     }
+}
+
+/// Whether all that is drawn is 0.
+fn is_zero(figure: &Figure) -> bool {
+    figure.series.iter().flat_map(|series| &series.points).all(|(_, y)| y.abs() < 1e-9 || !y.is_finite())
 }

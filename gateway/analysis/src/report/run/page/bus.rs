@@ -1,9 +1,10 @@
 //! What became of the cells' replies and packets, and what a real bus would carry.
 
 use super::super::bus_figures::{Latency, LinkId};
-use super::Draft;
+use super::{Draft, shown};
+use crate::fit::limits::NODES;
 use crate::fit::verdict::{Answer, percent};
-use crate::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table, number};
+use crate::report::figure::{Axis, Figure, Finding, Mark, Section, Series, Shape, Table, number, quantity};
 use crate::report::svg::stairs;
 use crate::report::thin::{Binned, Thinned};
 use crate::shadow::BusShadow;
@@ -16,16 +17,32 @@ const WORST: usize = 12;
 impl Draft<'_> {
     pub(super) fn replies(&self) -> Section {
         let due = self.run.bus_figures.iter().filter(|bus_figures| bus_figures.account().due > 0);
-        Section::new("replies", "Replies")
+        let mut section = Section::new("replies", "Replies")
             .text(
                 "A reply is due from every cell that is configured, awake and in contact; it is in time before the next \
                  joints, late within three more.",
             )
-            .figures(due.flat_map(|bus_figures| self.replies_of(bus_figures)))
-            .tables([self.accounts(), self.worst()])
+            .figures(due.flat_map(|bus_figures| self.replies_of(bus_figures)).filter_map(shown))
+            .tables([self.accounts(), self.worst()]);
+        let none_due = |bus_figures: &&LinkId| bus_figures.account().due == 0;
+        let complete = |bus_figures: &&LinkId| {
+            let account = bus_figures.account();
+            account.due > 0 && account.late + account.missing == 0
+        };
+        for (which, sentence) in [
+            (&none_due as &dyn Fn(&&LinkId) -> bool, "no reply was due"),
+            (&complete, "every reply that was due came in time"),
+        ] {
+            let names: Vec<_> =
+                self.run.bus_figures.iter().filter(which).map(|it| it.name.as_str()).collect();
+            if !names.is_empty() {
+                section = section.text(format!("{}: {sentence}.", names.join(", ")));
+            }
+        }
+        section
     }
 
-    fn replies_of(&self, bus_figures: &LinkId) -> [Figure; 3] {
+    fn replies_of(&self, bus_figures: &LinkId) -> Vec<Figure> {
         let name = &bus_figures.name;
         let unit = if bus_figures.sums { "cells in sums" } else { "replies" };
         let steps = |figure: &str, title: &str, y: Axis, of: [(&str, &Thinned); 2]| {
@@ -34,18 +51,17 @@ impl Draft<'_> {
         };
         let y = Axis::new(unit, "");
         let lost = bus_figures.account().late + bus_figures.account().missing;
-        let y_lost = if lost == 0 { y.clone().between(0.0, 1.0) } else { y.clone() };
         let slowest = format!("{name}: from joints to the last reply for them, epoch by epoch");
         let [due, late] = [
             [("due", &bus_figures.lines.due), ("in time", &bus_figures.lines.in_time)],
             [("late", &bus_figures.lines.late), ("missing", &bus_figures.lines.missing)],
         ];
-        [
-            steps("replies", "due and in time, epoch by epoch", y, due),
-            steps("late", "late and missing, when that was settled", y_lost, late),
-            self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"))
-                .series([self.line("", &bus_figures.lines.slowest)]),
-        ]
+        let mut figures = vec![steps("replies", "due and in time, epoch by epoch", y.clone(), due)];
+        figures.extend((lost > 0).then(|| steps("late", "late and missing, when that was settled", y, late)));
+        let slowest = self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
+        let slowest = slowest.series([self.line("", &bus_figures.lines.slowest)]);
+        figures.push(if lost > 0 { slowest } else { slowest.half() });
+        figures
     }
 
     fn accounts(&self) -> Table {
@@ -62,7 +78,7 @@ impl Draft<'_> {
                 counters.epochs_complete,
             ];
             let numbers = numbers.map(|count| count.to_string());
-            let times = [reply.p50, reply.p99, reply.max].map(|micros| number(micros * 1e-3));
+            let times = [reply.p50, reply.p99, reply.max].map(|micros| quantity(micros, "µs"));
             [bus_figures.name.clone()].into_iter().chain(numbers).chain(times).collect::<Vec<_>>()
         };
         let rows = self.run.bus_figures.iter().map(row);
@@ -74,7 +90,7 @@ impl Draft<'_> {
             "missing",
             "epochs due",
             "complete",
-            "last reply, ms: median",
+            "last reply: median",
             "99 %",
             "max",
         ];
@@ -103,7 +119,7 @@ impl Draft<'_> {
             let (mean, slowest) = if latency.count == 0 {
                 (f64::NAN, f64::NAN)
             } else {
-                (latency.sum as f64 / latency.count as f64 * 1e-3, latency.max as f64 * 1e-3)
+                (latency.sum as f64 / latency.count as f64, latency.max as f64)
             };
             let replies = &cell.replies;
             let counts = [replies.due, replies.in_time, replies.late, replies.missing, cell.uplink().lost];
@@ -111,7 +127,7 @@ impl Draft<'_> {
             [format!("{} {}", bus_figures.name, cell.node), joint.to_string()]
                 .into_iter()
                 .chain(counts)
-                .chain([cell.uplink().restarts.to_string(), number(mean), number(slowest)])
+                .chain([cell.uplink().restarts.to_string(), quantity(mean, "µs"), quantity(slowest, "µs")])
                 .collect::<Vec<_>>()
         };
         let rows: Vec<_> = cells.iter().take(WORST).map(row).collect();
@@ -124,7 +140,7 @@ impl Draft<'_> {
             "missing",
             "packets lost",
             "restarts",
-            "reply, ms: mean",
+            "reply: mean",
             "max",
         ];
         let of = self.run.skin.cells.len();
@@ -152,17 +168,18 @@ impl Draft<'_> {
     /// Whether real buses would carry it: in this run, and at most. Only chosen rates are rated, not defaults.
     pub(super) fn fits(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
+        let limits = format!("at most 100 %, replies before the next joints, {NODES} nodes");
         for bus in self.shadows() {
             let bus_figures = self.run.bus_figures.iter().find(|bus_figures| bus_figures.name == bus.bus);
-            let is_chosen = bus_figures.is_some_and(|bus_figures| bus_figures.rates.is_chosen);
+            let origin = bus_figures.and_then(|bus_figures| bus_figures.rates_from);
             for answer in bus.this_run.iter().chain(&bus.worst_case) {
                 let Answer { load, rates, cells, verdict } = answer;
                 let what = format!("{} at {rates}, {}: {verdict} ({cells})", bus.bus, answer.case());
-                let mut finding = Finding::stated(what, (tenths(100.0 * load), "%"));
-                if is_chosen {
-                    finding = finding.must("within all limits", verdict.fits());
-                }
-                findings.push(finding);
+                let finding = Finding::stated(what, (tenths(100.0 * load), "%"));
+                findings.push(match origin {
+                    Some(origin) => finding.must(limits.as_str(), verdict.fits()).from(origin),
+                    None => finding.against("not rated: these bit rates are defaults"),
+                });
             }
         }
         findings
@@ -172,8 +189,8 @@ impl Draft<'_> {
     pub(super) fn load(&self) -> Section {
         let figure = |bus_figures: &LinkId| {
             let LinkId { name, load, load_of_all, rates, .. } = bus_figures;
-            let (rates, width) = (rates.rates, number(load.width()));
-            let title = format!("{name}: load of a real bus at {rates}, over {width} s each");
+            let (rates, width) = (rates.rates, quantity(load.width(), "s"));
+            let title = format!("{name}: load of a real bus at {rates}, over {width} each");
             self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
                 .draw("what a real bus would carry", Shape::Steps, self.percent(load))
                 .draw("with what only a bench sends", Shape::Dashed, stairs(&self.percent(load_of_all)))
@@ -190,7 +207,7 @@ impl Draft<'_> {
                 .text("The skin has no bit rates for every bus, so common ones are shown, for information.");
         }
         section
-            .figures(self.run.bus_figures.iter().map(figure))
+            .figures(self.run.bus_figures.iter().map(figure).filter_map(shown))
             .tables(self.shadows().map(|bus| carried(&bus)))
     }
 
@@ -229,7 +246,8 @@ impl Draft<'_> {
         row("messages that cannot be read".to_owned(), run.unreadable, false);
         Section::new("losses", "Losses")
             .text("Rows of possible losses are always shown; other rows only when they are not 0.")
-            .tables([Table::new("", ["what", "count"], rows)])
+            .tables(self.lost())
+            .tables([Table::new("All counts", ["what", "count"], rows)])
     }
 }
 
@@ -250,7 +268,7 @@ fn carried(bus: &BusShadow) -> Table {
         row([run.case(), &run.verdict.to_string(), &share(bus.load.mean), &second, &short, &cells]);
     }
     if let Some(start) = &bus.start_up {
-        let frames = format!("{} frames in {} s without joints", start.frames, number(start.duration_s));
+        let frames = format!("{} frames in {} without joints", start.frames, quantity(start.duration_s, "s"));
         let [second, short] = [start.load.worst_1_s, start.load.worst_16_ms].map(|it| percent(it.value));
         row(["start-up", "", &share(start.load.mean), &second, &short, &frames]);
     }

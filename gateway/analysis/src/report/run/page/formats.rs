@@ -5,7 +5,7 @@ use protocol::fixed::TorqueFormat;
 
 use super::super::bus_figures::LinkId;
 use super::Draft;
-use crate::report::figure::{Finding, Table, number};
+use crate::report::figure::{Finding, Table, quantity};
 
 /// What the formats would have made of the torques on a bus.
 struct Choice<'a> {
@@ -29,19 +29,19 @@ impl Choice<'_> {
     fn advice(&self) -> Option<String> {
         let (used, best) = (self.used, self.best());
         let beyond = self.of(used).beyond;
-        let cost = |format: TorqueFormat| number(self.of(format).errors.mean().unwrap_or(f64::NAN));
+        let cost = |format: TorqueFormat| quantity(self.of(format).errors.mean().unwrap_or(f64::NAN), "Nm");
         let (costs, instead) = (cost(best), cost(used));
         let (name, bus) = (best.name(), self.bus);
         match (best == used, beyond) {
             (true, _) => None,
             (false, 0) => Some(format!(
                 "{bus}: {name} would have fitted better: it holds every torque too, and rounds by {costs} instead of \
-                 {instead} Nm on average."
+                 {instead} on average."
             )),
             (false, _) => Some(format!(
-                "{bus}: {name} would have fitted better: {beyond} torques are beyond {} Nm, the range of {}. It rounds by \
-                 {costs} instead of {instead} Nm on average.",
-                number(used.bound()),
+                "{bus}: {name} would have fitted better: {beyond} torques are beyond {}, the range of {}. It rounds by \
+                 {costs} instead of {instead} on average.",
+                quantity(used.bound(), "Nm"),
                 used.name(),
             )),
         }
@@ -65,9 +65,9 @@ impl Draft<'_> {
     pub(super) fn beyond_range(&self) -> impl Iterator<Item = Finding> {
         self.choices().map(|choice| {
             let (bus, used) = (choice.bus, choice.used);
-            let bound = number(used.bound());
-            let what = format!("{bus}: torques beyond the range of {}, {bound} Nm", used.name());
-            super::none(what, choice.of(used).beyond)
+            let bound = quantity(used.bound(), "Nm");
+            let what = format!("{bus}: torques beyond the range of {}, {bound}", used.name());
+            super::none(what, choice.of(used).beyond).from("skin: torque_format")
         })
     }
 
@@ -78,15 +78,16 @@ impl Draft<'_> {
     }
 
     pub(super) fn formats(&self) -> Option<Table> {
+        let unit = self.torque_unit();
         let rows = self.choices().flat_map(|choice| {
             choice.all.map(|(format, rounded)| {
                 let used = if format == choice.used { ", used" } else { "" };
                 [
                     format!("{} {}{used}", choice.bus, format.name()),
-                    number(format.bound()),
+                    quantity(format.bound(), unit),
                     rounded.beyond.to_string(),
-                    number(rounded.errors.mean().unwrap_or(f64::NAN)),
-                    number(rounded.errors.max()),
+                    quantity(rounded.errors.mean().unwrap_or(f64::NAN), unit),
+                    quantity(rounded.errors.max(), unit),
                 ]
                 .to_vec()
             })
@@ -94,7 +95,7 @@ impl Draft<'_> {
         let rows: Vec<_> = rows.collect();
         (!rows.is_empty()).then(|| {
             Table::new(
-                "Torque formats: the central torques of single cells, rounded to each, in Nm or N",
+                "Torque formats: the central torques of single cells, rounded to each",
                 ["", "range", "beyond it", "rounding: mean", "max"],
                 rows,
             )

@@ -1,0 +1,170 @@
+//! How numbers are written, everywhere in a report.
+//!
+//! One rule: three significant digits without zeros at the end, and with a unit the SI prefix that leaves 1 to 999 before
+//! it. Numbers of things are whole.
+
+/// Prefixes by their powers of a thousand.
+const PREFIXES: [(i32, &str); 7] = [(-4, "p"), (-3, "n"), (-2, "µ"), (-1, "m"), (0, ""), (1, "k"), (2, "M")];
+
+/// Units that take prefixes: the unit, what one of it is in the unit without a prefix, that unit, and the highest power of
+/// a thousand that is usual with it.
+const UNITS: [(&str, f64, &str, i32); 8] = [
+    ("Nm", 1.0, "Nm", 1),
+    ("N", 1.0, "N", 1),
+    ("Hz", 1.0, "Hz", 2),
+    ("m", 1.0, "m", 0),
+    ("mm", 1e-3, "m", 0),
+    ("s", 1.0, "s", 0),
+    ("ms", 1e-3, "s", 0),
+    ("µs", 1e-6, "s", 0),
+];
+
+/// A unit with the prefix that fits a size.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Fitted {
+    /// What one of the given unit is in this one.
+    pub(super) factor: f64,
+    /// With its prefix.
+    pub(super) unit: String,
+}
+
+/// A unit that takes prefixes, as this program keeps it.
+pub(super) fn known(unit: &str) -> Option<&'static str> {
+    UNITS.iter().find(|(name, ..)| *name == unit).map(|(name, ..)| *name)
+}
+
+/// The unit with the prefix that leaves 1 to 999 of a size; none where the unit takes no prefix.
+pub(super) fn fitted(size: f64, unit: &str) -> Option<Fitted> {
+    let (_, scale, base, most) = *UNITS.iter().find(|(name, ..)| *name == unit)?;
+    let size = rounded(size.abs() * scale);
+    let prefixes = PREFIXES.iter().filter(|(power, _)| *power <= most);
+    let fits = |(power, _): &&(i32, &str)| size >= 1_000_f64.powi(*power) * 0.999_999;
+    let (power, prefix) = match size {
+        0.0 => (0, ""),
+        _ => *prefixes.rev().find(fits).or(PREFIXES.first())?,
+    };
+    Some(Fitted { factor: scale / 1_000_f64.powi(power), unit: format!("{prefix}{base}") })
+}
+
+/// To three digits, as it is written.
+fn rounded(value: f64) -> f64 {
+    format!("{value:.2e}").parse().unwrap_or(value)
+}
+
+/// A number with its unit, which may be empty; what is not finite is a dash.
+///
+/// ```
+/// # use analysis::report::figure::quantity;
+/// assert_eq!(quantity(1.06e-4, "Nm"), "106\u{a0}µNm");
+/// assert_eq!(quantity(1_968.0, "µs"), "1.97\u{a0}ms");
+/// assert_eq!(quantity(62.5, "Hz"), "62.5\u{a0}Hz");
+/// assert_eq!(quantity(253.0, ""), "253");
+/// assert_eq!(quantity(0.25, "rad"), "0.25\u{a0}rad");
+/// ```
+#[must_use]
+pub fn quantity(value: f64, unit: &str) -> String {
+    interval(value, None, unit)
+}
+
+/// The same with half the width of its 95 % interval.
+pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
+    let size = value.abs().max(half.unwrap_or(0.0));
+    if !value.is_finite() || unit.is_empty() && half.is_none() {
+        return number(value);
+    }
+    let Fitted { factor, unit } =
+        fitted(size, unit).unwrap_or_else(|| Fitted { factor: 1.0, unit: unit.to_owned() });
+    let (value, half) = (number(value * factor), half.map(|half| number(half * factor)));
+    let half = half.map_or_else(String::new, |half| format!(" ± {half}"));
+    if unit.is_empty() { format!("{value}{half}") } else { format!("{value}{half}\u{a0}{unit}") }
+}
+
+/// A number without a unit: whole ones below a million as they are, else at most three significant digits; very
+/// small and very large ones by a power of ten; what is not finite is a dash.
+///
+/// ```
+/// # use analysis::report::figure::number;
+/// assert_eq!(number(24_364.0), "24364");
+/// assert_eq!(number(0.005_4), "0.0054");
+/// assert_eq!(number(6.25e-5), "6.25e-5");
+/// assert_eq!(number(1_919.4), "1919");
+/// ```
+#[must_use]
+pub fn number(value: f64) -> String {
+    let size = value.abs();
+    if !value.is_finite() {
+        return "–".to_owned();
+    }
+    if size < 1e6 && (value - value.round()).abs() < 1e-12 * size.max(1e-300) || size == 0.0 {
+        return format!("{:.0}", value + 0.0);
+    }
+    if !(1e-4..1e6).contains(&size) {
+        let text = format!("{value:.2e}");
+        let Some((digits, exponent)) = text.split_once('e') else { return text };
+        return format!("{}e{exponent}", digits.trim_end_matches('0').trim_end_matches('.'));
+    }
+    let digits = [(100.0, 0), (10.0, 1), (1.0, 2), (0.1, 3), (0.01, 4), (0.001, 5)];
+    let digits = digits.iter().find(|(from, _)| size >= *from).map_or(6, |(_, digits)| *digits);
+    let text = format!("{value:.digits$}");
+    if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn numbers_have_three_digits_and_no_more_zeros_than_they_need() {
+        for (value, text) in [
+            (0.0, "0"),
+            (-0.0, "0"),
+            (1.0, "1"),
+            (999_999.0, "999999"),
+            (2.5e7, "2.5e7"),
+            (0.012_345, "0.0123"),
+            (0.1, "0.1"),
+            (-12.349, "-12.3"),
+            (1.5e-7, "1.5e-7"),
+            (5e-5, "5e-5"),
+            (f64::NAN, "–"),
+        ] {
+            assert_eq!(number(value), text);
+        }
+    }
+
+    #[test]
+    fn a_unit_has_the_prefix_that_leaves_1_to_999() {
+        for (value, unit, text) in [
+            (0.0, "Nm", "0 Nm"),
+            (0.005_4, "Nm", "5.4 mNm"),
+            (-6.25e-5, "Nm", "-62.5 µNm"),
+            (0.999_6, "Nm", "1 Nm"),
+            (9.996e-4, "Nm", "1 mNm"),
+            (2_500.0, "s", "2500 s"),
+            (2_500.0, "Hz", "2.5 kHz"),
+            (0.4, "µs", "400 ns"),
+            (12.0, "ms", "12 ms"),
+            (48.2, "%", "48.2 %"),
+            (f64::NAN, "Nm", "–"),
+        ] {
+            assert_eq!(quantity(value, unit).replace('\u{a0}', " "), text);
+        }
+        assert_eq!(interval(0.25, Some(0.5), "Nm"), "250 ± 500\u{a0}mNm");
+        assert_eq!(interval(0.25, Some(0.5), ""), "0.25 ± 0.5");
+    }
+
+    proptest! {
+        #[test]
+        fn what_is_written_is_the_value_to_three_digits(digits in 1.0..10.0_f64, power in -11..3_i32, below: bool) {
+            let value = digits * 10_f64.powi(power) * if below { -1.0 } else { 1.0 };
+            let text = quantity(value, "Nm");
+            let (number, unit) = text.split_once('\u{a0}').unwrap();
+            let prefix = unit.strip_suffix("Nm").unwrap();
+            let (power, _) = PREFIXES.iter().find(|(_, name)| *name == prefix).unwrap();
+            let number: f64 = number.parse().unwrap();
+            prop_assert!(number.abs() < 1_000.0 && number.abs() >= 1.0, "{text}");
+            prop_assert!((number * 1_000_f64.powi(*power) / value - 1.0).abs() < 0.006, "{text} {value}");
+        }
+    }
+}

@@ -1,0 +1,105 @@
+//! When something went wrong on a bus: replies late or missing, packets lost, cells that fell silent or restarted.
+
+use std::collections::VecDeque;
+
+use model::table::{Notice, Replies};
+use model::tracker::LATEST;
+
+/// Losses that follow each other within this time are one, in s.
+const TOGETHER_S: f64 = 0.5;
+/// The most that are kept of each kind.
+const KEPT: usize = 500;
+
+/// Losses that follow each other.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Loss {
+    /// From the first to the last epoch that lacked something, in s after the recording's first message.
+    pub(super) seconds: (f64, f64),
+    pub(super) late: u64,
+    pub(super) missing: u64,
+    /// Packets of cells, by their own counts; found at the next heartbeat.
+    pub(super) packets: u64,
+}
+
+impl Loss {
+    pub(super) const fn total(&self) -> u64 {
+        self.late + self.missing + self.packets
+    }
+}
+
+/// The losses and notices of one bus.
+#[derive(Debug, Default)]
+pub(super) struct Moments {
+    /// When the newest epochs were opened, newest first.
+    opened: VecDeque<f64>,
+    pub(super) losses: Vec<Loss>,
+    pub(super) notices: Vec<(f64, Notice)>,
+    /// What is not kept.
+    pub(super) further: u64,
+}
+
+impl Moments {
+    /// An epoch ends that was opened at this time; what has become late or missing in it, and packets found lost.
+    pub(super) fn epoch(&mut self, at: f64, before: &Replies, now: &Replies, packets: u64) {
+        self.opened.push_front(at);
+        self.opened.truncate(LATEST + 1);
+        let late = now.late.saturating_sub(before.late);
+        let missing = now.missing.saturating_sub(before.missing);
+        if late + missing + packets == 0 {
+            return;
+        }
+        // A reply is late for one of the epochs before, and missing when it can no longer come.
+        let behind = if missing > 0 { LATEST } else { usize::from(late > 0) };
+        let from = self.opened.get(behind).or_else(|| self.opened.back()).copied().unwrap_or(at);
+        let is_full = self.losses.len() >= KEPT;
+        match self.losses.last_mut() {
+            Some(last) if from - last.seconds.1 <= TOGETHER_S => {
+                last.seconds.1 = at.max(last.seconds.1);
+                last.late += late;
+                last.missing += missing;
+                last.packets += packets;
+            }
+            _ if is_full => self.further += 1,
+            _ => self.losses.push(Loss { seconds: (from, at), late, missing, packets }),
+        }
+    }
+
+    /// What a table has to say.
+    pub(super) fn notice(&mut self, at: f64, notice: Notice) {
+        if self.notices.len() < KEPT {
+            self.notices.push((at, notice));
+        } else {
+            self.further += 1;
+        }
+    }
+
+    /// The loss with most of what a count names.
+    pub(super) fn worst(&self, of: impl Fn(&Loss) -> u64) -> Option<&Loss> {
+        self.losses.iter().filter(|loss| of(loss) > 0).max_by_key(|loss| of(loss))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn losses_that_follow_each_other_are_one_and_begin_with_the_epoch_that_lacks_something() {
+        let mut moments = Moments::default();
+        let mut before = Replies::default();
+        for epoch in 0..200_u32 {
+            let mut now = before;
+            now.missing += u64::from((50..60).contains(&epoch)) * 2;
+            now.late += u64::from(epoch == 150);
+            moments.epoch(f64::from(epoch) * 0.016, &before, &now, u64::from(epoch == 61));
+            before = now;
+        }
+        let [first, second] = moments.losses.as_slice() else { panic!("{:?}", moments.losses) };
+        assert_eq!((first.late, first.missing, first.packets, first.total()), (0, 20, 1, 21));
+        assert!((first.seconds.0 - 47.0 * 0.016).abs() < 1e-9, "three epochs before it was settled");
+        assert!((first.seconds.1 - 61.0 * 0.016).abs() < 1e-9, "{first:?}");
+        assert!((second.seconds.0 - 149.0 * 0.016).abs() < 1e-9 && second.late == 1, "{second:?}");
+        assert_eq!(moments.worst(|loss| loss.late), Some(second));
+        assert_eq!(moments.worst(Loss::total), Some(first));
+    }
+}

@@ -1,0 +1,140 @@
+//! Moments of the recording, each with the command that shows it.
+
+use model::table::Notice;
+
+use super::super::moments::Loss;
+use super::Draft;
+use crate::report::figure::{Table, quantity};
+
+/// Rows of a table of moments.
+const ROWS: usize = 25;
+
+/// The heading of such a table.
+const HEAD: [&str; 3] = ["at", "what", "look at it"];
+
+/// A moment, how much it counts, and what was there.
+struct Moment {
+    at: f64,
+    weight: f64,
+    what: String,
+}
+
+impl Draft<'_> {
+    /// The command that shows the recording at a time, in s after its first message; `--at` counts from its first frame,
+    /// as that of `gateway explain` does.
+    pub(super) fn look(&self, at: f64) -> String {
+        let seconds = (at - self.run.first_frame.unwrap_or(0.0)).max(0.0);
+        let files: Vec<_> = self.run.files.iter().map(|file| quoted(file)).collect();
+        format!("gateway view {} --at {seconds:.3}", files.join(" "))
+    }
+
+    /// Touches, link by link.
+    pub(super) fn touches(&self) -> Option<Table> {
+        let skin = &self.run.skin;
+        let mut all = Vec::new();
+        let mut further = 0;
+        for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
+            let nodes: Vec<_> = skin.cells_of(bus).map(|cell| cell.node).collect();
+            let chain = skin.buses.get(bus).map_or(0, |bus| bus.chain);
+            further += bus_figures.touched.further;
+            all.extend(bus_figures.touched.touches.iter().map(|touch| {
+                let ((from, to), (place, force)) = (touch.seconds, touch.strongest);
+                let link = self.link((chain, touch.row), Some(bus));
+                let (cells, node) = (touch.cells.len(), nodes.get(place));
+                let cell = node.map_or_else(String::new, |node| format!(" {node}"));
+                let long = quantity(to - from, "s");
+                let force_n = quantity(force, "N");
+                let what = if cells == 1 {
+                    format!("{link}: cell{cell}, at most {force_n}, {long}")
+                } else {
+                    format!("{link}: {cells} cells, at most {force_n} on cell{cell}, {long}")
+                };
+                Moment { at: from, weight: force * cells as f64, what }
+            }));
+        }
+        self.table("Touches, cells of a link together", all, further)
+    }
+
+    /// Losses, and cells that fell silent, came back or restarted.
+    pub(super) fn lost(&self) -> Option<Table> {
+        let mut all = Vec::new();
+        let mut further = 0;
+        for bus_figures in &self.run.bus_figures {
+            let (name, moments) = (&bus_figures.name, &bus_figures.moments);
+            further += moments.further;
+            all.extend(moments.losses.iter().map(|loss| {
+                let what = format!(
+                    "{name}: {} within {}",
+                    counts(loss),
+                    quantity(loss.seconds.1 - loss.seconds.0, "s")
+                );
+                Moment { at: loss.seconds.0, weight: loss.total() as f64, what }
+            }));
+            all.extend(moments.notices.iter().filter_map(|(at, notice)| {
+                let what = match notice {
+                    Notice::Dead(node) => format!("{name}: cell {node} is silent"),
+                    Notice::Back(node) => format!("{name}: cell {node} sends again"),
+                    Notice::Restarted(node) => format!("{name}: cell {node} restarted"),
+                    Notice::Duplicate(node) => {
+                        format!("{name}: cell {node} received packets of another one with its node id")
+                    }
+                    Notice::OtherGateway => format!("{name}: another gateway sends"),
+                    Notice::Returned(_) => return None,
+                };
+                Some(Moment { at: *at, weight: f64::INFINITY, what })
+            }));
+        }
+        self.table("Moments of losses", all, further)
+    }
+
+    /// Those that count most, by time.
+    fn table(&self, title: &str, mut all: Vec<Moment>, further: u64) -> Option<Table> {
+        if all.is_empty() {
+            return None;
+        }
+        all.sort_by(|one, other| other.weight.total_cmp(&one.weight).then(one.at.total_cmp(&other.at)));
+        let out = all.len().saturating_sub(ROWS) as u64 + further;
+        all.truncate(ROWS);
+        all.sort_by(|one, other| one.at.total_cmp(&other.at));
+        let title = if out > 0 {
+            format!("{title}: the {ROWS} largest, {out} more are left out")
+        } else {
+            title.to_owned()
+        };
+        let rows = all.into_iter().map(|Moment { at, what, .. }| {
+            vec![format!("{:.3}\u{a0}s", at - self.zero), what, self.look(at)]
+        });
+        Some(Table::new(title, HEAD, rows).of_commands())
+    }
+}
+
+/// What was lost.
+fn counts(loss: &Loss) -> String {
+    let all =
+        [(loss.late, "replies late"), (loss.missing, "replies missing"), (loss.packets, "packets lost")];
+    let all = all.iter().filter(|(count, _)| *count > 0).map(|(count, what)| format!("{count} {what}"));
+    all.collect::<Vec<_>>().join(", ")
+}
+
+/// A word for a shell.
+fn quoted(word: &str) -> String {
+    let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-+=:,@%".contains(letter);
+    if !word.is_empty() && word.chars().all(is_plain) {
+        return word.to_owned();
+    }
+    format!("'{}'", word.replace('\'', r"'\''"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::quoted;
+
+    #[test]
+    fn names_of_files_are_one_word_for_a_shell() {
+        for (name, word) in
+            [("runs/a-1.mcap", "runs/a-1.mcap"), ("a b", "'a b'"), ("it's", r"'it'\''s'"), ("", "''")]
+        {
+            assert_eq!(quoted(name), word);
+        }
+    }
+}

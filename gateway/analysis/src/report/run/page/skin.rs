@@ -1,0 +1,152 @@
+//! What the skin was touched with, over time and by place, and where replies and packets were lost.
+
+use std::collections::BTreeMap;
+
+use model::surface::lay_flat;
+
+use super::Draft;
+use crate::report::figure::{
+    Drawing, Legend, Map, Panel, Section, Spot, Strip, StripGroup, StripRow, quantity,
+};
+
+/// Rows of the strip.
+const ROWS: usize = 40;
+
+/// A link: a row of a chain, from 1.
+type Link = (usize, u8);
+
+impl Draft<'_> {
+    /// Which cells were touched when and with how much.
+    pub(super) fn skin(&self) -> Section {
+        let section = Section::new("skin", "The skin");
+        let forces = self.by_cell(|bus, place| {
+            self.run.bus_figures.get(bus).and_then(|it| it.touched.max.get(place)).copied().flatten()
+        });
+        let losses = self.by_cell(|bus, place| {
+            let cell = self.run.bus_figures.get(bus)?.table.cells().get(place)?;
+            Some((cell.replies.late + cell.replies.missing + cell.uplink().lost) as f64)
+        });
+        let title = "Where: the largest force on each cell, as seen from outside; links are unrolled, the side of the tip is below";
+        let force = self.map("map-force", title, "force", "N", &forces);
+        let title = "Where replies were late or missing or packets lost, added up for each cell";
+        let loss = self.map("map-losses", title, "losses", "", &losses);
+        let section = match (self.strip(), force) {
+            (Some(strip), Some(force)) => section
+                .text("A force is that of Algorithm 1 on the cell's sensors, from the joints at which it was latched to the next.")
+                .drawings([Drawing::Strip(strip), Drawing::Map(force)])
+                .tables(self.touches()),
+            (..) => section.text("No cell was touched, as far as the frames say."),
+        };
+        match loss {
+            Some(loss) => section.drawings([Drawing::Map(loss)]),
+            None => section.text("No cell's reply was late or missing, and no packet of a cell was lost."),
+        }
+    }
+
+    /// Each row's cells over time, those that were touched.
+    fn strip(&self) -> Option<Strip> {
+        let mut rows = Vec::new();
+        for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
+            let nodes: Vec<_> = self.run.skin.cells_of(bus).collect();
+            for (place, values) in bus_figures.touched.cells() {
+                let Some(cell) = nodes.get(place) else { continue };
+                let max = values.iter().map(|value| value.2).fold(0.0, f64::max);
+                let values =
+                    values.into_iter().map(|(from, to, force)| (from - self.zero, to - self.zero, force));
+                let row = StripRow { caption: cell.node.to_string(), values: values.collect() };
+                let chain = self.run.skin.buses.get(bus).map_or(0, |bus| bus.chain);
+                rows.push(((chain, cell.row, bus, cell.node), max, row));
+            }
+        }
+        let touched = rows.len();
+        if touched == 0 {
+            return None;
+        }
+        rows.sort_by(|one, other| other.1.total_cmp(&one.1).then(one.0.cmp(&other.0)));
+        let rest = rows.split_off(touched.min(ROWS));
+        let legend = Legend::of("force", "N", rows.iter().map(|(_, max, _)| *max));
+        let title = match rest.first() {
+            None => format!(
+                "When: the force on each cell that was touched, {touched} of {}",
+                self.run.skin.cells.len()
+            ),
+            Some((_, max, _)) => format!(
+                "When: the force on the {ROWS} cells with the largest one; {} more were touched, with at most {}",
+                rest.len(),
+                quantity(*max, "N")
+            ),
+        };
+        rows.sort_by_key(|(key, ..)| *key);
+        let mut groups: Vec<((Link, usize), StripGroup)> = Vec::new();
+        for ((chain, row, bus, _), _, of_cell) in rows {
+            let key = ((chain, row), bus);
+            if groups.last().is_none_or(|(last, _)| *last != key) {
+                let title = self.link((chain, row), Some(bus));
+                groups.push((key, StripGroup { title, rows: Vec::new() }));
+            }
+            if let Some((_, group)) = groups.last_mut() {
+                group.rows.push(of_cell);
+            }
+        }
+        let groups = groups.into_iter().map(|(_, group)| group).collect();
+        let seconds = (0.0, self.run.motion.seconds());
+        Some(Strip { name: "touches".to_owned(), title, seconds, legend, groups })
+    }
+
+    /// A value of each cell in the skin's order, by bus and place on it.
+    fn by_cell(&self, value: impl Fn(usize, usize) -> Option<f64>) -> Vec<Option<f64>> {
+        let mut places = vec![0; self.run.skin.buses.len()];
+        let of = |cell: &protocol::skin::Cell| {
+            let place = places.get_mut(cell.bus)?;
+            *place += 1;
+            value(cell.bus, *place - 1)
+        };
+        self.run.skin.cells.iter().map(of).collect()
+    }
+
+    /// The cells at their places, with their values; none where all of them are 0.
+    fn map(&self, name: &str, title: &str, caption: &str, unit: &str, values: &[Option<f64>]) -> Option<Map> {
+        let skin = &self.run.skin;
+        let legend = Legend::of(caption, unit, values.iter().copied().flatten());
+        if legend.max <= 0.0 {
+            return None;
+        }
+        let mut links = BTreeMap::<Link, Vec<_>>::new();
+        for (cell, value) in skin.cells.iter().zip(values) {
+            let chain = skin.buses.get(cell.bus).map_or(0, |bus| bus.chain);
+            links.entry((chain, cell.row)).or_default().push((cell, *value));
+        }
+        let panels = links.into_iter().map(|(link, cells)| {
+            let placed: Vec<_> = cells.iter().map(|(cell, _)| (cell.position, cell.normal)).collect();
+            let flat = lay_flat(&placed, self.to_tip(link));
+            let spots = cells.iter().zip(flat.places).map(|((cell, value), at)| {
+                let bus = skin.buses.get(cell.bus).map_or("", |bus| &bus.name);
+                Spot { at, value: *value, caption: format!("{bus} {}", cell.node) }
+            });
+            Panel { title: self.link(link, None), radius: flat.radius, cells: spots.collect() }
+        });
+        let panels = panels.collect();
+        Some(Map { name: name.to_owned(), title: title.to_owned(), legend, panels })
+    }
+
+    /// From the link before it to this one, in this one's frame.
+    fn to_tip(&self, (chain, row): Link) -> [f64; 3] {
+        let rows = self.run.skin.robot.chains.get(chain).map(|chain| &chain.rows);
+        let row = rows.and_then(|rows| rows.get(usize::from(row).saturating_sub(1)));
+        row.map_or([0.0, 0.0, 1.0], |row| {
+            let (sine, cosine) = row.table.alpha.sin_cos();
+            [row.table.a, row.table.d * sine, row.table.d * cosine]
+        })
+    }
+
+    /// What a link is called; with its bus where there are several.
+    pub(super) fn link(&self, (chain, row): Link, bus: Option<usize>) -> String {
+        let skin = &self.run.skin;
+        let chains = &skin.robot.chains;
+        let of_chain = chains.get(chain).filter(|_| chains.len() > 1);
+        let of_chain = of_chain.map_or_else(String::new, |chain| format!("{}, ", chain.name));
+        let bus = bus.filter(|_| skin.buses.len() > 1).and_then(|bus| skin.buses.get(bus));
+        let bus = bus.map_or_else(String::new, |bus| format!(", {}", bus.name));
+        format!("{of_chain}link {row}{bus}")
+    }
+}

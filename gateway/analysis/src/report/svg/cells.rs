@@ -1,0 +1,311 @@
+//! Draws cells: over time, and where they are.
+
+use std::fmt::Write as _;
+
+use super::super::figure::{Axis, Drawing, Legend, Map, Panel, Size, Strip, quantity};
+use super::super::scale::Span;
+use super::colour::{LEVELS, TRACK, colours, level};
+use super::{FAINT, INK, LETTERS, dark, escaped, natural};
+
+/// A letter's mean width.
+const LETTER: f64 = 0.56 * LETTERS;
+/// From a drawing's edge to what is in it.
+const EDGE: f64 = 12.0;
+/// The height of the legend with the space below it.
+const LEGEND: f64 = 52.0;
+/// The height of a panel's or a group's heading.
+const HEADING: f64 = 24.0;
+/// From one cell's middle to the next one's, at most.
+const PITCH: f64 = 18.0;
+/// By how much neighbouring areas cover each other, so that no seam is seen.
+const SEAM: f64 = 0.3;
+/// Of a link with one cell, in m.
+const ALONE_M: f64 = 0.028;
+
+/// A file of its own.
+#[must_use]
+pub fn draw(drawing: &Drawing) -> String {
+    let style = format!("<style>{}</style>\n", dark());
+    let (width, _) = natural(Size::Wide);
+    let (height, body) = body(drawing, width.into());
+    let attributes = format!("width=\"{width}\" height=\"{height}\" font-family=\"sans-serif\"");
+    document(drawing, (width.into(), height), &attributes, &format!("{style}{body}"))
+}
+
+/// A part of a page that has the rules of [`dark()`], `width` pixels wide when the page shows it as it is.
+#[must_use]
+pub fn inline(drawing: &Drawing, width: u32, class: &str) -> String {
+    let (height, body) = body(drawing, width.into());
+    document(drawing, (width.into(), height), &format!("class=\"{class}\""), &body)
+}
+
+fn document(drawing: &Drawing, (width, height): (f64, f64), attributes: &str, body: &str) -> String {
+    let title = escaped(drawing.title());
+    format!(
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" role=\"img\" {attributes} \
+         font-size=\"{LETTERS}\">\n<title>{title}</title>\n{body}</svg>\n"
+    )
+}
+
+/// The drawing's height and its elements.
+fn body(drawing: &Drawing, width: f64) -> (f64, String) {
+    let mut out = String::new();
+    let height = match drawing {
+        Drawing::Strip(strip) => strip_of(&mut out, strip, width),
+        Drawing::Map(map) => map_of(&mut out, map, width),
+    };
+    (height.ceil(), out)
+}
+
+/// Where a text stands at its place.
+#[derive(Clone, Copy)]
+enum Anchor {
+    Start,
+    Middle,
+    End,
+}
+
+fn words(out: &mut String, (x, y): (f64, f64), anchor: Anchor, is_faint: bool, text: &str) {
+    let (colour, class) = if is_faint { (FAINT, "faint-f") } else { (INK, "ink-f") };
+    let anchor = match anchor {
+        Anchor::Start => "",
+        Anchor::Middle => " text-anchor=\"middle\"",
+        Anchor::End => " text-anchor=\"end\"",
+    };
+    let (r, g, b) = (colour.0, colour.1, colour.2);
+    let _ = writeln!(
+        out,
+        "<text x=\"{x:.1}\" y=\"{y:.1}\"{anchor} class=\"{class}\" fill=\"#{r:02X}{g:02X}{b:02X}\">{}</text>",
+        escaped(text)
+    );
+}
+
+fn line(out: &mut String, path: &str) {
+    let (r, g, b) = (FAINT.0, FAINT.1, FAINT.2);
+    let _ = writeln!(
+        out,
+        "<path class=\"faint-s\" fill=\"none\" stroke=\"#{r:02X}{g:02X}{b:02X}\" stroke-width=\"1\" d=\"{path}\"/>"
+    );
+}
+
+fn track(out: &mut String, path: &str) {
+    let [paper, _] = TRACK;
+    let _ = writeln!(out, "<path class=\"track\" fill=\"{paper}\" d=\"{path}\"/>");
+}
+
+/// Areas by their level, each level in one element.
+#[derive(Default)]
+struct Levels([String; LEVELS]);
+
+impl Levels {
+    fn of(&mut self, value: f64, max: f64) -> Option<&mut String> {
+        self.0.get_mut(level(value, max))
+    }
+
+    fn write(self, out: &mut String) {
+        for (level, path) in self.0.iter().enumerate().filter(|(_, path)| !path.is_empty()) {
+            let [paper, _] = colours(level);
+            let _ = writeln!(out, "<path class=\"v{level}\" fill=\"{paper}\" d=\"{path}\"/>");
+        }
+    }
+}
+
+fn rectangle(path: &mut String, (x, y): (f64, f64), (width, height): (f64, f64)) {
+    let _ = write!(path, "M{x:.1} {y:.1}h{width:.1}v{height:.1}h-{width:.1}z");
+}
+
+/// The colours with what they stand for, at the top.
+fn legend(out: &mut String, legend: &Legend, width: f64) {
+    let bar = (width * 0.4).min(260.0);
+    let left = EDGE + LETTER * legend.caption.chars().count() as f64 + 14.0;
+    words(out, (EDGE, 23.0), Anchor::Start, false, &legend.caption);
+    let mut levels = Levels::default();
+    for at in 0..LEVELS {
+        let part = bar / LEVELS as f64;
+        let path = levels.of((at as f64 + 0.5) / LEVELS as f64, 1.0);
+        path.into_iter()
+            .for_each(|path| rectangle(path, (left + part * at as f64, 12.0), (part + SEAM, 14.0)));
+    }
+    levels.write(out);
+    for (part, anchor) in [(0.0, Anchor::Middle), (0.5, Anchor::Middle), (1.0, Anchor::Middle)] {
+        words(out, (left + part * bar, 42.0), anchor, true, &quantity(part * legend.max, &legend.unit));
+    }
+}
+
+fn strip_of(out: &mut String, strip: &Strip, width: f64) -> f64 {
+    legend(out, &strip.legend, width);
+    let rows: usize = strip.groups.iter().map(|group| group.rows.len()).sum();
+    let row = if rows > 20 { 14.0 } else { 18.0 };
+    let captions = strip.groups.iter().flat_map(|group| &group.rows).map(|row| row.caption.chars().count());
+    let left = EDGE + LETTER * captions.max().unwrap_or(0) as f64 + 10.0;
+    let right = width - 24.0;
+    let time = Axis::new("time", "s").between(strip.seconds.0, strip.seconds.1);
+    let span = Span::new(&time, [].into_iter(), 0.0);
+    let place = |seconds: f64| left + span.place(seconds).clamp(0.0, 1.0) * (right - left);
+    let (mut tracks, mut levels, mut y) = (String::new(), Levels::default(), LEGEND);
+    for group in &strip.groups {
+        words(out, (EDGE, y + 16.0), Anchor::Start, false, &group.title);
+        y += HEADING;
+        for of_cell in &group.rows {
+            words(out, (left - 8.0, y + row * 0.5 + 4.5), Anchor::End, true, &of_cell.caption);
+            rectangle(&mut tracks, (left, y), (right - left, row - 2.0));
+            for (from, to, value) in &of_cell.values {
+                let (from, to) = (place(*from), place(*to));
+                let path = levels.of(*value, strip.legend.max);
+                path.into_iter()
+                    .for_each(|path| rectangle(path, (from, y), ((to - from).max(0.5) + SEAM, row - 2.0)));
+            }
+            y += row;
+        }
+        y += 4.0;
+    }
+    track(out, &tracks);
+    levels.write(out);
+    let mut axis = format!("M{left:.1} {y:.1}H{right:.1}");
+    let most = if width > 600.0 { 12 } else { 5 };
+    for tick in span.ticks(most) {
+        let x = place(tick);
+        let _ = write!(axis, "M{x:.1} {y:.1}v5");
+        words(out, (x, y + 19.0), Anchor::Middle, false, &span.caption(tick, most));
+    }
+    line(out, &axis);
+    words(out, ((left + right) / 2.0, y + 38.0), Anchor::Middle, false, &span.title(&time));
+    y + 46.0
+}
+
+/// A panel's cells and its size, in m.
+struct Sheet<'a> {
+    panel: &'a Panel,
+    /// The smallest place, and from it to the largest one.
+    from: [f64; 2],
+    size: [f64; 2],
+    /// From a cell to the nearest one, half of them nearer.
+    pitch: f64,
+    /// Which way the nearest ones lie, modulo 60 degrees.
+    turn: f64,
+}
+
+impl<'a> Sheet<'a> {
+    fn new(panel: &'a Panel) -> Self {
+        let nearest = panel.cells.iter().filter_map(|cell| {
+            let [x, y] = cell.at;
+            let others = panel.cells.iter().map(|other| (other.at[0] - x, other.at[1] - y));
+            let others =
+                others.map(|(x, y)| (x.hypot(y), y.atan2(x))).filter(|(distance, _)| *distance > 1e-6);
+            others.min_by(|one, other| one.0.total_cmp(&other.0))
+        });
+        let mut nearest: Vec<_> = nearest.collect();
+        nearest.sort_by(|one, other| one.0.total_cmp(&other.0));
+        let pitch = nearest.get(nearest.len() / 2).map_or(ALONE_M, |(distance, _)| *distance);
+        let [sine, cosine] = nearest.iter().fold([0.0, 0.0], |[sine, cosine], (_, way)| {
+            [sine + (6.0 * way).sin(), cosine + (6.0 * way).cos()]
+        });
+        let ends = |of: fn([f64; 2]) -> f64| {
+            let all = panel.cells.iter().map(|cell| of(cell.at));
+            all.fold((f64::INFINITY, f64::NEG_INFINITY), |(from, to), at| (from.min(at), to.max(at)))
+        };
+        let (mut x, y) = (ends(|[x, _]| x), ends(|[_, y]| y));
+        if let Some(radius) = panel.radius {
+            // All the way round.
+            x = (-core::f64::consts::PI * radius, core::f64::consts::PI * radius);
+        }
+        let (from, size) = ([x.0, y.0].map(|at| at - pitch * 0.6), [x.1 - x.0, y.1 - y.0]);
+        Self { panel, from, size: size.map(|size| size + pitch * 1.2), pitch, turn: sine.atan2(cosine) / 6.0 }
+    }
+}
+
+fn map_of(out: &mut String, map: &Map, width: f64) -> f64 {
+    legend(out, &map.legend, width);
+    let sheets: Vec<_> = map.panels.iter().filter(|panel| !panel.cells.is_empty()).map(Sheet::new).collect();
+    let max = |of: &dyn Fn(&Sheet<'_>) -> f64| sheets.iter().map(of).fold(f64::MIN_POSITIVE, f64::max);
+    let pitch = sheets.iter().map(|sheet| sheet.pitch).fold(f64::INFINITY, f64::min);
+    // Pixels for a metre, the same for all links.
+    let scale = (PITCH / pitch).min((width - 2.0 * EDGE - 50.0) / max(&|sheet| sheet.size[0]));
+    let (mut x, mut y, mut height) = (EDGE, LEGEND, 0.0_f64);
+    for sheet in &sheets {
+        let title = LETTER * sheet.panel.title.chars().count() as f64;
+        let wide = (sheet.size[0] * scale + 50.0).max(title);
+        if x > EDGE && x + wide > width - EDGE {
+            (x, y, height) = (EDGE, y + height, 0.0);
+        }
+        let high = panel_of(out, sheet, &map.legend, (x, y), scale);
+        (x, height) = (x + wide + 20.0, height.max(high + 12.0));
+    }
+    y + height
+}
+
+/// One link; how high it is with its heading and its axis.
+fn panel_of(out: &mut String, sheet: &Sheet<'_>, legend: &Legend, (x, y): (f64, f64), scale: f64) -> f64 {
+    words(out, (x, y + 14.0), Anchor::Start, false, &sheet.panel.title);
+    let (left, top) = (x + 44.0, y + HEADING);
+    let [wide, high] = sheet.size.map(|size| size * scale);
+    let mut ground = String::new();
+    rectangle(&mut ground, (left, top), (wide, high));
+    track(out, &ground);
+    let mut axis = String::new();
+    let radius = sheet.pitch / 3_f64.sqrt() * 0.94 * scale;
+    for cell in &sheet.panel.cells {
+        let [across, down] =
+            [cell.at[0] - sheet.from[0], cell.at[1] - sheet.from[1]].map(|from| from * scale);
+        let mut path = String::new();
+        for corner in 0..6_u32 {
+            let angle = sheet.turn + core::f64::consts::FRAC_PI_3 * (f64::from(corner) + 0.5);
+            let (x, y) = (left + across + radius * angle.cos(), top + down + radius * angle.sin());
+            let _ = write!(path, "{}{x:.1} {y:.1}", if corner == 0 { "M" } else { "L" });
+        }
+        path.push('z');
+        hexagon(out, cell.value, legend, &cell.caption, &path);
+    }
+    // Along the link in cm, about it in degrees.
+    let step = if high > 120.0 { 0.1 } else { 0.05 };
+    let length = sheet.size[1] - sheet.pitch * 1.2;
+    let first = sheet.from[1] + sheet.pitch * 0.6;
+    for at in 0..40_u32 {
+        let along = f64::from(at) * step;
+        if along > length + 1e-6 {
+            break;
+        }
+        let y = top + (first + along - sheet.from[1]) * scale;
+        let _ = write!(axis, "M{left:.1} {y:.1}h-5");
+        let text = if at == 0 { "0 cm".to_owned() } else { format!("{:.0}", along * 100.0) };
+        words(out, (left - 7.0, y + 4.5), Anchor::End, true, &text);
+    }
+    let bottom = top + high;
+    if sheet.panel.radius.is_some() {
+        for (at, degrees) in (0_u32..).zip(["−180°", "−90°", "0°", "90°", "180°"]) {
+            let part = f64::from(at) / 4.0;
+            let inner = sheet.pitch * 0.6 * scale;
+            let x = left + inner + part * (wide - 2.0 * inner);
+            let _ = write!(axis, "M{x:.1} {bottom:.1}v5");
+            if wide > 200.0 || at % 2 == 0 {
+                words(out, (x, bottom + 18.0), Anchor::Middle, true, degrees);
+            }
+        }
+    } else {
+        words(out, (left, bottom + 18.0), Anchor::Start, true, "flat");
+    }
+    line(out, &axis);
+    HEADING + high + 24.0
+}
+
+fn hexagon(out: &mut String, value: Option<f64>, legend: &Legend, caption: &str, path: &str) {
+    let (fill, text) = match value {
+        Some(value) if value > 0.0 => {
+            let level = level(value, legend.max);
+            let [paper, _] = colours(level);
+            (format!("class=\"v{level}\" fill=\"{paper}\""), quantity(value, &legend.unit))
+        }
+        Some(_) => ("class=\"none\" fill=\"none\"".to_owned(), quantity(0.0, &legend.unit)),
+        None => ("class=\"none\" fill=\"none\" stroke-dasharray=\"2 2\"".to_owned(), "not known".to_owned()),
+    };
+    let (r, g, b) = (FAINT.0, FAINT.1, FAINT.2);
+    let _ = writeln!(
+        out,
+        "<path {fill} stroke=\"#{r:02X}{g:02X}{b:02X}\" stroke-width=\"0.5\" d=\"{path}\"><title>{}: {}</title></path>",
+        escaped(caption),
+        escaped(&text)
+    );
+}
+
+#[cfg(test)]
+mod tests;

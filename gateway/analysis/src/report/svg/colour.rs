@@ -1,0 +1,88 @@
+//! The colours of values: cividis (Nuñez, Anderton and Renslow, *Optimizing colormaps with consideration for color vision
+//! deficiency*, 2018), which readers see in one order whatever colours they can tell apart. High values are far from the
+//! ground: dark on paper, light on a dark screen.
+
+use std::fmt::Write as _;
+
+/// How many colours there are.
+pub(super) const LEVELS: usize = 16;
+
+/// Cividis at equal distances.
+const CIVIDIS: [[f64; 3]; 10] = [
+    [0.0, 34.0, 78.0],
+    [18.0, 53.0, 112.0],
+    [59.0, 73.0, 108.0],
+    [87.0, 93.0, 109.0],
+    [112.0, 113.0, 115.0],
+    [138.0, 134.0, 120.0],
+    [165.0, 156.0, 116.0],
+    [195.0, 179.0, 105.0],
+    [225.0, 204.0, 85.0],
+    [254.0, 232.0, 56.0],
+];
+
+/// What lies below cells and rows on paper, and on a dark screen.
+pub(super) const TRACK: [&str; 2] = ["#EBEDEF", "#26292E"];
+
+/// A colour from 0 to 1.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 9, and 0 to 255")]
+fn cividis(place: f64) -> String {
+    let at = place.clamp(0.0, 1.0) * (CIVIDIS.len() - 1) as f64;
+    let (from, part) = (at.floor() as usize, at.fract());
+    let [one, next] =
+        [from, from + 1].map(|at| CIVIDIS.get(at).or(CIVIDIS.last()).copied().unwrap_or_default());
+    let mut text = "#".to_owned();
+    for (one, next) in one.into_iter().zip(next) {
+        let _ = write!(text, "{:02X}", (one + part * (next - one)).round() as u8);
+    }
+    text
+}
+
+/// Of a level from 0: its colour on paper, and on a dark screen.
+pub(super) fn colours(level: usize) -> [String; 2] {
+    let part = level as f64 / (LEVELS - 1) as f64;
+    [cividis(1.0 - part), cividis(0.2 + 0.8 * part)]
+}
+
+/// The level of a value above 0, of which `max` is the largest.
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 15")]
+pub(super) fn level(value: f64, max: f64) -> usize {
+    let part = (value / max).clamp(0.0, 1.0) * LEVELS as f64;
+    (part.ceil() as usize).clamp(1, LEVELS) - 1
+}
+
+/// The rules of a dark screen.
+pub(super) fn dark(rules: &mut String) {
+    let [_, track] = TRACK;
+    let _ = write!(rules, ".track{{fill:{track}}}");
+    for level in 0..LEVELS {
+        let [_, colour] = colours(level);
+        let _ = write!(rules, ".v{level}{{fill:{colour}}}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Of a colour, as in the sRGB standard.
+    fn luminance(colour: &str) -> f64 {
+        let part = |at: usize| f64::from(u8::from_str_radix(&colour[at..at + 2], 16).unwrap()) / 255.0;
+        let [r, g, b] = [1, 3, 5].map(|at| part(at).powf(2.2));
+        0.2126 * r + 0.7152 * g + 0.0722 * b
+    }
+
+    #[test]
+    fn levels_grow_darker_on_paper_and_lighter_on_a_dark_screen() {
+        let all: Vec<_> = (0..LEVELS).map(colours).collect();
+        assert_eq!(all[0][0], "#FEE838");
+        assert_eq!(all[LEVELS - 1], ["#00224E", "#FEE838"]);
+        assert!(all.is_sorted_by(|one, next| luminance(&one[0]) > luminance(&next[0])));
+        assert!(all.is_sorted_by(|one, next| luminance(&one[1]) < luminance(&next[1])));
+    }
+
+    #[test]
+    fn every_value_above_0_has_a_level() {
+        assert_eq!([1e-9, 0.5, 1.0, 7.0].map(|value| level(value, 1.0)), [0, 7, 15, 15]);
+    }
+}
