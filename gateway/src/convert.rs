@@ -1,5 +1,7 @@
 //! `gateway convert`.
 
+mod torques;
+
 use std::ffi::OsStr;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, IsTerminal};
@@ -7,8 +9,10 @@ use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use analysis::explain::series::SeriesError;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use protocol::skin::Skin;
 use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;
 use trace::capture::convert::{ConvertError, Converted, Output, convert};
@@ -17,7 +21,7 @@ use trace::capture::{Format, ORIGIN, Reader};
 use trace::files::WholeFile;
 
 use super::arguments::{Word, one_of};
-use super::input::{captures, no_frame, place};
+use super::input::{captures, no_frame, place, skin_of};
 use super::output::{Force, apart, note, refused};
 use super::print::list;
 
@@ -26,10 +30,11 @@ const NAMED: u64 = 100;
 /// Bytes that are written at once.
 const PIECE: usize = 1 << 18;
 
-/// Convert a capture: a candump log to an MCAP recording, or back
+/// Convert a capture: a candump log to an MCAP recording, or back; or its torques to CSV
 ///
 /// The format of IN is detected from its first bytes, that of OUT from the end of its name: .mcap is a recording, .log
-/// or .txt a candump log, - a log on standard output. Frames come back bit for bit: times, names of buses, directions, FD flags, raw
+/// or .txt a candump log, - a log on standard output, .csv the torques of each epoch, as `gateway explain` computes
+/// them. Frames come back bit for bit: times, names of buses, directions, FD flags, raw
 /// DLCs, error and remote frames; comments, drop lines and lines that cannot be read keep their places. What OUT has no
 /// place for is reported. OUT appears when it is complete. Exit code 0: done, 1: it cannot be done, 2: wrong use.
 #[derive(Args, Debug)]
@@ -37,12 +42,14 @@ const PIECE: usize = 1 << 18;
   gateway convert run.mcap run.log
   gateway convert run.mcap run-*.mcap all.log
   gateway convert run.mcap - --plain | log2asc -I /dev/stdin vcan0
+  gateway convert run.mcap torques.csv
+  gateway convert run.log torques.csv --skin skin.toml
   candump -L can0 | gateway convert - can0.mcap")]
 pub(crate) struct Convert {
     /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input
     #[arg(value_name = "IN", required = true)]
     from: Vec<PathBuf>,
-    /// The new capture; - for candump text on standard output
+    /// The new capture, or a CSV file; - for candump text on standard output
     #[arg(value_name = "OUT")]
     to: PathBuf,
     #[command(flatten)]
@@ -59,12 +66,24 @@ pub(crate) struct Convert {
     /// Write only what every tool reads: frames, without direction and raw DLC, 6 digits, no comments
     #[arg(long)]
     plain: bool,
+    /// For a CSV file: the skin's description; else the one in the recording
+    #[arg(long, value_name = "FILE")]
+    skin: Option<PathBuf>,
 }
 
 const DIGITS: &[Word<Digits>] = &[("6", "", Digits::Six), ("9", "", Digits::Nine)];
 
 impl Convert {
     pub(crate) fn run(self) -> Result<(), Failure> {
+        if torques::is_csv(&self.to) {
+            return self.torques();
+        }
+        if let Some(skin) = &self.skin {
+            return Err(Failure::usage(format!(
+                "--skin {} is for torques: name an OUT that ends in .csv",
+                skin.display()
+            )));
+        }
         let format = self.format()?;
         let text = format == Format::Candump;
         let options =
@@ -143,6 +162,51 @@ impl Convert {
         Ok(())
     }
 
+    /// The torque of every epoch, in a CSV file.
+    fn torques(&self) -> Result<(), Failure> {
+        let to = self.to.display();
+        let options =
+            [("--plain", self.plain), ("--direction", self.direction), ("--digits", self.digits.is_some())];
+        if let Some((option, _)) = options.iter().find(|(_, given)| *given) {
+            return Err(Failure::usage(format!("{option} is for a candump log, and {to} is a CSV file")));
+        }
+        apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
+        self.force.check("", &self.to)?;
+        let skin = match &self.skin {
+            Some(path) => Skin::read(path).map_err(Failure::usage)?,
+            None => skin_of(&self.from)?,
+        };
+        let size = size(&self.from);
+        let live = size.is_none();
+        let bar = bar(size);
+        let progress = bar.clone();
+        let mut reader = captures(&self.from, move |file| Box::new(progress.wrap_read(file)))?;
+        let stopped = stop::flag();
+        let name = reader.name().to_owned();
+        let (whole, out) = self.create(stopped)?;
+        let done = torques::write(&mut reader, &skin, out);
+        bar.finish_and_clear();
+        let (epochs, missing) = done.map_err(|error| match error {
+            SeriesError::Taken(error) => Failure::run(format!("{to}: {error}; nothing is left of it")),
+            error @ (SeriesError::Capture(_) | SeriesError::NotFound { .. }) => Failure::run(error),
+        })?;
+        if stopped.load(Ordering::Relaxed) && !live {
+            return Err(Failure::run(format!("interrupted after {epochs} epochs: {to} is not written")));
+        }
+        if let Some(why) = reader.extras().unfinished.as_ref().filter(|_| self.strict) {
+            return Err(Failure::run(format!("{name}: {why}")));
+        }
+        if let Some(whole) = whole {
+            whole.finish().map_err(|error| Failure::run(format!("{to}: {error}")))?;
+        }
+        missing.tell(&reader, "left out");
+        if let Some(buses) = torques::summed(&skin) {
+            note(format_args!("{name}: {buses} answers with sums: distributed torques and errors are empty"));
+        }
+        note(format_args!("{name} -> {to}: {epochs} epochs"));
+        Ok(())
+    }
+
     /// The output; standard output is written to as it is.
     fn create(
         &self,
@@ -166,7 +230,8 @@ impl Convert {
             Some("log" | "txt") => Ok(Format::Candump),
             _ if is_standard(&self.to) || other => Ok(Format::Candump),
             _ => Err(Failure::usage(format!(
-                "{}: a name that ends in .mcap is a recording, in .log or .txt a candump log, and - is standard output",
+                "{}: a name that ends in .mcap is a recording, in .log or .txt a candump log, in .csv its torques, and - is \
+                 standard output",
                 self.to.display()
             ))),
         }

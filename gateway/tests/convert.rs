@@ -175,7 +175,8 @@ fn an_output_that_exists_is_left_alone_unless_it_is_to_be_overwritten() {
     );
     assert_eq!(
         folder.refuses("convert run.log . --force", 2),
-        "gateway: .: a name that ends in .mcap is a recording, in .log or .txt a candump log, and - is standard output"
+        "gateway: .: a name that ends in .mcap is a recording, in .log or .txt a candump log, in .csv its torques, and - is \
+         standard output"
     );
     folder.says("convert run.log run.mcap --force", 0);
     folder.says("convert run.mcap run.log --force", 0);

@@ -11,13 +11,16 @@
 //! near the exact one that gives this word. What a capture does not contain is listed in [`Explanation::missing`]
 //! and left open.
 
+mod not_found;
 mod read;
 mod row;
+pub mod series;
 mod watch;
 
+pub use not_found::{NotFound, another_robot};
 pub use read::{Found, find};
 pub use row::{JACOBIAN_STEPS, Row, Verdict};
-pub use watch::{CellMoment, Moment, NotFound, Origin, Requested, Watch, another_robot};
+pub use watch::{CellMoment, Moment, Origin, Requested, Watch};
 
 use protocol::fixed::{Q, is_saturated};
 use protocol::message::{SkinSensors, State};
@@ -136,10 +139,41 @@ pub struct Total {
 /// Explains what was found, by the skin's bus.
 #[must_use]
 pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
+    Explainer::new(skin).explain(moments)
+}
+
+/// What every epoch of a skin is explained with.
+#[derive(Debug)]
+pub struct Explainer<'a> {
+    skin: &'a Skin,
+    /// Of each bus: its part of the skin, and the central computation in words and in the file's numbers.
+    buses: Vec<(Skin, [Central; 2])>,
+}
+
+impl<'a> Explainer<'a> {
+    /// That of a skin.
+    #[must_use]
+    pub fn new(skin: &'a Skin) -> Self {
+        let parts = (0..skin.buses.len()).map(|bus| {
+            let part = skin.part_on(bus);
+            let both = [Central::new(&part), Central::unquantised(&part)];
+            (part, both)
+        });
+        Self { skin, buses: parts.collect() }
+    }
+
+    /// Explains what was found, by the skin's bus.
+    #[must_use]
+    pub fn explain(&self, moments: &[Option<Moment>]) -> Explanation {
+        explain_with(self.skin, &self.buses, moments)
+    }
+}
+
+fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<Moment>]) -> Explanation {
     let mut explanation =
         Explanation { buses: Vec::new(), cells: Vec::new(), total: Vec::new(), missing: Vec::new() };
     let mut sums = [Sum::default(); MAX_ROBOT_JOINTS];
-    for (index, (bus, moment)) in skin.buses.iter().zip(moments).enumerate() {
+    for (index, ((bus, (part, both)), moment)) in skin.buses.iter().zip(parts).zip(moments).enumerate() {
         let name = &bus.name;
         let Some(moment) = moment else {
             if skin.cells_of(index).next().is_some() {
@@ -155,9 +189,7 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
                 .push(format!("{name} answers with sums, which do not contain the torques of single cells"));
         }
         let positions = moment.joints.positions;
-        let part = skin.part_on(index);
-        let both = [Central::new(&part), Central::unquantised(&part)];
-        let [central, _] = &both;
+        let [central, _] = both;
         let frames = both.each_ref().map(|central| central.frames(&positions));
         let chain: Vec<_> = skin.joints_of(index).collect();
         explanation.buses.push(BusExplained {
@@ -195,7 +227,7 @@ pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
                 ));
             }
             let newtons = force.map_or(0.0, |force| force.fused_or_none());
-            let ([in_words, in_numbers], [rounded, real]) = (&both, &frames);
+            let ([in_words, in_numbers], [rounded, real]) = (both, &frames);
             let exact = in_words.torque(place, rounded, newtons);
             let unit = in_words.torque(place, rounded, 1.0);
             let unrounded = in_numbers.torque(place, real, newtons);

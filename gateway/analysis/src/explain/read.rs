@@ -5,7 +5,8 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use trace::capture::{CaptureError, Entry, NoteKind, Reader};
 
-use super::watch::{Moment, NotFound, Requested, Watch};
+use super::NotFound;
+use super::watch::{Moment, Requested, Watch};
 
 /// What a capture contains up to some joints.
 #[derive(Debug)]

@@ -1,5 +1,7 @@
 //! Finds the requested joints, and the contact state and answer of each cell at them.
 
+use std::collections::VecDeque;
+
 use model::tracker::{Claim, Contact, LATEST, PerCell, Word, is_late};
 use protocol::id::{CellId, Node};
 use protocol::message::{
@@ -9,7 +11,8 @@ use protocol::packet::{Epoch, Words};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use serde::Serialize;
-use thiserror::Error;
+
+use super::not_found::NotFound;
 
 /// Joints after them, within which late torques and the configurations of cells are waited for.
 const TIMEOUT: u32 = 32;
@@ -57,44 +60,6 @@ pub struct Requested {
     pub occurrence: u32,
 }
 
-/// Why there is nothing to explain.
-#[derive(Clone, Debug, Error, PartialEq)]
-#[non_exhaustive]
-pub enum NotFound {
-    /// No bus of the capture is one of the skin's.
-    #[error("none of its buses ({capture}) is one of the skin's ({skin})")]
-    Buses {
-        /// Those of the capture.
-        capture: String,
-        /// Those of the skin.
-        skin: String,
-    },
-    /// There are no joints at all.
-    #[error("there are no joints on {buses}, and cells answer nothing else")]
-    Joints {
-        /// The skin's buses that are in the capture.
-        buses: String,
-    },
-    /// The joints are those of another robot.
-    #[error("{}", another_robot(bus, *came, *chain))]
-    Robot {
-        /// The bus.
-        bus: String,
-        /// Joints that came.
-        came: usize,
-        /// Joints of the skin's chain.
-        chain: usize,
-    },
-    /// The epoch is not there, or not so often, or not so late.
-    #[error("there are no joints {requested}; there are {runs}")]
-    Epoch {
-        /// The requested joints.
-        requested: String,
-        /// Epochs that are there, in their order, and from when to when.
-        runs: String,
-    },
-}
-
 /// What was sent to the cells of one bus, and their answers.
 #[derive(Clone, Debug)]
 pub struct Moment {
@@ -131,7 +96,8 @@ pub struct CellMoment {
 #[derive(Debug)]
 pub struct Watch<'a> {
     skin: &'a Skin,
-    requested: Requested,
+    /// All joints, if none are requested.
+    requested: Option<Requested>,
     first: Option<u64>,
     /// By the skin's bus.
     bus_watches: Vec<LinkId>,
@@ -149,15 +115,23 @@ struct LinkId {
     halted: bool,
     /// How many of the requested joints there were.
     occurrences: u32,
-    moment: Option<Moment>,
-    /// Joints since the moment.
-    since: u32,
+    /// Moments that are not complete, oldest first.
+    open: VecDeque<Open>,
     cells: PerCell<Cell>,
     runs: Vec<Run>,
     /// The number of joints, where that is not the chain's.
     other_joints: Option<usize>,
     /// Runs beyond those that are kept.
     further_runs: u64,
+}
+
+/// A moment whose answers may still come.
+#[derive(Debug)]
+struct Open {
+    epoch: Epoch,
+    moment: Moment,
+    /// Joints since the moment.
+    since: u32,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -179,6 +153,16 @@ impl<'a> Watch<'a> {
     /// Begins before the first frame.
     #[must_use]
     pub fn new(skin: &'a Skin, requested: Requested) -> Self {
+        Self::of(skin, Some(requested))
+    }
+
+    /// The same for all joints; moments are taken with [`Watch::pop`].
+    #[must_use]
+    pub fn all(skin: &'a Skin) -> Self {
+        Self::of(skin, None)
+    }
+
+    fn of(skin: &'a Skin, requested: Option<Requested>) -> Self {
         let bus_watch = |bus| LinkId { cells_here: skin.cells_of(bus).next().is_some(), ..LinkId::default() };
         let bus_watches = (0..skin.buses.len()).map(bus_watch).collect();
         Self { skin, requested, first: None, bus_watches, others: Vec::new() }
@@ -222,6 +206,13 @@ impl<'a> Watch<'a> {
         self.is_complete()
     }
 
+    /// The oldest moment of a bus, if all is known of it, or at the end of the capture; each once.
+    pub fn pop(&mut self, bus: usize, is_end: bool) -> Option<(Epoch, Moment)> {
+        let moments = &mut self.bus_watches.get_mut(bus)?.open;
+        moments.front().filter(|open| is_end || open.is_complete())?;
+        moments.pop_front().map(|open| (open.epoch, open.moment))
+    }
+
     /// Whether nothing more is waited for.
     fn is_complete(&self) -> bool {
         self.bus_watches.iter().filter(|bus_watch| bus_watch.cells_here).all(LinkId::is_complete)
@@ -246,7 +237,7 @@ impl<'a> Watch<'a> {
             let capture = if self.others.is_empty() { "none".to_owned() } else { self.others.join(", ") };
             return Err(NotFound::Buses { capture, skin: names(false) });
         }
-        if self.bus_watches.iter().all(|bus_watch| bus_watch.moment.is_none()) {
+        if self.bus_watches.iter().all(|bus_watch| bus_watch.open.is_empty()) {
             let first = self.first.unwrap_or_default();
             let Some(bus_watch) = self.bus_watches.iter().find(|bus_watch| !bus_watch.runs.is_empty()) else {
                 for (index, (bus, watch)) in self.skin.buses.iter().zip(&self.bus_watches).enumerate() {
@@ -257,7 +248,9 @@ impl<'a> Watch<'a> {
                 }
                 return Err(NotFound::Joints { buses: names(true) });
             };
-            let Requested { epoch, from_ns, occurrence } = self.requested;
+            let Some(Requested { epoch, from_ns, occurrence }) = self.requested else {
+                return Err(NotFound::Joints { buses: names(true) });
+            };
             let mut requested = format!("of epoch {epoch}");
             if occurrence > 1 {
                 requested += &format!(" for the {occurrence}. time");
@@ -271,16 +264,9 @@ impl<'a> Watch<'a> {
             }
             return Err(NotFound::Epoch { requested, runs: runs.join("; ") });
         }
-        Ok(self.bus_watches.into_iter().map(|bus_watch| bus_watch.moment).collect())
+        let moment = |bus_watch: LinkId| bus_watch.open.into_iter().next().map(|open| open.moment);
+        Ok(self.bus_watches.into_iter().map(moment).collect())
     }
-}
-
-/// Says that a skin is of another robot than a bus' joints.
-#[must_use]
-pub fn another_robot(bus: &str, came: usize, chain: usize) -> String {
-    format!(
-        "the joints on {bus} are {came}, and the skin's chain there has {chain}: it is the skin of another robot, name the right one"
-    )
 }
 
 #[expect(clippy::cast_precision_loss, reason = "to be read")]
@@ -300,7 +286,7 @@ impl Run {
     }
 }
 
-impl LinkId {
+impl Open {
     fn is_complete(&self) -> bool {
         // A cell that answered has reported its configuration, and a cell that was touched has answered.
         let settled = |cell: &CellMoment| match cell.answer {
@@ -310,13 +296,29 @@ impl LinkId {
                     || cell.contact_state.is_none_or(|(skin, _)| skin == SkinSensors::default())
             }
         };
-        let known = |moment: &Moment| moment.cells.iter().all(settled);
-        self.moment
-            .as_ref()
-            .is_some_and(|moment| self.since >= TIMEOUT || self.is_too_late() && known(moment))
+        self.since >= TIMEOUT || self.is_too_late() && self.moment.cells.iter().all(settled)
     }
 
-    fn take(&mut self, nanos: u64, after: u64, message: &Message, requested: Requested, robot: usize) {
+    /// Whether so many joints have followed that answers are too late to be used.
+    const fn is_too_late(&self) -> bool {
+        self.since as usize > LATEST
+    }
+}
+
+impl LinkId {
+    /// Whether all is known of the requested moment.
+    fn is_complete(&self) -> bool {
+        self.open.front().is_some_and(Open::is_complete)
+    }
+
+    fn take(
+        &mut self,
+        nanos: u64,
+        after: u64,
+        message: &Message,
+        requested: Option<Requested>,
+        robot: usize,
+    ) {
         let last = self.last;
         match *message {
             Message::Halt => self.halted = true,
@@ -365,12 +367,12 @@ impl LinkId {
                     cell.contact.learn(page, origin);
                 }
                 // A cell that measures has read its sensors at these very joints.
-                if let Some((cell, _)) = self.answering(from, epoch, requested) {
+                if let Some((cell, _)) = self.answering(from, epoch) {
                     cell.contact_state.get_or_insert((skin, origin));
                 }
             }
             Message::Torque { from, epoch, torque } => {
-                if let Some((cell, in_time)) = self.answering(from, epoch, requested) {
+                if let Some((cell, in_time)) = self.answering(from, epoch) {
                     if cell.answer.is_some() {
                         cell.repeated += 1;
                     } else if in_time {
@@ -390,24 +392,27 @@ impl LinkId {
         }
     }
 
-    fn joints(&mut self, nanos: u64, after: u64, epoch: Epoch, joints: Joints, requested: Requested) {
+    fn joints(&mut self, nanos: u64, after: u64, epoch: Epoch, joints: Joints, requested: Option<Requested>) {
         self.run(nanos, epoch);
         self.latch(epoch);
-        if self.moment.is_some() {
-            self.since += 1;
-        } else if epoch == requested.epoch && after >= requested.from_ns {
-            self.occurrences += 1;
-            if self.occurrences == requested.occurrence {
-                let cells = self.cells.iter().map(|(_, Cell { claim, contact, hash })| CellMoment {
-                    contact_state: contact.skin().copied(),
-                    test_mode: contact.obeys(),
-                    state: claim.heartbeat().map(|heartbeat| heartbeat.state),
-                    hash: *hash,
-                    ..CellMoment::default()
-                });
-                self.moment =
-                    Some(Moment { at_ns: nanos, joints, halted: self.halted, cells: cells.collect() });
-            }
+        for open in &mut self.open {
+            open.since += 1;
+        }
+        let opens = requested.is_none_or(|requested| {
+            let is_one = epoch == requested.epoch && after >= requested.from_ns && self.open.is_empty();
+            self.occurrences += u32::from(is_one);
+            is_one && self.occurrences == requested.occurrence
+        });
+        if opens {
+            let cells = self.cells.iter().map(|(_, Cell { claim, contact, hash })| CellMoment {
+                contact_state: contact.skin().copied(),
+                test_mode: contact.obeys(),
+                state: claim.heartbeat().map(|heartbeat| heartbeat.state),
+                hash: *hash,
+                ..CellMoment::default()
+            });
+            let moment = Moment { at_ns: nanos, joints, halted: self.halted, cells: cells.collect() };
+            self.open.push_back(Open { epoch, moment, since: 0 });
         }
     }
 
@@ -429,28 +434,19 @@ impl LinkId {
         }
     }
 
-    /// Whether so many joints have followed that answers are too late to be used.
-    const fn is_too_late(&self) -> bool {
-        self.since as usize > LATEST
-    }
-
-    /// The cell at the moment, if the packet is about it; and whether that is in time.
-    fn answering(
-        &mut self,
-        from: CellId,
-        epoch: Epoch,
-        requested: Requested,
-    ) -> Option<(&mut CellMoment, bool)> {
-        let in_time = !self.is_too_late();
-        let moment = self.moment.as_mut().filter(|_| epoch == requested.epoch)?;
-        Some((moment.cells.get_mut(from.index())?, in_time))
+    /// The cell at the newest moment of this epoch; and whether that is in time.
+    fn answering(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut CellMoment, bool)> {
+        let open = self.open.iter_mut().rev().find(|open| open.epoch == epoch)?;
+        let in_time = !open.is_too_late();
+        Some((open.moment.cells.get_mut(from.index())?, in_time))
     }
 
     /// What a cell computes with became known only after the moment; it was the same then.
     fn learn(&mut self, from: CellId, hash: u16) {
-        let cell = self.moment.as_mut().and_then(|moment| moment.cells.get_mut(from.index()));
-        if let Some(cell) = cell {
-            cell.hash.get_or_insert(hash);
+        for open in &mut self.open {
+            if let Some(cell) = open.moment.cells.get_mut(from.index()) {
+                cell.hash.get_or_insert(hash);
+            }
         }
     }
 }

@@ -1,0 +1,190 @@
+//! The torque of every epoch of a capture, each as [`explain`](super::explain) computes it.
+//!
+//! Buses carry the joints of an epoch one after the other: moments are put together by their epochs, counted on from the
+//! first one beyond 255.
+
+use std::collections::BTreeMap;
+
+use model::decode::{Decoded, Decoder};
+use protocol::packet::Epoch;
+use protocol::skin::{Reply, Skin};
+use protocol::time::Micros;
+use thiserror::Error;
+use trace::capture::{CaptureError, Entry, Note, Reader};
+
+use super::watch::{Moment, Watch};
+use super::{Explainer, Explanation, NotFound};
+
+/// A bus that is so many epochs behind another one is not waited for.
+const BEHIND: i64 = 64;
+
+/// One epoch.
+#[derive(Clone, Debug, PartialEq)]
+pub struct EpochTorque {
+    /// When its first joints came, in ns since 1970.
+    pub at_ns: u64,
+    /// Its number, modulo 256.
+    pub epoch: u8,
+    /// The position of each joint of the robot in rad or m; `None` where its bus has no such joints.
+    pub positions: Vec<Option<f64>>,
+    /// Its explanation.
+    pub explanation: Explanation,
+}
+
+/// Why there are no torques, or not all.
+#[derive(Debug, Error)]
+pub enum SeriesError<E> {
+    /// It cannot be read, or is damaged.
+    #[error(transparent)]
+    Capture(#[from] CaptureError),
+    /// There are no joints of this skin.
+    #[error("{name}: {source}")]
+    NotFound {
+        /// The capture.
+        name: String,
+        /// Why.
+        source: NotFound,
+    },
+    /// What takes the epochs has failed.
+    #[error("{0}")]
+    Taken(E),
+}
+
+/// What a capture came to.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Counted {
+    /// Epochs.
+    pub epochs: u64,
+    /// When the first frame came, in ns since 1970.
+    pub first_ns: u64,
+}
+
+/// Reads a capture to its end, and gives out each epoch when nothing more can come of it, with the time of the capture's
+/// first frame. Bounded memory.
+///
+/// # Errors
+/// When it cannot be read, or has no joints of the skin; the first error of `take`.
+pub fn each_epoch<E>(
+    reader: &mut Reader,
+    skin: &Skin,
+    mut note: impl FnMut(&Note<'_>),
+    mut take: impl FnMut(u64, &EpochTorque) -> Result<(), E>,
+) -> Result<Counted, SeriesError<E>> {
+    let mut series = Series::new(skin);
+    let mut decoder = Decoder::new(None);
+    for before in &reader.extras().latched {
+        let at = Micros(before.nanos / 1_000);
+        if let Decoded::Message(message) = decoder.decode(at, &before.bus, &before.frame) {
+            series.watch.begin(before.nanos, &before.bus, &message);
+        }
+    }
+    let mut counted = Counted::default();
+    let mut first = None;
+    while let Some(entry) = reader.next()? {
+        let record = match entry {
+            Entry::Frame(record) => record,
+            Entry::Note(of_reader) => {
+                note(&of_reader);
+                continue;
+            }
+        };
+        let nanos = record.time.nanos;
+        counted.first_ns = *first.get_or_insert(nanos);
+        let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
+        let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
+        series.watch.take(nanos, record.interface, message);
+        series.collect(false);
+        while let Some(epoch) = series.next(false) {
+            counted.epochs += 1;
+            take(counted.first_ns, &epoch).map_err(SeriesError::Taken)?;
+        }
+    }
+    series.collect(true);
+    while let Some(epoch) = series.next(true) {
+        counted.epochs += 1;
+        take(counted.first_ns, &epoch).map_err(SeriesError::Taken)?;
+    }
+    if counted.epochs == 0
+        && let Err(source) = series.watch.moments()
+    {
+        return Err(SeriesError::NotFound { name: reader.name().to_owned(), source });
+    }
+    Ok(counted)
+}
+
+/// Whether a joint's torques come in sums, which do not contain those of single cells.
+#[must_use]
+pub fn is_summed(skin: &Skin, joint: usize) -> bool {
+    let mut buses = skin.buses.iter().enumerate();
+    buses.any(|(at, bus)| bus.reply != Reply::Torque && skin.joints_of(at).any(|(of_bus, _)| of_bus == joint))
+}
+
+/// Moments of several buses on their way to be put together.
+struct Series<'a> {
+    skin: &'a Skin,
+    watch: Watch<'a>,
+    explainer: Explainer<'a>,
+    /// By number, and by bus.
+    waiting: BTreeMap<i64, (Epoch, Vec<Option<Moment>>)>,
+    /// The newest number of each bus that has cells.
+    last: Vec<(usize, Option<i64>)>,
+    newest: Option<(i64, Epoch)>,
+}
+
+impl<'a> Series<'a> {
+    fn new(skin: &'a Skin) -> Self {
+        let with_cells = (0..skin.buses.len()).filter(|bus| skin.cells_of(*bus).next().is_some());
+        Self {
+            skin,
+            watch: Watch::all(skin),
+            explainer: Explainer::new(skin),
+            waiting: BTreeMap::new(),
+            last: with_cells.map(|bus| (bus, None)).collect(),
+            newest: None,
+        }
+    }
+
+    /// Takes the moments of which all is known, or all of them at the end.
+    fn collect(&mut self, is_end: bool) {
+        for (bus, last) in &mut self.last {
+            while let Some((epoch, moment)) = self.watch.pop(*bus, is_end) {
+                let (newest, of_newest) = self.newest.unwrap_or((0, epoch));
+                let mut number = newest + i64::from(epoch.since(of_newest));
+                while last.is_some_and(|last| number <= last) {
+                    number += 256;
+                }
+                *last = Some(number);
+                if number >= newest {
+                    self.newest = Some((number, epoch));
+                }
+                let buses = self.skin.buses.len();
+                let (_, moments) = self.waiting.entry(number).or_insert_with(|| (epoch, vec![None; buses]));
+                if let Some(place) = moments.get_mut(*bus) {
+                    *place = Some(moment);
+                }
+            }
+        }
+    }
+
+    /// The next epoch, if no bus can add to it.
+    fn next(&mut self, is_end: bool) -> Option<EpochTorque> {
+        let (number, _) = self.waiting.first_key_value()?;
+        let newest = self.newest.map_or(*number, |(newest, _)| newest);
+        let is_passed = self.last.iter().all(|(_, last)| last.is_some_and(|last| last >= *number));
+        if !is_end && !is_passed && newest - number <= BEHIND {
+            return None;
+        }
+        let (_, (epoch, moments)) = self.waiting.pop_first()?;
+        let explanation = self.explainer.explain(&moments);
+        let mut positions = vec![None; self.skin.robot.joints.len()];
+        for bus in &explanation.buses {
+            for (joint, position) in bus.joints.iter().zip(&bus.position_rad) {
+                if let Some(place) = positions.get_mut(usize::from(*joint).saturating_sub(1)) {
+                    place.get_or_insert(*position);
+                }
+            }
+        }
+        let at_ns = moments.iter().flatten().map(|moment| moment.at_ns).min().unwrap_or_default();
+        Some(EpochTorque { at_ns, epoch: epoch.0, positions, explanation })
+    }
+}

@@ -1,0 +1,86 @@
+//! The torque of every epoch as CSV.
+
+use std::io::Write;
+use std::path::Path;
+
+use analysis::explain::series::{EpochTorque, SeriesError, each_epoch, is_summed};
+use csv::{Writer, WriterBuilder};
+use protocol::skin::{Reply, Skin};
+use trace::capture::Reader;
+
+use crate::input::Missing;
+use crate::print::list;
+
+/// Whether a name is one of a CSV file.
+pub(super) fn is_csv(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "csv")
+}
+
+/// Writes a row for each epoch; how many there were. What the capture lacks is noted.
+pub(super) fn write(
+    reader: &mut Reader,
+    skin: &Skin,
+    out: impl Write,
+) -> Result<(u64, Missing), SeriesError<csv::Error>> {
+    let summed = (0..skin.robot.joints.len()).map(|joint| is_summed(skin, joint)).collect();
+    let mut rows = Rows { summed, out: WriterBuilder::new().from_writer(out) };
+    rows.out.write_record(header(skin)).map_err(SeriesError::Taken)?;
+    let mut missing = Missing::default();
+    let done = each_epoch(reader, skin, |note| missing.take(note), |first, epoch| rows.write(first, epoch));
+    let epochs = done?.epochs;
+    rows.out.flush().map_err(|error| SeriesError::Taken(error.into()))?;
+    Ok((epochs, missing))
+}
+
+/// The buses whose cells answer with sums, which do not contain the torques of single cells; none if there are none.
+pub(super) fn summed(skin: &Skin) -> Option<String> {
+    let summed = skin.buses.iter().filter(|bus| bus.reply != Reply::Torque).map(|bus| bus.name.clone());
+    let summed: Vec<_> = summed.collect();
+    (!summed.is_empty()).then(|| list(summed))
+}
+
+/// Names and units.
+fn header(skin: &Skin) -> Vec<String> {
+    let joints = skin.robot.joints.iter().flat_map(|joint| {
+        let (name, unit, torque) = (&joint.name, joint.kind.unit(), joint.kind.torque_unit());
+        [
+            format!("position_{name}_{unit}"),
+            format!("distributed_{name}_{torque}"),
+            format!("central_{name}_{torque}"),
+            format!("error_{name}_{torque}"),
+        ]
+    });
+    let first = ["time_s", "epoch"].map(str::to_owned).into_iter();
+    first.chain(joints).chain(["open_cells", "saturated_cells"].map(str::to_owned)).collect()
+}
+
+struct Rows<W: Write> {
+    /// By joint, whether its torques come in sums.
+    summed: Vec<bool>,
+    out: Writer<W>,
+}
+
+impl<W: Write> Rows<W> {
+    /// The numbers are those of `gateway explain`; `first` is the time of the capture's first frame.
+    #[expect(clippy::cast_precision_loss, reason = "to a nanosecond within three months")]
+    fn write(&mut self, first: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
+        let EpochTorque { at_ns, epoch, positions, explanation } = epoch;
+        let seconds = at_ns.saturating_sub(first) as f64 / 1e9;
+        let mut row = vec![format!("{seconds:.9}"), epoch.to_string()];
+        let joints = positions.iter().zip(&explanation.total).zip(&self.summed);
+        for ((position, total), summed) in joints {
+            let of_words = |value: f64| if *summed { String::new() } else { value.to_string() };
+            row.extend([
+                position.map_or_else(String::new, |position| position.to_string()),
+                of_words(total.words_nm),
+                total.central_nm.to_string(),
+                of_words(total.difference_nm),
+            ]);
+        }
+        let most = |count: fn(&analysis::explain::Total) -> u32| {
+            explanation.total.iter().map(count).max().unwrap_or_default().to_string()
+        };
+        row.extend([most(|total| total.open), most(|total| total.saturated)]);
+        self.out.write_record(row)
+    }
+}

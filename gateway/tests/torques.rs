@@ -1,0 +1,207 @@
+//! `gateway convert RUN.mcap torques.csv`: each row beside `gateway explain --json` of its epoch.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+#![allow(clippy::float_cmp, reason = "0, and counts")]
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+use tempfile::TempDir;
+use trace::capture::Reader;
+
+/// Rows between those that are compared.
+const EACH: usize = 9;
+
+fn recordings() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/recordings")
+}
+
+fn gateway(folder: &Path, arguments: &str) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    command.args(arguments.split(' ').filter(|word| !word.is_empty())).current_dir(folder).output().unwrap()
+}
+
+/// A folder with recordings and the skin of each.
+fn folder(names: &[&str]) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    for name in names {
+        let from = recordings().join(name);
+        fs::copy(&from, folder.path().join(name)).unwrap();
+        let reader = Reader::open(&from).unwrap();
+        let skin = reader.extras().attachments.iter().find(|(name, _)| name == "skin.toml");
+        if let Some((_, skin)) = skin {
+            fs::write(folder.path().join(name).with_extension("toml"), skin).unwrap();
+        }
+    }
+    folder
+}
+
+/// The one line of a command that ends with this code.
+fn said(folder: &TempDir, arguments: &str, code: i32) -> String {
+    let Output { status, stderr, .. } = gateway(folder.path(), arguments);
+    let said = String::from_utf8(stderr).unwrap();
+    assert_eq!((status.code(), said.matches('\n').count()), (Some(code), 1), "{arguments}: {said}");
+    said.trim_end().to_owned()
+}
+
+type Row = BTreeMap<String, String>;
+
+fn rows(folder: &TempDir, name: &str) -> Vec<Row> {
+    let mut reader = csv::Reader::from_path(folder.path().join(name)).unwrap();
+    reader.deserialize().map(|row| row.unwrap()).collect()
+}
+
+/// Whether numbers are the same; serde_json reads some of them a bit of their last digit off.
+fn same(one: f64, other: &Value) -> bool {
+    let other = other.as_f64().unwrap();
+    (one - other).abs() <= 4e-16 * other.abs()
+}
+
+/// Compares rows with what `gateway explain` says of their epochs; how many torques were not 0.
+fn compared(folder: &TempDir, rows: &[Row], capture: &str) -> usize {
+    let (mut loaded, mut next) = (0, 0.0);
+    for row in rows.iter().step_by(EACH).chain(rows.last()) {
+        let seconds: f64 = row["time_s"].parse().unwrap();
+        assert!(seconds >= next, "in order of time");
+        next = seconds;
+        let epoch = &row["epoch"];
+        let at = (seconds - 0.004).max(0.0);
+        let ended = gateway(folder.path(), &format!("explain {capture} --epoch {epoch} --at {at:.6} --json"));
+        let explained: Value = serde_json::from_slice(&ended.stdout).unwrap();
+        let number =
+            |column: &str| row[column].parse::<f64>().unwrap_or_else(|error| panic!("{column}: {error}"));
+        for total in explained["total"].as_array().unwrap() {
+            let (joint, unit) = (&total["joint"], total["unit"].as_str().unwrap());
+            for (column, key) in
+                [("distributed", "words_nm"), ("central", "central_nm"), ("error", "difference_nm")]
+            {
+                let value = number(&format!("{column}_joint{joint}_{unit}"));
+                assert!(same(value, &total[key]), "{capture}, epoch {epoch}, joint {joint}, {key}");
+                loaded += usize::from(value != 0.0);
+            }
+        }
+        for bus in explained["buses"].as_array().unwrap() {
+            for (joint, position) in
+                bus["joints"].as_array().unwrap().iter().zip(bus["position_rad"].as_array().unwrap())
+            {
+                assert!(same(number(&format!("position_joint{joint}_rad")), position), "{capture}");
+            }
+        }
+        for (column, key) in [("open_cells", "open"), ("saturated_cells", "saturated")] {
+            let most =
+                explained["total"].as_array().unwrap().iter().map(|total| total[key].as_f64().unwrap());
+            assert_eq!(number(column), most.fold(0.0, f64::max), "{capture}, epoch {epoch}: {column}");
+        }
+    }
+    loaded
+}
+
+#[test]
+fn rows_are_what_explain_says_of_their_epochs_in_recordings_logs_and_parts() {
+    let parts = "split.mcap split-1.mcap split-2.mcap";
+    let folder = folder(&[
+        "fd.mcap",
+        "classic.mcap",
+        "classic.log",
+        "two.mcap",
+        "split.mcap",
+        "split-1.mcap",
+        "split-2.mcap",
+    ]);
+    for (capture, skin, epochs) in [
+        ("fd.mcap", "", 100),
+        ("classic.mcap", "", 100),
+        ("classic.log", " --skin classic.toml", 100),
+        ("two.mcap", "", 100),
+        (parts, "", 150),
+        ("split-1.mcap", "", 0),
+    ] {
+        let last = said(&folder, &format!("convert {capture} out.csv --force{skin}"), 0);
+        let rows = rows(&folder, "out.csv");
+        assert!(last.ends_with(&format!(" -> out.csv: {} epochs", rows.len())), "{last}");
+        assert!(rows.len() == epochs || epochs == 0 && !rows.is_empty(), "{capture}: {}", rows.len());
+        assert!(
+            compared(&folder, &rows, &format!("{capture}{skin}")) > 0,
+            "{capture}: something was touched"
+        );
+    }
+    // Parts give what the whole gives, whatever their order.
+    said(&folder, &format!("convert {parts} a.csv"), 0);
+    said(&folder, "convert split-2.mcap split.mcap split-1.mcap b.csv", 0);
+    assert_eq!(
+        fs::read(folder.path().join("a.csv")).unwrap(),
+        fs::read(folder.path().join("b.csv")).unwrap()
+    );
+}
+
+#[test]
+fn torques_that_come_in_sums_are_empty_and_the_central_ones_are_there() {
+    let folder = folder(&["sums.mcap"]);
+    let Output { status, stderr, .. } = gateway(folder.path(), "convert sums.mcap sums.csv");
+    let said = String::from_utf8(stderr).unwrap();
+    assert_eq!(status.code(), Some(0), "{said}");
+    assert!(
+        said.contains("sums.mcap: vcan0 answers with sums: distributed torques and errors are empty"),
+        "{said}"
+    );
+    let rows = rows(&folder, "sums.csv");
+    assert!(
+        rows.iter().all(|row| row["distributed_joint2_Nm"].is_empty() && row["error_joint2_Nm"].is_empty())
+    );
+    assert!(rows.iter().any(|row| row["central_joint2_Nm"].parse::<f64>().unwrap() != 0.0));
+}
+
+#[test]
+fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
+    let folder = folder(&["fd.mcap", "classic.log", "two.mcap"]);
+    fs::write(folder.path().join("foreign.log"), "(1.000001) can7 123#11\n").unwrap();
+    fs::write(folder.path().join("mine.csv"), "mine").unwrap();
+    for (arguments, code, line) in [
+        ("classic.log out.csv", 2, "gateway: classic.log has no skin in it: name one with --skin"),
+        (
+            "foreign.log out.csv --skin fd.toml",
+            1,
+            "gateway: foreign.log: none of its buses (can7) is one of the skin's (vcan0)",
+        ),
+        ("- out.csv", 2, "gateway: standard input is read once: name the skin with --skin"),
+        ("fd.mcap out.csv --plain", 2, "gateway: --plain is for a candump log, and out.csv is a CSV file"),
+        (
+            "fd.mcap out.log --skin fd.toml",
+            2,
+            "gateway: --skin fd.toml is for torques: name an OUT that ends in .csv",
+        ),
+        (
+            "fd.mcap mine.csv",
+            2,
+            "gateway: mine.csv: it exists: name another file, or overwrite it with --force",
+        ),
+        (
+            "fd.mcap fd.csv/out.csv",
+            2,
+            "gateway: fd.csv/out.csv: No such file or directory (os error 2); name a file in a folder that can be written",
+        ),
+    ] {
+        assert_eq!(said(&folder, &format!("convert {arguments}"), code), line);
+    }
+    assert!(!folder.path().join("out.csv").exists());
+    assert_eq!(fs::read_to_string(folder.path().join("mine.csv")).unwrap(), "mine");
+    // A damaged recording leaves nothing.
+    let bytes = fs::read(folder.path().join("fd.mcap")).unwrap();
+    let mut damaged = bytes.clone();
+    let middle = damaged.len() / 2;
+    damaged[middle..middle + 64].fill(0x55);
+    fs::write(folder.path().join("damaged.mcap"), damaged).unwrap();
+    let line = said(&folder, "convert damaged.mcap out.csv --skin fd.toml", 1);
+    assert!(line.contains("damaged.mcap is damaged"), "{line}");
+    assert!(!folder.path().join("out.csv").exists());
+    // One that was cut off gives what is there.
+    fs::write(folder.path().join("begun.mcap"), &bytes[..middle]).unwrap();
+    let line = said(&folder, "convert begun.mcap strict.csv --strict --skin fd.toml", 1);
+    assert!(line.contains("it has no end") && !folder.path().join("strict.csv").exists(), "{line}");
+    let Output { status, .. } = gateway(folder.path(), "convert begun.mcap begun.csv --skin fd.toml");
+    assert_eq!(status.code(), Some(0));
+    let cut = rows(&folder, "begun.csv");
+    assert!(!cut.is_empty() && cut.len() < 100, "{}", cut.len());
+}
