@@ -137,10 +137,11 @@ fn findings(out: &mut String, findings: &[Finding]) {
 }
 
 fn table(out: &mut String, table: &Table) {
-    out.push_str("<div class=\"scroll\"><table>\n");
+    // Not as the table's caption, which would be as wide as the table where that is wider than the screen.
     if !table.title.is_empty() {
-        let _ = writeln!(out, "<caption>{}</caption>", svg::escaped(&table.title));
+        let _ = writeln!(out, "<h3>{}</h3>", svg::escaped(&table.title));
     }
+    out.push_str("<div class=\"scroll\"><table>\n");
     let columns = 0..table.head.len();
     let classes: Vec<_> = columns.map(|column| if numbers(table, column) { NUMBER } else { "" }).collect();
     let classes = || classes.iter().copied().chain(std::iter::repeat(""));

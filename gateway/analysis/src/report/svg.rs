@@ -26,7 +26,7 @@ use super::thin::thinned;
 /// How many units of the drawing are one pixel of its natural size: places are whole units.
 const UNIT: i32 = 8;
 /// How high a diagram below another one is, in pixels.
-const BELOW: u32 = 150;
+const BELOW: u32 = 170;
 /// Of letters, in pixels.
 const LETTERS: f64 = 13.0;
 /// The widths of lines in units. Plotters would draw each dash as a line of its own, which of a noisy curve are
@@ -194,8 +194,9 @@ impl<'a> Diagram<'a> {
 
     /// The most ticks upwards in so many units.
     const fn ticks(height: u32) -> usize {
-        let ticks = (height / pixels(42)) as usize;
-        if ticks < 3 { 3 } else { ticks }
+        // A low one would have too few.
+        let distance = if height > pixels(BELOW) { 42 } else { 32 };
+        (height / pixels(distance)) as usize
     }
 
     /// Letters of the widest caption upwards.

@@ -1,5 +1,5 @@
 use super::*;
-use crate::report::figure::Axis;
+use crate::report::figure::{Axis, Below};
 use roxmltree::{Document, Node};
 
 fn figure(series: Vec<Series>) -> Figure {
@@ -132,4 +132,35 @@ fn every_colour_has_another_one_on_a_dark_screen() {
             .any(|value| value.starts_with('#'));
         assert!(!coloured || node.attribute("class").is_some(), "{node:?}");
     }
+}
+
+#[test]
+fn a_diagram_below_has_its_own_scale_and_the_same_time() {
+    let upper = [(0.0, -100_000.0), (10.0, 100_000.0)];
+    let lower = Series::new("", Shape::Line, vec![(0.0, -1e-4), (10.0, 1e-4)]);
+    let below = Below {
+        y: Axis::new("difference", "Nm").between(-1e-4, 1e-4),
+        series: vec![lower],
+        marks: Vec::new(),
+    };
+    let upper = Figure { y: Axis::new("torque", "Nm").between(-1e5, 1e5), ..figure(vec![line(&upper)]) };
+    let text = draw(&upper.below(below));
+    let document = Document::parse(&text).unwrap();
+    let places = lines(&document, "c0-s");
+    let ([(left, bottom), (right, top)], [(from, lowest), (to, highest)]) = (&places[0][..], &places[2][..])
+    else {
+        panic!("the upper line, its legend, the lower line: {places:?}")
+    };
+    assert_eq!((left, right), (from, to), "one time axis, whatever the widths of the numbers");
+    assert!(top < bottom && bottom < highest && highest < lowest, "{places:?}");
+    let (_, height) = natural(Size::Wide);
+    assert!(*lowest < f64::from(height + BELOW) * f64::from(UNIT), "inside");
+    let words: Vec<_> = document
+        .descendants()
+        .filter(|node| node.has_tag_name((SVG, "text")))
+        .filter_map(|node| node.text())
+        .map(str::trim)
+        .collect();
+    assert_eq!(words.iter().filter(|word| **word == "time (s)").count(), 1, "{words:?}");
+    assert!(words.contains(&"torque (kNm)") && words.contains(&"difference (µNm)"), "{words:?}");
 }

@@ -124,7 +124,7 @@ impl Draft<'_> {
             let replies = &cell.replies;
             let counts = [replies.due, replies.in_time, replies.late, replies.missing, cell.uplink().lost];
             let counts = counts.map(|count| count.to_string());
-            [format!("{} {}", bus_figures.name, cell.node), joint.to_string()]
+            [format!("{}\u{a0}{}", bus_figures.name, cell.node), joint.to_string()]
                 .into_iter()
                 .chain(counts)
                 .chain([cell.uplink().restarts.to_string(), quantity(mean, "µs"), quantity(slowest, "µs")])

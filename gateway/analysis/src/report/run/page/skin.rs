@@ -37,9 +37,16 @@ impl Draft<'_> {
                 .tables(self.touches()),
             (..) => section.text("No cell was touched, as far as the frames say."),
         };
-        match loss {
-            Some(loss) => section.drawings([Drawing::Map(loss)]),
-            None => section.text("No cell's reply was late or missing, and no packet of a cell was lost."),
+        let sums = self.run.bus_figures.iter().any(|bus_figures| bus_figures.sums);
+        match (loss, sums) {
+            (Some(loss), _) => section.drawings([Drawing::Map(loss)]),
+            (None, false) => {
+                section.text("No cell's reply was late or missing, and no packet of a cell was lost.")
+            }
+            (None, true) => section.text(
+                "No packet of a cell was lost. Which cells were late or missing in a sum is not on the bus, so there is no \
+                 map of it.",
+            ),
         }
     }
 
