@@ -54,6 +54,11 @@ fn header(skin: &Skin) -> Vec<String> {
     first.chain(joints).chain(["open_cells", "saturated_cells"].map(str::to_owned)).collect()
 }
 
+/// All digits of a number; small ones with an exponent.
+fn digits(value: f64) -> String {
+    format!("{value:?}")
+}
+
 struct Rows<W: Write> {
     /// By joint, whether its torques come in sums.
     summed: Vec<bool>,
@@ -69,11 +74,11 @@ impl<W: Write> Rows<W> {
         let mut row = vec![format!("{seconds:.9}"), epoch.to_string()];
         let joints = positions.iter().zip(&explanation.total).zip(&self.summed);
         for ((position, total), summed) in joints {
-            let of_words = |value: f64| if *summed { String::new() } else { value.to_string() };
+            let of_words = |value: f64| if *summed { String::new() } else { digits(value) };
             row.extend([
-                position.map_or_else(String::new, |position| position.to_string()),
+                position.map_or_else(String::new, digits),
                 of_words(total.words_nm),
-                total.central_nm.to_string(),
+                digits(total.central_nm),
                 of_words(total.difference_nm),
             ]);
         }

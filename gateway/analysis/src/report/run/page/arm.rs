@@ -31,15 +31,16 @@ impl Draft<'_> {
                 )
                 .marks([papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)])
         });
-        let mut section = Section::new("torque", "Torque, and its difference from the central one").text(
-            "The upper curve is the sum of what has come at each tick. The difference below it compares like with like, once \
+        let mut section = Section::new("torque", "Torque, and its difference from the central one");
+        if !loaded.is_empty() {
+            section = section.text("The upper curve is the sum of what has come at each tick. The difference below it compares like with like, once \
              an epoch: what all cells answered to these joints, less the central computation for them; an epoch without an \
-             answer in time is a gap. Dotted: one step of the torque words.",
-        );
+             answer in time is a gap. Dotted: one step of the torque words.");
+        }
         if !free.is_empty() {
             let names: Vec<_> = free.iter().map(|joint| self.joint(*joint)).collect();
             section = section.text(format!(
-                "No torque, distributed or central, on {}: no cell that was touched loads them.",
+                "No torque as large as half a step of the words, distributed or central, on {}.",
                 names.join(", ")
             ));
         }
@@ -182,11 +183,7 @@ impl Draft<'_> {
         });
         let (still, figures): (Vec<_>, Vec<_>) = figures.partition(is_zero);
         let section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
-        if still.is_empty() {
-            section
-        } else {
-            section.text("The arm stood still: these velocities were 0 throughout.")
-        }
+        if still.is_empty() { section } else { section.text("What is not drawn here was 0 throughout.") }
     }
 
     /// Joints that share a figure: those of one kind that a chain adds to the chains before it.

@@ -23,7 +23,8 @@ impl Draft<'_> {
                  joints, late within three more.",
             )
             .figures(due.flat_map(|bus_figures| self.replies_of(bus_figures)).filter_map(shown))
-            .tables([self.accounts(), self.worst()]);
+            .tables([self.accounts()])
+            .tables(self.worst());
         let none_due = |bus_figures: &&LinkId| bus_figures.account().due == 0;
         let complete = |bus_figures: &&LinkId| {
             let account = bus_figures.account();
@@ -78,7 +79,8 @@ impl Draft<'_> {
                 counters.epochs_complete,
             ];
             let numbers = numbers.map(|count| count.to_string());
-            let times = [reply.p50, reply.p99, reply.max].map(|micros| quantity(micros, "µs"));
+            let times = [reply.p50, reply.p99, reply.max];
+            let times = times.map(|micros| quantity(if reply.count > 0 { micros } else { f64::NAN }, "µs"));
             [bus_figures.name.clone()].into_iter().chain(numbers).chain(times).collect::<Vec<_>>()
         };
         let rows = self.run.bus_figures.iter().map(row);
@@ -98,7 +100,7 @@ impl Draft<'_> {
     }
 
     /// Cells by what went wrong with them, and then by how slow they were.
-    fn worst(&self) -> Table {
+    fn worst(&self) -> Option<Table> {
         let cells = self.run.bus_figures.iter().enumerate().flat_map(|(bus, bus_figures)| {
             let described = self.run.skin.cells_of(bus);
             bus_figures.table.cells().iter().zip(described).zip(&bus_figures.latency).map(
@@ -111,6 +113,11 @@ impl Draft<'_> {
             )
         });
         let mut cells: Vec<_> = cells.collect();
+        let stands_out =
+            |cell: &Cell| cell.replies.due + cell.uplink().lost > 0 || cell.uplink().restarts > 0;
+        if !cells.iter().any(|(_, cell, ..)| stands_out(cell)) {
+            return None;
+        }
         cells.sort_by_key(|(_, cell, _, latency)| {
             let (replies, uplink) = (&cell.replies, cell.uplink());
             std::cmp::Reverse((replies.missing + replies.late, uplink.lost, uplink.restarts, latency.max))
@@ -146,11 +153,8 @@ impl Draft<'_> {
         let of = self.run.skin.cells.len();
         let title =
             if rows.len() < of { format!("The {WORST} worst of {of} cells") } else { "All cells".to_owned() };
-        Table::new(
-            format!("{title}: by replies late or missing, then losses, then the slowest reply"),
-            head,
-            rows,
-        )
+        let title = format!("{title}: by replies late or missing, then losses, then the slowest reply");
+        Some(Table::new(title, head, rows))
     }
 
     /// A load in % from the first tick on: before it cells start, all at once.
