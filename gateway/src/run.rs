@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use analysis::dbc;
 use bench::record::{self, Candump};
+use bench::remote::Lines;
 use bench::run::launch::in_memory;
 use bench::run::{self, Options};
 use bench::summary::{Outcome, Summary};
@@ -299,7 +300,7 @@ fn bench(
     summary_file: Option<&Path>,
     force: Force,
     read: &[PathBuf],
-    page: Option<Page>,
+    page: Option<(Page, Lines)>,
 ) -> Result<(), Failure> {
     let written = [
         ("--candump", options.record.candump.as_ref().map(|candump| candump.path.as_path())),
@@ -310,7 +311,8 @@ fn bench(
     // Before the run, so that a file that cannot be written is reported first.
     let summary = summary_file.map(|path| force.create("--summary", path)).transpose()?;
     // A panic is reported in the summary too.
-    let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options)));
+    let (page, lines) = page.unzip();
+    let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options, lines)));
     drop(page);
     let (ended, panicked) = match ended {
         Ok(ended) => (ended.map_err(|error| Failure::with_code(error.exit_code(), error))?, None),

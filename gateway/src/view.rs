@@ -1,13 +1,13 @@
 //! `gateway view`, and the option `--view` of runs.
 
 use std::ffi::OsString;
+use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::{io, thread};
 
+use bench::remote::Lines;
 use bench::run;
 use clap::Args;
 use protocol::skin::Skin;
@@ -63,7 +63,7 @@ pub(crate) struct View {
     /// Wait for buses that are not there yet
     #[arg(long)]
     wait: bool,
-    /// End with standard input: with the run that has started it
+    /// Belong to the run that has started it: take its state from standard input, write commands to standard output, end with it
     #[arg(long, hide = true)]
     of_run: bool,
     #[command(flatten)]
@@ -111,10 +111,8 @@ impl View {
         let skin = Skin::read(skin).map_err(Failure::usage)?;
         let kinds = self.kinds.of(bus_names(&skin))?;
         let stop = stopped()?;
-        if self.of_run {
-            end_with_input(&stop);
-        }
-        let options = Options { skin, kinds, directory: None, access, patient: self.wait };
+        let bench = self.of_run.then(run_of_this).transpose().map_err(|error| failed(&error))?;
+        let options = Options { skin, kinds, directory: None, access, patient: self.wait, bench };
         serve(options, &stop, says).map_err(Failure::usage)?;
         Ok(())
     }
@@ -159,13 +157,13 @@ impl View {
     }
 }
 
-/// Stops at the end of standard input, which a run holds open while it lives.
-fn end_with_input(stop: &Arc<AtomicBool>) {
-    let stop = Arc::clone(stop);
-    thread::spawn(move || {
-        let _ = io::copy(&mut io::stdin(), &mut io::sink());
-        stop.store(true, Ordering::Relaxed);
-    });
+/// The run that has started this program, at its standard input and output.
+fn run_of_this() -> io::Result<Lines> {
+    Lines::new(io::stdin().as_fd().try_clone_to_owned()?, io::stdout().as_fd().try_clone_to_owned()?)
+}
+
+fn failed(error: &io::Error) -> Failure {
+    Failure::run(format!("--view: {error}"))
 }
 
 /// The page of a run, in a process of its own; it ends with this value.
@@ -173,10 +171,10 @@ fn end_with_input(stop: &Arc<AtomicBool>) {
 pub(crate) struct Page(Child);
 
 impl Page {
-    /// Serves the page of a run, whose buses open later.
-    pub(crate) fn of(run: &run::Options, listen: Option<SocketAddr>) -> Result<Self, Failure> {
+    /// Serves the page of a run, whose buses open later; and where it sends what pages want of the run.
+    pub(crate) fn of(run: &run::Options, listen: Option<SocketAddr>) -> Result<(Self, Lines), Failure> {
         let run::Options { skin_file, skin, kinds, directory, .. } = run;
-        let program = std::env::current_exe().map_err(|error| Failure::run(format!("--view: {error}")))?;
+        let program = std::env::current_exe().map_err(|error| failed(&error))?;
         let mut command = Command::new(program);
         command.args(["view", "--wait", "--of-run"]).arg(skin_file);
         for bus in &skin.buses {
@@ -190,8 +188,13 @@ impl Page {
             command.env("SKINBUS_DIR", directory);
         }
         // Its signals are its own: the run ends it.
-        let child = command.stdin(Stdio::piped()).stdout(Stdio::null()).spawn();
-        child.map(Self).map_err(|error| Failure::run(format!("--view: {error}")))
+        let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
+        let mut page = child.map(Self).map_err(|error| failed(&error))?;
+        let (Some(commands), Some(state)) = (page.0.stdout.take(), page.0.stdin.take()) else {
+            return Err(Failure::run("--view: no pipes"));
+        };
+        let lines = Lines::new(commands, state).map_err(|error| failed(&error))?;
+        Ok((page, lines))
     }
 }
 

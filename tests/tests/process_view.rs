@@ -114,11 +114,17 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
     let mut flood = Page::new(&address);
     let flooding = std::thread::spawn(move || {
         for number in 0..100_000_u32 {
-            let text = match number % 5 {
+            let text = match number % 8 {
                 0 => "{\"do\":\"press\",\"bus\":9,\"node\":1,\"force_n\":1}".to_owned(),
                 1 => format!("{{\"do\":\"choose\",\"bus\":0,\"node\":{}}}", number % 256),
                 2 => "x".repeat(200),
                 3 => "{\"do\":\"press\",\"bus\":0,\"node\":2,\"force_n\":1e308}".to_owned(),
+                4 => "{\"do\":\"bench\",\"on\":\"process\",\"action\":\"kill\",\"bus\":9,\"node\":1}"
+                    .to_owned(),
+                5 => "{\"do\":\"bench\",\"on\":\"link\",\"down\":true,\"bus\":0,\"nodes\":[1,1]}".to_owned(),
+                6 => {
+                    "{\"do\":\"bench\",\"on\":\"bus\",\"down\":false,\"bus\":18446744073709551615}".to_owned()
+                }
                 _ => "{\"do\":\"release\"}".to_owned(),
             };
             if flood.socket.send(Message::text(text)).is_err() {
@@ -167,12 +173,16 @@ fn pages_that_may_only_look_press_nothing_and_others_need_a_token() {
     assert_eq!(page.scene["may_press"], false);
     page.press(2, 5.0);
     page.say(r#"{"do":"halt"}"#);
+    page.act("kill", 3);
     let mut seen = 0;
     let last = page.sees("snapshots", |_| {
         seen += 1;
         seen > 30
     });
     assert!(last.cells.iter().all(|cell| cell.2 == 0 && cell.1 == 0));
+    let said = page.hears("words", |_| true);
+    assert!(said["bench"].is_null(), "it belongs to no run: {said}");
+    assert_eq!(run.cells().len(), 4);
     view.signal(rustix::process::Signal::INT);
     view.end().well();
     run.signal(rustix::process::Signal::INT);

@@ -68,6 +68,15 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     browser.key("keyUp", " ");
     browser.until("document.getElementById('facts').textContent.includes('In contact0')");
 
+    // The process of that cell.
+    let kill = "[...document.querySelectorAll('button')].find((it) => it.textContent === 'Kill')";
+    browser.until(&format!("{kill} && !{kill}.disabled"));
+    browser.value(&format!("{kill}.click()"));
+    browser.until("document.getElementById('answer').textContent.startsWith('kill cell ')");
+    browser.until(&format!(
+        "{kill}.disabled && document.getElementById('facts').textContent.includes('Silent1')"
+    ));
+
     for (width, scheme) in [(1400, "dark"), (390, "light"), (390, "dark")] {
         browser.resize(width, 844);
         browser.scheme(scheme);

@@ -6,6 +6,7 @@
 //! | [`cells`], [`commission`], [`sensing`] | querying cells, writing their parameters, switching what they report |
 //! | [`run`] | a run: processes, buses, loop, and its result ([`summary`]) |
 //! | [`record`] | what a run records, and the thread that writes it |
+//! | [`remote`] | commands to a run from another process, and what that is sent |
 //! | [`replay`] | a capture on a bus again, compared |
 //! | [`view`] | the state of a bus' cells that a receiver shows |
 //! | [`signals`] | signals that end a command |
@@ -15,6 +16,7 @@ pub mod cells;
 pub mod commission;
 pub mod listen;
 pub mod record;
+pub mod remote;
 pub mod replay;
 pub mod run;
 pub mod sensing;

@@ -1,7 +1,7 @@
 //! Distributions of times, and their quantiles.
 
 use hdrhistogram::Histogram;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// An empty histogram with three digits that grows by itself.
 #[must_use]
@@ -45,7 +45,7 @@ impl Times {
 }
 
 /// Median, 90th and 99th percentile, maximum, and of how many values; in µs.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
+#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
 pub struct Quantiles {
     /// Median.
     pub p50: f64,

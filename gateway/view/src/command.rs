@@ -27,6 +27,8 @@ pub enum Command {
     Choose(Chosen),
     /// Asks for no details any more.
     Unchoose,
+    /// A command to the run that the page belongs to.
+    Bench(bench::remote::Command),
     /// Plays a recording.
     Play {
         /// How many seconds of it pass in one.
@@ -82,7 +84,7 @@ impl Command {
     /// Whether it changes what cells do.
     #[must_use]
     pub const fn acts(&self) -> bool {
-        matches!(self, Self::Press { .. } | Self::Release | Self::Halt | Self::Resume)
+        matches!(self, Self::Press { .. } | Self::Release | Self::Halt | Self::Resume | Self::Bench(_))
     }
 
     /// Whether it is about the position in a recording.
@@ -105,11 +107,17 @@ mod tests {
         let press = Command::Press { bus: 0, node: 12, force_n: 2.5 };
         assert_eq!(Command::parse(r#"{"do":"press","bus":0,"node":12,"force_n":2.5}"#), Some(press.clone()));
         assert!(press.acts() && !Command::Unchoose.acts());
+        let down = Command::Bench(bench::remote::Command::Bus { down: true, bus: 1 });
+        assert_eq!(Command::parse(r#"{"do":"bench","on":"bus","down":true,"bus":1}"#), Some(down.clone()));
+        assert!(down.acts());
         for wrong in [
             "",
             "null",
             "[]",
             r#"{"do":"kill"}"#,
+            r#"{"do":"bench"}"#,
+            r#"{"do":"bench","on":"bus","down":true,"bus":1,"more":1}"#,
+            r#"{"do":"bench","on":"process","action":"kill","bus":0,"node":300}"#,
             r#"{"do":"press","bus":-1,"node":12,"force_n":2.5}"#,
             r#"{"do":"press","bus":0,"node":256,"force_n":2.5}"#,
             r#"{"do":"press","bus":0,"node":1,"force_n":"x"}"#,

@@ -138,6 +138,7 @@ fn obey(player: &mut Player, command: &Command) -> Result<(), String> {
         | Command::Release
         | Command::Halt
         | Command::Resume
+        | Command::Bench(_)
         | Command::Choose(_)
         | Command::Unchoose => Ok(()),
     };

@@ -1,6 +1,7 @@
 //! The shell: buses, clock, and the server in one loop.
 
 use std::collections::BTreeMap;
+use std::iter;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -8,6 +9,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use bench::listen::{now, open, send};
+use bench::remote::{Lines, State};
 use protocol::bus::{self, Bus, BusError, Inbox, Kinds};
 use protocol::can::Format;
 use protocol::id::Node;
@@ -15,8 +17,8 @@ use protocol::message::{From, Message, SensorPage};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use crate::command::Command;
-use crate::live::Live;
+use crate::command::{Chosen, Command};
+use crate::live::{Live, Said};
 use crate::locked;
 use crate::player::PlayError;
 use crate::pressed::Pressed;
@@ -47,6 +49,8 @@ pub struct Options {
     pub access: Access,
     /// Whether a bus that is not there at the start is waited for.
     pub patient: bool,
+    /// The run that it belongs to, which pages command; it ends with that.
+    pub bench: Option<Lines>,
 }
 
 /// Why nothing can be shown.
@@ -81,7 +85,7 @@ struct Shared {
 /// # Errors
 /// When the address cannot be listened on, or a bus cannot be opened at the start and is not waited for.
 pub fn serve(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Result<Counts, ServeError> {
-    let Options { skin, kinds, directory, access, patient } = options;
+    let Options { skin, kinds, directory, access, patient, bench } = options;
     let (listen, may_act) = (access.listen, access.may_act);
     let opened = |name: &str, format: Format| {
         let options = bus::Options {
@@ -110,7 +114,7 @@ pub fn serve(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Re
             let (live, opened) = (&live, &opened);
             scope.spawn(move || receive(index, shared, live, stop, opened));
         }
-        publish(&live, &buses, &server, stop);
+        publish(&live, &buses, &server, bench, stop);
     });
     Ok(server.counts())
 }
@@ -163,14 +167,33 @@ fn receive(
     }
 }
 
-/// Snapshots for the pages, and their commands for the buses.
-fn publish(live: &Mutex<Live>, buses: &[Shared], server: &Server, stop: &AtomicBool) {
+/// Snapshots for the pages, and their commands for the buses and for the run.
+fn publish(
+    live: &Mutex<Live>,
+    buses: &[Shared],
+    server: &Server,
+    mut bench: Option<Lines>,
+    stop: &AtomicBool,
+) {
     let mut pressed = Pressed::default();
+    let mut state = None;
     let mut next = Instant::now();
     let mut number = 0_u64;
     while !stop.load(Ordering::Relaxed) {
         for (page, command) in server.commands() {
-            obey(page, &command, &locked(live), &mut pressed, buses);
+            let Command::Bench(command) = command else {
+                obey(page, &command, &locked(live), &mut pressed, buses);
+                continue;
+            };
+            if !bench.as_mut().is_some_and(|run| run.send(&command)) {
+                server.ignore();
+            }
+        }
+        if let Some(run) = &mut bench {
+            state = iter::from_fn(|| run.receive::<State>()).last().or(state);
+            if run.has_ended() {
+                stop.store(true, Ordering::Relaxed);
+            }
         }
         server.gone().into_iter().for_each(|page| pressed.release(page));
         let now = now();
@@ -181,7 +204,11 @@ fn publish(live: &Mutex<Live>, buses: &[Shared], server: &Server, stop: &AtomicB
             if server.pages() > 0 {
                 let snapshot = live.snapshot(now, &pressed);
                 let said = number.is_multiple_of(SAID_EVERY).then(|| {
-                    let text = |chosen| serde_json::to_string(&live.said(now, chosen)).unwrap_or_default();
+                    let text = |chosen: Option<Chosen>| {
+                        let cell = chosen.map(|chosen| (chosen.bus, chosen.node));
+                        let bench = state.as_ref().map(|state: &State| state.seen_from(cell));
+                        serde_json::to_string(&Said { bench, ..live.said(now, chosen) }).unwrap_or_default()
+                    };
                     let chosen = server.chosen().into_iter();
                     (
                         text(None),
@@ -213,9 +240,10 @@ fn obey(page: u64, command: &Command, live: &Live, pressed: &mut Pressed, buses:
         Command::Release => pressed.release(page),
         Command::Halt => everywhere(&Message::Halt),
         Command::Resume => everywhere(&Message::Resume),
-        // The server keeps these, and there is nothing to be played.
+        // The server keeps these, the run does them, and there is nothing to be played.
         Command::Choose(_)
         | Command::Unchoose
+        | Command::Bench(_)
         | Command::Play { .. }
         | Command::Pause
         | Command::Seek { .. }

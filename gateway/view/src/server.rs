@@ -30,7 +30,7 @@ const COMMANDS: usize = 256;
 pub struct Access {
     /// Where the server listens.
     pub listen: SocketAddr,
-    /// Whether pages may press cells, halt and resume.
+    /// Whether pages may press cells, halt and resume, and command the bench.
     pub may_act: bool,
     /// Whether there is a recording that pages may play.
     pub may_play: bool,
@@ -153,6 +153,11 @@ impl Server {
     /// The commands that pages have sent, each with the page's number.
     pub fn commands(&self) -> impl Iterator<Item = (u64, Command)> + '_ {
         self.commands.try_iter()
+    }
+
+    /// Counts a command that is not carried out.
+    pub fn ignore(&self) {
+        self.shared.ignored.fetch_add(1, Ordering::Relaxed);
     }
 
     /// Pages that have gone since the last call.

@@ -7,6 +7,7 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
         "/" => ("text/html; charset=utf-8", include_bytes!("../web/index.html")),
         "/style.css" => ("text/css; charset=utf-8", include_bytes!("../web/style.css")),
         "/app.js" => (SCRIPT, include_bytes!("../web/app.js")),
+        "/bench.js" => (SCRIPT, include_bytes!("../web/bench.js")),
         "/math.js" => (SCRIPT, include_bytes!("../web/math.js")),
         "/robot.js" => (SCRIPT, include_bytes!("../web/robot.js")),
         "/picture.js" => (SCRIPT, include_bytes!("../web/picture.js")),
@@ -29,10 +30,11 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
 mod tests {
     use super::*;
 
-    const FILES: [&str; 17] = [
+    const FILES: [&str; 18] = [
         "/",
         "/style.css",
         "/app.js",
+        "/bench.js",
         "/math.js",
         "/robot.js",
         "/picture.js",

@@ -1,5 +1,6 @@
 // The page: holds the newest of everything, and draws when something changed.
 
+import { Bench } from "./bench.js";
 import { Camera } from "./camera.js";
 import { SHOWS, css, ramp } from "./colours.js";
 import { hold } from "./frames.js";
@@ -48,6 +49,7 @@ function draw(still) {
   if (news) {
     said = null;
     words.say(scene, news, ask);
+    bench.say(scene, news.bench, chosen);
     plots.draw();
     camera.fit(extent(scene, all));
   }
@@ -95,6 +97,7 @@ function where(i) {
   return at && pick(scene, all, camera, view(), width, height, ...at) === i ? at : null;
 }
 
+const bench = new Bench((command) => link.send(command));
 const link = new Link({
   scene(it) {
     scene = it;

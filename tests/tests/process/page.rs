@@ -69,6 +69,24 @@ impl Page {
         self.say(&format!(r#"{{"do":"press","bus":0,"node":{node},"force_n":{force_n}}}"#));
     }
 
+    /// Commands the bench: `"on":"bus","down":true,"bus":0`.
+    pub(crate) fn command(&mut self, command: &str) {
+        self.say(&format!(r#"{{"do":"bench",{command}}}"#));
+    }
+
+    /// Does something to the process of a cell on the first bus.
+    pub(crate) fn act(&mut self, action: &str, node: u8) {
+        self.command(&format!(r#""on":"process","action":"{action}","bus":0,"node":{node}"#));
+    }
+
+    /// Waits for the answer to a command: whether it was carried out, and its text.
+    pub(crate) fn answer(&mut self, text: &str) -> bool {
+        let is_it = |answer: &&Value| answer["text"].as_str().unwrap().contains(text);
+        let answers = |said: &Value| said["bench"]["answers"].as_array().cloned().unwrap_or_default();
+        let said = self.hears(text, |said| answers(said).iter().any(|answer| is_it(&answer)));
+        answers(&said).iter().rfind(is_it).unwrap()["done"].as_bool().unwrap()
+    }
+
     /// Waits for a snapshot at which this holds.
     pub(crate) fn sees(&mut self, what: &str, mut is: impl FnMut(&Snapshot) -> bool) -> Snapshot {
         let give_up = Instant::now() + TIMEOUT;

@@ -33,6 +33,7 @@ use trace::recording::repair;
 use trace::recording::series::{Attached, Head, Series, Split};
 
 use crate::run::RunError;
+use crate::run::realtime::wall;
 use crate::setup::spawn;
 use trace::files::check_regular;
 
@@ -155,10 +156,11 @@ impl Outputs {
     pub fn start(self, feed: Feed, layout: Layout, head: Head) -> Result<Recorder, RunError> {
         let stop = Arc::new(Stop::default());
         let (tell, said) = mpsc::channel();
-        let work = thread::Work::new(self, feed, layout, tell);
+        let (notes, noted) = mpsc::channel();
+        let work = thread::Work::new(self, feed, layout, (noted, tell));
         let ended = Arc::clone(&stop);
         let thread = spawn("recorder", move || work.run(head, &ended))?;
-        Ok(Recorder { thread, stop, said })
+        Ok(Recorder { thread, stop, notes, said })
     }
 }
 
@@ -176,6 +178,7 @@ struct Stop {
 pub struct Recorder {
     thread: std::thread::JoinHandle<Recording>,
     stop: Arc<Stop>,
+    notes: mpsc::Sender<(u64, String)>,
     said: mpsc::Receiver<String>,
 }
 
@@ -183,6 +186,12 @@ impl Recorder {
     /// Messages for the user since the last call.
     pub fn said(&self) -> impl Iterator<Item = String> + '_ {
         self.said.try_iter()
+    }
+
+    /// Notes in a recording what is done to the bench now; a log has frames only.
+    pub fn note(&self, text: &str) {
+        // Without its thread nothing is recorded any more.
+        let _ = self.notes.send((wall(), text.to_owned()));
     }
 
     /// Ends the recording of a run that never began, and leaves only a log of received frames.

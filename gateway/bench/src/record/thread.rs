@@ -4,7 +4,7 @@ use std::io;
 use std::mem;
 use std::path::Path;
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::Sender;
+use std::sync::mpsc::{Receiver, Sender};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -64,6 +64,8 @@ pub(super) struct Work {
     files: Files,
     feed: Feed,
     layout: Layout,
+    /// What is done to the bench, and when.
+    noted: Receiver<(u64, String)>,
     tell: Sender<String>,
     /// How many errors were reported.
     reported: usize,
@@ -95,13 +97,19 @@ impl Every {
 }
 
 impl Work {
-    pub(super) fn new(outputs: Outputs, feed: Feed, layout: Layout, tell: Sender<String>) -> Self {
+    pub(super) fn new(
+        outputs: Outputs,
+        feed: Feed,
+        layout: Layout,
+        (noted, tell): (Receiver<(u64, String)>, Sender<String>),
+    ) -> Self {
         let Outputs { text, series } = outputs;
         let buses = feed.bus_feeds.iter().map(|_| Seen::default()).collect();
         Self {
             files: Files { text, series, errors: Vec::new() },
             feed,
             layout,
+            noted,
             tell,
             reported: 0,
             buses,
@@ -155,6 +163,9 @@ impl Work {
         for bus in 0..self.feed.bus_feeds.len() {
             most = most.max(self.take_frames(bus));
             self.take_touched(bus);
+        }
+        for (nanos, text) in self.noted.try_iter() {
+            self.files.note(nanos, "", NoteKind::Text, &text);
         }
         most
     }
@@ -289,7 +300,7 @@ impl Work {
             if frames > 0 {
                 let place = format!("CAN frames on '{name}' while nothing could be written");
                 // The log has them.
-                self.files.note(wall(), name, frames, &dropped(frames, &place, frames));
+                self.files.note(wall(), name, NoteKind::Dropped(frames), &dropped(frames, &place, frames));
             }
         }
     }
@@ -380,12 +391,11 @@ impl Files {
     fn dropped(&mut self, nanos: u64, interface: &str, frames: u64, place: &str, total: u64) {
         let line = dropped(frames, place, total);
         self.text(|text| text.note(&line));
-        self.note(nanos, interface, frames, &line);
+        self.note(nanos, interface, NoteKind::Dropped(frames), &line);
     }
 
     /// Notes it in the recording alone.
-    fn note(&mut self, nanos: u64, interface: &str, frames: u64, line: &str) {
-        let kind = NoteKind::Dropped(frames);
+    fn note(&mut self, nanos: u64, interface: &str, kind: NoteKind, line: &str) {
         let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
         self.put(Count::others(1), |writer, topics| topics.note(writer, &note));
     }

@@ -15,6 +15,7 @@ use protocol::packet::Epoch;
 use protocol::time::Micros;
 
 use super::Options;
+use super::commanded::Remote;
 use super::launch::{Processes, ServedBus};
 use super::link::{Link, Slot, may_return};
 use super::network::Network;
@@ -83,6 +84,8 @@ pub(super) struct Bench<'a> {
     pub(super) recorder: Option<Recorder>,
     /// The queue of loop records to be recorded.
     pub(super) recorded: Option<rtrb::Producer<Timed>>,
+    /// Who commands it, if anybody does.
+    pub(super) remote: Option<Remote>,
     // In this order they end: the cells before their buses.
     pub(super) processes: Processes,
     pub(super) served: Vec<ServedBus>,

@@ -19,6 +19,7 @@ use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, se
 use thiserror::Error;
 
 use super::RunError;
+use crate::remote::{Phase, ProcessState};
 use model::scenario::ProcessAction;
 
 /// Two gateways on one bus notice each other in this time.
@@ -156,6 +157,13 @@ impl ServedBus {
         &self.bus
     }
 
+    /// Ends its process, which takes its socket away; clients find a closed connection.
+    pub fn end(&mut self) {
+        // Its standard input ends, and so does it.
+        drop(self.child.stdin.take());
+        end(&mut [&mut self.child]);
+    }
+
     /// How its process ended, if it did.
     pub fn ended(&mut self) -> Option<ExitStatus> {
         self.child.try_wait().ok().flatten()
@@ -184,9 +192,7 @@ pub fn open_or_serve(
 
 impl Drop for ServedBus {
     fn drop(&mut self) {
-        // Its standard input ends, and so does it.
-        drop(self.child.stdin.take());
-        end(&mut [&mut self.child]);
+        self.end();
     }
 }
 
@@ -198,7 +204,7 @@ struct Process {
     bus: usize,
     nodes: (u8, u8),
     child: Child,
-    ended: bool,
+    phase: Phase,
 }
 
 /// A process that ended by itself or was killed; displayed as its cells.
@@ -263,7 +269,7 @@ impl Processes {
             for nodes in groups(&nodes, plan.per_process) {
                 let mut command = plan.of(&described.name, nodes);
                 let child = spawn(&mut command)?;
-                processes.all.push(Process { command, bus, nodes, child, ended: false });
+                processes.all.push(Process { command, bus, nodes, child, phase: Phase::Running });
             }
         }
         Ok(processes)
@@ -271,7 +277,12 @@ impl Processes {
 
     /// The process ids.
     pub fn pids(&self) -> impl Iterator<Item = u32> {
-        self.all.iter().filter(|process| !process.ended).map(|process| process.child.id())
+        self.all.iter().filter(|process| process.lives()).map(|process| process.child.id())
+    }
+
+    /// What each does.
+    pub fn states(&self) -> impl Iterator<Item = ProcessState> {
+        self.all.iter().map(Process::state)
     }
 
     /// Processes that have ended since the last call.
@@ -280,9 +291,9 @@ impl Processes {
         if !self.changed.swap(false, Ordering::Relaxed) {
             return ended;
         }
-        for process in self.all.iter_mut().filter(|process| !process.ended) {
+        for process in self.all.iter_mut().filter(|process| process.lives()) {
             if let Ok(Some(status)) = process.child.try_wait() {
-                process.ended = true;
+                process.phase = Phase::Ended;
                 ended.push(Ended { bus: process.bus, nodes: process.nodes, status });
             }
         }
@@ -294,18 +305,17 @@ impl Processes {
     /// # Errors
     /// When a process is to be started again and does not start.
     pub fn act(&mut self, bus: usize, node: u8, action: ProcessAction) -> Result<bool, LaunchError> {
-        let holds =
-            |process: &&mut Process| process.bus == bus && process.nodes.0 <= node && node <= process.nodes.1;
+        let holds = |process: &&mut Process| process.state().runs(bus, node);
         let Some(process) = self.all.iter_mut().find(holds) else { return Ok(false) };
         match action {
-            ProcessAction::Kill => process.signal(Signal::KILL),
-            ProcessAction::Stop => process.signal(Signal::STOP),
-            ProcessAction::Continue => process.signal(Signal::CONT),
+            ProcessAction::Kill => process.signal(Signal::KILL, Phase::Running),
+            ProcessAction::Stop => process.signal(Signal::STOP, Phase::Stopped),
+            ProcessAction::Continue => process.signal(Signal::CONT, Phase::Running),
             ProcessAction::Restart => {
-                process.signal(Signal::KILL);
+                process.signal(Signal::KILL, Phase::Ended);
                 let _ = process.child.wait();
                 process.child = spawn(&mut process.command)?;
-                process.ended = false;
+                process.phase = Phase::Running;
             }
         }
         Ok(true)
@@ -313,22 +323,32 @@ impl Processes {
 }
 
 impl Process {
-    fn signal(&self, signal: Signal) {
-        if let Some(pid) = Pid::from_raw(self.child.id().cast_signed()).filter(|_| !self.ended) {
+    const fn state(&self) -> ProcessState {
+        ProcessState { bus: self.bus, nodes: self.nodes, phase: self.phase }
+    }
+
+    fn lives(&self) -> bool {
+        self.phase != Phase::Ended
+    }
+
+    /// Sends it a signal, after which it is in a phase; one that has ended stays so.
+    fn signal(&mut self, signal: Signal, phase: Phase) {
+        if let Some(pid) = Pid::from_raw(self.child.id().cast_signed()).filter(|_| self.lives()) {
             let _ = kill_process(pid, signal);
+            self.phase = phase;
         }
     }
 }
 
 impl Drop for Processes {
     fn drop(&mut self) {
-        for process in &self.all {
+        for process in &mut self.all {
             // A stopped process would not handle the other signal.
-            process.signal(Signal::CONT);
-            process.signal(Signal::TERM);
+            process.signal(Signal::CONT, Phase::Running);
+            process.signal(Signal::TERM, Phase::Running);
         }
         let mut children: Vec<_> =
-            self.all.iter_mut().filter(|process| !process.ended).map(|process| &mut process.child).collect();
+            self.all.iter_mut().filter(|process| process.lives()).map(|process| &mut process.child).collect();
         end(&mut children);
     }
 }

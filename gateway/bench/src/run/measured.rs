@@ -8,6 +8,7 @@ use protocol::skin::Skin;
 use protocol::time::Span;
 
 use super::halts::Halts;
+use crate::remote::Lateness;
 use control::cycle::turn::Timed;
 use model::quantiles::{Quantiles, histogram};
 use model::scenario::Mode;
@@ -26,6 +27,11 @@ pub(super) struct Measured {
     pub(super) missing: [u64; 32],
     pub(super) halts: Halts,
     last: Option<Timed>,
+    /// Since when ticks are recorded in `recent`, and how late they began.
+    since: Instant,
+    recent: Histogram<u64>,
+    /// What is known of lateness, once a second.
+    pub(super) lateness: Lateness,
     pub(super) first_broadcast_s: Option<f64>,
 }
 
@@ -42,6 +48,9 @@ impl Measured {
             missing: [0; 32],
             halts: Halts::default(),
             last: None,
+            since: Instant::now(),
+            recent: histogram(),
+            lateness: Lateness::default(),
             first_broadcast_s: None,
         }
     }
@@ -54,6 +63,7 @@ impl Measured {
             self.ticks += 1;
             self.skipped += timed.record.skipped;
             record(&mut self.late, timed.late_ns);
+            record(&mut self.recent, timed.late_ns);
             record(&mut self.took, timed.took_ns);
             match timed.central {
                 Some((nanos, _)) => record(&mut self.central, nanos),
@@ -67,6 +77,12 @@ impl Measured {
             }
             self.halts.take(&timed);
             self.last = Some(timed);
+        }
+        if self.since.elapsed() >= Duration::from_secs(1) {
+            let [second, all] = [&self.recent, &self.late].map(|late| Quantiles::of(late, 1e-3));
+            self.lateness = Lateness { second, all, skipped: self.skipped };
+            self.since = Instant::now();
+            self.recent.reset();
         }
     }
 

@@ -13,6 +13,7 @@
 
 mod begin;
 mod bench;
+mod commanded;
 mod end;
 mod error;
 mod halts;
@@ -36,8 +37,10 @@ use std::path::PathBuf;
 use protocol::bus::Kinds;
 use protocol::skin::Skin;
 
+use self::commanded::Remote;
 pub use self::error::RunError;
 pub use self::network::TooDeep;
+use crate::remote::Lines;
 use crate::summary::Summary;
 use model::scenario::Scenario;
 
@@ -72,11 +75,12 @@ pub struct Options {
     pub quiet: bool,
 }
 
-/// Runs a bench to its end, or until SIGINT or SIGTERM. A run that fails has a summary too, with the reason.
+/// Runs a bench to its end, or until SIGINT or SIGTERM. A run that fails has a summary too, with the reason. While the
+/// loop runs, `remote` commands the bench.
 ///
 /// # Errors
 /// When it cannot begin because of wrong use or configuration; cells and buses that were started are ended again.
-pub fn run(options: &Options) -> Result<Summary, RunError> {
+pub fn run(options: &Options, remote: Option<Lines>) -> Result<Summary, RunError> {
     let mut bench = match start::start(options) {
         Ok(bench) => bench,
         Err(error) if error.exit_code() == 1 => {
@@ -84,6 +88,7 @@ pub fn run(options: &Options) -> Result<Summary, RunError> {
         }
         Err(error) => return Err(error),
     };
+    bench.remote = remote.map(Remote::new);
     match bench.begin() {
         Ok(()) => Ok(bench.watch()),
         Err(error) => bench.give_up(error),

@@ -184,6 +184,15 @@ impl Network {
         self.reported_links_down.renew(to);
     }
 
+    /// The links that are to be down in one direction or in both, each once: its cells, the smaller node id first.
+    pub(super) fn links_down(&self) -> BTreeSet<[CellId; 2]> {
+        let ports = |(&to, &bits): (&CellId, &u8)| {
+            let down = (0..PORTS).filter(move |port| bits >> port & 1 == 1);
+            down.filter_map(move |port| self.wires.other_end(to, port)).map(move |(from, _)| (from, to))
+        };
+        self.deaf.iter().flat_map(ports).map(|(from, to)| [from.min(to), from.max(to)]).collect()
+    }
+
     /// Messages for cells whose links are to go down, or up again.
     fn report_links_down(&mut self, now: Micros, view: &View) -> Vec<Message> {
         let target = |node: &CellId| self.deaf.get(node).copied();
@@ -374,6 +383,12 @@ mod tests {
         assert_eq!(look(&mut network, 0b10), []);
         network.set_link_down(true, cell(1), cell(2));
         assert_eq!(look(&mut network, 0b10), [(2, 0b11)]);
+        network.set_link_down(true, cell(2), cell(1));
+        assert_eq!(
+            network.links_down().into_iter().collect::<Vec<_>>(),
+            [[cell(1), cell(2)], [cell(2), cell(3)]]
+        );
+        network.set_link_down(false, cell(2), cell(1));
         network.set_link_down(false, cell(3), cell(2));
         assert_eq!(look(&mut network, 0b11), [(2, 0b01)]);
         assert_eq!(look(&mut network, 0b01), []);

@@ -95,6 +95,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         first_epoch: Epoch(0),
         recorder,
         recorded,
+        remote: None,
         processes: Processes::default(),
         served,
     })

@@ -16,7 +16,7 @@ use protocol::skin::Cell;
 use super::RunError;
 use super::begin::{Announced, SWITCH_AGAIN};
 use super::bench::Bench;
-use super::launch::{ServedBus, program};
+use super::commanded::serve;
 use super::link::Slot;
 use super::measured::Measured;
 use super::progress::Progress;
@@ -141,6 +141,7 @@ impl Bench<'_> {
             return Err(RunError::ReceiverEnded);
         }
         self.inject_faults(script, progress)?;
+        self.obey(measured, progress);
         self.hear(script, progress)?;
         self.serve_again(progress);
         for note in self.watch_networks()? {
@@ -257,6 +258,12 @@ impl Bench<'_> {
         progress.note(&format!("scenario: {what} {begin} cell {from} {end} cell {to} on {bus}"));
     }
 
+    /// Whether all buses are gone, and none is to come back by a command.
+    fn has_no_bus(&self) -> bool {
+        let mut buses = self.bus_links.iter().enumerate();
+        buses.all(|(bus, bus_link)| bus_link.link.is_gone() && !self.is_taken_down(bus))
+    }
+
     /// Handles the events of receivers and processes.
     fn hear(&mut self, script: &Script, progress: &Progress) -> Result<(), RunError> {
         let bus_event: Vec<_> = self.bus_event.try_iter().collect();
@@ -287,12 +294,11 @@ impl Bench<'_> {
                 }
                 BusEvent::Down(why) => progress.note(&why.to_string()),
                 BusEvent::Up => {
+                    self.is_up_again(bus);
                     progress.note(&format!("{} works again", self.name(bus)));
                 }
-                // Without any bus there is no torque.
-                BusEvent::Lost(why) if self.bus_links.iter().all(|bus_link| bus_link.link.is_gone()) => {
-                    return Err(RunError::Lost(why));
-                }
+                // Without any bus there is no torque, unless one is to come back.
+                BusEvent::Lost(why) if self.has_no_bus() => return Err(RunError::Lost(why)),
                 BusEvent::Lost(why) => {
                     progress
                         .note(&format!("{why}; the others go on, and it is opened again when it is back"));
@@ -324,18 +330,15 @@ impl Bench<'_> {
         Ok(())
     }
 
-    /// Serves embedded buses again that were ours and whose processes have ended.
+    /// Serves embedded buses again that were ours and whose processes have ended, unless a command has taken them down.
     fn serve_again(&mut self, progress: &Progress) {
-        let gone: Vec<_> = self.bus_links.iter().filter(|bus_link| bus_link.link.is_gone()).collect();
-        for served in &mut self.served {
-            let name = served.bus().to_owned();
-            if !gone.iter().any(|bus_link| bus_link.link.name == name) {
-                continue;
-            }
+        let gone = self.bus_links.iter().enumerate();
+        let gone = gone.filter(|&(bus, bus_link)| bus_link.link.is_gone() && !self.is_taken_down(bus));
+        let gone: Vec<_> = gone.map(|(_, bus_link)| bus_link.link.name.clone()).collect();
+        for served in self.served.iter_mut().filter(|served| gone.iter().any(|name| name == served.bus())) {
             let Some(status) = served.ended() else { continue };
-            let again = program("vcan-setup", self.options.vcan_setup.as_deref())
-                .and_then(|program| ServedBus::start(&program, &name, self.options.directory.as_deref()));
-            progress.note(&match again {
+            let name = served.bus().to_owned();
+            progress.note(&match serve(self.options, &name) {
                 Ok(again) => {
                     *served = again;
                     format!("the process that served {name} ended ({status}); it is served again")

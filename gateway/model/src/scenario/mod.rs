@@ -16,6 +16,7 @@ use protocol::document::{self, DocumentError};
 use protocol::fixed::{Q1_14, Q9_6};
 use protocol::skin::{KEYS, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::{Micros, Span};
+use serde::{Deserialize, Serialize};
 
 pub use touches::{MAX_FORCE_N, Stimulus, Touches, contact_words};
 
@@ -225,7 +226,8 @@ impl FaultKind {
 }
 
 /// What is done to a process.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+#[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum ProcessAction {
     /// `kill`: it ends at once.
     Kill,
@@ -235,6 +237,19 @@ pub enum ProcessAction {
     Continue,
     /// `restart`: it is restarted, or started if it has ended.
     Restart,
+}
+
+impl ProcessAction {
+    /// Its name in a scenario's file.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Kill => "kill",
+            Self::Stop => "stop",
+            Self::Continue => "continue",
+            Self::Restart => "restart",
+        }
+    }
 }
 
 /// How a cell measures wrongly.

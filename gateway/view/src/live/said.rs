@@ -1,5 +1,6 @@
 //! What changes more slowly, as JSON for the page.
 
+use bench::remote::State;
 use model::table::{Event, Status};
 use protocol::fixed::is_saturated;
 use protocol::id::CellId;
@@ -33,6 +34,8 @@ pub struct Said {
     pub detail: Option<Detail>,
     /// Where in a recording this is.
     pub playback: Option<Playback>,
+    /// What the run that the page belongs to says of itself; of its processes only that of the chosen cell.
+    pub bench: Option<State>,
 }
 
 /// A cell that fell silent.
@@ -153,6 +156,7 @@ impl Live {
             buses: self.buses.iter().map(LiveBus::said).collect(),
             detail: chosen.and_then(|chosen| self.detail(chosen, now)),
             playback: None,
+            bench: None,
         }
     }
 

@@ -2,6 +2,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
+import { about, allowed, isDown, processOf } from "../bench.js";
 import { Camera } from "../camera.js";
 import { SHAPES, ramp, shapeOf } from "../colours.js";
 import { cellOf, decode, decodeHistory } from "../link.js";
@@ -171,4 +172,17 @@ test("a frame is followed by as long a pause as it took, and software has a limi
   assert.ok(Math.abs(soft.wait(1002) - (1000 / SOFTWARE_HZ - 2)) < 1e-9);
   assert.deepEqual([soft.ratio(1, false), soft.ratio(3, false), soft.ratio(1, true)], [1, 1, 2]);
   assert.deepEqual([pace.ratio(1, false), pace.ratio(3, true)], [1, 2]);
+});
+
+test("a process offers what makes sense, and says which cells it runs", () => {
+  const state = { processes: [{ bus: 1, nodes: [1, 63], phase: "running" }], links_down: [{ bus: 1, nodes: [4, 9] }] };
+  const process = processOf(state, { bus: 1, node: 63 });
+  assert.deepEqual(allowed(process), ["kill", "stop", "restart"]);
+  assert.match(about(process), /cells 1 to 63: .* is running\.$/);
+  assert.deepEqual(allowed({ phase: "stopped" }), ["kill", "continue", "restart"]);
+  assert.deepEqual(allowed({ phase: "ended" }), ["restart"]);
+  for (const other of [{ bus: 0, node: 5 }, { bus: 1, node: 64 }, undefined]) assert.deepEqual(allowed(processOf(state, other)), []);
+  assert.equal(about({ nodes: [7, 7], phase: "ended" }), "The process of this cell has ended.");
+  assert.deepEqual([[9, 4], [4, 9], [4, 5]].map(([a, b]) => isDown(state, 1, a, b)), [true, true, false]);
+  assert.equal(isDown(state, 0, 4, 9), false);
 });

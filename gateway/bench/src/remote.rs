@@ -1,0 +1,316 @@
+//! A run that another process commands: lines of JSON over two pipes, at which neither side waits.
+//!
+//! ```text
+//!   server of the page ── Command ──> main thread of the run
+//!   server of the page <── State ──── main thread of the run
+//! ```
+//!
+//! A [`State`] holds everything, so that one that did not fit into the pipe is not needed once the next one did.
+
+use std::io;
+use std::os::fd::OwnedFd;
+
+use model::quantiles::Quantiles;
+use model::scenario::ProcessAction;
+use rustix::io::{Errno, ioctl_fionbio, read, write};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+
+/// Bytes that are read at once.
+const PIECE: usize = 4_096;
+/// The longest line, in bytes: the state of 16 buses with a process for each cell is shorter.
+const LONGEST: usize = 1 << 20;
+
+/// A command to a bench. Buses are indices into the skin's.
+#[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
+#[serde(tag = "on", rename_all = "lowercase", deny_unknown_fields)]
+pub enum Command {
+    /// Does something to the process of a cell, and so to all cells of that process.
+    Process {
+        /// What.
+        action: ProcessAction,
+        /// The cell's bus.
+        bus: usize,
+        /// Its node id.
+        node: u8,
+    },
+    /// Takes the link between two cells down in both directions, or up again.
+    Link {
+        /// Whether it is to be down.
+        down: bool,
+        /// The cells' bus.
+        bus: usize,
+        /// Their node ids.
+        nodes: [u8; 2],
+    },
+    /// Takes a bus down, or up again.
+    Bus {
+        /// Whether it is to be down.
+        down: bool,
+        /// The bus.
+        bus: usize,
+    },
+}
+
+/// What is known of a bench that is commanded.
+#[derive(Clone, Debug, Default, Deserialize, PartialEq, Serialize)]
+pub struct State {
+    /// The processes of cells that the run has started.
+    pub processes: Vec<ProcessState>,
+    /// Links that are down, in one direction or in both.
+    pub links_down: Vec<LinkDown>,
+    /// Each bus.
+    pub buses: Vec<BusState>,
+    /// How late ticks began.
+    pub lateness: Lateness,
+    /// The last answers to commands, oldest first.
+    pub answers: Vec<Answer>,
+}
+
+impl State {
+    /// The same with the process of one cell only, or with none.
+    #[must_use]
+    pub fn seen_from(&self, cell: Option<(usize, u8)>) -> Self {
+        let is_its = |process: &&ProcessState| cell.is_some_and(|(bus, node)| process.runs(bus, node));
+        let processes = self.processes.iter().filter(is_its).copied().collect();
+        Self { processes, ..self.clone() }
+    }
+}
+
+/// A process of cells.
+#[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
+pub struct ProcessState {
+    /// Its bus.
+    pub bus: usize,
+    /// The first and the last of its cells.
+    pub nodes: (u8, u8),
+    /// What it does.
+    pub phase: Phase,
+}
+
+impl ProcessState {
+    /// Whether it runs this cell.
+    #[must_use]
+    pub const fn runs(&self, bus: usize, node: u8) -> bool {
+        self.bus == bus && self.nodes.0 <= node && node <= self.nodes.1
+    }
+}
+
+/// What a process does.
+#[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Phase {
+    /// It runs.
+    Running,
+    /// This run has stopped it.
+    Stopped,
+    /// It has ended.
+    Ended,
+}
+
+/// A link that is down.
+#[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
+pub struct LinkDown {
+    /// The bus of its cells.
+    pub bus: usize,
+    /// Their node ids, the smaller one first.
+    pub nodes: [u8; 2],
+}
+
+/// A bus.
+#[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
+pub struct BusState {
+    /// Whether a command has taken it down.
+    pub down: bool,
+    /// Whether its cells have links that can be taken down: they answer with sums.
+    pub links: bool,
+}
+
+/// How late ticks began, in µs.
+#[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
+pub struct Lateness {
+    /// Those of the last full second.
+    pub second: Quantiles,
+    /// All.
+    pub all: Quantiles,
+    /// Ticks that were skipped, because they were late by a period or more.
+    pub skipped: u64,
+}
+
+/// The answer to a command.
+#[derive(Clone, Debug, Deserialize, Eq, PartialEq, Serialize)]
+pub struct Answer {
+    /// Its number, from 1.
+    pub number: u64,
+    /// Whether the command was carried out; else it was refused.
+    pub done: bool,
+    /// What was done, or the command and why it was refused.
+    pub text: String,
+}
+
+/// One side of two pipes.
+#[derive(Debug)]
+pub struct Lines {
+    input: OwnedFd,
+    output: OwnedFd,
+    /// Received, and not taken.
+    received: Vec<u8>,
+    /// Sent, and not written.
+    unwritten: Vec<u8>,
+    ended: bool,
+}
+
+impl Lines {
+    /// Reads from one pipe and writes to another; both are set not to block.
+    ///
+    /// # Errors
+    /// When one of them cannot be set so.
+    pub fn new(input: impl Into<OwnedFd>, output: impl Into<OwnedFd>) -> io::Result<Self> {
+        let (input, output) = (input.into(), output.into());
+        ioctl_fionbio(&input, true)?;
+        ioctl_fionbio(&output, true)?;
+        Ok(Self { input, output, received: Vec::new(), unwritten: Vec::new(), ended: false })
+    }
+
+    /// Whether the other side has ended.
+    #[must_use]
+    pub const fn has_ended(&self) -> bool {
+        self.ended
+    }
+
+    /// Sends a value as one line. Whether there was room for it: as long as the one before is not written, there is none.
+    pub fn send(&mut self, value: &impl Serialize) -> bool {
+        self.flush();
+        if self.ended || !self.unwritten.is_empty() {
+            return false;
+        }
+        let Ok(mut line) = serde_json::to_vec(value) else { return false };
+        line.push(b'\n');
+        self.unwritten = line;
+        self.flush();
+        !self.ended
+    }
+
+    fn flush(&mut self) {
+        while !self.unwritten.is_empty() {
+            match write(&self.output, &self.unwritten) {
+                Ok(written) => _ = self.unwritten.drain(..written),
+                Err(Errno::INTR) => {}
+                Err(Errno::AGAIN) => return,
+                Err(_) => {
+                    self.ended = true;
+                    self.unwritten.clear();
+                }
+            }
+        }
+    }
+
+    /// The next line's value, if one has come. Lines that are no such value, or too long, are passed over.
+    pub fn receive<T: DeserializeOwned>(&mut self) -> Option<T> {
+        loop {
+            if let Some(end) = self.received.iter().position(|&byte| byte == b'\n') {
+                let line: Vec<_> = self.received.drain(..=end).collect();
+                if let Ok(value) = serde_json::from_slice(&line) {
+                    return Some(value);
+                }
+            } else if !self.read() {
+                return None;
+            }
+        }
+    }
+
+    /// Reads what has come; whether that was anything.
+    fn read(&mut self) -> bool {
+        let mut piece = [0; PIECE];
+        if self.received.len() > LONGEST {
+            self.received.clear();
+        }
+        match read(&self.input, &mut piece) {
+            Ok(0) => self.ended = true,
+            Ok(count) => {
+                self.received.extend(piece.iter().take(count));
+                return true;
+            }
+            Err(Errno::AGAIN | Errno::INTR) => {}
+            Err(_) => self.ended = true,
+        }
+        false
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::{Write, pipe};
+
+    /// Both sides.
+    fn pair() -> (Lines, Lines) {
+        let ((one_in, two_out), (two_in, one_out)) = (pipe().unwrap(), pipe().unwrap());
+        (Lines::new(one_in, one_out).unwrap(), Lines::new(two_in, two_out).unwrap())
+    }
+
+    #[test]
+    fn commands_are_json_and_nothing_else_is_one() {
+        let read = |text: &str| serde_json::from_str::<Command>(text).ok();
+        let kill = Command::Process { action: ProcessAction::Kill, bus: 0, node: 12 };
+        assert_eq!(read(r#"{"on":"process","action":"kill","bus":0,"node":12}"#), Some(kill));
+        let link = Command::Link { down: true, bus: 1, nodes: [3, 4] };
+        assert_eq!(read(r#"{"on":"link","down":true,"bus":1,"nodes":[3,4]}"#), Some(link));
+        assert_eq!(read(r#"{"on":"bus","down":false,"bus":0}"#), Some(Command::Bus { down: false, bus: 0 }));
+        for wrong in [
+            r#"{"on":"process","action":"shoot","bus":0,"node":12}"#,
+            r#"{"on":"process","action":"kill","bus":0,"node":256}"#,
+            r#"{"on":"process","action":"kill","bus":-1,"node":1}"#,
+            r#"{"on":"process","action":"kill","bus":0,"node":1,"pid":1}"#,
+            r#"{"on":"link","down":true,"bus":1,"nodes":[3]}"#,
+            r#"{"on":"bus","bus":0}"#,
+            r#"{"on":"machine","down":true}"#,
+        ] {
+            assert_eq!(read(wrong), None, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn values_come_as_they_were_sent_and_other_lines_are_passed_over() {
+        let (mut run, mut page) = pair();
+        let command = Command::Bus { down: true, bus: 2 };
+        assert_eq!(run.receive::<Command>(), None);
+        assert!(page.send(&"no command") && page.send(&command) && page.send(&command));
+        assert_eq!((run.receive(), run.receive()), (Some(command), Some(command)));
+        assert_eq!((run.receive::<Command>(), run.has_ended()), (None, false));
+        let answers = vec![Answer { number: 1, done: false, text: "\"a\"\nb".to_owned() }];
+        let process = ProcessState { bus: 1, nodes: (1, 63), phase: Phase::Stopped };
+        let state = State { answers, processes: vec![process; 3_000], ..State::default() };
+        // More than a pipe holds.
+        assert!(run.send(&state) && !run.send(&state));
+        let mut received = None;
+        while received.is_none() {
+            received = page.receive::<State>();
+            run.flush();
+        }
+        assert_eq!(received, Some(state));
+        drop(run);
+        assert_eq!((page.receive::<State>(), page.has_ended()), (None, true));
+        assert!(!page.send(&command));
+    }
+
+    #[test]
+    fn a_side_that_reads_nothing_or_ends_no_line_holds_nothing_up() {
+        let (mut run, page) = pair();
+        let sent = (0..100_000).take_while(|_| run.send(&State::default())).count();
+        assert!((100..10_000).contains(&sent), "{sent}: a pipe holds 64 KiB");
+        assert!(!run.has_ended());
+        drop(page);
+        assert!(!run.send(&State::default()) && run.has_ended());
+
+        let ((input, mut other), (_reader, output)) = (pipe().unwrap(), pipe().unwrap());
+        let mut lines = Lines::new(input, output).unwrap();
+        for _ in 0..40 {
+            other.write_all(&[b'x'; 60_000]).unwrap();
+            assert_eq!(lines.receive::<Command>(), None);
+        }
+        assert!(lines.received.len() <= LONGEST + 60_000);
+        other.write_all(b"\n{\"on\":\"bus\",\"down\":true,\"bus\":0}\n").unwrap();
+        assert_eq!(lines.receive(), Some(Command::Bus { down: true, bus: 0 }));
+    }
+}

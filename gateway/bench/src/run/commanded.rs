@@ -1,0 +1,278 @@
+//! Commands to a run from another process: checked, carried out, noted, and answered with the state of the bench.
+
+use std::collections::BTreeSet;
+use std::io;
+use std::time::{Duration, Instant};
+
+use protocol::bus::BusKind;
+use protocol::skin::{Cell, Skin};
+use thiserror::Error;
+use vcan_setup::link::Kind;
+use vcan_setup::netlink::Netlink;
+
+use super::Options;
+use super::bench::Bench;
+use super::launch::{LaunchError, ServedBus, program};
+use super::measured::Measured;
+use super::progress::Progress;
+use crate::remote::{Answer, BusState, Command, Lines, LinkDown, Phase, ProcessState, State};
+use model::scenario::ProcessAction;
+
+/// Commands that are carried out at once, so that stimuli are not late.
+const AT_ONCE: usize = 4;
+/// From one state to the next.
+const EVERY: Duration = Duration::from_millis(200);
+/// Answers that are kept.
+const ANSWERS: usize = 8;
+
+/// Who commands a run, and what it was answered.
+#[derive(Debug)]
+pub(super) struct Remote {
+    lines: Lines,
+    /// Buses that it has taken down.
+    down: BTreeSet<usize>,
+    answers: Vec<Answer>,
+    /// How many answers there were.
+    count: u64,
+    due: Instant,
+}
+
+/// Why a command is not carried out.
+#[derive(Debug, Error)]
+enum Refused {
+    #[error("the skin has no such bus")]
+    NoBus,
+    #[error("the skin has no such cell")]
+    NoCell,
+    #[error("this run has started no process of it")]
+    NoProcess,
+    #[error("its process is {}", match .0 { Phase::Running => "running", Phase::Stopped => "stopped", Phase::Ended => "ended: restart starts it again" })]
+    Phase(Phase),
+    #[error("the skin has no wire between them")]
+    NoWire,
+    #[error("cells of this bus answer with their own torques: no link carries anything")]
+    NoLinks,
+    #[error("it is not {0} by a command")]
+    Already(&'static str),
+    #[error("another program serves it: end that one")]
+    NotServed,
+    #[error("it is no virtual interface: only vcan, vxcan and embedded buses are taken down here")]
+    NotVirtual,
+    #[error("there is no such interface")]
+    NoInterface,
+    #[error(
+        "{source}; a run that may not do it needs CAP_NET_ADMIN, or `sudo ip link set {name} {state}` does it"
+    )]
+    Interface { name: String, state: &'static str, source: io::Error },
+    #[error(transparent)]
+    Launch(#[from] LaunchError),
+}
+
+impl Remote {
+    pub(super) fn new(lines: Lines) -> Self {
+        Self { lines, down: BTreeSet::new(), answers: Vec::new(), count: 0, due: Instant::now() }
+    }
+
+    fn answer(&mut self, done: bool, text: String) {
+        self.count += 1;
+        if self.answers.len() >= ANSWERS {
+            self.answers.remove(0);
+        }
+        self.answers.push(Answer { number: self.count, done, text });
+        self.due = Instant::now();
+    }
+}
+
+impl Bench<'_> {
+    /// Whether a command has taken a bus down.
+    pub(super) fn is_taken_down(&self, bus: usize) -> bool {
+        self.remote.as_ref().is_some_and(|remote| remote.down.contains(&bus))
+    }
+
+    /// A bus works: nobody has it down.
+    pub(super) fn is_up_again(&mut self, bus: usize) {
+        self.remote.iter_mut().for_each(|remote| _ = remote.down.remove(&bus));
+    }
+
+    /// Carries out the commands that have come, and sends the state when it is time. With its other side a remote ends, and
+    /// buses that it has taken down are as any that were lost.
+    pub(super) fn obey(&mut self, measured: &Measured, progress: &Progress) {
+        let Some(mut remote) = self.remote.take().filter(|remote| !remote.lines.has_ended()) else { return };
+        for _ in 0..AT_ONCE {
+            let Some(command) = remote.lines.receive() else { break };
+            let what = self.words(command);
+            match self.carry_out(command, &mut remote.down) {
+                Ok(()) => {
+                    let note = format!("view: {what}");
+                    progress.note(&note);
+                    self.recorder.iter().for_each(|recorder| recorder.note(&note));
+                    remote.answer(true, what);
+                }
+                Err(why) => remote.answer(false, format!("{what}: {why}")),
+            }
+        }
+        let now = Instant::now();
+        if now >= remote.due {
+            remote.due = now + EVERY;
+            let state = self.state(&remote, measured);
+            remote.lines.send(&state);
+        }
+        self.remote = Some(remote);
+    }
+
+    /// A command as text.
+    fn words(&self, command: Command) -> String {
+        let switched = |down: bool| if down { "down" } else { "up" };
+        match command {
+            Command::Process { action, bus, node } => {
+                let (action, name) = (action.name(), self.name(bus));
+                match self.process(bus, node).map(|process| process.nodes) {
+                    Some((first, last)) if first != last => {
+                        format!("{action} cells {first} to {last} on {name}")
+                    }
+                    Some(_) | None => format!("{action} cell {node} on {name}"),
+                }
+            }
+            Command::Link { down, bus, nodes: [one, other] } => {
+                format!("link {} between cell {one} and cell {other} on {}", switched(down), self.name(bus))
+            }
+            Command::Bus { down, bus } => format!("bus {} {}", self.name(bus), switched(down)),
+        }
+    }
+
+    fn carry_out(&mut self, command: Command, down: &mut BTreeSet<usize>) -> Result<(), Refused> {
+        match command {
+            Command::Process { action, bus, node } => self.act(action, bus, node),
+            Command::Link { down, bus, nodes } => self.command_link(down, bus, nodes),
+            Command::Bus { down: true, bus } if down.contains(&bus) => Err(Refused::Already("up")),
+            Command::Bus { down: false, bus } if !down.contains(&bus) => Err(Refused::Already("down")),
+            Command::Bus { down: true, bus } => self.switch_bus(true, bus).map(|()| _ = down.insert(bus)),
+            Command::Bus { down: false, bus } => self.switch_bus(false, bus).map(|()| _ = down.remove(&bus)),
+        }
+    }
+
+    /// The process of a cell.
+    fn process(&self, bus: usize, node: u8) -> Option<ProcessState> {
+        self.processes.states().find(|process| process.runs(bus, node))
+    }
+
+    fn act(&mut self, action: ProcessAction, bus: usize, node: u8) -> Result<(), Refused> {
+        cell(&self.options.skin, bus, node)?;
+        let phase = self.process(bus, node).ok_or(Refused::NoProcess)?.phase;
+        match (action, phase) {
+            (ProcessAction::Restart, _)
+            | (ProcessAction::Kill, Phase::Running | Phase::Stopped)
+            | (ProcessAction::Stop, Phase::Running)
+            | (ProcessAction::Continue, Phase::Stopped) => {}
+            (_, phase) => return Err(Refused::Phase(phase)),
+        }
+        self.processes.act(bus, node, action)?;
+        Ok(())
+    }
+
+    fn command_link(&mut self, down: bool, bus: usize, [one, other]: [u8; 2]) -> Result<(), Refused> {
+        let skin = &self.options.skin;
+        let (one, other) = (cell(skin, bus, one)?, cell(skin, bus, other)?);
+        if !one.neighbors.contains(&Some(other.node)) {
+            return Err(Refused::NoWire);
+        }
+        let network = self.bus_links.get_mut(bus).and_then(|bus_link| bus_link.network.as_mut());
+        let network = network.ok_or(Refused::NoLinks)?;
+        network.set_link_down(down, one.node, other.node);
+        network.set_link_down(down, other.node, one.node);
+        Ok(())
+    }
+
+    fn switch_bus(&mut self, down: bool, bus: usize) -> Result<(), Refused> {
+        let link = &self.bus_links.get(bus).ok_or(Refused::NoBus)?.link;
+        match link.kind {
+            BusKind::Embedded => {
+                let served = self.served.iter_mut().find(|served| served.bus() == link.name);
+                let served = served.ok_or(Refused::NotServed)?;
+                if down {
+                    served.end();
+                } else {
+                    *served = serve(self.options, &link.name)?;
+                }
+                Ok(())
+            }
+            BusKind::SocketCan => switch_interface(&link.name, down),
+        }
+    }
+
+    fn state(&self, remote: &Remote, measured: &Measured) -> State {
+        let networks = self.bus_links.iter().enumerate();
+        let networks = networks.filter_map(|(bus, bus_link)| Some((bus, bus_link.network.as_ref()?)));
+        let links_down = networks.flat_map(|(bus, network)| {
+            let pairs = network.links_down().into_iter();
+            pairs.map(move |[one, other]| LinkDown { bus, nodes: [one.get(), other.get()] })
+        });
+        let buses = self.bus_links.iter().enumerate().map(|(bus, bus_link)| BusState {
+            down: remote.down.contains(&bus),
+            links: bus_link.network.is_some(),
+        });
+        State {
+            processes: self.processes.states().collect(),
+            links_down: links_down.collect(),
+            buses: buses.collect(),
+            lateness: measured.lateness,
+            answers: remote.answers.clone(),
+        }
+    }
+}
+
+/// Serves an embedded bus.
+pub(super) fn serve(options: &Options, bus: &str) -> Result<ServedBus, LaunchError> {
+    let program = program("vcan-setup", options.vcan_setup.as_deref())?;
+    ServedBus::start(&program, bus, options.directory.as_deref())
+}
+
+/// A cell of the skin.
+fn cell(skin: &Skin, bus: usize, node: u8) -> Result<&Cell, Refused> {
+    if bus >= skin.buses.len() {
+        return Err(Refused::NoBus);
+    }
+    skin.cells.iter().find(|cell| cell.bus == bus && cell.node.get() == node).ok_or(Refused::NoCell)
+}
+
+/// Brings an interface of the kernel down, or up again.
+fn switch_interface(name: &str, down: bool) -> Result<(), Refused> {
+    let state = if down { "down" } else { "up" };
+    let failed = |source| Refused::Interface { name: name.to_owned(), state, source };
+    let mut netlink = Netlink::open().map_err(failed)?;
+    let interfaces = netlink.interfaces().map_err(failed)?;
+    let interface = interfaces.into_iter().find(|interface| interface.name == name);
+    let interface = interface.ok_or(Refused::NoInterface)?;
+    match interface.kind {
+        Kind::Vcan | Kind::Vxcan(_) => netlink.set_up(interface.index, !down).map_err(failed),
+        Kind::Hardware(_) | Kind::Other(_) => Err(Refused::NotVirtual),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_virtual_interfaces_are_taken_down() {
+        assert!(matches!(switch_interface("lo", true), Err(Refused::NotVirtual)));
+        assert!(matches!(switch_interface("no-such-one", true), Err(Refused::NoInterface)));
+    }
+
+    #[test]
+    fn a_refusal_says_why_in_one_line() {
+        let source = io::Error::from_raw_os_error(1);
+        let refused = Refused::Interface { name: "vcan0".to_owned(), state: "down", source };
+        let why = "Operation not permitted (os error 1); a run that may not do it needs CAP_NET_ADMIN, or `sudo ip \
+                   link set vcan0 down` does it";
+        assert_eq!(refused.to_string(), why);
+    }
+
+    #[test]
+    fn cells_are_those_of_the_skin() {
+        let skin = Skin::parse("skin.toml", model::testing::SKIN).unwrap();
+        assert_eq!(cell(&skin, 0, 1).unwrap().node.get(), 1);
+        assert!(matches!(cell(&skin, 0, 200), Err(Refused::NoCell)));
+        assert!(matches!(cell(&skin, usize::MAX, 1), Err(Refused::NoBus)));
+    }
+}
