@@ -7,12 +7,14 @@ mod process;
 
 use model::generate::{Target, generate};
 use process::buses::{carries, mixed_skin};
+use process::page::{Page, watched_skin};
 use process::test_client::TestClient;
 use process::vcan::{Vcan, tool};
 use process::{PRESSED, Place, Running, until};
 use protocol::bus::{BusKind, Choice};
 use protocol::can::Format;
 use rustix::process::Signal;
+use serde_json::Value;
 
 /// vcan0 is there already; vcan1 is a classic interface; vcan3 is an embedded bus.
 const BUSES: [(&str, Format, BusKind); 4] = [
@@ -144,5 +146,40 @@ fn a_bus_that_is_missing_when_a_run_begins_is_refused_with_its_hint() {
         refused.refusal(2).starts_with("gateway: there is no interface vcan3: make it with `"),
         "{refused:#?}"
     );
+    place.is_left_clean();
+}
+
+#[test]
+#[ignore = "needs vcan"]
+fn a_page_takes_an_interface_down_and_up() {
+    let place = Place::on_vcan();
+    let slow = Target { cells: 4, broadcast_hz: 20.0, ..Target::default() };
+    place.write("skin.toml", &generate(&slow).unwrap());
+    let (run, address) = watched_skin(&place, "");
+    let mut page = Page::new(&address);
+    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.command(r#""on":"bus","down":true,"bus":0"#);
+    assert!(page.answer("bus vcan0 down"));
+    let is_up = || {
+        let shown: Value = serde_json::from_slice(&tool("ip -json link show vcan0").stdout).unwrap();
+        shown[0]["flags"].as_array().unwrap().iter().any(|flag| flag == "UP")
+    };
+    assert!(!is_up());
+    page.hears("the bus down", |said| {
+        said["buses"][0]["up"] == false && said["bench"]["buses"][0]["down"] == true
+    });
+    page.sees("silent cells", |it| it.cells.iter().all(|cell| cell.0 == 4));
+    let said = page.hears("words", |_| true);
+    assert_eq!(said["buses"][0]["up"], false, "frames from before are no sign that it works again");
+    page.command(r#""on":"bus","down":false,"bus":0"#);
+    assert!(page.answer("bus vcan0 up"));
+    assert!(is_up());
+    run.hears("vcan0 works again");
+    page.hears("the bus up", |said| {
+        said["buses"][0]["up"] == true && said["bench"]["buses"][0]["down"] == false
+    });
+    page.sees("all cells again", |it| it.cells.iter().all(|cell| cell.0 != 4));
+    run.signal(Signal::INT);
+    run.end();
     place.is_left_clean();
 }

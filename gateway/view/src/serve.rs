@@ -128,11 +128,16 @@ fn receive(
     opened: &impl Fn(&str, Format) -> Result<Arc<Bus>, BusError>,
 ) {
     let mut inbox = Inbox::new();
+    // An interface that went down reports it once, and has frames from before; later ones show that it works again.
+    let mut lost = None;
     while !stop.load(Ordering::Relaxed) {
         let bus = locked(&shared.bus).clone();
         let Some(bus) = bus else {
             match opened(&shared.name, shared.format) {
-                Ok(bus) => *locked(&shared.bus) = Some(bus),
+                Ok(bus) => {
+                    lost = None;
+                    *locked(&shared.bus) = Some(bus);
+                }
                 Err(_) => {
                     locked(live).set_bus(index, false, inbox.dropped().into());
                     thread::sleep(AGAIN);
@@ -152,11 +157,14 @@ fn receive(
             Ok(_) => {
                 let mut live = locked(live);
                 for received in inbox.frames() {
-                    live.frame(index, Micros(received.at_nanos / 1_000), &received.frame);
+                    let at = Micros(received.at_nanos / 1_000);
+                    lost = lost.filter(|lost| at <= *lost);
+                    live.frame(index, at, &received.frame);
                 }
-                live.set_bus(index, true, inbox.dropped().into());
+                live.set_bus(index, lost.is_none(), inbox.dropped().into());
             }
             Err(error) => {
+                lost = Some(now());
                 locked(live).set_bus(index, false, inbox.dropped().into());
                 if !error.may_pass() {
                     *locked(&shared.bus) = None;

@@ -147,7 +147,8 @@ pub(crate) fn watched(place: &Place, cells: usize, more: &str) -> (Running, Stri
 pub(crate) fn watched_skin(place: &Place, more: &str) -> (Running, String) {
     place.scenario(QUIET);
     let words = format!(
-        "run skin.toml --bus-kind embedded --scenario scenario.toml --view --summary run.json {more}"
+        "run skin.toml --bus-kind {} --scenario scenario.toml --view --summary run.json {more}",
+        place.kind()
     );
     let run = place.start("gateway", &words);
     let address = address(&run);
