@@ -28,7 +28,7 @@ export class Plots {
     });
   }
 
-  // Begins anew with what was before.
+  // Begins again with what was before.
   replace(history) {
     for (const row of this.rows) row.points.length = 0;
     for (const { time, joints } of history) this.push(time, joints);
