@@ -10,6 +10,7 @@ use protocol::skin::Skin;
 use trace::capture::Reader;
 
 use crate::command::Command;
+use crate::live::Said;
 use crate::player::{PlayError, Player};
 use crate::pressed::Pressed;
 use crate::scene::Scene;
@@ -101,13 +102,15 @@ fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
                     marks = (playback.events, kinds.map(|kind| (kind, player.marks(kind, PARTS))).into());
                 }
                 let live = player.live();
-                let text = |chosen| {
-                    let mut said = live.said(now, chosen);
-                    said.playback = Some(playback.clone().marked(marks.1.clone()));
-                    serde_json::to_string(&said).unwrap_or_default()
-                };
-                let chosen = server.chosen().into_iter();
-                (text(None), chosen.map(|(page, cell)| (page, text(Some(cell)))).collect())
+                let playback = Some(playback.marked(marks.1.clone()));
+                let mut said = Said { playback, ..live.said(now) };
+                let text = |said: &Said| serde_json::to_string(said).unwrap_or_default();
+                let all = text(&said);
+                let own = server.chosen().into_iter().map(|(page, chosen)| {
+                    said.detail = live.detail(chosen, now);
+                    (page, text(&said))
+                });
+                (all, own.collect())
             });
             if is_changed || said.is_some() {
                 server.publish(player.live().snapshot(now, &nobody), said);

@@ -17,7 +17,7 @@ use protocol::message::{From, Message, SensorPage};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use crate::command::{Chosen, Command};
+use crate::command::Command;
 use crate::live::{Live, Said};
 use crate::locked;
 use crate::player::PlayError;
@@ -212,16 +212,15 @@ fn publish(
             if server.pages() > 0 {
                 let snapshot = live.snapshot(now, &pressed);
                 let said = number.is_multiple_of(SAID_EVERY).then(|| {
-                    let text = |chosen: Option<Chosen>| {
-                        let cell = chosen.map(|chosen| (chosen.bus, chosen.node));
-                        let bench = state.as_ref().map(|state: &State| state.seen_from(cell));
-                        serde_json::to_string(&Said { bench, ..live.said(now, chosen) }).unwrap_or_default()
-                    };
-                    let chosen = server.chosen().into_iter();
-                    (
-                        text(None),
-                        chosen.map(|(page, cell)| (page, text(Some(cell)))).collect::<BTreeMap<_, _>>(),
-                    )
+                    let seen = |cell| state.as_ref().map(|state: &State| state.seen_from(cell));
+                    let mut said = Said { bench: seen(None), ..live.said(now) };
+                    let all = text(&said);
+                    let own = server.chosen().into_iter().map(|(page, chosen)| {
+                        said.bench = seen(Some((chosen.bus, chosen.node)));
+                        said.detail = live.detail(chosen, now);
+                        (page, text(&said))
+                    });
+                    (all, own.collect::<BTreeMap<_, _>>())
                 });
                 drop(live);
                 server.publish(snapshot, said);
@@ -236,6 +235,10 @@ fn publish(
         next = (next + EVERY).max(Instant::now());
         thread::sleep(next.saturating_duration_since(Instant::now()).max(Duration::from_millis(1)));
     }
+}
+
+fn text(said: &Said) -> String {
+    serde_json::to_string(said).unwrap_or_default()
 }
 
 fn obey(page: u64, command: &Command, live: &Live, pressed: &mut Pressed, buses: &[Shared]) {

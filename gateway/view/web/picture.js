@@ -28,6 +28,7 @@ void main() {
 void main() {
   vec2 p = abs(place);
   float hex = max(p.x + p.y * .57735, p.y * 1.1547);
+  if (hex > 1.001) discard;
   vec3 c = hex > .86 ? rim : inner;
   if (kind != 0) {
     int shape = kind & 15;
@@ -44,9 +45,10 @@ void main() {
   o = vec4(c, 1.);
 }`];
 
-const CORNERS = [0, 1, 2, 3, 4, 5].map((k) => [Math.cos(k * Math.PI / 3), Math.sin(k * Math.PI / 3)]);
-const VERTICES = 6;
-const FAN = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5];
+// What a cell is drawn as: its hexagon, or a triangle around it, of which a software renderer draws the pixels in the hexagon.
+const corner = (degrees, far) => [far * Math.cos(degrees * Math.PI / 180), far * Math.sin(degrees * Math.PI / 180)];
+const HEXAGON = { corners: [0, 60, 120, 180, 240, 300].map((at) => corner(at, 1)), fan: [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5] };
+const TRIANGLE = { corners: [90, 210, 330].map((at) => corner(at, Math.sqrt(3))), fan: [0, 1, 2] };
 
 export class Picture {
   constructor(canvas) {
@@ -85,21 +87,22 @@ export class Picture {
       if (last && last.chain === chain && last.row === cell.row) last.count++;
       else this.groups.push({ chain, row: cell.row, first: at, count: 1 });
     });
-    const nearest = neighbors(scene);
-    const data = new Float32Array(order.length * VERTICES * 8), size = scene.pitch * 0.56;
-    const indices = new Uint32Array(order.length * FAN.length);
+    const nearest = neighbors(scene), { corners, fan } = this.software ? TRIANGLE : HEXAGON;
+    [this.vertices, this.indices] = [corners.length, fan.length];
+    const data = new Float32Array(order.length * corners.length * 8), size = scene.pitch * 0.56;
+    const indices = new Uint32Array(order.length * fan.length);
     order.forEach((i, at) => {
       const { position, normal } = scene.cells[i], [x, y] = axes(scene, nearest, i);
       const middle = add(position, normal, 0.0012);
-      CORNERS.forEach(([u, v], k) => data.set([...add(add(middle, x, u * size), y, v * size), ...normal, u, v], (at * VERTICES + k) * 8));
-      FAN.forEach((corner, k) => { indices[at * FAN.length + k] = at * VERTICES + corner; });
+      corners.forEach(([u, v], k) => data.set([...add(add(middle, x, u * size), y, v * size), ...normal, u, v], (at * corners.length + k) * 8));
+      fan.forEach((corner, k) => { indices[at * fan.length + k] = at * corners.length + corner; });
     });
     this.cells = gl.createVertexArray();
     gl.bindVertexArray(this.cells);
     floats(gl, data, [[0, 3], [1, 3], [2, 2]]);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
-    this.looks = new Uint32Array(order.length * VERTICES);
+    this.looks = new Uint32Array(order.length * corners.length);
     this.look = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, this.look);
     gl.bufferData(gl.ARRAY_BUFFER, this.looks, gl.DYNAMIC_DRAW);
@@ -117,7 +120,7 @@ export class Picture {
 
   // Takes the cells of a snapshot, in the scene's order. Those that did not change are left alone.
   update(words, shows, chosen) {
-    const { gl, looks, order, scene, theme } = this, before = this.before;
+    const { gl, looks, order, scene, theme, vertices } = this, before = this.before;
     const same = before && before.shows === shows && before.theme === theme && before.words.length === words.length;
     let [first, end] = [order.length, 0];
     order.forEach((i, at) => {
@@ -126,14 +129,14 @@ export class Picture {
       const cell = cellOf(words, i), value = shows.of(cell);
       const [r, g, b] = shows.rest(value) ? theme.unlit : ramp((value - shows.low) / (shows.high - shows.low));
       const kind = shapeOf(cell).shape | (i === chosen ? 16 : 0) | (cell.flags & 16 ? 32 : 0) | (scene.cells[i].root ? 64 : 0);
-      looks.fill((r | g << 8 | b << 16 | kind << 24) >>> 0, at * VERTICES, (at + 1) * VERTICES);
+      looks.fill((r | g << 8 | b << 16 | kind << 24) >>> 0, at * vertices, (at + 1) * vertices);
       [first, end] = [Math.min(first, at), at + 1];
     });
     this.before = { shows, theme, words, chosen };
     if (first >= end) return;
     this.changed = true;
     gl.bindBuffer(gl.ARRAY_BUFFER, this.look);
-    gl.bufferSubData(gl.ARRAY_BUFFER, first * VERTICES * 4, looks, first * VERTICES, (end - first) * VERTICES);
+    gl.bufferSubData(gl.ARRAY_BUFFER, first * vertices * 4, looks, first * vertices, (end - first) * vertices);
   }
 
   // Draws, if anything changed since it drew last, or it is to be finer; whether it did.
@@ -158,7 +161,7 @@ export class Picture {
     gl.uniform3fv(cell.chosen, theme.chosen);
     for (const { chain, row, first, count } of this.groups) {
       gl.uniformMatrix4fv(cell.m, false, frames[chain][row]);
-      gl.drawElements(gl.TRIANGLES, count * FAN.length, gl.UNSIGNED_INT, first * FAN.length * 4);
+      gl.drawElements(gl.TRIANGLES, count * this.indices, gl.UNSIGNED_INT, first * this.indices * 4);
     }
     gl.useProgram(solid.program);
     gl.uniformMatrix4fv(solid.view, false, view);

@@ -86,10 +86,9 @@ export function triangles({ from, to, radius }) {
 
 // The middle and the size of all that is drawn, where the robot stands now.
 export function extent(scene, all) {
-  const points = [];
-  scene.chains.forEach((_, c) => all[c].forEach((m) => points.push(point(m, [0, 0, 0]))));
-  for (const cell of scene.cells) points.push(point(all[scene.buses[cell.bus].chain][cell.row], cell.position));
-  const low = [0, 1, 2].map((i) => points.reduce((m, p) => Math.min(m, p[i]), Infinity));
-  const high = [0, 1, 2].map((i) => points.reduce((m, p) => Math.max(m, p[i]), -Infinity));
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  const take = (p) => p.forEach((v, i) => { low[i] = Math.min(low[i], v); high[i] = Math.max(high[i], v); });
+  scene.chains.forEach((_, c) => all[c].forEach((m) => take(point(m, [0, 0, 0]))));
+  for (const cell of scene.cells) take(point(all[scene.buses[cell.bus].chain][cell.row], cell.position));
   return { middle: low.map((v, i) => (v + high[i]) / 2), size: Math.hypot(...high.map((v, i) => v - low[i])) || 1 };
 }

@@ -5,6 +5,8 @@ import { element, show } from "./dom.js";
 import { forget, frames } from "./frames.js";
 import { number } from "./plots.js";
 
+// More buses than these have a row each in one table.
+const FEW_BUSES = 3;
 const $ = (id) => document.getElementById(id);
 
 function table(rows) {
@@ -28,6 +30,26 @@ function facts(pairs) {
 
 const percent = (share) => (share === null || share === undefined ? "–" : `${(share * 100).toFixed(share < 0.1 ? 1 : 0)} %`);
 
+// One row for each bus.
+function many(buses) {
+  const it = element("table"), head = element("tr");
+  for (const text of ["Bus", "Load", "Late, missing", "Lost, damaged"]) {
+    const cell = element("th", text);
+    cell.scope = "col";
+    head.append(cell);
+  }
+  it.className = "buses";
+  it.append(head, ...buses.map((bus) => {
+    const row = element("tr"), name = element("th", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad");
+    const [late, lost] = [[bus.late, bus.missing], [bus.lost + bus.dropped, bus.rejected]];
+    name.scope = "row";
+    row.append(name, element("td", percent(bus.load), bus.load > 1 ? "bad" : ""),
+      ...[late, lost].map((pair) => element("td", pair.join(", "), pair.some((n) => n) ? "bad" : "")));
+    return row;
+  }));
+  return it;
+}
+
 export function say(scene, said, ask) {
   const sum = (of) => said.buses.reduce((all, bus) => all + of(bus), 0);
   const [due, complete] = [sum((bus) => bus.epochs_due), sum((bus) => bus.epochs_complete)];
@@ -38,7 +60,7 @@ export function say(scene, said, ask) {
     ["Epochs complete", due ? `${complete} of ${due}` : "–", complete < due ? "bad" : ""],
     ...(said.halted ? [["Robot", "halted", "bad"]] : []),
   ]);
-  show($("buses"), said.buses.flatMap((bus) => [
+  show($("buses"), said.buses.length > FEW_BUSES ? [many(said.buses)] : said.buses.flatMap((bus) => [
     element("h3", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad"),
     table([
       ["Load of a real bus", percent(bus.load), bus.load > 1 ? "bad" : ""],

@@ -239,6 +239,12 @@ impl Table {
         &self.cells
     }
 
+    /// Where a cell is in [`cells`](Self::cells); none of a node that the skin does not have on this bus.
+    #[must_use]
+    pub fn place(&self, cell: CellId) -> Option<usize> {
+        self.places.get(cell.index()).copied().flatten()
+    }
+
     /// Frames by kind and event.
     #[must_use]
     pub const fn counters(&self) -> &Counters {
@@ -353,7 +359,7 @@ impl Table {
     /// Whether somebody on this bus uses an identifier, as the skin describes the bus: what is no packet under another
     /// one is foreign.
     fn is_used(&self, id: Id) -> bool {
-        let is_cell = |cell: CellId| self.places.get(cell.index()).copied().flatten().is_some();
+        let is_cell = |cell: CellId| self.place(cell).is_some();
         match (id.kind, Node::from_byte(id.node)) {
             (Kind::Command, _) => Command::from_byte(id.node).is_some(),
             (Kind::Network, Node::Gateway) | (Kind::Configure | Kind::Stimulus, Node::Everyone) => true,
@@ -376,7 +382,7 @@ impl Table {
     }
 
     fn cell_mut(&mut self, cell: CellId) -> Option<&mut Cell> {
-        let place = (*self.places.get(cell.index())?)?;
+        let place = self.place(cell)?;
         self.cells.get_mut(place)
     }
 

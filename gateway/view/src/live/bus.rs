@@ -106,7 +106,7 @@ impl LiveBus {
                 self.before = self.heard.replace(heard);
             }
             Some(Message::Torque { from, epoch, torque }) => {
-                let place = self.place(from);
+                let place = self.table.place(from);
                 if let Some(last) = place.and_then(|place| self.last.get_mut(place)) {
                     *last = Some((epoch, torque));
                 }
@@ -168,16 +168,12 @@ impl LiveBus {
         self.load.share
     }
 
-    pub(super) fn place(&self, node: CellId) -> Option<usize> {
-        self.table.cells().iter().position(|cell| cell.node == node)
-    }
-
     pub(super) fn cell(&self, node: CellId) -> Option<&Cell> {
-        self.table.cells().get(self.place(node)?)
+        self.table.cells().get(self.table.place(node)?)
     }
 
     pub(super) fn sensors(&self, node: CellId, now: Micros) -> Option<SkinSensors> {
-        self.table.sensors(now).nth(self.place(node)?)?.0
+        self.table.sensors(now).nth(self.table.place(node)?)?.0
     }
 
     /// Distributed and central, by joint of the chain.

@@ -133,9 +133,9 @@ pub struct Answer {
 }
 
 impl Live {
-    /// What is to be said now.
+    /// What is to be said now to all pages: the details of a cell are none.
     #[must_use]
-    pub fn said(&self, now: Micros, chosen: Option<Chosen>) -> Said {
+    pub fn said(&self, now: Micros) -> Said {
         let (mut contacts, mut dead, mut dead_cells) = (0, 0, Vec::new());
         for bus in &self.buses {
             for ((cell, status), since) in bus.table.statuses(now).zip(&bus.dead_since) {
@@ -154,17 +154,19 @@ impl Live {
             dead_cells,
             halted: self.buses.iter().any(|bus| bus.halted),
             buses: self.buses.iter().map(LiveBus::said).collect(),
-            detail: chosen.and_then(|chosen| self.detail(chosen, now)),
+            detail: None,
             playback: None,
             bench: None,
         }
     }
 
-    fn detail(&self, chosen: Chosen, now: Micros) -> Option<Detail> {
+    /// A cell in detail; none if the skin has no such cell.
+    #[must_use]
+    pub fn detail(&self, chosen: Chosen, now: Micros) -> Option<Detail> {
         let Chosen { bus: index, node, frame } = chosen;
         let bus = self.buses.get(index)?;
         let id = CellId::new(node.into()).ok()?;
-        let place = bus.place(id)?;
+        let place = bus.table.place(id)?;
         let cell = bus.table.cells().get(place)?;
         let (sensors, status) = bus.table.sensors(now).nth(place)?;
         let sensors = sensors.unwrap_or_default();

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::command::Chosen;
+use model::generate::{Target, generate};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
 use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, State};
@@ -15,26 +16,29 @@ fn skin() -> Skin {
 struct Bench {
     live: Live,
     now: Micros,
+    /// The bus on which is said what is said.
+    bus: usize,
 }
 
 impl Bench {
     fn new() -> Self {
-        Self { live: Live::new(skin()), now: Micros(1_000_000) }
+        Self { live: Live::new(skin()), now: Micros(1_000_000), bus: 0 }
     }
 
     fn say(&mut self, message: &Message) {
         self.now.0 += 100;
         let packet: Packet = message.encode();
         for frame in packet.frames(protocol::can::Format::Fd) {
-            self.live.frame(0, self.now, &frame);
+            self.live.frame(self.bus, self.now, &frame);
         }
     }
 
     fn heartbeat(&mut self, node: u8, configuration: u16) {
         let from = CellId::new(node.into()).unwrap();
         let state = State(0x1000 | State::CONFIGURED.0 | State::TEST_MODE.0 | 2 << 8);
-        let heartbeat =
-            Heartbeat { serial: 100_000 + u32::from(node), configuration, state, ..Heartbeat::default() };
+        let is_it = |cell: &&protocol::skin::Cell| (cell.bus, cell.node) == (self.bus, from);
+        let serial = self.live.skin.cells.iter().find(is_it).unwrap().serial;
+        let heartbeat = Heartbeat { serial, configuration, state, ..Heartbeat::default() };
         let page = NetworkPage::Heartbeat(heartbeat);
         self.say(&Message::Network { from: Node::Cell(from), epoch: Epoch(0), page });
     }
@@ -93,15 +97,15 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!((cell(6)[0], cell(6)[1]), (1, flag::OTHER_CONFIGURATION), "quiet, with another configuration");
     assert_eq!(cell(7)[0], 0, "never heard");
 
-    let said = bench.live.said(bench.now, Some(Chosen { bus: 0, node: 5, frame: None }));
+    let said = bench.live.said(bench.now);
     assert_eq!((said.contacts, said.dead, said.halted, said.buses[0].due), (1, 0, false, 2));
-    let detail = said.detail.unwrap();
+    let detail = bench.live.detail(Chosen { bus: 0, node: 5, frame: None }, bench.now).unwrap();
     let answer = detail.torque.unwrap();
     assert_eq!((answer.epoch, answer.words[..2].to_vec(), detail.serial), (2, vec![100, -200], 100_005));
     let exact = answer.central.unwrap();
     assert!((exact[0] - f64::from(central)).abs() < 1e-6, "the only cell in contact: {exact:?} {central}");
-    assert_eq!(bench.live.said(bench.now, Some(Chosen { bus: 0, node: 254, frame: None })).detail, None);
-    assert_eq!(bench.live.said(bench.now, Some(Chosen { bus: 7, node: 1, frame: None })).detail, None);
+    assert_eq!(bench.live.detail(Chosen { bus: 0, node: 254, frame: None }, bench.now), None);
+    assert_eq!(bench.live.detail(Chosen { bus: 7, node: 1, frame: None }, bench.now), None);
 }
 
 #[test]
@@ -114,13 +118,13 @@ fn a_silent_cell_is_dead_since_it_was_noticed_and_a_halt_stands_until_the_resume
     let bytes = bench.snapshot();
     assert_eq!(bytes[24 + 72 + 8 * 4], 4);
     bench.now.0 += 3_000_000;
-    let said = bench.live.said(bench.now, None);
+    let said = bench.live.said(bench.now);
     assert!(said.halted && said.dead == 1 && (said.dead_cells[0].for_s - 3.0).abs() < 0.1, "{said:?}");
     bench.say(&Message::Resume);
-    assert!(!bench.live.said(bench.now, None).halted);
+    assert!(!bench.live.said(bench.now).halted);
     bench.heartbeat(5, 0);
     bench.snapshot();
-    assert_eq!(bench.live.said(bench.now, None).dead_cells, []);
+    assert_eq!(bench.live.said(bench.now).dead_cells, []);
 }
 
 #[test]
@@ -133,4 +137,41 @@ fn only_cells_of_the_skin_in_test_mode_may_be_pressed() {
         (bench.live.may_press(0, 0), bench.live.may_press(0, 254), bench.live.may_press(1, 12)),
         (None, None, None)
     );
+}
+
+#[test]
+fn ten_thousand_cells_on_forty_buses_are_shown() {
+    let (buses, each) = (40, 250);
+    let target = Target { cells: buses * each, buses, broadcast_hz: 20.0, ..Target::default() };
+    let skin = Skin::parse("large", &generate(&target).unwrap()).unwrap();
+    let mut bench = Bench { live: Live::new(skin), now: Micros(1_000_000), bus: 0 };
+    for bus in 0..buses {
+        bench.bus = bus;
+        bench.joints(1, Q);
+        for node in 1..=each {
+            let node = CellId::new(i64::try_from(node).unwrap()).unwrap();
+            let word = i16::try_from(bus).unwrap();
+            bench.say(&Message::Torque {
+                from: node,
+                epoch: Epoch(1),
+                torque: [word + 1, 0, 0, 0, 0, 0].into(),
+            });
+        }
+        bench.joints(2, Q);
+    }
+    let bytes = bench.snapshot();
+    assert_eq!(bytes.len(), 24 + 12 * 6 + 8 * buses * each);
+    let sum: f64 = (1..=buses).map(|bus| f64::from(u32::try_from(bus * each).unwrap()) / 4096.0).sum();
+    assert!((f64::from(float(&bytes, 24 + 4)) - sum).abs() < 1e-3, "the torques of all buses");
+    let (bus, node) = (buses - 1, CellId::new(250).unwrap());
+    let page = SensorPage::Skin(SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() });
+    bench.heartbeat(250, 0);
+    bench.say(&Message::Stimulus { to: Node::Cell(node), from: From::Next, page });
+    bench.joints(3, Q);
+    let bytes = bench.snapshot();
+    let pressed: Vec<_> =
+        bytes[24 + 72..].chunks(8).enumerate().filter(|(_, cell)| cell[2..4] != [0, 0]).collect();
+    let expected = bench.live.skin.cells.iter().position(|cell| (cell.bus, cell.node) == (bus, node));
+    assert_eq!(pressed.iter().map(|(at, _)| *at).collect::<Vec<_>>(), [expected.unwrap()]);
+    assert_eq!(bench.live.said(bench.now).buses.len(), buses);
 }

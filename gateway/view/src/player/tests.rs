@@ -4,6 +4,7 @@ use std::io::Write;
 
 use super::*;
 use crate::command::Chosen;
+use crate::live::Said;
 use crate::pressed::Pressed;
 use proptest::prelude::*;
 use protocol::can::Format;
@@ -81,7 +82,8 @@ fn log(skin: &Skin) -> Vec<u8> {
 
 /// What a page would show, without what counts the snapshots.
 fn shown(tape: &mut Live, now: Micros) -> (Vec<u8>, String) {
-    let said = tape.said(now, Some(Chosen { bus: 0, node: 5, frame: None }));
+    let detail = tape.detail(Chosen { bus: 0, node: 5, frame: None }, now);
+    let said = Said { detail, ..tape.said(now) };
     (tape.snapshot(now, &Pressed::default()).split_off(4), serde_json::to_string(&said).unwrap())
 }
 
@@ -198,7 +200,7 @@ fn what_is_not_known_yet_is_said_and_is_exact_later() {
     player.seek(35.0).unwrap();
     assert!(!player.said().exact);
     let now = player.now();
-    let glance = player.live().said(now, None);
+    let glance = player.live().said(now);
     assert!(glance.contacts <= 1 && glance.buses[0].epochs_due < 250, "the last seconds");
     bench.build(&player);
     assert!(player.pass(Duration::ZERO).unwrap() && player.said().exact);
