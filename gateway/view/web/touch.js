@@ -2,19 +2,20 @@
 
 import { add, direction, dot, point, project } from "./math.js";
 
-// The cell under a place of the picture: the nearest one to the eye among those that are hit from their front.
+// The cell under a place of the picture, among those that are hit from their front: of the ones nearest to the eye, which are within
+// a pitch of each other, the one whose middle is nearest to the place.
 export function pick(scene, frames, camera, view, width, height, x, y) {
-  const eye = camera.eye();
-  let best = -1, nearest = Infinity;
+  const eye = camera.eye(), hit = [];
   scene.cells.forEach((cell, i) => {
     const m = frames[scene.buses[cell.bus].chain][cell.row], at = point(m, cell.position);
-    if (dot(direction(m, cell.normal), add(eye, at, -1)) <= 0) return;
     const seen = project(view, at, width, height);
     if (!seen) return;
     const radius = Math.max(6, scene.pitch * 0.56 / seen[2] * height / 2 * Math.min(2, 2 * width / height));
-    if (Math.hypot(seen[0] - x, seen[1] - y) <= radius && seen[2] < nearest) [best, nearest] = [i, seen[2]];
+    const off = Math.hypot(seen[0] - x, seen[1] - y);
+    if (off <= radius && dot(direction(m, cell.normal), add(eye, at, -1)) > 0) hit.push({ i, off, far: seen[2] });
   });
-  return best;
+  const nearest = Math.min(...hit.map((it) => it.far));
+  return hit.filter((it) => it.far < nearest + scene.pitch).reduce((best, it) => (it.off < best.off ? it : best), { i: -1, off: Infinity }).i;
 }
 
 // Calls `on.at(x, y)` for the cell there, `on.press(cell)`, `on.release()`, `on.turn(dx, dy)`, `on.zoom(by)`.

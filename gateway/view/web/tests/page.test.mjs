@@ -102,6 +102,12 @@ test("the nearest cell that faces the eye is picked", () => {
   assert.equal(pick(it, all, camera, view, 400, 400, 200, 200), 1);
   assert.equal(pick(it, all, camera, view, 400, 400, 20, 20), -1);
   assert.equal(project(view, [0, 0, 3], 400, 400), null, "behind the eye");
+  // Small ones on one surface: each by its middle, not all the one that is a little nearer.
+  const small = [0, 1, 2].map((k) => cell(1, [0.004 * k, 0, 0.001 * k], [0, 0, 1])), of = { ...it, cells: small, pitch: 0.004 };
+  small.forEach(({ position }, i) => {
+    const [x, y] = project(view, point(frames(of, [])[0][1], position), 400, 400);
+    assert.equal(pick(of, frames(of, []), camera, view, 400, 400, x, y), i);
+  });
 });
 
 test("the camera shows all of the robot until somebody moves it", () => {
