@@ -31,8 +31,10 @@ mod scenario;
 mod sensing;
 mod shadow;
 mod skin;
+mod surface;
 mod torque;
 mod view;
+mod visuals;
 
 use std::process::ExitCode;
 

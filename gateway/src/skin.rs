@@ -3,7 +3,6 @@
 mod covering;
 mod import;
 mod show;
-mod visuals;
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap};

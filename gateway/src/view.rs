@@ -1,5 +1,6 @@
 //! `gateway view`, and the option `--view` of runs.
 
+use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
@@ -10,9 +11,12 @@ use std::process::{Child, Command, Stdio};
 use bench::remote::Lines;
 use bench::run;
 use clap::Args;
+use cover::mesh::{Triangle, simplify};
 use protocol::skin::Skin;
 use protocol::usage::Failure;
+use robots::Isometry3;
 use trace::capture::{Entry, Format, Reader};
+use view::Shell;
 use view::play::{self, play};
 use view::serve::{Options, serve};
 use view::server::Access;
@@ -20,6 +24,11 @@ use view::server::Access;
 use super::arguments::{BusKinds, bus_names, nanos};
 use super::input::{skin_of, stopped};
 use super::output::note;
+use super::surface::{Placed, Surface};
+use super::visuals::Packages;
+
+/// The most triangles of a robot that a page draws; more are simplified.
+const TRIANGLES: usize = 20_000;
 
 /// Lines among which a candump log has a frame.
 const LINES: u32 = 1_000;
@@ -32,7 +41,8 @@ const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 /// proximity or temperature, their state by their shape, each joint's torque beside the central computation. A click presses
 /// a cell with a stimulus, if it is in test mode. Of a recording the same page plays, scrubs, steps by epoch, and goes to
 /// the next touch, loss, silent cell or halt. The page needs no network but this server, which only answers this machine,
-/// unless --listen names another address; then each request needs the --token. It ends with Ctrl-C.
+/// unless --listen names another address; then each request needs the --token. If the skin has robot.urdf, the robot is
+/// drawn by its meshes, as far as they are found. It ends with Ctrl-C.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway demo --view
@@ -66,6 +76,8 @@ pub(crate) struct View {
     /// Belong to the run that has started it: take its state from standard input, write commands to standard output, end with it
     #[arg(long, hide = true)]
     of_run: bool,
+    #[command(flatten)]
+    packages: Packages,
     #[command(flatten)]
     kinds: BusKinds,
 }
@@ -108,27 +120,38 @@ impl View {
             let why = "is of a recording, and this is a skin, whose buses are listened to";
             return Err(Failure::usage(format!("{}: --skin or --at {why}", skin.display())));
         }
-        let skin = Skin::read(skin).map_err(Failure::usage)?;
+        let (path, skin) = (skin, Skin::read(skin).map_err(Failure::usage)?);
+        let surface = self.surface(path, &skin);
         let kinds = self.kinds.of(bus_names(&skin))?;
         let stop = stopped()?;
         let bench = self.of_run.then(run_of_this).transpose().map_err(|error| failed(&error))?;
-        let options = Options { skin, kinds, directory: None, access, patient: self.wait, bench };
+        let options = Options { skin, surface, kinds, directory: None, access, patient: self.wait, bench };
         serve(options, &stop, says).map_err(Failure::usage)?;
         Ok(())
     }
 
     /// A recording.
     fn recorded(self, access: Access, says: impl FnOnce(&str)) -> Result<(), Failure> {
-        let skin = match &self.skin {
-            Some(path) => Skin::read(path).map_err(Failure::usage)?,
-            None => skin_of(&self.sources)?,
+        let (skin, surface) = match &self.skin {
+            Some(path) => {
+                let skin = Skin::read(path).map_err(Failure::usage)?;
+                let surface = self.surface(path, &skin);
+                (skin, surface)
+            }
+            // Its URDF is not beside it.
+            None => (skin_of(&self.sources)?, Vec::new()),
         };
         #[expect(clippy::cast_precision_loss, reason = "to the µs")]
         let at_s = self.at.map(|nanos| nanos as f64 / 1e9);
         let stop = stopped()?;
-        play(play::Options { paths: self.sources, skin, access, at_s }, &stop, says)
+        play(play::Options { paths: self.sources, skin, surface, access, at_s }, &stop, says)
             .map_err(Failure::usage)?;
         Ok(())
+    }
+
+    /// The robot of a skin's file by its meshes, as far as they are found.
+    fn surface(&self, path: &Path, skin: &Skin) -> Vec<Shell> {
+        Surface::read(path, skin, &self.packages).map(|it| simplified(&it)).unwrap_or_default()
     }
 
     /// Whether it is a recording, by what is in it, and not a skin.
@@ -155,6 +178,20 @@ impl View {
         }
         Ok(reader.format() == Format::Mcap)
     }
+}
+
+/// What a page draws of a robot: for each row its triangles.
+fn simplified(surface: &Surface) -> Vec<Shell> {
+    let mut rows = BTreeMap::<_, Vec<_>>::new();
+    for Placed { chain, row, part } in &surface.parts {
+        rows.entry((*chain, *row)).or_default().extend(part.triangles(&Isometry3::identity()));
+    }
+    let (places, triangles): (Vec<_>, Vec<_>) = rows.into_iter().unzip();
+    let shells = places.into_iter().zip(simplify(triangles, TRIANGLES));
+    let point = |triangles: Vec<Triangle>| {
+        triangles.into_iter().map(|triangle| triangle.map(|corner| corner.coords.into())).collect()
+    };
+    shells.map(|((chain, row), all)| Shell { chain, row, triangles: point(all) }).collect()
 }
 
 /// The run that has started this program, at its standard input and output.

@@ -198,3 +198,43 @@ fn pages_that_may_only_look_press_nothing_and_others_need_a_token() {
         assert!(said.contains(expected), "{words}: {said}");
     }
 }
+
+#[test]
+fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
+    let place = Place::new();
+    std::fs::copy(
+        concat!(env!("CARGO_MANIFEST_DIR"), "/../gateway/examples/lift.urdf"),
+        place.path("lift.urdf"),
+    )
+    .unwrap();
+    place.start("gateway", "skin import lift.urdf --tip arm7 -o skin.toml").end().well();
+    let view = place.start("gateway", "view skin.toml --wait --bus-kind embedded");
+    view.hears("view: http://");
+    let address = address(&view.stderr());
+    let scene = Page::new(&address).scene;
+    let shells = scene["shells"].as_array().unwrap();
+    let number = |shell: &Value, key: &str| usize::try_from(shell[key].as_u64().unwrap()).unwrap();
+    let rows: Vec<_> = shells.iter().map(|shell| number(shell, "row")).collect();
+    assert!(rows[0] == 0 && rows.len() > 5 && rows.is_sorted(), "{rows:?}");
+
+    let mut stream = TcpStream::connect(&address).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
+    write!(stream, "GET /surface HTTP/1.1\r\nHost: {address}\r\n\r\n").unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    let body = answer.windows(4).position(|end| end == b"\r\n\r\n").unwrap() + 4;
+    let floats: Vec<_> =
+        answer[body..].chunks(4).map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap())).collect();
+    let corners: Vec<_> = floats.chunks(6).collect();
+    assert_eq!(corners.len(), shells.iter().map(|shell| number(shell, "count")).sum::<usize>());
+    // The base, a box, is as large as the URDF says.
+    let base = &corners[number(&shells[0], "first")..][..number(&shells[0], "count")];
+    let size = [0, 1, 2].map(|axis| {
+        let of = |pick: fn(f32, f32) -> f32| base.iter().map(|corner| corner[axis]).reduce(pick).unwrap();
+        of(f32::max) - of(f32::min)
+    });
+    assert!(size.iter().zip([0.5, 0.4, 0.3]).all(|(one, other)| (one - other).abs() < 1e-5), "{size:?}");
+    assert_eq!(base.len(), 36, "two triangles for each of six faces");
+    view.signal(rustix::process::Signal::INT);
+    view.end();
+}

@@ -31,10 +31,10 @@ mod tests;
 mod tree;
 mod wire;
 
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Point3};
 use thiserror::Error;
 
-use mesh::Mesh;
+use mesh::{Mesh, Triangle};
 use surface::Surface;
 pub use wire::{MAX_NODES, PORTS};
 
@@ -75,6 +75,14 @@ impl Part {
     #[must_use]
     pub fn new(mesh: Mesh) -> Self {
         Self { mesh, pose: Isometry3::identity(), scale: [1.0; 3] }
+    }
+
+    /// Its triangles where `frame` is the link's frame.
+    #[must_use]
+    pub fn triangles(&self, frame: &Isometry3<f64>) -> Vec<Triangle> {
+        let (pose, [x, y, z]) = (frame * self.pose, self.scale);
+        let corner = |p: Point3<f64>| pose.transform_point(&Point3::new(p.x * x, p.y * y, p.z * z));
+        self.mesh.triangles().iter().map(|triangle| triangle.map(corner)).collect()
     }
 }
 

@@ -14,7 +14,7 @@
 //!
 //! A contact pushes against the outward normal: force = -F_z * normal.
 
-use nalgebra::{IsometryMatrix3, Point3, Quaternion, Rotation3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{IsometryMatrix3, Matrix4, Point3, Rotation3, Translation3, Vector3};
 use protocol::fixed::{Q, Q1_14};
 use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, RowKind};
@@ -199,9 +199,8 @@ impl Central {
 /// Frame 0 of the chain that the cells sit on, seen from the robot's base.
 fn base(skin: &Skin) -> IsometryMatrix3<f64> {
     let base = skin.cells.first().map_or_else(Base::default, |cell| skin.chain(cell.bus).base);
-    let [x, y, z, w] = base.orientation;
-    let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-    Translation3::from(base.position) * turn.to_rotation_matrix()
+    let turn = Matrix4::from(base.matrix()).fixed_view::<3, 3>(0, 0).into_owned();
+    Translation3::from(base.position) * Rotation3::from_matrix_unchecked(turn)
 }
 
 impl Frames {

@@ -2,7 +2,7 @@
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
-use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Matrix4, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use protocol::parameters::RowKind;
 use protocol::skin::{Base, ChainRow, DenavitHartenberg, JointKind};
 
@@ -135,7 +135,7 @@ fn base(first: &Axis) -> Isometry3<f64> {
     }
     let x = x.normalize();
     let y = z.cross(&x);
-    let turn = nalgebra::Rotation3::from_basis_unchecked(&[x, y, z]);
+    let turn = Rotation3::from_basis_unchecked(&[x, y, z]);
     let along = -z.dot(&first.point.coords);
     let origin = if along.abs() <= LONG_M / 2.0 { first.point + z * along } else { first.point };
     Isometry3::from_parts(origin.into(), UnitQuaternion::from_rotation_matrix(&turn))
@@ -222,6 +222,7 @@ fn quarter(angle: f64) -> f64 {
 /// Where a skin's chain begins, as a pose.
 #[must_use]
 pub fn pose_of(base: &Base) -> Isometry3<f64> {
-    let [x, y, z, w] = base.orientation;
-    Isometry3::from_parts(base.position.into(), UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z)))
+    let turn = Matrix4::from(base.matrix()).fixed_view::<3, 3>(0, 0).into_owned();
+    let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(turn));
+    Isometry3::from_parts(base.position.into(), turn)
 }

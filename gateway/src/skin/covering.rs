@@ -9,7 +9,7 @@ use protocol::usage::Failure;
 use robots::{CellOnLink, Chain, Urdf};
 
 use super::super::print::{count, list};
-use super::visuals::{Packages, Visuals};
+use super::super::visuals::{Packages, Visuals};
 
 /// Which links are covered, and how.
 #[derive(Args, Debug)]

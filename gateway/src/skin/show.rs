@@ -1,26 +1,20 @@
 //! `gateway skin show`.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::Args;
-use cover::Part;
 use cover::drawing::{Drawing, DrawnCell, page};
-use protocol::document;
 use protocol::parameters::RowKind;
 use protocol::skin::{Cell, Chain, ChainRow, Skin};
 use protocol::usage::{Failure, print};
-use robots::{Isometry3, Row, Urdf, frames, pose_of};
+use robots::{Isometry3, Row, frames, pose_of};
+use view::Scene;
 
-use super::super::output::{Force, apart, note};
-use super::super::print::{count, words};
+use super::super::output::{Force, apart};
+use super::super::print::words;
 use super::super::robot_file::urdf_of;
-use super::visuals::{Packages, Visuals};
-
-/// How large cells are drawn that have no neighbour, in m.
-const PITCH: f64 = 0.028;
-
-/// How many cells are asked for their nearest neighbour.
-const ASKED: usize = 500;
+use super::super::surface::{Placed, Surface};
+use super::super::visuals::Packages;
 
 /// Frames whose origins are nearer have no line between them, in m.
 const SHORTEST: f64 = 1e-6;
@@ -54,11 +48,8 @@ impl Show {
             self.force.check("-o", path)?;
         }
         let mut robot = Robot::alone(&skin);
-        if let Some(path) = &urdf {
-            match text(path) {
-                Ok(urdf) => robot.look(&skin, &urdf, path, &self.packages),
-                Err(error) => note(format_args!("the robot is not drawn: {error}")),
-            }
+        if let Some(surface) = Surface::read(&self.file, &skin, &self.packages) {
+            robot.look(&skin, &surface);
         }
         let page = page(&robot.drawing(&skin));
         match &self.output {
@@ -66,12 +57,6 @@ impl Show {
             None => print(&page),
         }
     }
-}
-
-fn text(path: &Path) -> Result<Urdf, String> {
-    let file = path.display().to_string();
-    let text = document::text(path).map_err(|error| error.to_string())?;
-    Urdf::parse(&file, &text).map_err(|error| error.to_string())
 }
 
 /// A robot as it stands.
@@ -96,36 +81,21 @@ impl Robot {
     }
 
     /// With what its URDF shows.
-    fn look(&mut self, skin: &Skin, urdf: &Urdf, file: &Path, packages: &Packages) {
+    fn look(&mut self, skin: &Skin, surface: &Surface) {
+        let Surface { urdf, chains, parts } = surface;
         let named = |name: &str| {
             let known = skin.robot.joints.iter().position(|joint| joint.name == name);
             known.and_then(|index| self.positions.get(index).copied()).unwrap_or_else(|| urdf.rest(name))
         };
-        let mut bases = Vec::with_capacity(self.bases.len());
-        for chain in &skin.robot.chains {
-            let Some(base) = base(urdf, chain, &named) else {
-                let (file, name) = (&urdf.file, &chain.name);
-                note(format_args!("the robot is not drawn: the rows of chain {name} are none of {file}"));
-                return;
-            };
-            bases.push(base);
-        }
-        let visuals = Visuals::new(urdf, file, packages);
-        let mut missing = Vec::new();
-        let mut triangles = Vec::new();
-        for link in urdf.links() {
-            match visuals.parts(link) {
-                Err(error) => missing.push(error),
-                Ok(parts) => {
-                    let Ok(pose) = urdf.pose(link, &named) else { continue };
-                    triangles.extend(parts.iter().flat_map(|part| corners(part, &(pose * part.pose))));
-                }
-            }
-        }
-        if let Some(first) = missing.first() {
-            note(format_args!("{} not drawn: {first}", count(missing.len(), "link")));
-        }
-        (self.bases, self.triangles) = (bases, triangles);
+        let base = |chain: &robots::Chain| Some(urdf.pose(&chain.root, &named).ok()? * chain.base);
+        self.bases = chains.iter().map(|chain| base(chain).unwrap_or_else(Isometry3::identity)).collect();
+        let frames: Vec<_> =
+            skin.robot.chains.iter().enumerate().map(|(index, chain)| self.frames(index, chain)).collect();
+        let drawn = parts
+            .iter()
+            .filter_map(|Placed { chain, row, part }| Some(part.triangles(frames.get(*chain)?.get(*row)?)));
+        self.triangles =
+            drawn.flatten().map(|triangle| triangle.map(|corner| corner.coords.into())).collect();
     }
 
     /// The frames of a chain, 0 to the last row's.
@@ -159,7 +129,7 @@ impl Robot {
         }
         Drawing {
             name: skin.name.clone(),
-            pitch: pitch(&cells),
+            pitch: Scene::of(skin, false).pitch,
             buses: skin.buses.iter().map(|bus| bus.name.clone()).collect(),
             cells,
             segments,
@@ -168,37 +138,9 @@ impl Robot {
     }
 }
 
-/// Frame 0 of a skin's chain in the root's coordinates: that of the URDF's chain with the same rows.
-fn base(urdf: &Urdf, chain: &Chain, position: &dyn Fn(&str) -> f64) -> Option<Isometry3<f64>> {
-    // Which link the chain begins at is not in the skin.
-    let roots = urdf.links().filter_map(|root| urdf.chain(Some(root), &chain.name).ok());
-    let found = roots.into_iter().find(|found| {
-        let same = |(one, other): (&ChainRow, &Row)| {
-            let other = other.with_limits(one.limits);
-            let [one, other] = [one, &other].map(|it| (it.kind, it.table));
-            let near = |one: f64, other: f64| (one - other).abs() < 1e-9;
-            let (a, b) = (one.1, other.1);
-            one.0 == other.0
-                && near(a.a, b.a)
-                && near(a.d, b.d)
-                && near(a.alpha, b.alpha)
-                && near(a.theta_offset, b.theta_offset)
-        };
-        found.rows.len() == chain.rows.len() && chain.rows.iter().zip(&found.rows).all(same)
-    })?;
-    Some(urdf.pose(&found.root, position).ok()? * found.base)
-}
-
 fn row(row: &ChainRow) -> Row {
     let ChainRow { kind, table, .. } = *row;
     Row { kind, a: table.a, alpha: table.alpha, d: table.d, theta_offset: table.theta_offset }
-}
-
-/// A part's triangles at a pose.
-fn corners<'a>(part: &'a Part, pose: &Isometry3<f64>) -> impl Iterator<Item = [[f64; 3]; 3]> + use<'a> {
-    let ([x, y, z], pose) = (part.scale, *pose);
-    let corner = move |[i, j, k]: [f64; 3]| pose.transform_point(&[i * x, j * y, k * z].into()).coords.into();
-    part.mesh.triangles().iter().map(move |triangle| triangle.map(|point| corner(point.coords.into())))
 }
 
 fn drawn(skin: &Skin, cell: &Cell, frames: &[Vec<Isometry3<f64>>]) -> DrawnCell {
@@ -230,18 +172,6 @@ fn drawn(skin: &Skin, cell: &Cell, frames: &[Vec<Isometry3<f64>>]) -> DrawnCell 
         root: cell.root,
         details,
     }
-}
-
-/// The median distance from a cell to the nearest one.
-fn pitch(cells: &[DrawnCell]) -> f64 {
-    let nearest = |cell: &DrawnCell| {
-        let distances = cells.iter().map(|other| distance(&cell.position, &other.position));
-        distances.filter(|distance| *distance > SHORTEST).min_by(f64::total_cmp)
-    };
-    let each = cells.len().div_ceil(ASKED).max(1);
-    let mut nearest: Vec<_> = cells.iter().step_by(each).filter_map(nearest).collect();
-    nearest.sort_by(f64::total_cmp);
-    nearest.get(nearest.len() / 2).copied().unwrap_or(PITCH).min(0.1)
 }
 
 fn distance(one: &[f64; 3], other: &[f64; 3]) -> f64 {

@@ -9,7 +9,7 @@
 //! It listens to the buses as any other node, so that a control loop beside it is not touched: what it shows is what
 //! the buses carried. Touches are stimuli on the bus, which cells in test mode obey.
 //!
-//! [`live`], [`pressed`], [`scene`] and [`command`] have no socket and no clock; [`server`] and [`serve`] are the shell.
+//! [`live`], [`pressed`], [`scene`], [`surface`] and [`command`] have no socket and no clock; [`server`] and [`serve`] are the shell.
 
 pub mod command;
 pub mod index;
@@ -20,6 +20,7 @@ pub mod pressed;
 pub mod scene;
 pub mod serve;
 pub mod server;
+pub mod surface;
 pub mod tape;
 mod web;
 
@@ -27,6 +28,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 pub use live::Live;
 pub use scene::Scene;
+pub use surface::Shell;
 
 /// What a mutex holds, also after a thread that held it has panicked.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

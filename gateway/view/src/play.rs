@@ -16,6 +16,7 @@ use crate::pressed::Pressed;
 use crate::scene::Scene;
 use crate::serve::ServeError;
 use crate::server::{Access, Counts, Server};
+use crate::surface::{Shell, pack};
 use crate::tape::EventKind;
 
 /// From one snapshot to the next.
@@ -32,6 +33,8 @@ pub struct Options {
     pub paths: Vec<PathBuf>,
     /// The skin that it is of.
     pub skin: Skin,
+    /// The robot's surface, where it is known.
+    pub surface: Vec<Shell>,
     /// Who may use it.
     pub access: Access,
     /// Where to stay at first, in s since the first frame; else it plays from there.
@@ -43,12 +46,13 @@ pub struct Options {
 /// # Errors
 /// When the address cannot be listened on, or the recording cannot be read.
 pub fn play(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Result<Counts, ServeError> {
-    let Options { paths, skin, access, at_s } = options;
+    let Options { paths, skin, surface, access, at_s } = options;
     let listen = access.listen;
     let mut player = Player::open(&paths, skin.clone())?;
     let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
-    let scene = serde_json::to_string(&Scene::of(&skin, false)).unwrap_or_default();
-    let server = Server::start(access, scene).map_err(|source| ServeError::Listen { listen, source })?;
+    let (shells, corners) = pack(&surface);
+    let scene = serde_json::to_string(&Scene { shells, ..Scene::of(&skin, false) }).unwrap_or_default();
+    let server = Server::start(access, scene, corners).map_err(|source| ServeError::Listen { listen, source })?;
     says(&server.url());
     let (index, origin) = (player.index(), player.origin());
     thread::scope(|scope| {

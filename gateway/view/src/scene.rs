@@ -3,10 +3,12 @@
 use std::collections::BTreeMap;
 
 use model::surface::Cylinder;
-use nalgebra::{Isometry3, Quaternion, UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use protocol::parameters::RowKind;
 use protocol::skin::{Chain, Skin};
 use serde::Serialize;
+
+use crate::surface::SceneShell;
 
 /// Of more cells, the pitch is taken from about so many.
 const ASKED: usize = 200;
@@ -30,6 +32,8 @@ pub struct Scene {
     pub pitch: f64,
     /// Links as tubes below their cells.
     pub tubes: Vec<Tube>,
+    /// The robot's surface where it is known; [`surface`](crate::surface) has its triangles.
+    pub shells: Vec<SceneShell>,
     /// Whether the page may press cells, halt and resume.
     pub may_press: bool,
 }
@@ -146,6 +150,7 @@ impl Scene {
             tubes: tubes(&buses, &cells),
             buses,
             cells,
+            shells: Vec::new(),
             may_press,
         }
     }
@@ -161,10 +166,7 @@ fn chain(chain: &Chain) -> SceneChain {
         d: row.table.d,
         theta: row.table.theta_offset,
     });
-    let [x, y, z, w] = chain.base.orientation;
-    let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-    let base = Isometry3::from_parts(chain.base.position.into(), turn).to_homogeneous();
-    SceneChain { name: chain.name.clone(), base: base.as_slice().to_vec(), rows: rows.collect() }
+    SceneChain { name: chain.name.clone(), base: chain.base.matrix().concat(), rows: rows.collect() }
 }
 
 /// The median distance from a cell to the nearest one of its link.

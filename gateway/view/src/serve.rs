@@ -24,6 +24,7 @@ use crate::player::PlayError;
 use crate::pressed::Pressed;
 use crate::scene::Scene;
 use crate::server::{Access, Counts, Server};
+use crate::surface::{Shell, pack};
 
 /// From one snapshot to the next.
 const EVERY: Duration = Duration::from_millis(33);
@@ -41,6 +42,8 @@ const AGAIN: Duration = Duration::from_millis(200);
 pub struct Options {
     /// The skin.
     pub skin: Skin,
+    /// The robot's surface, where it is known.
+    pub surface: Vec<Shell>,
     /// Which kind each bus is.
     pub kinds: Kinds,
     /// Where embedded buses are, if not where they usually are.
@@ -85,7 +88,7 @@ struct Shared {
 /// # Errors
 /// When the address cannot be listened on, or a bus cannot be opened at the start and is not waited for.
 pub fn serve(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Result<Counts, ServeError> {
-    let Options { skin, kinds, directory, access, patient, bench } = options;
+    let Options { skin, surface, kinds, directory, access, patient, bench } = options;
     let (listen, may_act) = (access.listen, access.may_act);
     let opened = |name: &str, format: Format| {
         let options = bus::Options {
@@ -105,8 +108,11 @@ pub fn serve(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Re
         Ok(Shared { name: bus.name.clone(), format: bus.format, bus: Mutex::new(first) })
     });
     let buses: Vec<_> = buses.collect::<Result<_, _>>()?;
-    let scene = serde_json::to_string(&Scene::of(&skin, may_act)).unwrap_or_default();
-    let server = Server::start(access, scene).map_err(|source| ServeError::Listen { listen, source })?;
+    let (shells, corners) = pack(&surface);
+    let scene = Scene { shells, ..Scene::of(&skin, may_act) };
+    let scene = serde_json::to_string(&scene).unwrap_or_default();
+    let server =
+        Server::start(access, scene, corners).map_err(|source| ServeError::Listen { listen, source })?;
     says(&server.url());
     let live = Mutex::new(Live::new(skin));
     thread::scope(|scope| {

@@ -70,6 +70,8 @@ struct Shared {
     /// The port that it listens on.
     port: u16,
     scene: String,
+    /// What is served as /surface.
+    surface: Vec<u8>,
     newest: Mutex<Newest>,
     chosen: Mutex<BTreeMap<u64, Chosen>>,
     gone: Mutex<Vec<u64>>,
@@ -90,11 +92,11 @@ pub struct Server {
 }
 
 impl Server {
-    /// Listens, and serves from now on. `scene` is the first message to every page.
+    /// Listens, and serves from now on. `scene` is the first message to every page, `surface` is what it gets as `/surface`.
     ///
     /// # Errors
     /// When the address cannot be listened on.
-    pub fn start(access: Access, scene: String) -> io::Result<Self> {
+    pub fn start(access: Access, scene: String, surface: Vec<u8>) -> io::Result<Self> {
         let listener = TcpListener::bind(access.listen)?;
         let address = listener.local_addr()?;
         let (sender, commands) = sync_channel(COMMANDS);
@@ -102,6 +104,7 @@ impl Server {
             access,
             port: address.port(),
             scene,
+            surface,
             newest: Mutex::default(),
             chosen: Mutex::default(),
             gone: Mutex::default(),

@@ -98,6 +98,14 @@ function where(i) {
 }
 
 const bench = new Bench((command) => link.send(command));
+// The robot's surface, once it is there; cylinders are drawn until then.
+async function surface(of) {
+  const answer = await fetch(`/surface${location.search}`);
+  const corners = new Float32Array(await answer.arrayBuffer());
+  if (answer.ok && scene === of) picture.surface(corners);
+  redraw();
+}
+
 const link = new Link({
   scene(it) {
     scene = it;
@@ -109,6 +117,7 @@ const link = new Link({
     words.link("connected");
     for (const id of ["halt", "resume"]) $(id).disabled = !scene.may_press;
     picture?.set(scene);
+    if (picture && scene.shells.length) surface(scene);
   },
   snapshot(it) {
     snapshot = it;

@@ -62,20 +62,8 @@ export class Picture {
     [this.scene, this.before] = [scene, null];
     this.solid = program(gl, SOLID);
     this.cell = program(gl, CELL);
-    // What has one frame is drawn at once.
-    const parts = new Map();
-    for (const it of cylinders(scene)) {
-      const key = `${it.chain} ${it.row}`;
-      const part = parts.get(key) ?? { chain: it.chain, row: it.row, data: [] };
-      part.data.push(...triangles(it));
-      parts.set(key, part);
-    }
-    this.parts = [...parts.values()].map(({ chain, row, data }) => {
-      const vao = gl.createVertexArray();
-      gl.bindVertexArray(vao);
-      floats(gl, new Float32Array(data), [[0, 3], [1, 3]]);
-      return { chain, row, vao, count: data.length / 6 };
-    });
+    this.round = this.solids(cylinders(scene));
+    this.shells = null;
     // Cells by frame: `order` has their places in the scene.
     const order = scene.cells.map((_, i) => i);
     const key = (i) => { const c = scene.cells[i]; return scene.buses[c.bus].chain * 64 + c.row; };
@@ -109,6 +97,31 @@ export class Picture {
     gl.enableVertexAttribArray(3);
     gl.vertexAttribPointer(3, 4, gl.UNSIGNED_BYTE, true, 0, 0);
     this.colours();
+  }
+
+  // What has one frame is drawn at once.
+  solids(all) {
+    const { gl } = this, parts = new Map();
+    for (const it of all) {
+      const key = `${it.chain} ${it.row}`, part = parts.get(key) ?? { chain: it.chain, row: it.row, data: [] };
+      part.data.push(...triangles(it));
+      parts.set(key, part);
+    }
+    return [...parts.values()].map(({ chain, row, data }) => {
+      const vao = gl.createVertexArray();
+      gl.bindVertexArray(vao);
+      floats(gl, new Float32Array(data), [[0, 3], [1, 3]]);
+      return { chain, row, vao, first: 0, count: data.length / 6 };
+    });
+  }
+
+  // Takes the robot's surface, which is then drawn in place of cylinders.
+  surface(corners) {
+    const { gl } = this, vao = gl.createVertexArray();
+    gl.bindVertexArray(vao);
+    floats(gl, corners, [[0, 3], [1, 3]]);
+    this.shells = this.scene.shells.map((shell) => ({ ...shell, vao }));
+    this.changed = true;
   }
 
   // Reads the colours again: light and dark differ.
@@ -166,11 +179,12 @@ export class Picture {
     gl.useProgram(solid.program);
     gl.uniformMatrix4fv(solid.view, false, view);
     gl.uniform3fv(solid.colour, theme.robot);
-    gl.enable(gl.CULL_FACE);
-    for (const { chain, row, vao, count } of this.parts) {
+    // The faces of others' meshes may be turned either way.
+    if (!this.shells) gl.enable(gl.CULL_FACE);
+    for (const { chain, row, vao, first, count } of this.shells ?? this.round) {
       gl.bindVertexArray(vao);
       gl.uniformMatrix4fv(solid.m, false, frames[chain][row]);
-      gl.drawArrays(gl.TRIANGLES, 0, count);
+      gl.drawArrays(gl.TRIANGLES, first, count);
     }
     gl.disable(gl.CULL_FACE);
     return true;

@@ -133,6 +133,22 @@ impl Default for Base {
     }
 }
 
+impl Base {
+    /// From frame 0 to the robot's base, as a matrix of 4 by 4 in columns, lengths in m.
+    #[must_use]
+    pub fn matrix(&self) -> [[f64; 4]; 4] {
+        let norm = self.orientation.iter().map(|it| it * it).sum::<f64>().sqrt();
+        let [x, y, z, w] = self.orientation.map(|it| it / norm);
+        let [px, py, pz] = self.position;
+        [
+            [w * w + x * x - y * y - z * z, 2.0 * (x * y + w * z), 2.0 * (x * z - w * y), 0.0],
+            [2.0 * (x * y - w * z), w * w - x * x + y * y - z * z, 2.0 * (y * z + w * x), 0.0],
+            [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), w * w - x * x - y * y + z * z, 0.0],
+            [px, py, pz, 1.0],
+        ]
+    }
+}
+
 /// One row of a chain's table.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ChainRow {

@@ -2,6 +2,7 @@
 
 mod collada;
 mod primitive;
+mod simplify;
 #[cfg(test)]
 mod tests;
 
@@ -13,6 +14,8 @@ use std::path::Path;
 
 use nalgebra::{Matrix3, Point3, Vector3};
 use thiserror::Error;
+
+pub use simplify::simplify;
 
 /// The most triangles of one mesh.
 pub const MAX_TRIANGLES: usize = 1_000_000;

@@ -138,6 +138,13 @@ impl Urdf {
         Ok(self.link(link)?.1.collisions.as_slice())
     }
 
+    /// The link that a link hangs on; none of the root, or of a link that does not exist.
+    #[must_use]
+    pub fn parent(&self, link: &str) -> Option<&str> {
+        let (index, _) = self.link(link).ok()?;
+        self.above(index).next().map(|joint| self.link_name(joint.parent))
+    }
+
     /// Where a joint stands that nobody moves, in rad or m: at zero, or in the middle of its limits if zero is not between them. Zero
     /// for a joint that does not exist.
     #[must_use]

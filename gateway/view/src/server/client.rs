@@ -81,6 +81,9 @@ fn handle(mut stream: TcpStream, page: u64, shared: &Shared) -> io::Result<()> {
     if request.is_upgrade && request.path == "/live" {
         return live(Begun { head: Cursor::new(head), stream }, page, shared);
     }
+    if request.path == "/surface" {
+        return answer(&mut stream, "200 OK", "application/octet-stream", &shared.surface);
+    }
     match web::file(&request.path) {
         Some((kind, bytes)) => answer(&mut stream, "200 OK", kind, bytes),
         None => {

@@ -10,7 +10,7 @@ use trace::files::folder_of;
 
 /// Where the files of packages are.
 #[derive(Args, Clone, Debug)]
-pub(super) struct Packages {
+pub(crate) struct Packages {
     /// Where files are that the URDF names as package://NAME/..., as often as there are packages; else they are searched
     /// for in the folder of the URDF and those above it
     #[arg(long, value_name = "NAME=DIR", value_parser = package)]
@@ -27,7 +27,7 @@ fn package(text: &str) -> Result<(String, PathBuf), String> {
 }
 
 /// The shapes of a robot.
-pub(super) struct Visuals<'a> {
+pub(crate) struct Visuals<'a> {
     urdf: &'a Urdf,
     /// The folder of the URDF.
     folder: PathBuf,
@@ -36,7 +36,7 @@ pub(super) struct Visuals<'a> {
 
 impl<'a> Visuals<'a> {
     /// Those of the URDF in this file.
-    pub(super) fn new(urdf: &'a Urdf, file: &Path, packages: &'a Packages) -> Self {
+    pub(crate) fn new(urdf: &'a Urdf, file: &Path, packages: &'a Packages) -> Self {
         let folder = folder_of(file);
         // From `.` there are no folders above.
         let folder = folder.canonicalize().unwrap_or_else(|_| folder.to_owned());
@@ -44,7 +44,7 @@ impl<'a> Visuals<'a> {
     }
 
     /// What a link is made of; nothing, if the URDF has no visual of it.
-    pub(super) fn parts(&self, link: &str) -> Result<Vec<Part>, String> {
+    pub(crate) fn parts(&self, link: &str) -> Result<Vec<Part>, String> {
         let shapes = self.urdf.visuals(link).map_err(|error| error.to_string())?;
         let part =
             |shape| self.part(shape).map_err(|error| format!("{}: link {link}: {error}", self.urdf.file));

@@ -1,0 +1,106 @@
+//! Fewer triangles of the same shape: corners that are near each other become one.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use nalgebra::{Point3, Vector3};
+
+use super::Triangle;
+
+/// How much larger the cubes are at the next try.
+const GROWTH: f64 = 1.12;
+
+/// A cube of the grid.
+type Cube = [i64; 3];
+
+/// At most `most` triangles in all that look as those of these parts; the parts' own if they are no more. Parts stay apart. Corners
+/// within a cube of a grid become their mean, in cubes that are as small as `most` allows.
+#[must_use]
+#[expect(clippy::cast_precision_loss, reason = "a number of triangles")]
+pub fn simplify(parts: Vec<Vec<Triangle>>, most: usize) -> Vec<Vec<Triangle>> {
+    if parts.iter().map(Vec::len).sum::<usize>() <= most {
+        return parts;
+    }
+    let area: f64 = parts.iter().flatten().map(area).sum();
+    // On a flat surface two triangles are left of each cube: these are about half too many.
+    let mut size = (area / most.max(1) as f64).sqrt().max(1e-6);
+    loop {
+        let fewer: Vec<_> = parts.iter().map(|part| clustered(part, size)).collect();
+        if fewer.iter().map(Vec::len).sum::<usize>() <= most {
+            return fewer;
+        }
+        size *= GROWTH;
+    }
+}
+
+fn area([a, b, c]: &Triangle) -> f64 {
+    (b - a).cross(&(c - a)).norm() / 2.0
+}
+
+/// The triangles whose corners are in three cubes of this size, each once.
+#[expect(clippy::cast_possible_truncation, reason = "a coordinate over a size that is no smaller than 1 um")]
+fn clustered(part: &[Triangle], size: f64) -> Vec<Triangle> {
+    // From the part's own corner, so that a cube as large as the part holds it.
+    let infinite = Point3::new(f64::INFINITY, f64::INFINITY, f64::INFINITY);
+    let low = part.iter().flatten().fold(infinite, |low, corner| low.inf(corner));
+    let cube = |corner: &Point3<f64>| -> Cube { ((corner - low) / size).map(|it| it.floor() as i64).into() };
+    let mut means = BTreeMap::<Cube, (Vector3<f64>, f64)>::new();
+    for corner in part.iter().flatten() {
+        let (sum, count) = means.entry(cube(corner)).or_insert_with(|| (Vector3::zeros(), 0.0));
+        *sum += corner.coords;
+        *count += 1.0;
+    }
+    let mut seen = BTreeSet::new();
+    let kept = part.iter().filter_map(|triangle| {
+        let cubes = triangle.each_ref().map(cube);
+        let [a, b, c] = cubes;
+        let mut sorted = cubes;
+        sorted.sort_unstable();
+        (a != b && b != c && c != a && seen.insert(sorted)).then_some(cubes)
+    });
+    let mean = |cube: &Cube| means.get(cube).map(|(sum, count)| Point3::from(sum / *count));
+    kept.filter_map(|[a, b, c]| Some([mean(&a)?, mean(&b)?, mean(&c)?])).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mesh::Mesh;
+
+    #[test]
+    fn a_sphere_of_fewer_triangles_is_a_sphere_still() {
+        let sphere = Mesh::sphere(0.1).unwrap();
+        // Cut each triangle into 64, so that there is something to leave out.
+        let mut fine = sphere.triangles().to_vec();
+        for _ in 0..3 {
+            let middle = |a: &Point3<f64>, b: &Point3<f64>| {
+                Point3::from(((a.coords + b.coords) / 2.0).normalize() * 0.1)
+            };
+            let cut = fine.iter().flat_map(|[a, b, c]| {
+                let [ab, bc, ca] = [middle(a, b), middle(b, c), middle(c, a)];
+                [[*a, ab, ca], [ab, *b, bc], [ca, bc, *c], [ab, bc, ca]]
+            });
+            fine = cut.collect();
+        }
+        let whole: f64 = fine.iter().map(area).sum();
+        let [few] = simplify(vec![fine.clone()], 2000).try_into().unwrap();
+        assert!((800..=2000).contains(&few.len()), "{}", few.len());
+        let left: f64 = few.iter().map(area).sum();
+        assert!((left / whole - 1.0).abs() < 0.05, "{left} of {whole} m2");
+        for [a, b, c] in &few {
+            assert!([a, b, c].iter().all(|corner| (corner.coords.norm() - 0.1).abs() < 0.005));
+            let outward = (b - a).cross(&(c - a)).dot(&a.coords);
+            assert!(outward > 0.0, "the corners turn as before");
+        }
+        assert_eq!(simplify(vec![fine.clone()], fine.len()), vec![fine]);
+    }
+
+    #[test]
+    fn parts_stay_apart_and_nothing_may_be_left() {
+        let part = |z: f64| {
+            let corner = |x: f64, y: f64| Point3::new(x, y, z);
+            vec![[corner(0.0, 0.0), corner(1.0, 0.0), corner(0.0, 1.0)]]
+        };
+        assert_eq!(simplify(vec![part(0.0), part(0.0)], 2), vec![part(0.0), part(0.0)]);
+        assert_eq!(simplify(vec![part(0.0), part(1.0)], 0), [Vec::<Triangle>::new(), Vec::new()]);
+    }
+}

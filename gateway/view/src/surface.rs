@@ -1,0 +1,113 @@
+//! The robot's surface as the page takes it: corners with normals, by rows.
+
+use std::collections::HashMap;
+
+use nalgebra::Vector3;
+use serde::Serialize;
+
+/// At edges between faces that are at a smaller angle, the surface is drawn as round; the cosine of 40 degrees.
+const ROUND: f64 = 0.77;
+
+/// What is fixed to a row of a chain.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Shell {
+    /// The chain, as an index into the skin's.
+    pub chain: usize,
+    /// The row in whose frame it is, from 1; 0 is where the chain begins.
+    pub row: usize,
+    /// Its triangles in that frame, in m.
+    pub triangles: Vec<[[f64; 3]; 3]>,
+}
+
+/// Where the corners of a shell are among those of all.
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
+pub struct SceneShell {
+    /// The chain, as an index into [`Scene::chains`](crate::Scene::chains).
+    pub chain: usize,
+    /// The row, from 1; 0 is where the chain begins.
+    pub row: usize,
+    /// The first corner.
+    pub first: usize,
+    /// How many corners: three for each triangle.
+    pub count: usize,
+}
+
+/// The shells as a page takes them, and the bytes of all their corners: of each the place and the normal, 6 little-endian f32.
+#[must_use]
+pub fn pack(shells: &[Shell]) -> (Vec<SceneShell>, Vec<u8>) {
+    let (mut all, mut bytes) = (Vec::new(), Vec::new());
+    let mut first = 0;
+    for Shell { chain, row, triangles } in shells {
+        let count = 3 * triangles.len();
+        if count == 0 {
+            continue;
+        }
+        all.push(SceneShell { chain: *chain, row: *row, first, count });
+        first += count;
+        let corners = triangles.iter().flatten().zip(normals(triangles));
+        for value in corners.flat_map(|(place, normal)| [*place, normal.into()]).flatten() {
+            #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
+            bytes.extend((value as f32).to_le_bytes());
+        }
+    }
+    (all, bytes)
+}
+
+/// The normal of each corner: the mean of those of the faces there that are about its own face's.
+fn normals(triangles: &[[[f64; 3]; 3]]) -> Vec<Vector3<f64>> {
+    let key = |corner: &[f64; 3]| corner.map(f64::to_bits);
+    let faces: Vec<_> = triangles
+        .iter()
+        .map(|triangle| {
+            let [a, b, c] = triangle.map(Vector3::from);
+            (b - a).cross(&(c - a))
+        })
+        .collect();
+    let mut around = HashMap::<_, Vec<Vector3<f64>>>::new();
+    for (triangle, face) in triangles.iter().zip(&faces) {
+        for corner in triangle {
+            around.entry(key(corner)).or_default().push(*face);
+        }
+    }
+    let unit = |vector: Vector3<f64>| vector.try_normalize(0.0).unwrap_or_else(Vector3::z);
+    let of = |(triangle, face): (&[[f64; 3]; 3], &Vector3<f64>)| {
+        let own = unit(*face);
+        triangle.map(|corner| {
+            let near = around.get(&key(&corner)).into_iter().flatten();
+            unit(near.filter(|other| unit(**other).dot(&own) > ROUND).sum())
+        })
+    };
+    triangles.iter().zip(&faces).flat_map(of).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn corners_of_flat_faces_have_their_normal_and_round_ones_the_mean() {
+        let (low, high) = ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]);
+        // Two faces at an edge: at a right angle, and at 20 degrees.
+        for (turn, together) in [(90.0_f64, false), (20.0, true)] {
+            let (sine, cosine) = turn.to_radians().sin_cos();
+            let shell = Shell {
+                chain: 1,
+                row: 2,
+                triangles: vec![[low, high, [0.0, 1.0, 0.0]], [high, low, [0.0, -cosine, sine]]],
+            };
+            let nothing = Shell { chain: 0, row: 0, triangles: Vec::new() };
+            let (shells, bytes) = pack(&[nothing, shell.clone(), shell]);
+            let of = |first| SceneShell { chain: 1, row: 2, first, count: 6 };
+            assert_eq!(shells, [of(0), of(6)]);
+            assert_eq!(bytes.len(), 2 * 6 * 24);
+            let values: Vec<_> =
+                bytes.chunks(4).map(|it| f32::from_le_bytes(it.try_into().unwrap())).collect();
+            assert_eq!(values[6..9], [1.0, 0.0, 0.0], "the second corner");
+            let normal = &values[9..12];
+            let is_mean = (f64::from(normal[2]) - 10.0_f64.to_radians().cos()).abs() < 1e-3;
+            let is_own = normal == [0.0, 0.0, 1.0];
+            assert_eq!((is_mean, is_own), (together, !together), "{normal:?}");
+            assert_eq!(values[15..18], [0.0, 0.0, 1.0], "the corner that is only its own");
+        }
+    }
+}
