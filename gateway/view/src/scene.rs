@@ -101,7 +101,7 @@ pub struct SceneCell {
     pub position: [f64; 3],
     /// Which way it faces there.
     pub normal: [f64; 3],
-    /// The node ids that it is wired to.
+    /// The node ids that it is wired to, by its ports; 0 of a port without a wire.
     pub neighbors: Vec<u8>,
     /// Whether it is wired to the gateway.
     pub root: bool,
@@ -136,7 +136,7 @@ impl Scene {
             joint: cell.joint,
             position: cell.position,
             normal: cell.normal,
-            neighbors: cell.neighbors.iter().flatten().map(|node| node.get()).collect(),
+            neighbors: cell.neighbors.iter().map(|node| node.map_or(0, |node| node.get())).collect(),
             root: cell.root,
         });
         let cells: Vec<_> = cells.collect();

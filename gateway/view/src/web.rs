@@ -16,6 +16,7 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
         "/pace.js" => (SCRIPT, include_bytes!("../web/pace.js")),
         "/colours.js" => (SCRIPT, include_bytes!("../web/colours.js")),
         "/plots.js" => (SCRIPT, include_bytes!("../web/plots.js")),
+        "/wires.js" => (SCRIPT, include_bytes!("../web/wires.js")),
         "/words.js" => (SCRIPT, include_bytes!("../web/words.js")),
         "/touch.js" => (SCRIPT, include_bytes!("../web/touch.js")),
         "/dom.js" => (SCRIPT, include_bytes!("../web/dom.js")),
@@ -30,7 +31,7 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
 mod tests {
     use super::*;
 
-    const FILES: [&str; 18] = [
+    const FILES: [&str; 19] = [
         "/",
         "/style.css",
         "/app.js",
@@ -43,6 +44,7 @@ mod tests {
         "/pace.js",
         "/colours.js",
         "/plots.js",
+        "/wires.js",
         "/words.js",
         "/touch.js",
         "/dom.js",

@@ -12,11 +12,12 @@ import { Plots, number } from "./plots.js";
 import { TimeBar } from "./time.js";
 import { extent, frames } from "./robot.js";
 import { listen, pick } from "./touch.js";
+import { wires } from "./wires.js";
 import * as words from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), camera = new Camera();
-let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, chosen = -1, pressed = -1, due = false;
+let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, trees = [], chosen = -1, pressed = -1, due = false;
 // For whoever looks from outside.
 window.skinbus = { frames: 0, snapshots: 0, where, joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
 
@@ -50,6 +51,9 @@ function draw(still) {
     said = null;
     words.say(scene, news, ask);
     bench.say(scene, news.bench, chosen);
+    trees = news.buses.map((bus) => bus.tree);
+    $("tree-switch").hidden = trees.every((tree) => !tree);
+    drawTree();
     plots.draw();
     camera.fit(extent(scene, all));
   }
@@ -98,6 +102,10 @@ function where(i) {
 }
 
 const bench = new Bench((command) => link.send(command));
+function drawTree() {
+  picture?.tree($("tree").checked ? wires(scene, trees) : []);
+}
+
 // The robot's surface, once it is there; cylinders are drawn until then.
 async function surface(of) {
   const answer = await fetch(`/surface${location.search}`);
@@ -116,6 +124,7 @@ const link = new Link({
     words.chosen("");
     words.link("connected");
     for (const id of ["halt", "resume"]) $(id).disabled = !scene.may_press;
+    words.buses(scene);
     picture?.set(scene);
     if (picture && scene.shells.length) surface(scene);
   },
@@ -177,7 +186,11 @@ window.addEventListener("blur", release);
 window.addEventListener("resize", redraw);
 
 function legend() {
-  const shows = SHOWS[$("shows").value], pen = $("ramp").getContext("2d"), { width, height } = $("ramp");
+  const shows = SHOWS[$("shows").value];
+  $("scale").hidden = shows.isBus ?? false;
+  $("bus-colours").hidden = !shows.isBus;
+  if (shows.isBus) return redraw();
+  const pen = $("ramp").getContext("2d"), { width, height } = $("ramp");
   $("low").textContent = number(shows.low).replace(/\.0+$/, "");
   $("high").textContent = `${number(shows.high).replace(/\.0+$/, "")} ${shows.unit}`;
   for (let x = 0; x < width; x++) {
@@ -187,6 +200,7 @@ function legend() {
   redraw();
 }
 $("shows").onchange = legend;
+$("tree").onchange = () => { drawTree(); redraw(); };
 legend();
 words.shapes(css);
 matchMedia("(prefers-color-scheme: dark)").onchange = () => { if (scene) picture?.colours(); words.shapes(css); redraw(); };

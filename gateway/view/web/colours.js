@@ -7,12 +7,24 @@ export function ramp(share) {
   return STOPS[i].map((v, k) => Math.round(v + (STOPS[i + 1][k] - v) * (at - i)));
 }
 
+// Seven colours that people tell apart whatever colours they see (Okabe, Ito 2008); more buses than these share them.
+export const BUSES = [[86, 180, 233], [230, 159, 0], [0, 158, 115], [240, 228, 66], [0, 114, 178], [213, 94, 0], [204, 121, 167]];
+export const busColour = (bus) => BUSES[bus % BUSES.length];
+
 // What cells can show: how a value is read from a snapshot's cell, its range, its unit.
 export const SHOWS = {
   force: { of: (cell) => cell.force / 1000, low: 0, high: 10, unit: "N", rest: (v) => v <= 0 },
   proximity: { of: (cell) => cell.proximity / 32768, low: 0, high: 1, unit: "", rest: (v) => v <= 0 },
   temperature: { of: (cell) => cell.temperature / 100, low: 0, high: 60, unit: "°C", rest: () => false },
+  bus: { isBus: true },
 };
+
+// The colour of a cell, which is `at` in the scene; null at rest.
+export function colourOf(shows, cell, at) {
+  if (shows.isBus) return busColour(at.bus);
+  const value = shows.of(cell);
+  return shows.rest(value) ? null : ramp((value - shows.low) / (shows.high - shows.low));
+}
 
 // What a cell's shape says, the most important first: the number is that of the shader.
 export const SHAPES = [

@@ -1,10 +1,11 @@
 // Draws the robot and its cells with WebGL2.
 
-import { css, ramp, rgb, shapeOf } from "./colours.js";
+import { colourOf, css, rgb, shapeOf } from "./colours.js";
 import { context, floats, program } from "./gl.js";
 import { cellOf } from "./link.js";
 import { add } from "./math.js";
 import { axes, cylinders, neighbors, triangles } from "./robot.js";
+import { FLOATS, ribbons } from "./wires.js";
 
 // Light is that of a vertex, not of a pixel: a software renderer has few of the one and many of the other.
 const LIGHT = "float light(vec3 n) { return max(dot(normalize(n), normalize(vec3(.4, -.5, .77))), 0.); }";
@@ -45,6 +46,15 @@ void main() {
   o = vec4(c, 1.);
 }`];
 
+// A wire of the tree, or one that is cut: that is dashed. It is a little nearer than the cells that it leads over.
+const WIRE = [`layout(location=0) in vec3 at; layout(location=1) in vec2 how; uniform mat4 view; out vec2 kind;
+void main() { kind = how; gl_Position = view * vec4(at, 1.); gl_Position.z -= .0006 * gl_Position.w; }`,
+`in vec2 kind; uniform vec3 mark, alarm; out vec4 o;
+void main() {
+  if (kind.y > .5 && fract(kind.x * 3. + .25) > .5) discard;
+  o = vec4(kind.y > .5 ? alarm : mark, 1.);
+}`];
+
 // What a cell is drawn as: its hexagon, or a triangle around it, of which a software renderer draws the pixels in the hexagon.
 const corner = (degrees, far) => [far * Math.cos(degrees * Math.PI / 180), far * Math.sin(degrees * Math.PI / 180)];
 const HEXAGON = { corners: [0, 60, 120, 180, 240, 300].map((at) => corner(at, 1)), fan: [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5] };
@@ -62,6 +72,15 @@ export class Picture {
     [this.scene, this.before] = [scene, null];
     this.solid = program(gl, SOLID);
     this.cell = program(gl, CELL);
+    this.wire = program(gl, WIRE);
+    this.wires = [];
+    this.ribbon = { vao: gl.createVertexArray(), buffer: gl.createBuffer() };
+    gl.bindVertexArray(this.ribbon.vao);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.ribbon.buffer);
+    for (const [at, size, offset] of [[0, 3, 0], [1, 2, 12]]) {
+      gl.enableVertexAttribArray(at);
+      gl.vertexAttribPointer(at, size, gl.FLOAT, false, FLOATS * 4, offset);
+    }
     this.round = this.solids(cylinders(scene));
     this.shells = null;
     // Cells by frame: `order` has their places in the scene.
@@ -124,11 +143,17 @@ export class Picture {
     this.changed = true;
   }
 
+  // Takes the wires that are drawn.
+  tree(wires) {
+    if (JSON.stringify(wires) === JSON.stringify(this.wires)) return;
+    [this.wires, this.changed] = [wires, true];
+  }
+
   // Reads the colours again: light and dark differ.
   colours() {
     this.changed = true;
     const colour = (name) => rgb(css(name)).map((v) => v / 255);
-    this.theme = { back: colour("--back"), robot: colour("--robot"), unlit: rgb(css("--unlit")), mark: colour("--mark"), edge: colour("--edge"), chosen: colour("--chosen") };
+    this.theme = { back: colour("--back"), robot: colour("--robot"), unlit: rgb(css("--unlit")), mark: colour("--mark"), edge: colour("--edge"), chosen: colour("--chosen"), alarm: colour("--alarm") };
   }
 
   // Takes the cells of a snapshot, in the scene's order. Those that did not change are left alone.
@@ -139,8 +164,7 @@ export class Picture {
     order.forEach((i, at) => {
       const one = same && (i === chosen) === (i === before.chosen);
       if (one && words[2 * i] === before.words[2 * i] && words[2 * i + 1] === before.words[2 * i + 1]) return;
-      const cell = cellOf(words, i), value = shows.of(cell);
-      const [r, g, b] = shows.rest(value) ? theme.unlit : ramp((value - shows.low) / (shows.high - shows.low));
+      const cell = cellOf(words, i), [r, g, b] = colourOf(shows, cell, scene.cells[i]) ?? theme.unlit;
       const kind = shapeOf(cell).shape | (i === chosen ? 16 : 0) | (cell.flags & 16 ? 32 : 0) | (scene.cells[i].root ? 64 : 0);
       looks.fill((r | g << 8 | b << 16 | kind << 24) >>> 0, at * vertices, (at + 1) * vertices);
       [first, end] = [Math.min(first, at), at + 1];
@@ -175,6 +199,17 @@ export class Picture {
     for (const { chain, row, first, count } of this.groups) {
       gl.uniformMatrix4fv(cell.m, false, frames[chain][row]);
       gl.drawElements(gl.TRIANGLES, count * this.indices, gl.UNSIGNED_INT, first * this.indices * 4);
+    }
+    if (this.wires.length) {
+      const { wire, ribbon } = this, corners = ribbons(this.scene, frames, this.wires);
+      gl.useProgram(wire.program);
+      gl.bindVertexArray(ribbon.vao);
+      gl.bindBuffer(gl.ARRAY_BUFFER, ribbon.buffer);
+      gl.bufferData(gl.ARRAY_BUFFER, corners, gl.DYNAMIC_DRAW);
+      gl.uniformMatrix4fv(wire.view, false, view);
+      gl.uniform3fv(wire.mark, theme.mark);
+      gl.uniform3fv(wire.alarm, theme.alarm);
+      gl.drawArrays(gl.TRIANGLES, 0, corners.length / FLOATS);
     }
     gl.useProgram(solid.program);
     gl.uniformMatrix4fv(solid.view, false, view);

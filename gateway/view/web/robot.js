@@ -45,9 +45,12 @@ function near([from, to], p) {
   return add(from, along, dot(along, add(p, from, -1)));
 }
 
+// The cells' indices by 256 times the bus plus the node id.
+export const indices = (scene) => new Map(scene.cells.map((cell, i) => [cell.bus * 256 + cell.node, i]));
+
 // For each cell a cell that it is wired to and that is in its frame, as an index; -1 where there is none.
 export function neighbors(scene) {
-  const at = new Map(scene.cells.map((cell, i) => [cell.bus * 256 + cell.node, i]));
+  const at = indices(scene);
   return scene.cells.map((cell) => {
     const near = cell.neighbors.map((node) => at.get(cell.bus * 256 + node)).find((i) => scene.cells[i]?.row === cell.row);
     return near ?? -1;

@@ -1,6 +1,6 @@
 // What the page says in words: facts, buses, silent cells, the chosen cell.
 
-import { SHAPES } from "./colours.js";
+import { BUSES, SHAPES, busColour } from "./colours.js";
 import { element, show } from "./dom.js";
 import { forget, frames } from "./frames.js";
 import { number } from "./plots.js";
@@ -120,6 +120,21 @@ export function chosen(name) {
 export function link(text, isBad) {
   $("link").textContent = text;
   $("link").className = isBad ? "bad" : "";
+}
+
+// Which colour is which bus: those that share one are in one line.
+export function buses(scene) {
+  $("bus-colours").replaceChildren(...BUSES.slice(0, scene.buses.length).map((_, at) => {
+    const same = scene.buses.filter((_, bus) => bus % BUSES.length === at).map((bus) => bus.name);
+    const item = element("li"), key = element("canvas");
+    [key.width, key.height] = [14, 14];
+    key.setAttribute("aria-hidden", "true");
+    const pen = key.getContext("2d");
+    pen.fillStyle = `rgb(${busColour(at).join(" ")})`;
+    pen.fillRect(0, 0, 14, 14);
+    item.append(key, element("span", same.length > 2 ? `${same[0]}, ${same[1]} ... ${same[same.length - 1]}` : same.join(", ")));
+    return item;
+  }));
 }
 
 // The shapes of cells, as the picture draws them.

@@ -80,7 +80,18 @@ pub struct BusSaid {
     pub dropped: u64,
     /// Mean absolute error of single torques against the central computation, in Nm.
     pub error_nm: Option<f64>,
+    /// Of a bus with sums, the place in the tree of each cell, in the skin's order; none of a cell that is silent or has not reported it.
+    pub tree: Option<Vec<Option<Wires>>>,
 }
+
+/// A cell's place in the tree, as it reports.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
+pub struct Wires(
+    /// Where its sums go: the node id of a cell, 0 for the gateway's side; none where it is unreachable.
+    pub Option<u8>,
+    /// Bit p: port p works in both directions.
+    pub u8,
+);
 
 /// A cell in detail.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -153,7 +164,7 @@ impl Live {
             dead,
             dead_cells,
             halted: self.buses.iter().any(|bus| bus.halted),
-            buses: self.buses.iter().map(LiveBus::said).collect(),
+            buses: self.buses.iter().map(|bus| bus.said(now)).collect(),
             detail: None,
             playback: None,
             bench: None,
@@ -210,7 +221,7 @@ impl Live {
 }
 
 impl LiveBus {
-    fn said(&self) -> BusSaid {
+    fn said(&self, now: Micros) -> BusSaid {
         let counters = self.table.counters();
         let uplink = self.table.uplink();
         let account = self.table.replies();
@@ -231,6 +242,14 @@ impl LiveBus {
             saturated: counters.events(Event::Saturated),
             dropped: self.dropped,
             error_nm: errors.mean(),
+            tree: self.sums.then(|| {
+                let cells = self.table.statuses(now).map(|(cell, status)| {
+                    let sends = !matches!(status, Status::Dead | Status::Unknown);
+                    let tree = cell.pages().tree.filter(|_| sends);
+                    tree.map(|tree| Wires(tree.parent, tree.works))
+                });
+                cells.collect()
+            }),
         }
     }
 }

@@ -2,10 +2,10 @@
 
 use super::*;
 use crate::command::Chosen;
-use model::generate::{Target, generate};
+use model::generate::{Reply, Target, generate};
 use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::Node;
-use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, State};
+use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, State, Tree};
 use protocol::packet::{Epoch, Packet};
 
 fn skin() -> Skin {
@@ -174,4 +174,32 @@ fn ten_thousand_cells_on_forty_buses_are_shown() {
     let expected = bench.live.skin.cells.iter().position(|cell| (cell.bus, cell.node) == (bus, node));
     assert_eq!(pressed.iter().map(|(at, _)| *at).collect::<Vec<_>>(), [expected.unwrap()]);
     assert_eq!(bench.live.said(bench.now).buses.len(), buses);
+}
+
+#[test]
+fn a_bus_with_sums_says_where_cells_are_in_the_tree() {
+    let target = Target { cells: 4, reply: Reply::Sum, ..Target::default() };
+    let skin = Skin::parse("sums", &generate(&target).unwrap()).unwrap();
+    let mut bench = Bench { live: Live::new(skin), now: Micros(1_000_000), bus: 0 };
+    let places = |bench: &Bench| bench.live.said(bench.now).buses[0].tree.clone().unwrap();
+    bench.joints(1, Q);
+    for (node, parent) in [(1, Some(0)), (2, Some(1)), (3, None)] {
+        bench.heartbeat(node, 0);
+        let page = NetworkPage::Tree(Tree { parent, up: 0, works: 0b0101, ..Tree::default() });
+        bench.say(&Message::Network {
+            from: Node::Cell(CellId::new(node.into()).unwrap()),
+            epoch: Epoch(1),
+            page,
+        });
+    }
+    assert_eq!(
+        places(&bench),
+        [Some(Wires(Some(0), 0b0101)), Some(Wires(Some(1), 0b0101)), Some(Wires(None, 0b0101)), None]
+    );
+    let json = serde_json::to_string(&bench.live.said(bench.now)).unwrap();
+    assert!(json.contains(r#""tree":[[0,5],[1,5],[null,5],null]"#), "{json}");
+    bench.now.0 += 5_000_000;
+    bench.live.handle_time(bench.now);
+    assert_eq!(places(&bench), [None; 4], "they are silent");
+    assert_eq!(Bench::new().live.said(Micros(0)).buses[0].tree, None, "torques have no tree");
 }

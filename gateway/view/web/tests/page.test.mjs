@@ -4,7 +4,7 @@ import { test } from "node:test";
 
 import { about, allowed, isDown, processOf } from "../bench.js";
 import { Camera } from "../camera.js";
-import { SHAPES, ramp, shapeOf } from "../colours.js";
+import { BUSES, SHAPES, SHOWS, busColour, colourOf, ramp, shapeOf } from "../colours.js";
 import { cellOf, decode, decodeHistory } from "../link.js";
 import { cross, dot, look, perspective, point, project, row, times, unit } from "../math.js";
 import { Pace, SOFTWARE_HZ } from "../pace.js";
@@ -12,6 +12,7 @@ import { axes, cylinders, extent, frames, neighbors, triangles } from "../robot.
 import { pick } from "../touch.js";
 import { number } from "../plots.js";
 import { clock, requested } from "../time.js";
+import { FLOATS, ribbons, wires } from "../wires.js";
 
 const close = (a, b, within = 1e-9) => a.forEach((v, i) => assert.ok(Math.abs(v - b[i]) < within, `${a} ${b}`));
 const IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
@@ -191,4 +192,31 @@ test("a process offers what makes sense, and says which cells it runs", () => {
   assert.equal(about({ nodes: [7, 7], phase: "ended" }), "The process of this cell has ended.");
   assert.deepEqual([[9, 4], [4, 9], [4, 5]].map(([a, b]) => isDown(state, 1, a, b)), [true, true, false]);
   assert.equal(isDown(state, 0, 4, 9), false);
+});
+
+test("the tree leads from each cell to its parent, and a wire that does not work is there once", () => {
+  const at = (node, x, neighbors, row = 1) => ({ ...cell(row, [x, 0, 0], [0, 0, 1]), node, neighbors });
+  const cells = [at(1, 0, [2, 0, 0, 3]), at(2, 0.03, [1, 0, 0, 0]), at(3, 0.06, [1, 0, 0, 0], 2), { ...at(1, 0.5, [2, 0, 0, 0]), bus: 1 }];
+  const it = { ...scene(cells), buses: [{ name: "vcan0", chain: 0 }, { name: "vcan1", chain: 0 }] };
+  // 1 is a root, both of its wires work; 2 hangs on 1; 3 has not reported, the other bus sends no sums.
+  assert.deepEqual(wires(it, [[[0, 0b1001], [1, 0b0001], null], null]), [{ from: 1, to: 0, cut: false }]);
+  // The wire between 1 and 2 is cut, as both say.
+  assert.deepEqual(wires(it, [[[0, 0b1000], [null, 0], [1, 0b0001]], null]), [{ from: 0, to: 1, cut: true }, { from: 2, to: 0, cut: false }]);
+  const all = [{ from: 1, to: 0, cut: false }, { from: 2, to: 0, cut: true }], places = frames(it, [0, 0, 0, 0, 0, 0]);
+  const corners = ribbons(it, places, all);
+  assert.equal(corners.length, 2 * 6 * FLOATS);
+  const corner = (k) => [...corners.slice(k * FLOATS, (k + 1) * FLOATS)];
+  assert.deepEqual([corner(0)[4], corner(6)[4]], [0, 1]);
+  const gap = (a, b) => Math.hypot(...[0, 1, 2].map((i) => corner(a)[i] - corner(b)[i]));
+  assert.ok(gap(0, 1) > 3 * gap(3, 5), "narrow at the parent");
+  close([gap(6, 7)], [gap(9, 11)], 1e-6);
+  const far = point(places[0][2], [0.06, 0, 0]).map((v, i) => v - (corner(6)[i] + corner(7)[i]) / 2);
+  assert.ok(Math.hypot(...far) < 0.3 * it.pitch, "a wire leads from one row's frame to another's");
+});
+
+test("buses have colours of their own, and cells at rest none", () => {
+  assert.deepEqual(colourOf(SHOWS.bus, {}, { bus: 1 }), BUSES[1]);
+  assert.deepEqual(busColour(BUSES.length), BUSES[0]);
+  assert.equal(colourOf(SHOWS.force, { force: 0 }, { bus: 1 }), null);
+  assert.deepEqual(colourOf(SHOWS.force, { force: 10000 }, { bus: 1 }), ramp(1));
 });
