@@ -26,6 +26,20 @@ fn text(browser: &mut Browser, id: &str) -> String {
     browser.value(&format!("document.getElementById('{id}').textContent")).as_str().unwrap().to_owned()
 }
 
+/// Rules of accessibility, and what looks for faults of a page.
+const AXE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../target/axe/node_modules/axe-core/axe.min.js");
+
+/// The serious and critical findings of axe-core, which is in the page.
+fn findings(browser: &mut Browser) -> Vec<String> {
+    browser.value(
+        "window.found = null; axe.run().then((it) => { window.found = [it.passes.length, it.violations.filter((it) =>
+         ['serious', 'critical'].includes(it.impact)).map((it) => `${it.id}: ${it.nodes[0].html}`)]; }); 0",
+    );
+    let found = browser.until("window.found");
+    assert!(found[0].as_u64().unwrap() > 20, "rules were looked at");
+    serde_json::from_value(found[1].clone()).unwrap()
+}
+
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
@@ -77,11 +91,17 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
         "{kill}.disabled && document.getElementById('facts').textContent.includes('Silent1')"
     ));
 
-    for (width, scheme) in [(1400, "dark"), (390, "light"), (390, "dark")] {
+    let axe = std::fs::read_to_string(AXE).expect("tests/tools/install makes axe-core ready");
+    browser.value(&format!("{axe};0"));
+    for (width, scheme) in [(1400, "light"), (1400, "dark"), (390, "light"), (390, "dark")] {
         browser.resize(width, 844);
         browser.scheme(scheme);
         browser.until(&format!("document.documentElement.scrollWidth <= {width}"));
+        assert_eq!(findings(&mut browser), Vec::<String>::new(), "{width} px, {scheme}");
     }
+    // It finds what is there.
+    browser.value("document.getElementById('halt').textContent = ''");
+    assert_eq!(findings(&mut browser).len(), 1);
     let host = url.trim_end_matches('/').to_owned();
     let outside: Vec<_> = browser
         .requests()

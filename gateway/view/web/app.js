@@ -117,7 +117,7 @@ async function surface(of) {
 const link = new Link({
   scene(it) {
     scene = it;
-    [chosen, pressed, snapshot, said] = [-1, -1, null, null];
+    [chosen, pressed, snapshot, said, camera.box] = [-1, -1, null, null, null];
     document.title = `${scene.name}: skinbus view`;
     $("name").textContent = scene.name;
     plots = new Plots($("torques"), scene.joints);

@@ -2,17 +2,22 @@
 
 import { look, perspective, times } from "./math.js";
 
+// So many sizes away a sphere of that size is seen whole, and the thickness of the links around it.
+const FAR = 1.15;
+
 export class Camera {
   constructor() {
-    Object.assign(this, { yaw: -1.0, pitch: 0.3, zoom: 1, middle: [0, 0, 0], size: 1, moved: false });
+    Object.assign(this, { yaw: -1.0, pitch: 0.3, zoom: 1, middle: [0, 0, 0], size: 1, moved: false, box: null });
   }
 
-  // Shows all of it, unless somebody has moved the camera; it stays where it is while the robot moves a little.
-  fit({ middle, size }) {
-    const off = Math.hypot(...middle.map((v, i) => v - this.middle[i]));
-    if (!this.moved && (off > 0.12 * this.size || Math.abs(size - this.size) > 0.25 * this.size)) {
-      Object.assign(this, { middle, size });
-    }
+  // Shows this box and all before it, unless somebody has moved the camera: it stands still once the robot has been everywhere.
+  fit({ low, high }) {
+    const now = this.box ?? { low, high };
+    this.box = { low: low.map((v, i) => Math.min(v, now.low[i])), high: high.map((v, i) => Math.max(v, now.high[i])) };
+    if (this.moved) return;
+    const [from, to] = [this.box.low, this.box.high];
+    this.middle = from.map((v, i) => (v + to[i]) / 2);
+    this.size = Math.hypot(...from.map((v, i) => to[i] - v)) || 1;
   }
 
   turn(dx, dy) {
@@ -27,7 +32,7 @@ export class Camera {
   }
 
   eye() {
-    const far = this.size * 1.02 / this.zoom, c = Math.cos(this.pitch);
+    const far = this.size * FAR / this.zoom, c = Math.cos(this.pitch);
     return [c * Math.cos(this.yaw), c * Math.sin(this.yaw), Math.sin(this.pitch)].map((v, i) => this.middle[i] + far * v);
   }
 

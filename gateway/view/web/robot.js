@@ -87,11 +87,11 @@ export function triangles({ from, to, radius }) {
   return out;
 }
 
-// The middle and the size of all that is drawn, where the robot stands now.
+// The corners of the box around all that is drawn, where the robot stands now.
 export function extent(scene, all) {
   const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
   const take = (p) => p.forEach((v, i) => { low[i] = Math.min(low[i], v); high[i] = Math.max(high[i], v); });
   scene.chains.forEach((_, c) => all[c].forEach((m) => take(point(m, [0, 0, 0]))));
   for (const cell of scene.cells) take(point(all[scene.buses[cell.bus].chain][cell.row], cell.position));
-  return { middle: low.map((v, i) => (v + high[i]) / 2), size: Math.hypot(...high.map((v, i) => v - low[i])) || 1 };
+  return { low, high };
 }

@@ -113,16 +113,22 @@ test("the nearest cell that faces the eye is picked", () => {
 
 test("the camera shows all of the robot until somebody moves it", () => {
   const it = scene(), all = frames(it, [0.3, -1.2, 1, -1.4, -1.5, 0.2]), camera = new Camera();
-  const { middle, size } = extent(it, all);
-  camera.fit({ middle, size });
+  camera.fit(extent(it, all));
   for (const m of all[0]) {
     for (const [w, h] of [[1000, 800], [390, 500]]) {
       const [x, y] = project(camera.matrix(w, h), point(m, [0, 0, 0]), w, h);
       assert.ok(x > 0 && x < w && y > 0 && y < h, `${x} ${y}`);
     }
   }
+  // It stands still while the robot moves where it has been.
+  const elsewhere = extent(it, frames(it, [1.3, -0.2, 1, -1.4, -1.5, 0.2]));
+  camera.fit(elsewhere);
+  const { middle, size } = camera;
+  camera.fit(extent(it, all));
+  camera.fit(elsewhere);
+  assert.deepEqual([camera.middle, camera.size], [middle, size]);
   camera.turn(10, 10);
-  camera.fit({ middle: [9, 9, 9], size: 1 });
+  camera.fit({ low: [9, 9, 9], high: [10, 10, 10] });
   assert.deepEqual(camera.middle, middle);
 });
 
