@@ -1,5 +1,6 @@
 //! `gateway replay`.
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -17,6 +18,7 @@ use protocol::usage::{Failure, print};
 use super::arguments::{BusKinds, Programs, Word, nanos, one_of};
 use super::output::{self, Force, apart};
 use super::print::{Rows, json, list, or, quantiles};
+use super::view::Page;
 
 /// Bytes for frames that wait: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
@@ -69,8 +71,8 @@ pub(crate) struct Replay {
     /// Start the cells, as processes, and end them afterwards
     #[arg(long)]
     spawn: bool,
-    /// The skin of the cells that are started; else the recording's own
-    #[arg(long, value_name = "FILE", requires = "spawn")]
+    /// The skin of the cells that are started, and of the page; else the recording's own
+    #[arg(long, value_name = "FILE")]
     skin: Option<PathBuf>,
     #[command(flatten)]
     programs: Programs,
@@ -88,12 +90,23 @@ pub(crate) struct Replay {
     summary: Option<PathBuf>,
     #[command(flatten)]
     force: Force,
+    #[command(flatten)]
+    shown: Shown,
+}
+
+/// What is shown, and how.
+#[derive(Args, Debug)]
+struct Shown {
     /// Print the figures as JSON instead of the table
     #[arg(long)]
     json: bool,
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
+    /// Show the skin live in a browser while it lasts: a page is served at this address or any free port of this machine;
+    /// docs/how-to/view.md
+    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true, conflicts_with = "map")]
+    view: Option<Option<SocketAddr>>,
 }
 
 /// Which frames of the capture, and where they go.
@@ -151,19 +164,28 @@ impl Replay {
         apart([("--summary", self.summary.as_deref())], read)?;
         // Before the replay, so that a file that cannot be written is reported first.
         let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
+        let page = |listen| Page::of_replay(&self.files, self.skin.as_deref(), &options.kinds, listen);
+        // Its pipes stay open until the end.
+        let _page = self.shown.view.map(page).transpose()?;
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
         let json = json(&summary)?;
         if let Some((whole, file)) = file {
             output::finish("--summary", whole, file, &json)?;
         }
-        print(&if self.json { json } else { table(&summary) })?;
+        print(&if self.shown.json { json } else { table(&summary) })?;
         summary.verdict().map_or(Ok(()), |why| Err(Failure::run(why)))
     }
 
     fn options(&self) -> Result<Options, Failure> {
         let answered = [("--expect", self.expect), ("--lockstep", self.lockstep), ("--spawn", self.spawn)];
         let needs = answered.into_iter().find_map(|(name, given)| given.then_some(name));
+        if let Some(skin) = self.skin.as_ref().filter(|_| !self.spawn && self.shown.view.is_none()) {
+            return Err(Failure::usage(format!(
+                "--skin {} is of the cells that --spawn starts, and of the page of --view: add one of the two",
+                skin.display()
+            )));
+        }
         let only = match (self.frames.only, needs) {
             (Some(Only::Replies | Only::All), Some(name)) => {
                 return Err(Failure::usage(format!(
@@ -201,7 +223,7 @@ impl Replay {
             timeout: Duration::from_millis(self.send_timeout.into()),
             receive_buffer: RECEIVE_BUFFER as usize,
             strict: self.strict,
-            quiet: self.quiet,
+            quiet: self.shown.quiet,
         })
     }
 }

@@ -1,7 +1,7 @@
 //! `gateway view`, and the option `--view` of runs.
 
 use std::collections::BTreeMap;
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::fd::AsFd;
@@ -12,6 +12,7 @@ use bench::remote::Lines;
 use bench::run;
 use clap::Args;
 use cover::mesh::{Triangle, simplify};
+use protocol::bus::Kinds;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use robots::Isometry3;
@@ -76,6 +77,9 @@ pub(crate) struct View {
     /// Belong to the run that has started it: take its state from standard input, write commands to standard output, end with it
     #[arg(long, hide = true)]
     of_run: bool,
+    /// Listen to the buses of a recording's skin, to which it is replayed
+    #[arg(long, hide = true)]
+    replayed: bool,
     #[command(flatten)]
     packages: Packages,
     #[command(flatten)]
@@ -98,7 +102,7 @@ impl View {
                 self.listen
             )));
         }
-        let is_recording = self.is_recording()?;
+        let is_recording = !self.replayed && self.is_recording()?;
         let access = Access {
             listen: self.listen,
             may_act: !self.read_only && !is_recording,
@@ -111,17 +115,18 @@ impl View {
 
     /// The skin of buses.
     fn live(self, access: Access, says: impl FnOnce(&str)) -> Result<(), Failure> {
-        let [skin] = self.sources.as_slice() else {
-            return Err(Failure::usage(
-                "several files are the parts of one recording, and a skin is shown alone",
-            ));
+        let (skin, surface) = match self.sources.as_slice() {
+            _ if self.replayed => self.recorded_skin()?,
+            [one] if self.skin.is_none() && self.at.is_none() => self.read(one)?,
+            [one] => {
+                let why = "is of a recording, and this is a skin, whose buses are listened to";
+                return Err(Failure::usage(format!("{}: --skin or --at {why}", one.display())));
+            }
+            _ => {
+                let why = "several files are the parts of one recording, and a skin is shown alone";
+                return Err(Failure::usage(why));
+            }
         };
-        if self.skin.is_some() || self.at.is_some() {
-            let why = "is of a recording, and this is a skin, whose buses are listened to";
-            return Err(Failure::usage(format!("{}: --skin or --at {why}", skin.display())));
-        }
-        let (path, skin) = (skin, Skin::read(skin).map_err(Failure::usage)?);
-        let surface = self.surface(path, &skin);
         let kinds = self.kinds.of(bus_names(&skin))?;
         let stop = stopped()?;
         let bench = self.of_run.then(run_of_this).transpose().map_err(|error| failed(&error))?;
@@ -132,15 +137,7 @@ impl View {
 
     /// A recording.
     fn recorded(self, access: Access, says: impl FnOnce(&str)) -> Result<(), Failure> {
-        let (skin, surface) = match &self.skin {
-            Some(path) => {
-                let skin = Skin::read(path).map_err(Failure::usage)?;
-                let surface = self.surface(path, &skin);
-                (skin, surface)
-            }
-            // Its URDF is not beside it.
-            None => (skin_of(&self.sources)?, Vec::new()),
-        };
+        let (skin, surface) = self.recorded_skin()?;
         #[expect(clippy::cast_precision_loss, reason = "to the µs")]
         let at_s = self.at.map(|nanos| nanos as f64 / 1e9);
         let stop = stopped()?;
@@ -149,14 +146,24 @@ impl View {
         Ok(())
     }
 
-    /// The robot of a skin's file by its meshes, as far as they are found.
-    fn surface(&self, path: &Path, skin: &Skin) -> Vec<Shell> {
-        Surface::read(path, skin, &self.packages).map(|it| simplified(&it)).unwrap_or_default()
+    /// The skin in a file, and its robot by its meshes, as far as they are found.
+    fn read(&self, path: &Path) -> Result<(Skin, Vec<Shell>), Failure> {
+        let skin = Skin::read(path).map_err(Failure::usage)?;
+        let surface = Surface::read(path, &skin, &self.packages).map(|it| simplified(&it));
+        Ok((skin, surface.unwrap_or_default()))
+    }
+
+    /// The skin of a recording; of the one in it the URDF is not beside it.
+    fn recorded_skin(&self) -> Result<(Skin, Vec<Shell>), Failure> {
+        match &self.skin {
+            Some(path) => self.read(path),
+            None => Ok((skin_of(&self.sources)?, Vec::new())),
+        }
     }
 
     /// Whether it is a recording, by what is in it, and not a skin.
     fn is_recording(&self) -> Result<bool, Failure> {
-        let first = self.sources.first().map_or(Path::new(""), PathBuf::as_path);
+        let Some(first) = self.sources.first() else { return Ok(false) };
         if !first.exists() {
             return Err(Failure::usage(format!(
                 "there is no file {}: name a skin, whose buses are listened to, or a recording",
@@ -211,9 +218,35 @@ impl Page {
     /// Serves the page of a run, whose buses open later; and where it sends what pages want of the run.
     pub(crate) fn of(run: &run::Options, listen: Option<SocketAddr>) -> Result<(Self, Lines), Failure> {
         let run::Options { skin_file, skin, kinds, directory, .. } = run;
+        Self::start([skin_file.as_os_str()], skin, kinds, directory.as_deref(), listen)
+    }
+
+    /// Serves the page of a replay, which cannot be commanded.
+    pub(crate) fn of_replay(
+        files: &[PathBuf],
+        skin: Option<&Path>,
+        kinds: &Kinds,
+        listen: Option<SocketAddr>,
+    ) -> Result<(Self, Lines), Failure> {
+        let known = match skin {
+            Some(path) => Skin::read(path).map_err(Failure::usage)?,
+            None => skin_of(files)?,
+        };
+        let given = skin.into_iter().flat_map(|path| [OsStr::new("--skin"), path.as_os_str()]);
+        let words = ["--replayed", "--read-only"].map(OsStr::new).into_iter().chain(given);
+        Self::start(words.chain(files.iter().map(|file| file.as_os_str())), &known, kinds, None, listen)
+    }
+
+    fn start<'a>(
+        words: impl IntoIterator<Item = &'a OsStr>,
+        skin: &Skin,
+        kinds: &Kinds,
+        directory: Option<&Path>,
+        listen: Option<SocketAddr>,
+    ) -> Result<(Self, Lines), Failure> {
         let program = std::env::current_exe().map_err(|error| failed(&error))?;
         let mut command = Command::new(program);
-        command.args(["view", "--wait", "--of-run"]).arg(skin_file);
+        command.args(["view", "--wait", "--of-run"]).args(words);
         for bus in &skin.buses {
             let kind = kinds.of(&bus.name).resolve();
             command.arg("--bus-kind").arg(OsString::from(format!("{}={kind}", bus.name)));

@@ -8,6 +8,7 @@ use std::net::TcpStream;
 
 use process::page::{Page, QUIET, address, ask, watched};
 use process::{Place, TIMEOUT, until};
+use serde_json::Value;
 use tungstenite::{Error, Message};
 
 #[test]

@@ -52,7 +52,8 @@ pub fn play(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Res
     let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
     let (shells, corners) = pack(&surface);
     let scene = serde_json::to_string(&Scene { shells, ..Scene::of(&skin, false) }).unwrap_or_default();
-    let server = Server::start(access, scene, corners).map_err(|source| ServeError::Listen { listen, source })?;
+    let server =
+        Server::start(access, scene, corners).map_err(|source| ServeError::Listen { listen, source })?;
     says(&server.url());
     let (index, origin) = (player.index(), player.origin());
     thread::scope(|scope| {
