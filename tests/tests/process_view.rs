@@ -211,7 +211,7 @@ fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
     place.start("gateway", "skin import lift.urdf --tip arm7 -o skin.toml").end().well();
     let view = place.start("gateway", "view skin.toml --wait --bus-kind embedded");
     view.hears("view: http://");
-    let address = address(&view.stderr());
+    let address = address(&view);
     let scene = Page::new(&address).scene;
     let shells = scene["shells"].as_array().unwrap();
     let number = |shell: &Value, key: &str| usize::try_from(shell[key].as_u64().unwrap()).unwrap();

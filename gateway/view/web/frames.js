@@ -3,9 +3,7 @@
 import { element } from "./dom.js";
 import { number } from "./plots.js";
 
-const VERDICTS = {
-  nearest: "the nearest step", saturated: "saturated", rounded: "J in 16 bits", unexplained: "no J near it", open: "not known",
-};
+const VERDICTS = { nearest: "nearest", saturated: "saturated", rounded: "16-bit J", unexplained: "no J near", open: "not known" };
 
 const $ = (id) => document.getElementById(id);
 // The list stands still while somebody reads it or chooses from it.
@@ -67,7 +65,7 @@ function explain(why) {
   }
   if (cell) {
     const value = (v) => (v === null || v === undefined ? "–" : number(v));
-    parts.push(table(["Joint", "J, m", "J F", "nearest", "word", ""], cell.rows.map((row) => [
+    parts.push(table(["Joint", "J, m", "J F", "step", "word", ""], cell.rows.map((row) => [
       String(row.joint), value(row.jacobian_m), `${value(row.product_nm)} ${row.unit}`, String(row.nearest_word ?? "–"),
       String(row.word ?? "–"), VERDICTS[row.verdict.is],
     ])));
