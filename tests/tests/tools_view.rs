@@ -40,6 +40,30 @@ fn findings(browser: &mut Browser) -> Vec<String> {
     serde_json::from_value(found[1].clone()).unwrap()
 }
 
+/// There are no faults of accessibility at two widths, light and dark.
+fn is_accessible(browser: &mut Browser) {
+    let axe = std::fs::read_to_string(AXE).expect("tests/tools/install makes axe-core ready");
+    browser.value(&format!("{axe};0"));
+    for (width, scheme) in [(1400, "light"), (1400, "dark"), (390, "light"), (390, "dark")] {
+        browser.resize(width, 844);
+        browser.scheme(scheme);
+        browser.until(&format!("document.documentElement.scrollWidth <= {width}"));
+        assert_eq!(findings(browser), Vec::<String>::new(), "{width} px, {scheme}");
+    }
+}
+
+/// The page asked for nothing elsewhere, and has nothing to complain about.
+fn is_content(browser: &Browser, url: &str) {
+    let host = url.split('#').next().unwrap().trim_end_matches('/');
+    let outside: Vec<_> = browser
+        .requests()
+        .into_iter()
+        .filter(|it| !it.starts_with(host) && !it.starts_with("data:"))
+        .collect();
+    assert_eq!(outside, Vec::<&str>::new(), "the page asks for nothing outside");
+    assert_eq!(browser.complaints(), Vec::<&serde_json::Value>::new());
+}
+
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
@@ -91,25 +115,11 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
         "{kill}.disabled && document.getElementById('facts').textContent.includes('Silent1')"
     ));
 
-    let axe = std::fs::read_to_string(AXE).expect("tests/tools/install makes axe-core ready");
-    browser.value(&format!("{axe};0"));
-    for (width, scheme) in [(1400, "light"), (1400, "dark"), (390, "light"), (390, "dark")] {
-        browser.resize(width, 844);
-        browser.scheme(scheme);
-        browser.until(&format!("document.documentElement.scrollWidth <= {width}"));
-        assert_eq!(findings(&mut browser), Vec::<String>::new(), "{width} px, {scheme}");
-    }
+    is_accessible(&mut browser);
     // It finds what is there.
     browser.value("document.getElementById('halt').textContent = ''");
     assert_eq!(findings(&mut browser).len(), 1);
-    let host = url.trim_end_matches('/').to_owned();
-    let outside: Vec<_> = browser
-        .requests()
-        .into_iter()
-        .filter(|it| !it.starts_with(&host) && !it.starts_with("data:"))
-        .collect();
-    assert_eq!(outside, Vec::<&str>::new(), "the page asks for nothing outside");
-    assert_eq!(browser.complaints(), Vec::<&serde_json::Value>::new());
+    is_content(&browser, &url);
     drop(browser);
     run.signal(rustix::process::Signal::INT);
     run.end();
@@ -131,6 +141,59 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     println!("the torque came {epochs} epochs after the stimulus");
     assert!(answered && epochs <= 3, "{epochs} epochs");
     place.is_left_clean();
+}
+
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn a_recording_is_gone_through_in_a_browser() {
+    let place = Place::new();
+    let from = concat!(env!("CARGO_MANIFEST_DIR"), "/recordings/fd.mcap");
+    std::fs::copy(from, place.path("fd.mcap")).unwrap();
+    let view = place.start("gateway", "view fd.mcap");
+    let url = format!("http://{}/#at=0.9", address(&view));
+    let mut browser = Browser::new(1400, 900);
+    browser.open(&url);
+    let at = "(() => { const said = document.querySelector('#time output').textContent; return said.startsWith('0:') ? Number(said.slice(2, 8)) : NaN; })()";
+    let click = |name: &str| {
+        format!("[...document.querySelectorAll('#time button')].find((it) => it.title === '{name}').click()")
+    };
+    browser.until(&format!("window.skinbus && window.skinbus.frames > 1 && {at} === 0.9"));
+    assert_eq!(browser.value("getComputedStyle(document.getElementById('commands')).display"), "none");
+
+    // An epoch forth and back.
+    browser.value(&click("The next epoch"));
+    browser.until(&format!("{at} > 0.9 && {at} < 0.92"));
+    browser.value(&click("The epoch before"));
+    browser.until(&format!("{at} < 0.91"));
+    // It plays to its end, and a touch is gone back to.
+    browser.value(&click("Play"));
+    browser.until(&format!("{at} > 1.2"));
+    browser.until(&format!("{at} > 2.1"));
+    browser.value(&click("The event before"));
+    browser.until(&format!("{at} < 2"));
+    // Its torque comes within an epoch or two.
+    browser.until(&format!(
+        "!document.getElementById('facts').textContent.includes('In contact0') || ({}, false)",
+        click("The next epoch")
+    ));
+    // The slider.
+    browser.value("(() => { const it = document.querySelector('#time input'); it.value = 0; it.oninput(); it.onchange(); })()");
+    browser.until(&format!("{at} === 0"));
+
+    // A cell's frames, and why its torque is what it is.
+    browser.value("location.hash = '#at=1'");
+    browser.until(&format!("{at} === 1"));
+    browser.value(
+        "(() => { const it = document.getElementById('search'); it.value = 'vcan0:1'; it.onchange(); })()",
+    );
+    browser.until("document.querySelector('#frames button')");
+    browser.value("document.querySelector('#frames button').click()");
+    browser.until("document.getElementById('why').textContent.includes('nearest')");
+    is_accessible(&mut browser);
+    is_content(&browser, &url);
+    drop(browser);
+    view.signal(rustix::process::Signal::INT);
+    view.end().well();
 }
 
 /// Prints how often the page draws an arm that moves, beside the 253 processes of its cells.

@@ -23,17 +23,17 @@ export function requested(fragment) {
 export class TimeBar {
   constructor(box, send) {
     Object.assign(this, { box, send, playback: null, dragged: null, marked: "" });
-    const button = (text, label, click) => {
+    const button = (text, label, click, title = label) => {
       const it = element("button", text);
       it.type = "button";
-      it.title = label;
+      it.title = title;
       it.setAttribute("aria-label", label);
       it.onclick = click;
       return it;
     };
     this.play = button("Play", "Play", () => this.toggle());
-    this.back = button("−1", "The epoch before", () => send({ do: "step", forward: false }));
-    this.forth = button("+1", "The next epoch", () => send({ do: "step", forward: true }));
+    this.back = button("−1", "−1 epoch", () => send({ do: "step", forward: false }), "The epoch before");
+    this.forth = button("+1", "+1 epoch", () => send({ do: "step", forward: true }), "The next epoch");
     this.speed = element("select");
     this.speed.setAttribute("aria-label", "Speed");
     for (const speed of SPEEDS) {
