@@ -98,11 +98,7 @@ impl Convert {
             apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
             self.force.check("", &self.to)?;
         }
-        let size = size(&self.from);
-        let live = size.is_none();
-        let bar = bar(size);
-        let progress = bar.clone();
-        let mut reader = captures(&self.from, move |file| Box::new(progress.wrap_read(file)))?;
+        let (mut reader, bar, live) = self.open()?;
         let stopped = stop::flag();
         let name = reader.name().to_owned();
         if !text && reader.format() == Format::Mcap {
@@ -176,11 +172,7 @@ impl Convert {
             Some(path) => Skin::read(path).map_err(Failure::usage)?,
             None => skin_of(&self.from)?,
         };
-        let size = size(&self.from);
-        let live = size.is_none();
-        let bar = bar(size);
-        let progress = bar.clone();
-        let mut reader = captures(&self.from, move |file| Box::new(progress.wrap_read(file)))?;
+        let (mut reader, bar, live) = self.open()?;
         let stopped = stop::flag();
         let name = reader.name().to_owned();
         let (whole, out) = self.create(stopped)?;
@@ -205,6 +197,15 @@ impl Convert {
         }
         note(format_args!("{name} -> {to}: {epochs} epochs"));
         Ok(())
+    }
+
+    /// The capture, its progress, and whether it goes on for as long as somebody writes it.
+    fn open(&self) -> Result<(Reader, ProgressBar, bool), Failure> {
+        let size = size(&self.from);
+        let bar = bar(size);
+        let progress = bar.clone();
+        let reader = captures(&self.from, move |file| Box::new(progress.wrap_read(file)))?;
+        Ok((reader, bar, size.is_none()))
     }
 
     /// The output; standard output is written to as it is.
