@@ -143,9 +143,12 @@ fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
 
     let report = files.report("");
     let at = "vcan0 at 1M/5M";
+    let limits = "at most 100 %, replies before the next joints, 110 nodes";
     for words in [
-        format!("{at}, worst case: does not fit: bandwidth (all 253 cells answer) 119 % within all limits ✗"),
-        format!("{at}, this run: {verdict} ({}) {load} within all limits ✗", run[1]),
+        format!(
+            "{at}, worst case: does not fit: bandwidth (all 253 cells answer) 119 % {limits} (skin: bitrate) ✗"
+        ),
+        format!("{at}, this run: {verdict} ({}) {load} {limits} (skin: bitrate) ✗", run[1]),
         format!("worst case does not fit: bandwidth 118.9 % {}", worst[1]),
         format!("{load} {} {}, 120 on average", row(&shadow, "most in any 16 ms")[0], run[1]),
     ] {
@@ -214,5 +217,5 @@ fn default_rates_are_shown_and_not_rated() {
     assert!(!text.contains("does not hold"), "{text}");
     let rated = files.report(" --nominal 1M --data 8M");
     assert!(rated.contains("vcan0 at 1M/8M, worst case: in time, but 254 nodes"), "{rated}");
-    assert!(rated.contains("within all limits ✗ does not hold"), "{rated}");
+    assert!(rated.contains("110 nodes (--nominal, --data) ✗ does not hold"), "{rated}");
 }
