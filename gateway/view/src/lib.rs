@@ -9,7 +9,11 @@
 //! It listens to the buses as any other node, so that a control loop beside it is not touched: what it shows is what
 //! the buses carried. Touches are stimuli on the bus, which cells in test mode obey.
 //!
-//! [`live`], [`pressed`], [`scene`], [`surface`] and [`command`] have no socket and no clock; [`server`] and [`serve`] are the shell.
+//! A recording goes the same way: [`tape`] takes its frames up to a moment into [`Live`], [`index`] keeps states on the way,
+//! and [`player`] goes from one of them to any moment.
+//!
+//! [`live`], [`pressed`], [`scene`], [`surface`], [`command`] and [`tape`] have no socket and no clock; [`server`], [`serve`] and
+//! [`play`] are the shell.
 
 pub mod command;
 pub mod index;
