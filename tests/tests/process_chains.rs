@@ -196,10 +196,14 @@ fn a_report_names_the_torque_format_that_would_have_fitted() {
     place.scenario(&place.read("scenario.toml").replace("force_n = 2.0", "force_n = 60.0"));
     let page = report();
     let (_, advice) = page.split_once("vcan0: Q5.10 would have fitted better: ").expect("advice");
-    assert!(
-        advice.contains(" torques are beyond 8 Nm, the range of Q3.12. It rounds by 0.000"),
-        "{advice:.200}"
-    );
+    let advice = advice.split_once("</p>").expect("a sentence").0.replace('\u{a0}', " ");
+    let (torques, rounds) =
+        advice.split_once(" torques are beyond 8 Nm, the range of Q3.12. It rounds by ").unwrap();
+    assert!(torques.parse::<u32>().unwrap() > 0, "{advice}");
+    let (better, worse) = rounds.split_once(" µNm instead of ").unwrap();
+    let worse = worse.split_once(" µNm on average").unwrap().0;
+    let [better, worse] = [better, worse].map(|text| text.parse::<f64>().unwrap());
+    assert!(worse > 10.0 && better > worse && better < 1_000.0, "a coarser step: {advice}");
     let skin =
         place.read("skin.toml").replace("name = \"vcan0\"\n", "name = \"vcan0\"\ntorque_format = \"Q7.8\"\n");
     place.write("skin.toml", &skin);

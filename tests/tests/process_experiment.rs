@@ -36,7 +36,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_rated() {
     assert!(value(finding(1, "velocity")) > 0.0);
     assert!(value(finding(2, "after the switch, maximum")) <= 0.0, "the central computation is off");
     let page = place.read("results/report.html");
-    assert!(page.contains("<svg") && page.contains("0.0356"));
+    assert!(page.contains("<svg") && page.contains("35.6\u{a0}mNm"));
     let torque = place.read("results/fig6-joint2.csv");
     let mut lines = torque.lines();
     assert_eq!(lines.next(), Some("time (s),central (Nm),distributed (Nm)"));
