@@ -78,12 +78,25 @@ export function say(scene, said, ask) {
   if (said.detail) detail(scene, said.detail, ask);
 }
 
+// Where the skin has a cell: in the frame of its row.
+function where(scene, { bus, node }) {
+  const cell = scene.cells.find((it) => it.bus === bus && it.node === node);
+  if (!cell) return [];
+  const three = (values, digits) => values.map((v) => v.toFixed(digits).replace("-", "−")).join(", ");
+  return [
+    ["Row, joint", `${cell.row}, ${cell.joint}`],
+    ["Position, mm", three(cell.position.map((v) => v * 1000), 1)],
+    ["Normal", three(cell.normal, 3)],
+  ];
+}
+
 function detail(scene, it, ask) {
   const joints = scene.chains[scene.buses[it.bus].chain].rows.filter((row) => row.joint !== null).map((row) => scene.joints[row.joint]);
   const wrong = it.configuration[0] !== null && it.configuration[0] !== it.configuration[1];
   const rows = [
     ["Status", it.status, it.status === "dead" || it.status === "stale" ? "bad" : ""],
     ["Serial number", String(it.serial)],
+    ...where(scene, it),
     ["Configuration", wrong ? `${it.configuration[0]}, not ${it.configuration[1]}` : it.configuration[1], wrong ? "bad" : ""],
     ["Force", `${it.force_n.toFixed(3)} N`],
     ["Contact, N", it.contact_n.map((v) => v.toFixed(3)).join(" + ")],
