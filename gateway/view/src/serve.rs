@@ -3,13 +3,14 @@
 use std::collections::BTreeMap;
 use std::iter;
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use bench::listen::{now, open, send};
 use bench::remote::{Lines, State};
+use protocol::bus::batch::BATCH;
 use protocol::bus::{self, Bus, BusError, Inbox, Kinds};
 use protocol::can::Format;
 use protocol::id::Node;
@@ -36,6 +37,9 @@ const WAIT: Duration = Duration::from_millis(50);
 const GATHER: Duration = Duration::from_millis(8);
 /// A bus that cannot be opened is tried again after so long.
 const AGAIN: Duration = Duration::from_millis(200);
+
+/// No frame waits to be read.
+const UP_TO_DATE: u64 = u64::MAX;
 
 /// What to show where.
 #[derive(Debug)]
@@ -81,6 +85,8 @@ struct Shared {
     name: String,
     format: Format,
     bus: Mutex<Option<Arc<Bus>>>,
+    /// The time of the last frame that was read while more wait, in µs; [`UP_TO_DATE`] when none do.
+    read_to: AtomicU64,
 }
 
 /// Shows a skin until `stop`. `says` is told the page's address once it is served.
@@ -105,7 +111,8 @@ pub fn serve(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Re
             Err(_) if patient => None,
             Err(error) => return Err(ServeError::Bus(error)),
         };
-        Ok(Shared { name: bus.name.clone(), format: bus.format, bus: Mutex::new(first) })
+        let read_to = AtomicU64::new(UP_TO_DATE);
+        Ok(Shared { name: bus.name.clone(), format: bus.format, bus: Mutex::new(first), read_to })
     });
     let buses: Vec<_> = buses.collect::<Result<_, _>>()?;
     let (shells, corners) = pack(&surface);
@@ -154,13 +161,19 @@ fn receive(
         inbox.clear();
         let heard = match bus.wait(Some(WAIT)) {
             Ok(true) => {
-                thread::sleep(GATHER);
-                bus.receive(&mut inbox).map(|frames| frames > 0)
+                // After a full batch more may wait.
+                if shared.read_to.load(Ordering::Relaxed) == UP_TO_DATE {
+                    thread::sleep(GATHER);
+                }
+                bus.receive(&mut inbox).map(|_| ())
             }
-            other => other,
+            other => other.map(|_| ()),
         };
+        let last = inbox.frames().last().filter(|_| inbox.frames().len() == BATCH);
+        let read_to = last.map_or(UP_TO_DATE, |last| last.at_nanos / 1_000);
+        shared.read_to.store(read_to, Ordering::Relaxed);
         match heard {
-            Ok(_) => {
+            Ok(()) => {
                 let mut live = locked(live);
                 for received in inbox.frames() {
                     let at = Micros(received.at_nanos / 1_000);
@@ -210,7 +223,9 @@ fn publish(
             }
         }
         server.gone().into_iter().for_each(|page| pressed.release(page));
-        let now = now();
+        // What cells said that is not read yet is no silence.
+        let read_to = buses.iter().map(|bus| Micros(bus.read_to.load(Ordering::Relaxed))).min();
+        let now = read_to.map_or_else(now, |read_to| now().min(read_to));
         let due = {
             let mut live = locked(live);
             live.handle_time(now);
