@@ -22,7 +22,7 @@ use view::play::{self, play};
 use view::serve::{Options, serve};
 use view::server::Access;
 
-use super::arguments::{BusKinds, bus_names, nanos};
+use super::arguments::{BusKinds, bus_names, bus_of, nanos};
 use super::input::{skin_of, stopped};
 use super::output::note;
 use super::surface::{Placed, Surface};
@@ -48,15 +48,16 @@ const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 #[command(after_help = "Examples:
   gateway demo --view
   gateway view gateway/examples/ur5-253.toml --bus-kind embedded
+  gateway view can1 --skin humanoid.toml
   gateway view run.mcap run-*.mcap --at 12.5
   gateway view run.log --skin skin.toml
   gateway view skin.toml --listen 0.0.0.0:8100 --token $(openssl rand -hex 16) --read-only")]
 pub(crate) struct View {
-    /// A skin's description, whose buses are listened to; or a candump log or MCAP recording, or all parts of a split one in
-    /// any order
-    #[arg(required = true, value_name = "SKIN|FILE")]
+    /// A skin's description, whose buses are listened to; or some of its buses, with --skin; or a candump log or MCAP
+    /// recording, or all parts of a split one in any order
+    #[arg(required = true, value_name = "SKIN|BUS|FILE")]
     sources: Vec<PathBuf>,
-    /// The skin of a recording; else the one in it
+    /// The skin of buses that are named, or of a recording; without it a recording's is the one in it
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// Stay at so many seconds after the first frame of a recording, instead of playing it
@@ -117,6 +118,7 @@ impl View {
     fn live(self, access: Access, says: impl FnOnce(&str)) -> Result<(), Failure> {
         let (skin, surface) = match self.sources.as_slice() {
             _ if self.replayed => self.recorded_skin()?,
+            [one, ..] if !one.exists() => self.on_buses()?,
             [one] if self.skin.is_none() && self.at.is_none() => self.read(one)?,
             [one] => {
                 let why = "is of a recording, and this is a skin, whose buses are listened to";
@@ -133,6 +135,25 @@ impl View {
         let options = Options { skin, surface, kinds, directory: None, access, patient: self.wait, bench };
         serve(options, &stop, says).map_err(Failure::usage)?;
         Ok(())
+    }
+
+    /// The part of a skin on the buses that are named.
+    fn on_buses(&self) -> Result<(Skin, Vec<Shell>), Failure> {
+        let Some(file) = &self.skin else {
+            let name = self.sources.first().map(|it| it.display().to_string()).unwrap_or_default();
+            return Err(Failure::usage(format!(
+                "there is no file {name}: name a skin, whose buses are listened to, a recording, or a bus and its --skin"
+            )));
+        };
+        if self.at.is_some() {
+            return Err(Failure::usage("--at is of a recording, and buses are listened to"));
+        }
+        let (skin, surface) = self.read(file)?;
+        let of = |source: &PathBuf| bus_of(&skin, &file.display().to_string(), &source.to_string_lossy());
+        let mut buses = self.sources.iter().map(of).collect::<Result<Vec<_>, _>>()?;
+        buses.sort_unstable();
+        buses.dedup();
+        Ok((skin.on_buses(&buses), surface))
     }
 
     /// A recording.
@@ -165,10 +186,7 @@ impl View {
     fn is_recording(&self) -> Result<bool, Failure> {
         let Some(first) = self.sources.first() else { return Ok(false) };
         if !first.exists() {
-            return Err(Failure::usage(format!(
-                "there is no file {}: name a skin, whose buses are listened to, or a recording",
-                first.display()
-            )));
+            return Ok(false);
         }
         if first.metadata().is_ok_and(|about| !about.is_file()) {
             let what = "is no regular file: name a skin, whose buses are listened to, or a recording";

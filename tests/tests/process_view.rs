@@ -201,6 +201,36 @@ fn pages_that_may_only_look_press_nothing_and_others_need_a_token() {
 }
 
 #[test]
+fn one_bus_of_a_skin_is_shown_alone() {
+    let place = Place::new();
+    place.start("gateway", "skin generate --cells 10 --buses 2 -o skin.toml").end().well();
+    place.scenario(QUIET);
+    let run = place.running_bench(30.0, "");
+    let view = place.start("gateway", "view vcan1 --skin skin.toml --bus-kind embedded");
+    let mut page = Page::new(&address(&view));
+    assert_eq!(page.scene["buses"].as_array().unwrap().len(), 1);
+    assert_eq!(page.scene["buses"][0]["name"], "vcan1");
+    let cells = page.scene["cells"].as_array().unwrap().len();
+    assert!((1..10).contains(&cells), "{cells}");
+    page.sees("its cells quiet", |it| it.cells.len() == cells && it.cells.iter().all(|cell| cell.0 == 1));
+    view.signal(rustix::process::Signal::INT);
+    view.end().well();
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    for (words, expected) in [
+        (
+            "view vcan1",
+            "there is no file vcan1: name a skin, whose buses are listened to, a recording, or a bus",
+        ),
+        ("view vcan7 --skin skin.toml", "bus vcan7 is not in skin.toml, which has vcan0, vcan1"),
+        ("view vcan1 --skin skin.toml --at 3", "--at is of a recording, and buses are listened to"),
+    ] {
+        let ended = place.start("gateway", &format!("{words} --bus-kind embedded")).end();
+        assert!(ended.refusal(2).contains(expected), "{words}: {}", ended.refusal(2));
+    }
+}
+
+#[test]
 fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
     let place = Place::new();
     std::fs::copy(

@@ -133,13 +133,16 @@ fn what_cannot_be_shown_is_named() {
     for (words, expected) in [
         (
             "view nothing.mcap",
-            "there is no file nothing.mcap: name a skin, whose buses are listened to, or a recording",
+            "there is no file nothing.mcap: name a skin, whose buses are listened to, a recording, or a bus and its --skin",
         ),
         (
             "view /dev/null",
             "/dev/null is no regular file: name a skin, whose buses are listened to, or a recording",
         ),
-        ("view -", "there is no file -: name a skin, whose buses are listened to, or a recording"),
+        (
+            "view -",
+            "there is no file -: name a skin, whose buses are listened to, a recording, or a bus and its --skin",
+        ),
         ("view text.log text.log", "text.log is no part of a recording"),
     ] {
         let ended = place.start("gateway", words).end();

@@ -12,7 +12,7 @@ use protocol::time::Micros;
 
 use self::bus::LiveBus;
 pub use self::recent::{FrameSaid, Recent, Why};
-pub use self::said::{Answer, BusSaid, Dead, Detail, Said, Wires};
+pub use self::said::{Answer, BusSaid, Dead, Detail, Gains, Said, Wires};
 use crate::pressed::{Place, Pressed};
 use protocol::message::SkinSensors;
 

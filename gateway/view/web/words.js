@@ -98,6 +98,8 @@ function detail(scene, it, ask) {
     ["Serial number", String(it.serial)],
     ...where(scene, it),
     ["Configuration", wrong ? `${it.configuration[0]}, not ${it.configuration[1]}` : it.configuration[1], wrong ? "bad" : ""],
+    ["Gains α", it.gains.alpha.map(String).join(", ") + " N"],
+    ["Thresholds", `${number(it.gains.thresholds[0])} N, ${number(it.gains.thresholds[1])}, ${number(it.gains.thresholds[2])} N`],
     ["Force", `${it.force_n.toFixed(3)} N`],
     ["Contact, N", it.contact_n.map((v) => v.toFixed(3)).join(" + ")],
     ["Proximity", it.proximity.toFixed(3)],
@@ -108,14 +110,17 @@ function detail(scene, it, ask) {
   const parts = [table(rows)];
   if (it.torque) {
     const head = element("tr");
-    head.append(...["Joint", "word", "cell", "central", ""].map((text, i) => element(i ? "td" : "th", text, "faint")));
+    head.append(...["Joint", "word", "cell", "central", "error", "", "J"].map((text, i) => element(i ? "td" : "th", text, "faint")));
     const torques = element("table");
     torques.append(head);
     it.torque.words.forEach((word, at) => {
       const row = element("tr"), name = element("th", joints[at] ? joints[at].name : String(at + 1));
       name.scope = "row";
       row.append(name, element("td", String(word)), element("td", number(it.torque.distributed[at])),
-        element("td", it.torque.central ? number(it.torque.central[at]) : "–"), element("td", joints[at] ? joints[at].torque_unit : "", "faint"));
+        element("td", it.torque.central ? number(it.torque.central[at]) : "–"),
+        element("td", it.torque.central ? number(it.torque.distributed[at] - it.torque.central[at]) : "–"),
+        element("td", joints[at] ? joints[at].torque_unit : "", "faint"),
+        element("td", it.torque.jacobian ? number(it.torque.jacobian[at]) : "–"));
       torques.append(row);
     });
     parts.push(element("h3", `Torque of epoch ${it.torque.epoch}${it.torque.saturated ? ", saturated" : ""}`), torques);

@@ -197,6 +197,18 @@ pub struct Cell {
 }
 
 impl Skin {
+    /// The part of it on some of its buses, given as indices into [`Skin::buses`]; indices that are none are left out.
+    #[must_use]
+    pub fn on_buses(&self, kept: &[usize]) -> Self {
+        let place = |bus: usize| kept.iter().position(|&it| it == bus);
+        let cells = self.cells.iter();
+        Self {
+            buses: kept.iter().filter_map(|&bus| self.buses.get(bus)).cloned().collect(),
+            cells: cells.filter_map(|cell| Some(Cell { bus: place(cell.bus)?, ..cell.clone() })).collect(),
+            ..self.clone()
+        }
+    }
+
     /// Reads and checks a file.
     ///
     /// # Errors

@@ -4,6 +4,7 @@ use bench::remote::State;
 use model::table::{Event, Status};
 use protocol::fixed::is_saturated;
 use protocol::id::CellId;
+use protocol::parameters::Contact;
 use protocol::time::Micros;
 use serde::Serialize;
 
@@ -106,6 +107,8 @@ pub struct Detail {
     pub status: &'static str,
     /// The hash of its configuration, and the one it must have.
     pub configuration: [Option<String>; 2],
+    /// Its gains and thresholds, as the skin has them.
+    pub gains: Gains,
     /// Its three contact forces in N.
     pub contact_n: [f64; 3],
     /// Its proximity, 0 to 1.
@@ -128,6 +131,25 @@ pub struct Detail {
     pub why: Option<Why>,
 }
 
+/// The gains and thresholds of Algorithm 1.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Gains {
+    /// alpha_c, and alpha_p in N.
+    pub alpha: [f64; 2],
+    /// F_c,th in N, F_p,th from 0 to 1, F_z,th in N.
+    pub thresholds: [f64; 3],
+}
+
+impl Gains {
+    fn of(contact: Contact) -> Self {
+        let Contact { alpha_c, alpha_p, contact_threshold, proximity_threshold, force_threshold } = contact;
+        Self {
+            alpha: [alpha_c.to_f64(), alpha_p.to_f64()],
+            thresholds: [contact_threshold.to_f64(), proximity_threshold.to_f64(), force_threshold.to_f64()],
+        }
+    }
+}
+
 /// A torque of a cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Answer {
@@ -139,6 +161,8 @@ pub struct Answer {
     pub distributed: Vec<f64>,
     /// The central computation at the positions of that epoch, while they are known.
     pub central: Option<Vec<f64>>,
+    /// J at these positions, in m, of prismatic joints a number, while they are known.
+    pub jacobian: Option<Vec<f64>>,
     /// Whether a word is saturated.
     pub saturated: bool,
 }
@@ -185,16 +209,21 @@ impl Live {
         let torque = bus.last.get(place).copied().flatten().map(|(epoch, words)| {
             let words = words.as_slice();
             let frames = bus.positions_of(epoch).map(|positions| bus.central.frames(&positions));
-            let central = frames.map(|frames| bus.central.torque(place, &frames, force_n));
             let joints = self.skin.joints_of(index).len();
+            let at = |force_n: f64| {
+                let torque = bus.central.torque(place, frames.as_ref()?, force_n);
+                Some(torque.into_iter().take(joints).collect())
+            };
             Answer {
                 epoch: epoch.0,
                 words: words.iter().take(joints).copied().collect(),
                 distributed: words.iter().take(joints).map(|&word| bus.torque_format.real(word)).collect(),
-                central: central.map(|central| central.into_iter().take(joints).collect()),
+                central: at(force_n),
+                jacobian: at(1.0),
                 saturated: words.iter().any(|&word| is_saturated(word)),
             }
         });
+        let skin_cell = self.skin.cells.iter().find(|it| it.bus == index && it.node == id)?;
         let hash = |hash: u16| format!("{hash:04X}");
         let uplink = cell.uplink();
         Some(Detail {
@@ -206,6 +235,7 @@ impl Live {
                 cell.heartbeat().map(|it| hash(it.configuration)),
                 Some(hash(cell.configuration)),
             ],
+            gains: Gains::of(skin_cell.contact),
             contact_n: sensors.contact.map(|word| word.to_f64()),
             proximity: sensors.proximity.to_f64(),
             temperature_c: sensors.temperature.map(|word| word.to_f64()),

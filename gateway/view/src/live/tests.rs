@@ -103,6 +103,13 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     let answer = detail.torque.unwrap();
     assert_eq!((answer.epoch, answer.words[..2].to_vec(), detail.serial), (2, vec![100, -200], 100_005));
     let exact = answer.central.unwrap();
+    let jacobian = answer.jacobian.unwrap();
+    for (torque, row) in exact.iter().zip(&jacobian) {
+        assert!((torque - row * detail.force_n).abs() < 1e-9, "tau = J F: {exact:?} {jacobian:?}");
+    }
+    let contact = bench.live.skin.cells[4].contact;
+    assert_eq!(detail.gains.alpha[0], contact.alpha_c.to_f64());
+    assert_eq!(detail.gains.thresholds[2], contact.force_threshold.to_f64());
     assert!((exact[0] - f64::from(central)).abs() < 1e-6, "the only cell in contact: {exact:?} {central}");
     assert_eq!(bench.live.detail(Chosen { bus: 0, node: 254, frame: None }, bench.now), None);
     assert_eq!(bench.live.detail(Chosen { bus: 7, node: 1, frame: None }, bench.now), None);
