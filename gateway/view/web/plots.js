@@ -71,5 +71,6 @@ export class Plots {
 
 export function number(value) {
   const size = Math.abs(value);
-  return (size >= 100 ? value.toFixed(0) : size >= 10 ? value.toFixed(1) : size >= 1 ? value.toFixed(2) : value.toFixed(4)).replace("-", "−");
+  const text = size >= 100 ? value.toFixed(0) : size >= 10 ? value.toFixed(1) : size >= 1 ? value.toFixed(2) : value.toFixed(4);
+  return Number(text) === 0 ? text.replace("-", "") : text.replace("-", "−");
 }

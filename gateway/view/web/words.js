@@ -99,7 +99,7 @@ function detail(scene, it, ask) {
     ...where(scene, it),
     ["Configuration", wrong ? `${it.configuration[0]}, not ${it.configuration[1]}` : it.configuration[1], wrong ? "bad" : ""],
     ["Gains α", it.gains.alpha.map(String).join(", ") + " N"],
-    ["Thresholds", `${number(it.gains.thresholds[0])} N, ${number(it.gains.thresholds[1])}, ${number(it.gains.thresholds[2])} N`],
+    ["Thresholds", it.gains.thresholds.map((value, at) => `${Number(value.toPrecision(3))}${[" N", "", " N"][at]}`).join(", ")],
     ["Force", `${it.force_n.toFixed(3)} N`],
     ["Contact, N", it.contact_n.map((v) => v.toFixed(3)).join(" + ")],
     ["Proximity", it.proximity.toFixed(3)],
@@ -109,21 +109,23 @@ function detail(scene, it, ask) {
   ];
   const parts = [table(rows)];
   if (it.torque) {
+    const units = [...new Set(joints.map((joint) => joint.torque_unit))];
     const head = element("tr");
-    head.append(...["Joint", "word", "cell", "central", "error", "", "J"].map((text, i) => element(i ? "td" : "th", text, "faint")));
+    head.append(...["Joint", "word", "cell", "central", "error", "J"].map((text, i) => element(i ? "td" : "th", text, "faint")));
     const torques = element("table");
+    torques.className = "torques";
     torques.append(head);
     it.torque.words.forEach((word, at) => {
-      const row = element("tr"), name = element("th", joints[at] ? joints[at].name : String(at + 1));
+      const row = element("tr"), joint = joints[at] || { name: String(at + 1), torque_unit: "" };
+      const name = element("th", units.length > 1 ? `${joint.name}, ${joint.torque_unit}` : joint.name);
       name.scope = "row";
-      row.append(name, element("td", String(word)), element("td", number(it.torque.distributed[at])),
+      row.append(name, element("td", String(word).replace("-", "−")), element("td", number(it.torque.distributed[at])),
         element("td", it.torque.central ? number(it.torque.central[at]) : "–"),
         element("td", it.torque.central ? number(it.torque.distributed[at] - it.torque.central[at]) : "–"),
-        element("td", joints[at] ? joints[at].torque_unit : "", "faint"),
         element("td", it.torque.jacobian ? number(it.torque.jacobian[at]) : "–"));
       torques.append(row);
     });
-    parts.push(element("h3", `Torque of epoch ${it.torque.epoch}${it.torque.saturated ? ", saturated" : ""}`), torques);
+    parts.push(element("h3", `Torque of epoch ${it.torque.epoch}${units.length > 1 ? "" : `, ${units[0]}`}${it.torque.saturated ? ", saturated" : ""}`), torques);
   }
   show($("cell"), parts);
   frames(it.frames, it.why, ask);
