@@ -291,7 +291,12 @@ impl Player {
                 Step::Hungry => self.tape.feed(&mut self.reader)?,
                 Step::Looked => {}
                 Step::Applied { epoch } => {
-                    if epoch && self.history.back().is_none_or(|(at, _)| self.tape.at() - at >= SAMPLE_NS) {
+                    if epoch
+                        && self
+                            .history
+                            .back()
+                            .is_none_or(|(at, _)| self.tape.at().saturating_sub(*at) >= SAMPLE_NS)
+                    {
                         self.history.push_back((self.tape.at(), self.tape.live().torques()));
                     }
                     if epoch && to_epoch && self.tape.at() > self.at {
@@ -341,9 +346,9 @@ impl Player {
     #[must_use]
     pub fn said(&self) -> Playback {
         let progress = self.index.progress();
-        let (of, read) = (self.last() - self.origin, progress.at.saturating_sub(self.origin));
+        let (of, read) = (self.last().saturating_sub(self.origin), progress.at.saturating_sub(self.origin));
         Playback {
-            at_s: seconds(self.at - self.origin),
+            at_s: seconds(self.at.saturating_sub(self.origin)),
             at_ns: self.at.to_string(),
             of_s: seconds(of),
             playing: self.playing,

@@ -159,7 +159,7 @@ impl Tape {
         };
         if self.first.is_none() {
             self.first = Some(next.at);
-            (self.at, self.look) = (next.at, next.at + LOOK_NS);
+            (self.at, self.look) = (next.at, next.at.saturating_add(LOOK_NS));
             let latched = std::mem::take(&mut self.latched);
             self.live.begin(Micros(next.at / 1_000), latched.iter().map(|it| (it.bus, &it.frame)));
         }
@@ -185,12 +185,13 @@ impl Tape {
 
     /// A look at the time, if one is due up to this time.
     fn look_until(&mut self, until: u64) -> Option<Step> {
-        if self.look > until {
+        // At the end of what 64 bits of ns can say, in 2554, there is nothing more to look at.
+        if self.look > until || self.look == u64::MAX {
             return None;
         }
         self.live.handle_time(Micros(self.look / 1_000));
         self.at = self.look;
-        self.look += LOOK_NS;
+        self.look = self.look.saturating_add(LOOK_NS);
         // Nothing changes any more.
         if until.saturating_sub(self.look) > PAUSE_NS {
             self.look = until - PAUSE_NS;

@@ -110,12 +110,14 @@ struct Bench {
 
 impl Bench {
     fn new() -> Self {
-        let skin = skin();
-        let bytes = log(&skin);
+        Self::of(log(&skin()))
+    }
+
+    fn of(bytes: Vec<u8>) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.log");
         std::fs::write(&path, &bytes).unwrap();
-        Self { _folder: folder, paths: [path], skin, bytes }
+        Self { _folder: folder, paths: [path], skin: skin(), bytes }
     }
 
     fn player(&self) -> Player {
@@ -215,6 +217,41 @@ fn a_recording_without_frames_is_refused() {
     std::fs::write(&path, "nothing\n").unwrap();
     let error = Player::open(&[path], skin()).unwrap_err().to_string();
     assert!(error.ends_with("empty.log: there is no frame in it"), "{error}");
+}
+
+/// Times of frames: anything, near the ends of what 64 bits of ns can say, and near each other.
+fn times() -> impl Strategy<Value = Vec<u64>> {
+    let near = |at: u64| (0..3_000_000_000_u64).prop_map(move |off| at.saturating_sub(off));
+    let any = prop_oneof![any::<u64>(), near(u64::MAX), near(3_000_000_000), near(BEGAN), Just(u64::MAX)];
+    proptest::collection::vec(any, 1..8)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    #[test]
+    fn frames_of_any_time_are_played_to_the_end(times in times(), seeks in proptest::collection::vec(0.0..2e10, 3)) {
+        let mut log = Vec::new();
+        for nanos in times {
+            let time = Timestamp { nanos, nine_digits: true };
+            for frame in Message::Halt.encode().frames(Format::Fd) {
+                writeln!(log, "{}", Record { time, interface: "vcan0", frame, direction: None }).unwrap();
+            }
+        }
+        let bench = Bench::of(log);
+        let mut player = bench.player();
+        bench.build(&player);
+        for at_s in seeks {
+            player.seek(at_s).unwrap();
+            player.step(true).unwrap();
+            player.step(false).unwrap();
+            player.jump(EventKind::Halt, true).unwrap();
+            player.play(1e9);
+            player.pass(Duration::from_secs(3)).unwrap();
+            let now = player.now();
+            prop_assert!(player.said().at_s >= 0.0 && !player.history().is_empty());
+            shown(player.live(), now);
+        }
+    }
 }
 
 proptest! {
