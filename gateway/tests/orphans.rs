@@ -65,6 +65,29 @@ fn what_a_killed_run_left_is_repaired_and_nobody_may_read_more_of_it_than_before
 }
 
 #[test]
+fn an_original_that_is_damaged_before_its_end_is_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    for number in ["", "-1"] {
+        left(&folder, "run.mcap");
+        let part = folder.path().join("run.mcap.part");
+        let mut bytes = fs::read(&part).unwrap();
+        // A bit of the only chunk.
+        let end = bytes.len() - 60;
+        bytes[end] ^= 0x10;
+        File::options().write(true).open(&part).unwrap().write_all(&bytes).unwrap();
+        let (claimed, said) = claims(folder.path(), "next.mcap");
+        assert!(claimed.is_ok() && said.len() == 1, "{said:?}");
+        let repaired = format!("repaired, it is run-recovered{number}.mcap: 0 messages");
+        let kept = format!(" damaged bytes are lost; the damaged original is run.mcap.damaged{number}");
+        assert!(said[0].contains(&repaired) && said[0].ends_with(&kept), "{said:?}");
+        assert!(!part.exists());
+        assert_eq!(fs::read(folder.path().join(format!("run.mcap.damaged{number}"))).unwrap(), bytes);
+        drop(claimed);
+        assert_eq!(claims(folder.path(), "next.mcap").1, [""; 0], "nothing is repaired twice");
+    }
+}
+
+#[test]
 fn what_was_killed_before_it_recorded_anything_is_taken_away() {
     let folder = tempfile::tempdir().unwrap();
     let (part, file) = Part::create(folder.path().join("run.mcap")).unwrap();

@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::io::Cursor;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -54,7 +55,7 @@ fn messages(bytes: &[u8]) -> Vec<(String, u64, u32, Vec<u8>)> {
 
 fn recovered(bytes: &[u8]) -> Result<(Recovered, Vec<u8>), RecoverError> {
     let mut out = Vec::new();
-    recover(bytes, &mut out).map(|recovered| (recovered, out))
+    recover(Cursor::new(bytes), &mut out).map(|recovered| (recovered, out))
 }
 
 #[test]
@@ -115,12 +116,91 @@ fn a_damaged_chunk_is_omitted_and_said_and_the_others_are_kept() {
         assert_eq!((said.damaged.0, said.messages, said.whole), (1, 80, true), "{said:?}");
         let lost = (number - 1) * 20;
         assert_eq!(messages(&copy), [&all[..lost], &all[lost + 20..]].concat());
-        assert!(said.to_string().contains("1 damaged chunks of "), "{said}");
+        assert!(said.to_string().contains(" damaged bytes are lost"), "{said}");
     }
     let mut bytes = bytes;
     bytes[usize::try_from(chunks[0].chunk_start_offset + chunks[0].chunk_length - 9).unwrap()] ^= 0x10;
     let (said, _) = recovered(&bytes).unwrap();
     assert_eq!((said.messages, said.homeless), (0, 100), "{said:?}");
+}
+
+/// Whether all messages of chunks that these bytes do not belong to are kept, in their order, and none that was not there.
+fn keeps_what_is_intact(original: &[u8], damaged: &[u8], bytes: std::ops::Range<usize>, what: &str) {
+    let all = messages(original);
+    let chunks = Summary::read(original).unwrap().unwrap().chunk_indexes;
+    let (said, copy) = recovered(damaged).unwrap();
+    let kept = messages(&copy);
+    let mut at = kept.iter();
+    for (number, chunk) in chunks.iter().skip(1).enumerate() {
+        let start = usize::try_from(chunk.chunk_start_offset).unwrap();
+        let end = start + usize::try_from(chunk.chunk_length).unwrap();
+        let own = &all[20 * number..20 * number + 20];
+        if bytes.end <= start || end <= bytes.start {
+            assert!(
+                own.iter().all(|message| at.by_ref().any(|it| it == message)),
+                "{what}: chunk {number}, {said}"
+            );
+        }
+    }
+    assert!(kept.iter().all(|message| all.contains(message)), "{what}: {said}");
+    // A footer whose checksum is 0 has none.
+    assert!(!said.is_sound() || bytes.end > original.len() - 12, "{what}: {said:?}");
+}
+
+#[test]
+fn wherever_damage_is_every_intact_chunk_is_kept() {
+    let bytes = recording();
+    // Without the first chunk, which has the channels, nothing else has a topic.
+    let first = &Summary::read(&bytes).unwrap().unwrap().chunk_indexes[0];
+    let first = usize::try_from(first.chunk_start_offset + first.chunk_length).unwrap();
+    for at in first..bytes.len() {
+        let flip = [1, 0x40, 0x80, 0xFF][at % 4];
+        let mut damaged = bytes.clone();
+        damaged[at] ^= flip;
+        keeps_what_is_intact(&bytes, &damaged, at..at + 1, &format!("{flip:x} at {at}"));
+        for length in [9, 100, 700] {
+            if at % 13 != length % 13 {
+                continue;
+            }
+            let end = (at + length).min(bytes.len());
+            let mut damaged = bytes.clone();
+            damaged[at..end].fill(0);
+            if damaged != bytes {
+                keeps_what_is_intact(&bytes, &damaged, at..end, &format!("{length} zeros at {at}"));
+            }
+            damaged.drain(at..end);
+            keeps_what_is_intact(&bytes, &damaged, at..end, &format!("{length} bytes gone at {at}"));
+        }
+    }
+}
+
+#[test]
+fn a_length_that_leads_over_others_or_beyond_the_end_hides_nothing() {
+    let bytes = recording();
+    let summary = Summary::read(&bytes).unwrap().unwrap();
+    let chunk = usize::try_from(summary.chunk_indexes[2].chunk_start_offset).unwrap();
+    let attached = usize::try_from(summary.attachment_indexes[0].offset).unwrap();
+    // A chunk's own fields say how long it is, too.
+    for (at, expected) in [(chunk, [80, 100]), (attached, [100, 100])] {
+        for length in [7, 300, 2_000, 1 << 20, u64::MAX] {
+            let mut damaged = bytes.clone();
+            let own = u64::from_le_bytes(damaged[at + 1..at + 9].try_into().unwrap());
+            damaged[at + 1..at + 9].copy_from_slice(&own.wrapping_add(length).to_le_bytes());
+            let (said, _) = recovered(&damaged).unwrap();
+            assert!(expected.contains(&said.messages) && said.damaged.0 == 1, "{at} + {length}: {said}");
+        }
+    }
+    // Of the header: the profile is lost with it.
+    for at in 8..17 {
+        let mut damaged = bytes.clone();
+        damaged[at] ^= 0x21;
+        let (said, _) = recovered(&damaged).unwrap();
+        assert!(said.messages == 100 && !said.is_sound(), "{at}: {said}");
+    }
+    // What was never written is zeros, as after a power loss.
+    let zeros = [&bytes[..chunk], &[0; 300_000]].concat();
+    let (said, _) = recovered(&zeros).unwrap();
+    assert_eq!((said.messages, said.unfinished, said.damaged.0), (20, 300_000, 0), "{said}");
 }
 
 #[test]
@@ -158,7 +238,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     let said = says("recover run.mcap.part", 0);
     assert!(
         said.starts_with("run-recovered.mcap, ")
-            && said.contains("; 50 bytes of an unfinished chunk are lost"),
+            && said.contains("; 50 bytes of an unfinished record are lost"),
         "{said}"
     );
     assert_eq!(messages(&fs::read(path("run-recovered.mcap")).unwrap()).len(), 40);

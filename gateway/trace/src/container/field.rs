@@ -73,6 +73,11 @@ pub enum Record<'a> {
         /// The facts.
         facts: Facts<'a>,
     },
+    /// The end of the file.
+    Footer {
+        /// The checksum of the summary and of what is before this; 0 when there is none.
+        crc: u32,
+    },
     /// The end of what was recorded.
     DataEnd {
         /// The checksum of everything before it; 0 when there is none.
@@ -225,6 +230,12 @@ pub fn parse(opcode: u8, body: &[u8]) -> Result<Record<'_>, Damage> {
         op::METADATA => {
             let mut from = description("metadata")?;
             Record::Metadata { name: from.text("name")?, facts: from.facts("facts")? }
+        }
+        op::FOOTER => {
+            let mut from = Fields::new("footer", body);
+            from.u64("summary start")?;
+            from.u64("summary offset start")?;
+            Record::Footer { crc: from.u32("checksum")? }
         }
         op::DATA_END => Record::DataEnd { crc: Fields::new("data end", body).u32("checksum")? },
         _ => Record::Other,

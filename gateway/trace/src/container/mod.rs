@@ -10,10 +10,12 @@
 
 mod chunk;
 mod field;
+mod search;
 mod source;
 
 pub use chunk::Chunk;
 pub use field::{Facts, Names, Record, parse};
+pub use search::{HEAD, first_record, is_record, own_length};
 pub(crate) use source::read_some;
 pub use source::{Framed, Source, find};
 
@@ -113,6 +115,12 @@ pub enum Damage {
         /// Why.
         source: MessageError,
     },
+    /// An operation code that the format does not have.
+    #[error("no record has the operation code {0:02x}")]
+    Unknown(u8),
+    /// A record that leads beyond the end of the file.
+    #[error("{0} bytes at the end are no whole record")]
+    Cut(u64),
     /// Far more comes out than went in.
     #[error("{read} bytes unpack to more than {limit} {what}")]
     Bomb {

@@ -1,14 +1,18 @@
 //! Records of a file, one after the other.
 
-use std::io::{self, BufReader, Read, Seek};
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
 use mcap::records::op;
 
 use super::field::attachment_name;
+use super::search::is_known;
 use super::{LONGEST, MAGIC};
 
 /// Bytes that are kept of a record that is longer than anything that is taken into memory.
 const BEGINNING: u64 = 64 << 10;
+
+/// Bytes of a footer that its checksum is of; that stands behind them.
+const FOOTER_CHECKED: usize = 16;
 
 /// What comes next in a file.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -17,6 +21,8 @@ pub enum Framed {
     Record(u8),
     /// A record of this operation code and length that is too long for memory; its beginning is in [`Source::body`].
     Long(u8, u64),
+    /// A record of an operation code that the format does not know, and its length.
+    Unknown(u8, u64),
     /// So many bytes of a record that is not whole, and nothing behind them. 0 when the file ends between two records.
     End(u64),
 }
@@ -29,6 +35,8 @@ pub struct Source<R> {
     body: Vec<u8>,
     /// Bytes that came.
     read: u64,
+    /// Where the record that was read last begins, and the one before it.
+    began: [u64; 2],
     /// The longest attachment that is taken into memory.
     attachments: u64,
     /// Of everything before the end of the data section.
@@ -39,7 +47,7 @@ impl<R: Read> Source<R> {
     /// Reads from an input, attachments of so many bytes at most.
     pub fn new(input: R, attachments: u64) -> Self {
         let checksum = Some(crc32fast::Hasher::new());
-        Self { input, body: Vec::new(), read: 0, attachments, checksum }
+        Self { input, body: Vec::new(), read: 0, began: [0; 2], attachments, checksum }
     }
 
     /// The same in the middle of a file, behind so many bytes.
@@ -70,15 +78,27 @@ impl<R: Read> Source<R> {
         self.read
     }
 
+    /// Where the record that was read last begins, and the one before it.
+    #[must_use]
+    pub const fn began(&self) -> [u64; 2] {
+        self.began
+    }
+
     /// The name of an attachment that is too long.
     #[must_use]
     pub fn attachment_name(&self) -> &str {
         attachment_name(&self.body)
     }
 
-    /// The checksum of all before the end of the data section, when that has come; once.
-    pub fn data_checksum(&mut self) -> Option<u32> {
+    /// The checksum of all before the end of the data section, when that has come; or of the summary, when the footer
+    /// has; once, and if nothing was left out.
+    pub fn section_checksum(&mut self) -> Option<u32> {
         self.checksum.take().map(crc32fast::Hasher::finalize)
+    }
+
+    /// The summary section begins here: the next checksum is of it, and of the footer before its own.
+    pub fn begin_summary(&mut self) {
+        self.checksum = Some(crc32fast::Hasher::new());
     }
 
     /// The next record that anybody looks at.
@@ -92,6 +112,8 @@ impl<R: Read> Source<R> {
     pub fn next(&mut self) -> io::Result<Framed> {
         loop {
             let began = self.read;
+            let [last, _] = self.began;
+            self.began = [began, last];
             self.body.clear();
             self.take(9)?;
             let Some(&[opcode, ref length @ ..]) = self.body.first_chunk::<9>() else {
@@ -117,8 +139,10 @@ impl<R: Read> Source<R> {
             let is_long = length > limit;
             let kept = if is_long { limit.min(BEGINNING) } else { length };
             let mut there = self.take(kept)? == kept;
-            if opcode != op::DATA_END {
-                self.update();
+            match opcode {
+                op::DATA_END => {}
+                op::FOOTER => self.update_to(FOOTER_CHECKED),
+                _ => self.update(),
             }
             if is_long && there {
                 there = self.pass_over(length - kept)?;
@@ -127,6 +151,7 @@ impl<R: Read> Source<R> {
                 return Ok(Framed::End(self.read - began));
             }
             match (is_long, limit) {
+                _ if !is_known(opcode) => return Ok(Framed::Unknown(opcode, length)),
                 (false, _) => return Ok(Framed::Record(opcode)),
                 (true, 1..) => return Ok(Framed::Long(opcode, length)),
                 (true, 0) => {}
@@ -143,8 +168,12 @@ impl<R: Read> Source<R> {
     }
 
     fn update(&mut self) {
+        self.update_to(usize::MAX);
+    }
+
+    fn update_to(&mut self, bytes: usize) {
         if let Some(checksum) = &mut self.checksum {
-            checksum.update(&self.body);
+            checksum.update(self.body.get(..bytes).unwrap_or(&self.body));
         }
     }
 
@@ -164,6 +193,35 @@ impl<R: Read> Source<R> {
             leftover -= came.len() as u64;
         }
         Ok(true)
+    }
+}
+
+impl<R: Read + Seek> Source<R> {
+    /// What it reads from.
+    pub const fn input(&mut self) -> &mut R {
+        &mut self.input
+    }
+
+    /// All bytes that there are.
+    ///
+    /// # Errors
+    /// When the input fails, or is none that can be gone back in.
+    pub fn size(&mut self) -> io::Result<u64> {
+        let size = self.input.seek(SeekFrom::End(0))?;
+        self.input.seek(SeekFrom::Start(self.read))?;
+        Ok(size)
+    }
+
+    /// Goes on at another place. No checksum of all is known any more, unless it is the same place.
+    ///
+    /// # Errors
+    /// When the input fails.
+    pub fn move_to(&mut self, place: u64) -> io::Result<()> {
+        self.input.seek(SeekFrom::Start(place))?;
+        if place != self.read {
+            (self.read, self.began, self.checksum) = (place, [place; 2], None);
+        }
+        Ok(())
     }
 }
 

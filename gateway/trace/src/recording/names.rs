@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!   run.mcap.part  ── finish ──>  run.mcap         then run-1.mcap.part, run-2.mcap.part, ...
-//!        └─ writer killed ──────>  run-recovered.mcap
+//!        └─ writer killed ──────>  run-recovered.mcap     and run.mcap.damaged, if more is lost than its end
 //! ```
 //!
 //! Who writes a file holds a lock on it, which goes with the process, and has put its own mark into it before it had a
@@ -58,6 +58,35 @@ pub fn recovered(goal: &Path) -> PathBuf {
 
 fn exists(path: &Path) -> bool {
     fs::symlink_metadata(path).is_ok()
+}
+
+/// What a file is called in addition that is damaged, and kept beside what was recovered from it.
+const DAMAGED: &str = "damaged";
+
+/// Keeps a `.part` under another name, at which no run looks for what it could repair: `run.mcap.damaged`. That name.
+///
+/// # Errors
+/// When it is another file now, or cannot have another name.
+pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
+    if !is_still(part, identity(&from.metadata()?)) {
+        return Err(io::Error::other(format!("{} is another file now", part.display())));
+    }
+    let goal = goal_of(part);
+    for number in 0_u32.. {
+        let mut name = goal.file_name().unwrap_or_default().to_owned();
+        name.push(".");
+        name.push(DAMAGED);
+        if number > 0 {
+            name.push(format!("-{number}"));
+        }
+        let other = goal.with_file_name(name);
+        match rename(part, &other, false) {
+            Ok(()) => return Ok(other),
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Err(io::Error::other("it has no name left"))
 }
 
 /// The files of an earlier recording of this name that are there: it, and those with a number.

@@ -6,12 +6,12 @@
 //!            kept, message by message            └ reported: bytes of an incomplete record
 //! ```
 //!
-//! A chunk is kept when it is whole and its checksum is right. One that is damaged is left out and reported;
-//! what follows it is kept.
+//! A chunk is kept when it is whole and its checksum is right. One that is damaged is left out and reported, and so are
+//! bytes that are no record; what follows is kept, and looked for where a length leads nowhere.
 
 use std::collections::BTreeMap;
 use std::fmt;
-use std::io::{self, Read, Write};
+use std::io::{self, Read, Seek, Write};
 
 use mcap::records::{MessageHeader, op};
 use mcap::write::{Metadata, NoSeek};
@@ -21,7 +21,10 @@ use thiserror::Error;
 
 use super::TOPIC_OF_BUS;
 use super::file::{io_error, options};
-use crate::container::{Chunk, Damage, Framed, LONGEST, MAGIC, Names, Record, Source, parse};
+use crate::container::{
+    Chunk, Damage, Framed, HEAD, LONGEST, MAGIC, Names, Record, Source, first_record, is_record, own_length,
+    parse,
+};
 use crate::ros2::Message;
 
 /// The longest attachment that is copied.
@@ -38,19 +41,27 @@ pub struct Recovered {
     pub last_nanos: u64,
     /// Bytes at the end that are no whole record.
     pub unfinished: u64,
-    /// Whole chunks whose content is damaged, and their bytes.
+    /// Damaged places, and their bytes.
     pub damaged: (u64, u64),
     /// Messages whose topic was described in something that is lost.
     pub homeless: u64,
     /// Whether the file had its end.
     pub whole: bool,
+    /// Whether a checksum of all its data, or of its summary, is wrong.
+    pub checksum: bool,
 }
 
 impl Recovered {
+    /// Whether nothing is lost but what a killed writer had not finished.
+    #[must_use]
+    pub const fn is_undamaged(&self) -> bool {
+        self.damaged.0 == 0 && self.homeless == 0
+    }
+
     /// Whether nothing was wrong with the file.
     #[must_use]
     pub const fn is_sound(&self) -> bool {
-        self.whole && self.unfinished == 0 && self.damaged.0 == 0 && self.homeless == 0
+        self.whole && self.unfinished == 0 && self.is_undamaged() && !self.checksum
     }
 }
 
@@ -63,13 +74,19 @@ impl fmt::Display for Recovered {
         }
         match self.unfinished {
             0 => write!(f, "; nothing unfinished at the end")?,
-            bytes => write!(f, "; {bytes} bytes of an unfinished chunk are lost")?,
+            bytes => write!(f, "; {bytes} bytes of an unfinished record are lost")?,
         }
-        if let (chunks @ 1.., bytes) = self.damaged {
-            write!(f, "; {chunks} damaged chunks of {bytes} bytes are lost")?;
+        match self.damaged {
+            (0, _) => {}
+            (_, 0) => write!(f, "; a length in it was wrong, and nothing is lost for that")?,
+            (1, bytes) => write!(f, "; {bytes} damaged bytes are lost")?,
+            (places, bytes) => write!(f, "; {bytes} damaged bytes in {places} places are lost")?,
         }
         if self.homeless > 0 {
             write!(f, "; {} messages of topics that were described there are lost", self.homeless)?;
+        }
+        if self.checksum && self.is_undamaged() {
+            write!(f, "; a checksum of the whole was wrong, and none of a part")?;
         }
         Ok(())
     }
@@ -101,55 +118,86 @@ fn hex(bytes: &[u8]) -> String {
     if digits.is_empty() { "nothing".to_owned() } else { digits.join(" ") }
 }
 
-/// Copies everything whole into a new file, and ends it.
+/// Copies everything whole into a new file, and ends it. Behind damage it goes on with the next record that is certain;
+/// of an input that cannot be gone back in only where the damaged record ends by its length.
 ///
 /// # Errors
 /// When there is nothing to keep, or a file fails.
-pub fn recover(from: impl Read, out: impl Write) -> Result<Recovered, RecoverError> {
+pub fn recover(from: impl Read + Seek, out: impl Write) -> Result<Recovered, RecoverError> {
     let mut source = Source::new(from, LONGEST_ATTACHMENT);
     if !source.magic().map_err(RecoverError::Read)? && !MAGIC.starts_with(source.body()) {
         return Err(RecoverError::NoMcap { got: source.body().to_vec() });
     }
-    loop {
-        match source.next().map_err(RecoverError::Read)? {
-            Framed::Record(op::HEADER) => break,
-            Framed::End(_) => return Err(RecoverError::Empty(source.read())),
-            Framed::Record(_) | Framed::Long(..) => {}
+    let first = source.next().map_err(RecoverError::Read)?;
+    let is_header = first == Framed::Record(op::HEADER);
+    if !is_header {
+        let [began, _] = source.began();
+        if resume(&mut source, (began, began, None), true).map_err(RecoverError::Read)?.is_none() {
+            return Err(RecoverError::Empty(source.read()));
         }
     }
-    let mut copy = Copy::new(source.body(), out).map_err(RecoverError::Write)?;
+    let mut copy =
+        Copy::new(if is_header { source.body() } else { &[] }, out).map_err(RecoverError::Write)?;
+    if !is_header {
+        copy.lost(MAGIC.len() as u64, source.read());
+    }
     let mut chunk = Chunk::default();
+    // Up to here all is right.
+    let mut right = source.read();
     loop {
         let framed = source.next().map_err(RecoverError::Read)?;
-        let (kept, bytes) = match framed {
-            Framed::End(bytes) => {
-                copy.recovered.unfinished = bytes;
-                break;
-            }
+        let [began, _] = source.began();
+        let kept = match framed {
+            Framed::End(0) => break,
             Framed::Record(op::DATA_END) => {
+                let checksums = is_right(&mut source, op::DATA_END);
                 // What follows is generated again.
-                copy.recovered.whole = ends_well(&mut source).map_err(RecoverError::Read)?;
-                break;
+                let end = ends_well(&mut source).map_err(RecoverError::Read)?;
+                // Its operation code and length are five bytes: damage may look like it.
+                let goes_on = !end.whole
+                    && resume(&mut source, (right, began, None), false)
+                        .map_err(RecoverError::Read)?
+                        .is_some();
+                if !goes_on {
+                    copy.recovered.whole = end.whole;
+                    copy.recovered.checksum = !(checksums && end.checksum);
+                    break;
+                }
+                copy.lost(began, source.read());
+                continue;
             }
             Framed::Record(code) => {
                 let (body, read) = (source.body(), source.read());
-                let kept = if code == op::CHUNK {
-                    copy.chunk(&mut chunk, body, read)
-                } else {
-                    copy.record(code, body)
-                };
-                (kept, body.len() as u64)
+                if code == op::CHUNK { copy.chunk(&mut chunk, body, read) } else { copy.record(code, body) }
             }
-            Framed::Long(_, bytes) => {
-                (Err(Damage::Long { what: "record", bytes, limit: LONGEST }.into()), bytes)
-            }
+            Framed::Long(_, bytes) => Err(Damage::Long { what: "record", bytes, limit: LONGEST }.into()),
+            Framed::Unknown(code, _) => Err(Damage::Unknown(code).into()),
+            Framed::End(bytes) => Err(Damage::Cut(bytes).into()),
         };
         match kept {
-            Ok(()) => {}
+            Ok(()) => {
+                let code = if let Framed::Record(code) = framed { code } else { 0 };
+                right = source.read();
+                // Its content is right, and says where it ends.
+                let own = own_length(code, source.body()).map(|own| began + HEAD as u64 + own);
+                if let Some(own) = own.filter(|own| *own < right)
+                    && source.move_to(own).is_ok()
+                {
+                    right = own;
+                    copy.lost(began, began);
+                }
+            }
             Err(Failed::Write(error)) => return Err(RecoverError::Write(io_error(error))),
             Err(Failed::Damage(_)) => {
-                copy.recovered.damaged.0 += 1;
-                copy.recovered.damaged.1 += bytes;
+                let end = (!matches!(framed, Framed::End(_))).then_some(source.read());
+                match resume(&mut source, (right, began, end), true).map_err(RecoverError::Read)? {
+                    Some(at) => copy.lost(began, at),
+                    None => {
+                        copy.recovered.unfinished =
+                            source.size().unwrap_or_else(|_| source.read()).saturating_sub(began);
+                        break;
+                    }
+                }
             }
         }
     }
@@ -157,14 +205,61 @@ pub fn recover(from: impl Read, out: impl Write) -> Result<Recovered, RecoverErr
     Ok(copy.recovered)
 }
 
+/// Goes to where records go on behind a damaged one, which began and, by its length, ends there; before it all is right up
+/// to a place. Where that is; none when nothing follows. Only chunks and attachments are looked for, unless `any`.
+fn resume(
+    source: &mut Source<impl Read + Seek>,
+    (right, began, end): (u64, u64, Option<u64>),
+    any: bool,
+) -> io::Result<Option<u64>> {
+    let [_, before] = source.began();
+    let Ok(size) = source.size() else { return Ok(end) };
+    let input = source.input();
+    // The length of the record before it may have led over others.
+    let mut found = first_record(input, right.max(before + 1), began, false)?;
+    if found.is_none() {
+        let end = match end {
+            Some(end) if is_record(input, end, size)? => Some(end),
+            _ => None,
+        };
+        found = first_record(input, began + 1, end.unwrap_or(size), any && end.is_none())?.or(end);
+    }
+    if let Some(at) = found {
+        source.move_to(at)?;
+    }
+    Ok(found)
+}
+
+/// How a file ends behind its data section.
+struct End {
+    /// With a footer and the magic bytes.
+    whole: bool,
+    /// Its summary is as its checksum says.
+    checksum: bool,
+}
+
 /// Whether summary, footer and magic follow. An index that breaks off is no loss: the new file has its own.
-fn ends_well(source: &mut Source<impl Read>) -> io::Result<bool> {
+fn ends_well(source: &mut Source<impl Read>) -> io::Result<End> {
+    source.begin_summary();
     loop {
         match source.next()? {
-            Framed::Record(op::FOOTER) => return source.magic(),
-            Framed::End(_) => return Ok(false),
-            Framed::Record(_) | Framed::Long(..) => {}
+            Framed::Record(op::FOOTER) => {
+                let checksum = is_right(source, op::FOOTER);
+                return Ok(End { whole: source.magic()?, checksum });
+            }
+            Framed::End(_) => return Ok(End { whole: false, checksum: true }),
+            Framed::Record(_) | Framed::Long(..) | Framed::Unknown(..) => {}
         }
+    }
+}
+
+/// Whether the checksum in the end of a section is that of the section, as far as it has one and it is known.
+fn is_right(source: &mut Source<impl Read>, code: u8) -> bool {
+    let found = source.section_checksum();
+    match (parse(code, source.body()), found) {
+        (Ok(Record::DataEnd { crc } | Record::Footer { crc }), Some(found)) => crc == 0 || crc == found,
+        (Ok(_), None) => true,
+        _ => false,
     }
 }
 
@@ -196,6 +291,12 @@ impl<W: Write> Copy<W> {
         let writer = options().profile(profile).create(NoSeek::new(out)).map_err(io_error)?;
         let (schemas, channels, names) = (BTreeMap::new(), BTreeMap::new(), Names::default());
         Ok(Self { writer, schemas, channels, names, recovered: Recovered::default() })
+    }
+
+    /// What stood between two places is lost, as far as the first is before the second.
+    fn lost(&mut self, began: u64, goes_on: u64) {
+        self.recovered.damaged.0 += 1;
+        self.recovered.damaged.1 += goes_on.saturating_sub(began);
     }
 
     /// A chunk's records, if all of them are right; `read` is how many bytes of the file were read so far.
@@ -260,7 +361,7 @@ impl<W: Write> Copy<W> {
                 writer.write_metadata(&Metadata { name: name.to_owned(), metadata: facts.into() })?;
             }
             // Generated again, or of no file of ours.
-            Record::Header { .. } | Record::DataEnd { .. } | Record::Other => {}
+            Record::Header { .. } | Record::DataEnd { .. } | Record::Footer { .. } | Record::Other => {}
         }
         Ok(())
     }

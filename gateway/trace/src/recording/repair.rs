@@ -21,9 +21,12 @@ pub struct Repaired {
     pub recovered: Recovered,
     /// The new file and its bytes; none when nothing was recorded.
     pub new: Option<(PathBuf, u64)>,
+    /// What the original is called now, when more of it is lost than its writer had not finished; else it is gone.
+    pub original: Option<PathBuf>,
 }
 
-/// Makes a complete file of one that broke off, and removes the latter. `goal` gives a name for the new one at each
+/// Makes a complete file of one that broke off, and removes the latter, or keeps it under another name if it is damaged
+/// before its end. `goal` gives a name for the new one at each
 /// attempt; it replaces another file only with `force`.
 ///
 /// # Errors
@@ -47,12 +50,16 @@ pub fn repair(
                 if error.kind() == io::ErrorKind::AlreadyExists && attempts < NAMES => {}
             copied => {
                 let (recovered, bytes) = copied?;
-                break Repaired { recovered, new: bytes.map(|bytes| (path, bytes)) };
+                break Repaired { recovered, new: bytes.map(|bytes| (path, bytes)), original: None };
             }
         }
     };
-    names::remove(part, from).map_err(RecoverError::Write)?;
-    Ok(repaired)
+    if repaired.recovered.is_undamaged() {
+        names::remove(part, from).map_err(RecoverError::Write)?;
+        return Ok(repaired);
+    }
+    let original = Some(names::keep_damaged(part, from).map_err(RecoverError::Write)?);
+    Ok(Repaired { original, ..repaired })
 }
 
 /// Makes a whole file of another one, unless that is whole itself. What it came to, and the new one's bytes if
@@ -125,8 +132,10 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
         };
         let leftover = "was left by a run that was killed";
         match repair(&part, &held, || names::recovered(&names::goal_of(&part)), false) {
-            Ok(Repaired { recovered, new: Some((path, _)) }) => {
-                say(&format!("{name} {leftover}; repaired, it is {}: {recovered}", path.display()));
+            Ok(Repaired { recovered, new: Some((path, _)), original }) => {
+                let kept = original.map(|path| format!("; the damaged original is {}", path.display()));
+                let kept = kept.unwrap_or_default();
+                say(&format!("{name} {leftover}; repaired, it is {}: {recovered}{kept}", path.display()));
             }
             Ok(Repaired { new: None, .. }) => {
                 say(&format!("{name} {leftover}; nothing was recorded in it, it is gone"));

@@ -393,7 +393,7 @@ impl<T> Series<T> {
             let from = part.open().map_err(RecoverError::Read);
             let goal = || part.goal.clone();
             match from.and_then(|from| repair::repair(&part.path, &from, goal, self.force)) {
-                Ok(Repaired { recovered, new: Some((goal, bytes)) }) => {
+                Ok(Repaired { recovered, new: Some((goal, bytes)), .. }) => {
                     // More may have come to the disk than is known of, or less.
                     self.lost.frames = (self.lost.frames + kept.frames).saturating_sub(recovered.frames);
                     let others = recovered.messages - recovered.frames;

@@ -126,7 +126,7 @@ impl McapReader {
                     (*place, *anchor) = (Place::InChunk, (began, 0));
                 }
                 Framed::Record(op::DATA_END) => {
-                    let found = source.data_checksum();
+                    let found = source.section_checksum();
                     if let (Record::DataEnd { crc: saved @ 1.. }, Some(found)) =
                         (parse(op::DATA_END, source.body())?, found)
                         && saved != found
@@ -149,6 +149,7 @@ impl McapReader {
                 Framed::Long(_, bytes) => {
                     return Err(Damage::Long { what: "record", bytes, limit: LONGEST }.into());
                 }
+                Framed::Unknown(..) => {}
                 Framed::End(_) => self.truncated(),
             },
         }

@@ -163,6 +163,7 @@ impl State {
             | Raw::Attachment { .. }
             | Raw::Metadata { .. }
             | Raw::DataEnd { .. }
+            | Raw::Footer { .. }
             | Raw::Other => {}
         }
         Ok(None)

@@ -1,0 +1,159 @@
+//! Where records go on behind damage.
+//!
+//! A length that is wrong leads anywhere. What is certain again is a chunk or an attachment, whose lengths agree with each
+//! other, or a series of records each of which ends where the next one begins.
+
+use std::io::{self, Read, Seek, SeekFrom};
+
+use mcap::records::op;
+
+use super::field::Fields;
+use super::source::read_some;
+use super::{LONGEST, MAGIC};
+
+/// Bytes of an operation code and a length.
+pub const HEAD: usize = 9;
+/// Bytes that are looked through at once.
+const WINDOW: usize = 1 << 20;
+/// The most bytes of a record that say what it is.
+const BEGINNING: usize = 512;
+/// Records in a row that are no accident.
+const ROW: usize = 4;
+
+/// Whether the format knows records of this operation code; those of 80 and more are an application's own.
+#[must_use]
+pub(super) const fn is_known(opcode: u8) -> bool {
+    matches!(opcode, 0x01..=0x0F | 0x80..)
+}
+
+/// The fewest bytes that such a record has.
+const fn min_length(opcode: u8) -> Option<u64> {
+    Some(match opcode {
+        op::HEADER | op::METADATA => 8,
+        op::FOOTER => 20,
+        op::SCHEMA => 14,
+        op::CHANNEL => 16,
+        op::MESSAGE => 22,
+        op::CHUNK => 40,
+        op::MESSAGE_INDEX => 6,
+        op::CHUNK_INDEX => 64,
+        op::ATTACHMENT => 36,
+        op::ATTACHMENT_INDEX => 48,
+        op::STATISTICS => 46,
+        op::METADATA_INDEX => 20,
+        op::SUMMARY_OFFSET => 17,
+        op::DATA_END => 4,
+        _ => return None,
+    })
+}
+
+/// Whether a record can begin here: its operation code is known, and it ends within the file.
+///
+/// # Errors
+/// When the input fails.
+pub fn is_record(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Result<bool> {
+    Ok(at == size || next(input, at, size)?.is_some())
+}
+
+/// Where the first record begins, at `from` or behind it and before `until`; of chunks and attachments only, unless `any`.
+///
+/// # Errors
+/// When the input fails, or cannot be gone back in.
+pub fn first_record(
+    input: &mut (impl Read + Seek),
+    mut from: u64,
+    until: u64,
+    any: bool,
+) -> io::Result<Option<u64>> {
+    let size = input.seek(SeekFrom::End(0))?;
+    let mut window = Vec::new();
+    while from < until.min(size) {
+        input.seek(SeekFrom::Start(from))?;
+        window.clear();
+        input.by_ref().take((WINDOW + BEGINNING) as u64).read_to_end(&mut window)?;
+        let starts = usize::try_from(until - from).unwrap_or(WINDOW).min(WINDOW).min(window.len());
+        for start in 0..starts {
+            let at = from + start as u64;
+            let bytes = window.get(start..(start + BEGINNING).min(window.len())).unwrap_or_default();
+            if is_certain(bytes, size - at) || (any && may_be(bytes, size - at) && is_row(input, at, size)?) {
+                return Ok(Some(at));
+            }
+        }
+        from += starts.max(1) as u64;
+    }
+    Ok(None)
+}
+
+/// The operation code and the length of a record that begins with these bytes, if it can be one and is within `leftover`.
+fn head(bytes: &[u8], leftover: u64) -> Option<(u8, u64)> {
+    let &[opcode, ref length @ ..] = bytes.first_chunk::<HEAD>()?;
+    let length = u64::from_le_bytes(*length);
+    (min_length(opcode).is_some_and(|min| length >= min) && length <= leftover.checked_sub(HEAD as u64)?)
+        .then_some((opcode, length))
+}
+
+fn may_be(bytes: &[u8], leftover: u64) -> bool {
+    head(bytes, leftover).is_some()
+}
+
+/// Whether a chunk or an attachment begins with these bytes: each of its lengths is in it twice.
+fn is_certain(bytes: &[u8], leftover: u64) -> bool {
+    let Some((opcode, length)) = head(bytes, leftover) else { return false };
+    let body = bytes.get(HEAD..).unwrap_or_default();
+    (opcode != op::CHUNK || length <= LONGEST) && own_length(opcode, body) == Some(length)
+}
+
+/// The length of a chunk or an attachment by the fields that it begins with; of others none.
+#[must_use]
+pub fn own_length(opcode: u8, body: &[u8]) -> Option<u64> {
+    match opcode {
+        op::CHUNK => chunk(body),
+        op::ATTACHMENT => attachment(body),
+        _ => None,
+    }
+}
+
+/// The length of a chunk's record by the fields in it.
+fn chunk(body: &[u8]) -> Option<u64> {
+    let mut from = Fields::new("chunk", body);
+    let (start, end, unpacked) = (from.u64("").ok()?, from.u64("").ok()?, from.u64("").ok()?);
+    from.u32("").ok()?;
+    let compression = from.text("").ok()?;
+    let packed = from.u64("").ok()?;
+    let fields = 40 + compression.len() as u64;
+    (start <= end && unpacked <= LONGEST && matches!(compression, "" | "zstd" | "lz4"))
+        .then(|| packed.checked_add(fields))?
+}
+
+/// The length of an attachment's record by the fields in it.
+fn attachment(body: &[u8]) -> Option<u64> {
+    let mut from = Fields::new("attachment", body);
+    from.u64("").and_then(|_| from.u64("")).ok()?;
+    let (name, media_type) = (from.text("").ok()?, from.text("").ok()?);
+    let data = from.u64("").ok()?;
+    data.checked_add(36 + name.len() as u64 + media_type.len() as u64)
+}
+
+/// Whether records follow each other from here on.
+fn is_row(input: &mut (impl Read + Seek), mut at: u64, size: u64) -> io::Result<bool> {
+    for _ in 0..ROW {
+        let Some((opcode, end)) = next(input, at, size)? else { return Ok(false) };
+        if opcode == op::FOOTER {
+            return Ok(end + MAGIC.len() as u64 == size);
+        }
+        at = end;
+    }
+    Ok(true)
+}
+
+/// The operation code of the record that begins here, and where it ends.
+fn next(input: &mut (impl Read + Seek), at: u64, size: u64) -> io::Result<Option<(u8, u64)>> {
+    let mut bytes = [0; HEAD];
+    input.seek(SeekFrom::Start(at))?;
+    let mut read = 0;
+    while let came @ 1.. = read_some(input, bytes.get_mut(read..).unwrap_or_default())? {
+        read += came;
+    }
+    let there = bytes.get(..read).unwrap_or_default();
+    Ok(head(there, size.saturating_sub(at)).map(|(opcode, length)| (opcode, at + HEAD as u64 + length)))
+}
