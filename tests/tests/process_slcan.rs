@@ -119,7 +119,7 @@ fn frames_of_every_kind_pass_both_ways_and_the_adapter_is_opened_and_closed() {
         let name = pty.path.display();
         assert!(
             ended.stdout.ends_with(&format!(
-                "\n{name}: opened 1 times, lost 0 times\n  to the line: 100 received, 100 sent\n  to the bus:  100 received, 100 sent\n"
+                "\n{name}: opened once, lost never\n  to the line: 100 received, 100 sent\n  to the bus:  100 received, 100 sent\n"
             )),
             "{ended:?}"
         );
@@ -193,6 +193,7 @@ fn goes_and_returns(
         });
         bench.client.send(&[frame]).unwrap();
     }
+    until("all losses", || bridge.stderr().contains("3 dropped (3 line away)").then_some(()));
     let [line] = ended(bridge).try_into().unwrap();
     assert_eq!((&line["opened"], &line["lost"]), (&3.into(), &3.into()), "{line}");
     assert_eq!(line["to_line"]["dropped"]["line_away"], 3, "{line}");
@@ -233,9 +234,12 @@ fn a_unix_socket_goes_and_returns() {
 #[test]
 fn a_tcp_socket_goes_and_returns() {
     let bench = Bench::new();
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let port = listener.local_addr().unwrap().port();
-    let connect = || Peer::new(OwnedFd::from(listener.accept().unwrap().0));
+    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let connect = || {
+        // Not there once it is connected, as a program that ends.
+        let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
+        Peer::new(OwnedFd::from(listener.accept().unwrap().0))
+    };
     assert_eq!(goes_and_returns(&bench, &format!("tcp:127.0.0.1:{port}"), connect, drop), 3);
 }
 
@@ -260,6 +264,7 @@ fn what_a_line_is_too_slow_for_is_counted_exactly_and_holds_up_nobody() {
     while slow.look() {
         std::thread::sleep(Duration::from_millis(1));
     }
+    assert!(!bridge.stderr().contains("not closed"), "{}", bridge.stderr());
     let [line, quick] = ended_already(bridge).try_into().unwrap();
     let count = |key: &str| line["to_line"][key].as_u64().unwrap();
     let dropped = &line["to_line"]["dropped"];

@@ -178,11 +178,19 @@ fn losses(what: &str, named: &[(u64, &'static str)]) -> String {
     format!(", {total} {what} ({})", reasons.join(", "))
 }
 
+fn times(count: u64) -> String {
+    match count {
+        0 => "never".to_owned(),
+        1 => "once".to_owned(),
+        count => format!("{count} times"),
+    }
+}
+
 impl fmt::Display for Account {
     /// Three lines, without an end.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { line, opened, lost, to_line, to_bus } = self;
-        write!(f, "{line}: opened {opened} times, lost {lost} times")?;
+        write!(f, "{line}: opened {}, lost {}", times(*opened), times(*lost))?;
         write!(
             f,
             "\n  to the line: {} received, {} sent{}",
@@ -208,7 +216,7 @@ mod tests {
             Account { line: "/dev/ttyACM0".to_owned(), opened: 2, lost: 1, ..Account::default() };
         assert_eq!(
             account.to_string(),
-            "/dev/ttyACM0: opened 2 times, lost 1 times\n  to the line: 0 received, 0 sent\n  to the bus:  0 received, 0 sent"
+            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 0 received, 0 sent\n  to the bus:  0 received, 0 sent"
         );
         account.to_line = ToLine {
             received: 16,
@@ -226,7 +234,7 @@ mod tests {
         };
         assert_eq!(
             account.to_string(),
-            "/dev/ttyACM0: opened 2 times, lost 1 times\n  to the line: 16 received, 1 sent, 15 dropped (1 line too \
+            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 16 received, 1 sent, 15 dropped (1 line too \
              slow, 2 line away, 3 FD frames for a classic adapter, 4 error frames, 5 at the end), 6 not received (6 \
              dropped by the bus)\n  to the bus:  11 received, 1 sent, 10 dropped (1 bus full, 2 bus away, 3 FD frames \
              for a classic bus, 4 at the end), 6 lines refused (1 garbage, 2 too short, 3 wrong identifier), 7 times BEL"

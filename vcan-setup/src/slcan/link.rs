@@ -99,6 +99,11 @@ impl Port {
             return if Instant::now() < until { Ok(false) } else { Err(Errno::TIMEDOUT.into()) };
         }
         sockopt::socket_error(&self.fd)??;
+        // Where nobody listens on a port that the system also gives to those who connect, it connects sooner or later a
+        // socket to itself, and every frame would come back.
+        if Some(rustix::net::getsockname(&self.fd)?) == rustix::net::getpeername(&self.fd)? {
+            return Err(Errno::CONNREFUSED.into());
+        }
         self.connecting = None;
         Ok(true)
     }
@@ -143,8 +148,8 @@ fn connect(
     let fd = rustix::net::socket_with(family, SocketType::STREAM, flags, None)?;
     sockopt::set_socket_send_buffer_size(&fd, SEND_BUFFER)?;
     let connecting = match connect(&fd) {
-        Ok(()) => None,
-        Err(Errno::INPROGRESS) => Some(Instant::now() + CONNECT),
+        Ok(()) if family == AddressFamily::UNIX => None,
+        Ok(()) | Err(Errno::INPROGRESS) => Some(Instant::now() + CONNECT),
         Err(errno) => return Err(errno.into()),
     };
     Ok(Port { fd, is_tty: false, connecting })

@@ -146,6 +146,12 @@ impl Outgoing {
         }
     }
 
+    /// The end of the end: what was begun was not taken as a whole.
+    pub fn give_up(&mut self) {
+        self.account.dropped.ended += self.clear();
+        self.is_up = false;
+    }
+
     /// Whether nothing waits.
     #[must_use]
     pub fn is_empty(&self) -> bool {
@@ -251,6 +257,15 @@ mod tests {
         outgoing.end(&closing());
         assert_eq!(drain(&mut outgoing, NOW), b"3101\rC\r");
         assert_eq!((outgoing.account.sent, outgoing.account.dropped.ended), (1, 1));
+        // What is never taken as a whole is not sent.
+        let mut stuck = Outgoing::new(false, Pace::default());
+        stuck.up(b"");
+        stuck.take(&frame(1));
+        stuck.ready(NOW);
+        stuck.wrote(3);
+        stuck.end(&closing());
+        stuck.give_up();
+        assert_eq!((stuck.account.sent, stuck.account.dropped.ended, stuck.is_empty()), (0, 1, true));
         // Nothing is there that could be closed.
         let mut away = Outgoing::new(false, Pace::default());
         away.end(&closing());

@@ -56,7 +56,8 @@ impl fmt::Display for Event {
             Self::BusAway(why) => write!(f, "its bus is away ({why}); it is opened when it is there"),
             Self::Lost { to_line, to_bus, account } => {
                 let one = |count: u64, what, so_far: String| {
-                    (count > 0).then(|| format!("{count} more {what} lost, so far{so_far}"))
+                    let so_far = so_far.trim_start_matches(", ");
+                    (count > 0).then(|| format!("{count} more {what} lost, in all {so_far}"))
                 };
                 let lost = [
                     one(*to_line, "frames to the line", account.to_line.losses()),
@@ -378,8 +379,12 @@ impl Participant {
         (to_line.dropped.total() + by_bus, to_bus.dropped.total() + to_bus.refused.total())
     }
 
-    /// Closes the adapter, after what has begun; nothing comes from the bus any more.
+    /// Takes what has come, and closes the adapter after what has begun; nothing comes from the bus any more.
     pub(super) fn end(&mut self) {
+        let now = Instant::now();
+        self.read_line(now, &mut |_| {});
+        self.write_bus(now, &mut |_| {});
+        self.read_bus(now, &mut |_| {});
         self.client = Client::Away(Instant::now());
         self.incoming.end();
         self.outgoing.end(&closing());
@@ -399,7 +404,7 @@ impl Participant {
         {
             port.discard();
         }
-        self.outgoing.down();
+        self.outgoing.give_up();
         closed
     }
 }
