@@ -14,7 +14,7 @@ use protocol::bus::{Bus, Inbox, Options};
 use protocol::can::{EXTENDED, Frame};
 use rustix::process::Signal;
 use serde_json::Value;
-use slcan::{Peer, Pty};
+use slcan::{Peer, Pty, carry};
 
 /// A bus in a place.
 struct Bench {
@@ -353,4 +353,40 @@ fn what_cannot_be_is_refused_in_one_line() {
     let nowhere = Place::new();
     let refused = nowhere.start("vcan-setup", &format!("slcan vcan0 {tty} --bus-kind embedded")).end();
     assert!(refused.refusal(1).contains("no embedded bus vcan0 is served"));
+}
+
+#[test]
+fn a_cell_behind_a_line_answers_as_one_on_the_bus() {
+    // The cell is on a bus of its own, which stands for what is behind an adapter.
+    let [bench, behind] = [Bench::new(), Bench::new()];
+    for place in [&bench.place, &behind.place] {
+        place.pressed();
+    }
+    let [near, far] = [Pty::new(), Pty::new()];
+    carry(&near.peer, &far.peer);
+    carry(&far.peer, &near.peer);
+    let near = bench.joined(&format!("{} --cell 5", near.path.display()));
+    let far = behind.joined(&far.path.display().to_string());
+    let cells = [("1-4", &bench), ("6-8", &bench), ("5-5", &behind)].map(|(nodes, on)| {
+        on.place
+            .start("cell-node", &format!("--bus vcan0 --bus-kind embedded --nodes {nodes} --skin skin.toml"))
+    });
+    let heartbeats =
+        |frames: &[Frame]| (1..=8).all(|cell| frames.iter().any(|frame| frame.id() == 0x400 + cell));
+    let mut heard = Vec::new();
+    until("all cells", || {
+        heard.extend(bench.receives(1));
+        heartbeats(&heard).then_some(())
+    });
+    bench.place.bench(3.0, "--no-spawn").end().well();
+    let summary = bench.place.summary();
+    let [line] = ended(near).try_into().unwrap();
+    assert_eq!(line["to_line"]["received"], line["to_line"]["sent"], "{line}");
+    assert_eq!(line["to_bus"]["received"], line["to_bus"]["sent"], "{line}");
+    // Joints of 3 s at 62.5 Hz, and as many answers.
+    assert!(line["to_line"]["sent"].as_u64().unwrap() >= 180, "{line}");
+    assert!(line["to_bus"]["sent"].as_u64().unwrap() >= 180, "{line}");
+    assert_eq!(summary.0["buses"][0]["replies"]["unknown"], 0, "{:#}", summary.0["buses"][0]);
+    ended(far);
+    drop(cells);
 }

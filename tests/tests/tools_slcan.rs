@@ -7,18 +7,16 @@ mod process;
 mod slcan;
 
 use std::fmt::Write as _;
-use std::fs::File;
-use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
-use std::time::Duration;
 
 use process::{Place, until};
 use protocol::bus::{Bus, Inbox, Options};
 use protocol::can::{BIT_RATE_SWITCH, EXTENDED, Format, Frame};
 use rustix::process::Signal;
 use serde_json::Value;
-use slcan::Pty;
+use slcan::{Pty, carry};
 
 /// Each way.
 const FRAMES: usize = 10_000;
@@ -74,32 +72,6 @@ fn line(frame: &Frame) -> String {
     format!("{:X} {} {} {}", frame.id(), or_none(kind), frame.len(), or_none(data))
 }
 
-/// Carries what comes at one end to the other one, until that is gone.
-fn carry(mut from: File, mut to: File) {
-    std::thread::spawn(move || {
-        let mut buffer = [0; 4_096];
-        let pause = || std::thread::sleep(Duration::from_micros(200));
-        loop {
-            let count = match from.read(&mut buffer) {
-                Ok(count) => count,
-                Err(error) if error.kind() == ErrorKind::WouldBlock => {
-                    pause();
-                    continue;
-                }
-                Err(_) => return,
-            };
-            let mut rest = &buffer[..count];
-            while !rest.is_empty() {
-                match to.write(rest) {
-                    Ok(count) => rest = &rest[count..],
-                    Err(error) if error.kind() == ErrorKind::WouldBlock => pause(),
-                    Err(_) => return,
-                }
-            }
-        }
-    });
-}
-
 fn check(format: Format, options: &str) {
     let here = Path::new(env!("CARGO_MANIFEST_DIR"));
     let python = here.join("../target/tools/bin/python");
@@ -108,8 +80,8 @@ fn check(format: Format, options: &str) {
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0");
     let [ours, theirs] = [Pty::new(), Pty::new()];
-    carry(ours.peer.try_clone(), theirs.peer.try_clone());
-    carry(theirs.peer.try_clone(), ours.peer.try_clone());
+    carry(&ours.peer, &theirs.peer);
+    carry(&theirs.peer, &ours.peer);
     let words = format!("slcan vcan0 --bus-kind embedded --json {options} {}", ours.path.display());
     let bridge = place.start("vcan-setup", &words);
     bridge.hears("1 line on vcan0");

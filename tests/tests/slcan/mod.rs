@@ -11,6 +11,7 @@ use std::io::{ErrorKind, Read, Write};
 use std::os::fd::OwnedFd;
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use protocol::can::Frame;
 use protocol::slcan::{Decoder, Line, encode};
@@ -67,10 +68,6 @@ impl Peer {
         let fd = fd.into();
         rustix::io::ioctl_fionbio(&fd, true).unwrap();
         Self { file: File::from(fd), decoder: Decoder::new(), bytes: Vec::new(), lines: Vec::new() }
-    }
-
-    pub(crate) fn try_clone(&self) -> File {
-        self.file.try_clone().unwrap()
     }
 
     /// Reads what is there; whether the line is still open.
@@ -133,4 +130,31 @@ impl Peer {
             frames.iter().flat_map(|frame| encode(frame).unwrap().as_bytes().to_vec()).collect();
         self.says(&text);
     }
+}
+
+/// Carries what comes at one end to the other one, until that is gone.
+pub(crate) fn carry(from: &Peer, to: &Peer) {
+    let (mut from, mut to) = (from.file.try_clone().unwrap(), to.file.try_clone().unwrap());
+    std::thread::spawn(move || {
+        let mut buffer = [0; 4_096];
+        let pause = || std::thread::sleep(Duration::from_micros(200));
+        loop {
+            let count = match from.read(&mut buffer) {
+                Ok(count) => count,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                    pause();
+                    continue;
+                }
+                Err(_) => return,
+            };
+            let mut rest = &buffer[..count];
+            while !rest.is_empty() {
+                match to.write(rest) {
+                    Ok(count) => rest = &rest[count..],
+                    Err(error) if error.kind() == ErrorKind::WouldBlock => pause(),
+                    Err(_) => return,
+                }
+            }
+        }
+    });
 }
