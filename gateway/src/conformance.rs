@@ -96,8 +96,8 @@ impl Conformance {
             )));
         }
         let junit = self.junit.as_ref().map(|path| self.force.create("--junit", path)).transpose()?;
-        let mut live = Live::open(name, self.kind.bus_kind, self.format, stopped, self.restart.clone())
-            .map_err(Failure::usage)?;
+        let mut live =
+            Live::open(name, self.kind.bus_kind, stopped, self.restart.clone()).map_err(Failure::usage)?;
         let survey = Survey::take(&mut live, name).map_err(Failure::run)?;
         let format = survey
             .check(self.node, name, self.format, self.others_will_stop || self.restore.is_some())

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use bench::listen;
 use protocol::bus::{Bus as Socket, BusError, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
-use protocol::can::{Format, Frame};
+use protocol::can::Frame;
 use protocol::time::{Micros, Span};
 
 use crate::bus::{Bus, Seen, Stop};
@@ -39,13 +39,12 @@ impl Live {
     pub fn open(
         name: &str,
         kind: Choice,
-        format: Option<Format>,
         stopped: Arc<AtomicBool>,
         command: Option<String>,
     ) -> Result<Self, BusError> {
         let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
         let options = Options { own_frames: true, receive_buffer, ..Options::default() };
-        let socket = listen::open(name, kind, format, options)?;
+        let socket = listen::open(name, kind, None, options)?;
         let (inbox, waiting, late) = (Inbox::new(), VecDeque::new(), Span(0));
         Ok(Self { socket, inbox, waiting, stopped, obeys: true, late, command, child: None })
     }

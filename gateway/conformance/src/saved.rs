@@ -13,6 +13,8 @@ use crate::session::{Reply, Session};
 
 /// How long that may take.
 const LONGEST: Span = Span::from_millis(8_000);
+/// Answers to the test have come by then.
+const SETTLE: Span = Span::from_millis(60);
 /// Attempts to put something back.
 const ATTEMPTS: usize = 3;
 
@@ -72,6 +74,8 @@ impl Session<'_> {
     pub fn restore(&mut self, saved: &Saved) -> Result<Vec<String>, Stop> {
         let mut left = Vec::new();
         self.extend(LONGEST);
+        // What answers the test is no answer to this.
+        self.idle(SETTLE)?;
         self.start();
         self.say(&[Message::Resume])?;
         if saved.hash == 0 {

@@ -76,6 +76,21 @@ impl Exchange {
     }
 }
 
+/// Times of the conversation.
+#[derive(Clone, Copy, Debug)]
+struct Clock {
+    /// When the cell was heard last.
+    last: Micros,
+    /// When the time is over.
+    end: Micros,
+    /// By how much the bench was late since the exchange began.
+    late: Span,
+    /// The cell is put back, whoever else is there.
+    finishing: bool,
+    /// A regular heartbeat that nothing asked for.
+    regular: Option<Micros>,
+}
+
 /// The conversation.
 pub struct Session<'a> {
     bus: &'a mut dyn Bus,
@@ -102,13 +117,7 @@ pub struct Session<'a> {
     /// Of each heartbeat's *sent*: that of the last heartbeat, and packets since.
     sent: Option<(u16, u16)>,
     pub(crate) timings: Timings,
-    /// When the cell was heard last.
-    last: Micros,
-    end: Micros,
-    /// By how much the bench was late since the exchange began.
-    late: Span,
-    /// A regular heartbeat that nothing asked for.
-    regular: Option<Micros>,
+    clock: Clock,
 }
 
 impl core::fmt::Debug for Session<'_> {
@@ -141,10 +150,7 @@ impl<'a> Session<'a> {
             tag: 0x50,
             sent: None,
             timings: Timings::default(),
-            last: now,
-            end: now + longest,
-            late: Span(0),
-            regular: None,
+            clock: Clock { last: now, end: now + longest, late: Span(0), finishing: false, regular: None },
         }
     }
 
@@ -159,13 +165,14 @@ impl<'a> Session<'a> {
     /// There is so much time from now on, and no signal interrupts.
     pub(crate) fn extend(&mut self, span: Span) {
         self.bus.finish();
-        self.end = self.bus.now() + span;
-        self.last = self.bus.now();
+        self.clock.finishing = true;
+        self.clock.end = self.bus.now() + span;
+        self.clock.last = self.bus.now();
     }
 
     /// The cell was allowed to be silent until now.
     pub(crate) fn extend_life(&mut self) {
-        self.last = self.bus.now();
+        self.clock.last = self.bus.now();
     }
 
     pub(crate) fn can_restart(&self) -> bool {
@@ -201,7 +208,7 @@ impl<'a> Session<'a> {
     pub(crate) fn start(&mut self) {
         (self.since, self.from, self.consumed) = (self.log.len(), self.heard.len(), self.heard.len());
         self.bus.lateness();
-        self.late = Span(0);
+        self.clock.late = Span(0);
     }
 
     /// What came since the exchange began was expected.
@@ -345,8 +352,8 @@ impl<'a> Session<'a> {
 
     /// By how much the bench was late since the exchange began.
     pub(crate) fn lateness(&mut self) -> Span {
-        self.late = self.late.max(self.bus.lateness());
-        self.late
+        self.clock.late = self.clock.late.max(self.bus.lateness());
+        self.clock.late
     }
 
     /// No regular heartbeat comes for so long, less than 200 ms.
@@ -354,7 +361,7 @@ impl<'a> Session<'a> {
         const BEAT: Span = Span::from_millis(250);
         const EDGE: Span = Span::from_millis(25);
         let now = self.now();
-        let is_free = self.regular.is_some_and(|at| {
+        let is_free = self.clock.regular.is_some_and(|at| {
             let since = now.since(at);
             since > EDGE && since.0 + span.0 + EDGE.0 < BEAT.0
         });
@@ -363,7 +370,7 @@ impl<'a> Session<'a> {
             self.settle()?;
             let until = self.now() + BEAT + EDGE + EDGE;
             self.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
-            self.regular = self.answers().iter().rev().find(|it| it.beat().is_some()).map(|it| it.at);
+            self.clock.regular = self.answers().iter().rev().find(|it| it.beat().is_some()).map(|it| it.at);
             self.idle(EDGE)?;
             self.consume();
         }
@@ -372,8 +379,8 @@ impl<'a> Session<'a> {
 
     /// How long an answer took; not if the bench itself was late.
     pub(crate) fn note_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
-        self.late = self.late.max(self.bus.lateness());
-        self.timings.note(what, answered.since(asked), self.late);
+        self.clock.late = self.clock.late.max(self.bus.lateness());
+        self.timings.note(what, answered.since(asked), self.clock.late);
     }
 
     pub(crate) fn begin_restart(&mut self) -> Result<(), Stop> {

@@ -32,13 +32,22 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
+/// Regular heartbeats that were seen.
+#[derive(Clone, Copy, Debug)]
+struct Grid {
+    /// When the first of them was due at the latest, in us.
+    due: u64,
+    /// The mean time from one to the next.
+    each: u64,
+}
+
 /// Times of heartbeats since the exchange began.
 fn times(session: &Session<'_>) -> Vec<u64> {
     session.answers().iter().filter(|it| it.beat().is_some()).map(|it| it.at.0).collect()
 }
 
-/// Nothing is asked for 1.3 s: a heartbeat every 250 ms, at most 20 ms late; when the first of them was due at the latest.
-fn regular(session: &mut Session<'_>) -> Result<Option<Micros>, Stop> {
+/// Nothing is asked for 1.3 s: a heartbeat every 250 ms, at most 20 ms late.
+fn regular(session: &mut Session<'_>) -> Result<Option<Grid>, Stop> {
     for attempt in 0..3 {
         session.mark();
         session.idle(Span::from_millis(1_300))?;
@@ -53,9 +62,10 @@ fn regular(session: &mut Session<'_>) -> Result<Option<Micros>, Stop> {
                 let apart: Vec<_> = apart.iter().map(|span| span / 1_000).collect();
                 format!("{} heartbeats in 1.3 s, {apart:?} ms apart", times.len())
             });
-            let due =
-                times.iter().enumerate().map(|(place, at)| at.saturating_sub(place as u64 * BEAT)).min();
-            return Ok(due.filter(|_| is_so).map(Micros));
+            let due = times.iter().zip(0..).map(|(at, place)| at.saturating_sub(place * BEAT)).min();
+            let each = apart.iter().sum::<u64>().checked_div(apart.len() as u64);
+            let grid = due.zip(each).map(|(due, each)| Grid { due, each });
+            return Ok(grid.filter(|_| is_so));
         }
     }
     Ok(None)
@@ -163,9 +173,10 @@ fn early(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 /// The cell's clock by its heartbeats, over some seconds.
-fn clock(session: &mut Session<'_>, first: Micros, last: Micros) {
-    let span = last.since(first).0;
-    let beats = (span + BEAT / 2) / BEAT;
+fn clock(session: &mut Session<'_>, first: Grid, last: Grid) {
+    let span = last.due.saturating_sub(first.due);
+    let each = ((first.each + last.each) / 2).max(1);
+    let beats = (span + each / 2) / each;
     // 1 %, and how late the earliest of five heartbeats may be.
     let allowed = span / 100 + LATE / 4 + SLACK;
     let off = span.abs_diff(beats * BEAT);

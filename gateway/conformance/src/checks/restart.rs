@@ -38,11 +38,22 @@ fn claim(session: &Session<'_>) -> Span {
     Span(250_000 + u64::from(session.cell.get()) * 250_000 / 255)
 }
 
-/// Switches the cell off and on; `meanwhile` is called again and again until its first packet. When that came.
-fn restart(
+/// Switches the cell off and on: when its first packet came.
+fn restart(session: &mut Session<'_>) -> Result<Micros, Stop> {
+    let came = restart_with(session, BOOT, |_| Ok(()))?;
+    came.ok_or_else(|| {
+        let what = "no heartbeat with CLAIMING within 8 s after a restart";
+        session.check("CLAIM-1", false, || what.to_owned());
+        Stop::Restart(what.to_owned())
+    })
+}
+
+/// The same for so long; `meanwhile` is called again and again until that packet.
+fn restart_with(
     session: &mut Session<'_>,
+    longest: Span,
     mut meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), Stop>,
-) -> Result<Micros, Stop> {
+) -> Result<Option<Micros>, Stop> {
     let keep =
         Known { last_epoch: session.known.last_epoch, joints: session.known.joints, ..Known::default() };
     let parameters = session.known.parameters;
@@ -53,18 +64,16 @@ fn restart(
     session.idle(Span::from_millis(1))?;
     session.forget_counts();
     session.start();
-    let give_up = session.now() + BOOT;
+    let give_up = session.now() + longest;
     let is_claim = |it: &Heard| it.beat().is_some_and(|(beat, _)| beat.state.has(State::CLAIMING));
-    while !session.answers().iter().any(is_claim) || session.is_restarting()? {
+    while session.is_restarting()? || !session.answers().iter().any(is_claim) {
         let until = session.now() + Span::from_millis(12);
         session.wait(until, |heard| heard.last().is_some_and(is_claim))?;
         if !session.answers().iter().any(is_claim) {
             meanwhile(session)?;
         }
         if session.now() >= give_up {
-            let what = "no heartbeat with CLAIMING within 8 s after a restart";
-            session.check("CLAIM-1", false, || what.to_owned());
-            return Err(Stop::Restart(what.to_owned()));
+            return Ok(None);
         }
     }
     let first = session.answers().iter().position(is_claim).unwrap_or(0);
@@ -77,7 +86,7 @@ fn restart(
     });
     session.known.parameters = parameters;
     session.known.staged = None;
-    Ok(came)
+    Ok(Some(came))
 }
 
 /// Waits until its node id is settled: when the first heartbeat without CLAIMING came.
@@ -99,7 +108,8 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
 
 /// A plain restart: what is kept, what is lost, what is counted.
 fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
-    let kept = arm::document(2);
+    let kept = Parameters { period_us: 15_500, ..arm::document(3) };
+    session.ready(&kept)?;
     let staged = Parameters { period_us: 14_000, ..arm::document(4) };
     session.stage(&staged)?;
     if session.about.sensing {
@@ -109,7 +119,7 @@ fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
     }
     session.mark();
     session.say(&[Message::Halt])?;
-    let claimed = restart(session, |_| Ok(()))?;
+    let claimed = restart(session)?;
     let first =
         session.answers().iter().find_map(|it| Some((*it.beat()?.0, it.beat()?.1))).unwrap_or_default();
     let is_new = (first.0.sent, first.0.rejected, first.1.0) == (0, 0, 0);
@@ -184,7 +194,7 @@ fn volatile(session: &mut Session<'_>) -> Result<(), Stop> {
 
 /// What a claiming cell takes, and what it ignores.
 fn while_claiming(session: &mut Session<'_>) -> Result<(), Stop> {
-    let claimed = restart(session, |_| Ok(()))?;
+    let claimed = restart(session)?;
     let state =
         session.answers().last().and_then(Heard::beat).map(|(beat, _)| beat.state).unwrap_or_default();
     let presses = state.has(State::TEST_MODE);
@@ -249,7 +259,13 @@ fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
     };
     let rest = twin(session, higher, true);
     // Not too often: each is answered only if the last answer was 10 ms ago.
-    let claimed = restart(session, |session| session.say(&[rest]).map(|_| ()))?;
+    let longest = Span::from_millis(3_000);
+    let Some(claimed) = restart_with(session, longest, |session| session.say(&[rest]).map(|_| ()))? else {
+        session.check("CLAIM-3", false, || {
+            format!("no heartbeat came while claims with the higher serial number {higher} did: it gave way to them")
+        });
+        return Ok(());
+    };
     session.idle(Span::from_millis(90))?;
     for serial in [higher, u32::MAX] {
         session.start();
@@ -280,7 +296,7 @@ fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
 
 /// What is no valid 4nn changes nothing.
 fn invalid(session: &mut Session<'_>) -> Result<(), Stop> {
-    let claimed = restart(session, |_| Ok(()))?;
+    let claimed = restart(session)?;
     session.start();
     let mut packet = twin(session, 0, true).encode();
     packet.count = 7;
@@ -302,7 +318,7 @@ fn invalid(session: &mut Session<'_>) -> Result<(), Stop> {
 
 /// A packet to which a claiming cell gives way, and then silence.
 fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) -> Result<(), Stop> {
-    let claimed = restart(session, |_| Ok(()))?;
+    let claimed = restart(session)?;
     session.start();
     session.say(&[*other])?;
     session.idle(Span::from_millis(3))?;
@@ -332,7 +348,7 @@ fn claim_end(session: &Session<'_>) -> Span {
 
 /// A reset just after a commit was requested: flash has the old or the new, or says that it is damaged.
 fn in_the_middle(session: &mut Session<'_>) -> Result<(), Stop> {
-    let claimed = restart(session, |_| Ok(()))?;
+    let claimed = restart(session)?;
     settled(session, claimed)?;
     session.known.hash = None;
     let (old, new) = (arm::document(2), Parameters { period_us: 14_000, ..arm::document(4) });
@@ -342,7 +358,7 @@ fn in_the_middle(session: &mut Session<'_>) -> Result<(), Stop> {
         Request::Write { number: Parameter::Commit.number(), words: words([new.hash().cast_signed()]) };
     session.say(&[Message::Configure { to: Node::Cell(session.cell), tag: 1, request }])?;
     session.consume();
-    let claimed = restart(session, |_| Ok(()))?;
+    let claimed = restart(session)?;
     settled(session, claimed)?;
     session.start();
     let sync = session.say(&[Message::Sync])?;

@@ -27,12 +27,12 @@ impl Session<'_> {
             Kind::Network => id.node == 0,
             Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => false,
         };
-        if is_gateways {
+        if is_gateways && !self.clock.finishing {
             return Err(Stop::Gateway(seen.frame.to_string()));
         }
         if id.node == self.cell.get() {
             self.log.push(seen);
-            self.last = seen.at;
+            self.clock.last = seen.at;
             self.take(seen, id);
         }
         Ok(Some(seen))
@@ -40,10 +40,10 @@ impl Session<'_> {
 
     fn look_at_time(&self) -> Result<(), Stop> {
         let now = self.bus.now();
-        if now >= self.end {
+        if now >= self.clock.end {
             return Err(Stop::Time);
         }
-        let is_silent = now.since(self.last) > SILENT && !self.known.may_be_silent;
+        let is_silent = now.since(self.clock.last) > SILENT && !self.known.may_be_silent;
         if is_silent { Err(Stop::Silent) } else { Ok(()) }
     }
 

@@ -4,11 +4,13 @@ use protocol::id::Node;
 use protocol::message::{Answer, Heard as HeardPage, Message, NetworkPage, Refused, Request};
 use protocol::packet::{WORDS, words};
 use protocol::parameters::{Parameter, Parameters};
-use protocol::time::Span;
+use protocol::time::{Micros, Span};
 
-use super::{PATIENT, Session};
+use super::{Heard, PATIENT, Session};
 use crate::bus::Stop;
 
+/// After an answer with another tag the right one may come.
+const LATER: Span = Span::from_millis(30);
 /// A commit writes flash.
 const COMMIT: Span = Span::from_millis(900);
 
@@ -38,6 +40,15 @@ impl core::fmt::Display for Reply {
             Self::Refused(reason) => write!(f, "a refusal with {reason}"),
             Self::Nothing => f.write_str("nothing"),
         }
+    }
+}
+
+/// When an answer to a request came, its tag, and what it is.
+const fn configured(heard: &Heard) -> Option<(Micros, u8, Answer)> {
+    if let Message::Configured { tag, answer, .. } = heard.message {
+        Some((heard.at, tag, answer))
+    } else {
+        None
     }
 }
 
@@ -81,10 +92,14 @@ impl Session<'_> {
         self.wait(at + longest, |heard| {
             heard.iter().any(|it| matches!(it.message, Message::Configured { .. }))
         })?;
-        let found = self.answers().iter().find_map(|heard| {
-            let Message::Configured { tag, answer, .. } = heard.message else { return None };
-            Some((heard.at, tag, answer))
-        });
+        // That of an earlier request may come first, where that was interrupted.
+        let is_its = |heard: &Heard| heard.message.tag() == Some(tag) && configured(heard).is_some();
+        self.wait(self.now() + LATER, |heard| {
+            heard.iter().any(is_its) || !heard.iter().any(|it| configured(it).is_some())
+        })?;
+        let place = self.answers().iter().position(is_its);
+        let place = place.or_else(|| self.answers().iter().position(|heard| configured(heard).is_some()));
+        let found = place.and_then(|place| configured(self.answers().get(place)?));
         let Some((answered, came, answer)) = found else {
             self.check(id, false, || {
                 format!("no answer to parameter {number} within {} ms", longest.0 / 1_000)
