@@ -1,5 +1,7 @@
 //! A real bus, and the command that switches the cell off and on.
 
+mod probe;
+
 use std::collections::VecDeque;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
@@ -12,6 +14,7 @@ use protocol::can::Frame;
 use protocol::time::{Micros, Span};
 
 use crate::bus::{Bus, Seen, Stop};
+use probe::Probe;
 
 /// How long a signal to end may wait.
 const LOOK: Span = Span::from_millis(50);
@@ -27,6 +30,8 @@ pub struct Live {
     stopped: Arc<AtomicBool>,
     obeys: bool,
     late: Span,
+    /// Where the cell may be a process of this computer.
+    probe: Option<Probe>,
     command: Option<String>,
     child: Option<(Child, Micros)>,
 }
@@ -46,13 +51,8 @@ impl Live {
         let options = Options { own_frames: true, receive_buffer, ..Options::default() };
         let socket = listen::open(name, kind, None, options)?;
         let (inbox, waiting, late) = (Inbox::new(), VecDeque::new(), Span(0));
-        Ok(Self { socket, inbox, waiting, stopped, obeys: true, late, command, child: None })
-    }
-
-    /// Whether nothing real is on the bus.
-    #[must_use]
-    pub fn is_virtual(&self) -> bool {
-        self.socket.is_virtual().unwrap_or(false)
+        let probe = socket.is_virtual().unwrap_or(false).then(Probe::new);
+        Ok(Self { socket, inbox, waiting, stopped, obeys: true, late, probe, command, child: None })
     }
 
     fn interrupted(&self) -> bool {
@@ -106,7 +106,8 @@ impl Bus for Live {
     }
 
     fn lateness(&mut self) -> Span {
-        core::mem::take(&mut self.late)
+        let probed = self.probe.as_ref().map_or(Span(0), Probe::lateness);
+        core::mem::take(&mut self.late).max(probed)
     }
 
     fn finish(&mut self) {

@@ -89,6 +89,10 @@ struct Clock {
     finishing: bool,
     /// A regular heartbeat that nothing asked for.
     regular: Option<Micros>,
+    /// Syncs that were sent.
+    syncs: usize,
+    /// What an answer takes, with the way there and back.
+    round_trip: Span,
 }
 
 /// The conversation.
@@ -99,8 +103,10 @@ pub struct Session<'a> {
     pub(crate) format: Format,
     /// Frames of the cell and of the bench.
     log: Vec<Seen>,
-    /// Where the present exchange begins there.
+    /// Where the present exchange begins there: what was sent for it may come before it.
     since: usize,
+    /// Where the last exchange ended there.
+    ended: usize,
     /// Packets of the cell.
     pub(crate) heard: Vec<Heard>,
     /// Where the present exchange begins there.
@@ -116,6 +122,8 @@ pub struct Session<'a> {
     tag: u8,
     /// Of each heartbeat's *sent*: that of the last heartbeat, and packets since.
     sent: Option<(u16, u16)>,
+    /// The last heartbeat had CLAIMING.
+    claiming: bool,
     pub(crate) timings: Timings,
     clock: Clock,
 }
@@ -140,6 +148,7 @@ impl<'a> Session<'a> {
             format,
             log: Vec::new(),
             since: 0,
+            ended: 0,
             heard: Vec::new(),
             from: 0,
             consumed: 0,
@@ -149,8 +158,17 @@ impl<'a> Session<'a> {
             about: About::default(),
             tag: 0x50,
             sent: None,
+            claiming: false,
             timings: Timings::default(),
-            clock: Clock { last: now, end: now + longest, late: Span(0), finishing: false, regular: None },
+            clock: Clock {
+                last: now,
+                end: now + longest,
+                late: Span(0),
+                finishing: false,
+                regular: None,
+                syncs: 0,
+                round_trip: Span(0),
+            },
         }
     }
 
@@ -168,6 +186,11 @@ impl<'a> Session<'a> {
         self.clock.finishing = true;
         self.clock.end = self.bus.now() + span;
         self.clock.last = self.bus.now();
+    }
+
+    /// How much time is left.
+    pub(crate) fn left(&self) -> Span {
+        self.clock.end.since(self.bus.now())
     }
 
     /// The cell was allowed to be silent until now.
@@ -206,7 +229,7 @@ impl<'a> Session<'a> {
 
     /// The same where what came is expected.
     pub(crate) fn start(&mut self) {
-        (self.since, self.from, self.consumed) = (self.log.len(), self.heard.len(), self.heard.len());
+        (self.since, self.from, self.consumed) = (self.ended, self.heard.len(), self.heard.len());
         self.bus.lateness();
         self.clock.late = Span(0);
     }
@@ -214,6 +237,7 @@ impl<'a> Session<'a> {
     /// What came since the exchange began was expected.
     pub(crate) fn consume(&mut self) {
         self.consumed = self.heard.len();
+        self.ended = self.log.len();
     }
 
     /// What came since the last exchange ended.
@@ -268,6 +292,7 @@ impl<'a> Session<'a> {
         for message in messages {
             let frames = self.frames(message);
             let on_bus = self.send(&frames)?;
+            self.clock.syncs += usize::from(*message == Message::Sync);
             at.get_or_insert(on_bus);
         }
         Ok(at.unwrap_or_else(|| self.now()))
@@ -317,7 +342,7 @@ impl<'a> Session<'a> {
         let answered = self.wait(sync + PATIENT, |heard| heard.iter().any(is_answer))?;
         self.check("CMD-3", answered, || "no heartbeat after a sync".to_owned());
         let beats = |it: &Self| it.answers().iter().filter(|heard| heard.beat().is_some()).count();
-        if self.answers().len() == beats(self) {
+        if self.answers().len() == beats(self) || self.known.senses {
             // A regular heartbeat may have come between, and a cell that is wrong may answer later.
             self.idle(LINGER)?;
         }
@@ -350,10 +375,51 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
+    /// The time, and how many heartbeats came and syncs were sent until now.
+    pub(crate) fn tally(&self) -> (Micros, usize, usize) {
+        let beats = self.heard.iter().filter(|it| it.beat().is_some()).count();
+        (self.now(), beats, self.clock.syncs)
+    }
+
+    /// A heartbeat for each sync since then, four a second, and no more.
+    pub(crate) fn check_beats(&mut self, (began, beats, syncs): (Micros, usize, usize)) {
+        const EDGE: u64 = 2;
+        let (now, all_beats, all_syncs) = self.tally();
+        let regular = now.since(began).0 / 250_000;
+        let came = (all_beats - beats) as u64;
+        let asked = (all_syncs - syncs) as u64;
+        let range = (asked + regular).saturating_sub(EDGE)..=asked + regular + EDGE;
+        self.check("BEAT-1", range.contains(&came), || {
+            let ms = now.since(began).0 / 1_000;
+            format!("{came} heartbeats in {ms} ms with {asked} syncs; {} are right", asked + regular)
+        });
+    }
+
     /// By how much the bench was late since the exchange began.
     pub(crate) fn lateness(&mut self) -> Span {
         self.clock.late = self.clock.late.max(self.bus.lateness());
         self.clock.late
+    }
+
+    /// Measures what an answer takes.
+    pub(crate) fn measure(&mut self) -> Result<(), Stop> {
+        const TIMES: u64 = 8;
+        let began = self.now();
+        for _ in 0..TIMES {
+            self.read(0)?;
+        }
+        self.clock.round_trip = Span(self.now().since(began).0 / TIMES);
+        Ok(())
+    }
+
+    /// Whether answers take so long that there is no time for all that could be tried.
+    pub(crate) fn is_slow(&self) -> bool {
+        self.clock.round_trip > Span::from_millis(4)
+    }
+
+    /// So many attempts, or fewer with a slow cell.
+    pub(crate) fn attempts(&self, many: usize) -> usize {
+        if self.is_slow() { many.div_ceil(4) } else { many }
     }
 
     /// No regular heartbeat comes for so long, less than 200 ms.

@@ -2,8 +2,11 @@
 
 use std::collections::BTreeMap;
 
+use protocol::parameters::MAX_JOINTS;
 use protocol::time::Span;
 
+use crate::arm;
+use crate::bus::Stop;
 use crate::session::Session;
 
 /// A bench that was late by more than this does not blame the cell for what was late meanwhile.
@@ -49,7 +52,42 @@ impl Timings {
     }
 }
 
+impl Times {
+    /// Of many answers one in 50 may be late.
+    const fn are_right(self) -> bool {
+        self.late * 50 <= self.in_time + self.late || self.late == 1 && self.in_time > 0
+    }
+}
+
 impl Session<'_> {
+    /// Measures again what came too late, for the computer of a simulated cell may be busy for a while.
+    pub(crate) fn measure_times_again(&mut self) -> Result<(), Stop> {
+        const ATTEMPTS: usize = 3;
+        const ANSWERS: usize = 150;
+        const TIME: Span = Span::from_millis(15_000);
+        for _ in 0..ATTEMPTS {
+            let late = |name: &str| self.timings.0.get(name).is_some_and(|times| !times.are_right());
+            let again = ["torque", "heartbeat to sync", "configured"].map(late);
+            if !again.contains(&true) || self.left() < TIME {
+                break;
+            }
+            for name in ["torque", "heartbeat to sync", "configured"] {
+                self.timings.0.remove(name);
+            }
+            self.ready(&arm::document(6))?;
+            for step in 0..ANSWERS {
+                if self.about.test_mode {
+                    self.press(arm::press(4_096))?;
+                }
+                self.step(&[0; MAX_JOINTS])?;
+                if step.is_multiple_of(3) {
+                    self.read(0)?;
+                }
+            }
+        }
+        Ok(())
+    }
+
     /// Whether answers were in time: of many, one in 50 may be late, for the computer of a simulated cell may be.
     pub(crate) fn check_times(&mut self) {
         for (name, limit) in LIMITS {
@@ -59,7 +97,7 @@ impl Session<'_> {
                 self.findings.not_tested("TIME-2", format!("{name}: the bench was late each time"));
                 continue;
             }
-            let is_so = late * 50 <= in_time + late || late == 1 && in_time > 0;
+            let is_so = times.are_right();
             self.start();
             self.check("TIME-2", is_so, || {
                 format!(

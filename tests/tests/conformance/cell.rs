@@ -113,6 +113,13 @@ impl Virtual {
         bus
     }
 
+    /// A cell that measures when it is switched on.
+    pub(crate) fn measuring(mut self) -> Self {
+        self.test_mode = false;
+        self.start();
+        self
+    }
+
     pub(crate) fn without_restart(mut self) -> Self {
         self.restarts = false;
         self

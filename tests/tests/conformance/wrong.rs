@@ -38,6 +38,8 @@ pub(crate) struct Memory {
     pub(crate) at: Micros,
     pub(crate) kept: Vec<[i16; WORDS]>,
     pub(crate) frame: Option<Frame>,
+    /// It is not in test mode at a start.
+    pub(crate) measures: bool,
     segments: Vec<(u16, Segment)>,
     /// Packets that are sent, and those that the right cell inside sent before its present one.
     sent: u16,
@@ -224,7 +226,7 @@ impl Mutant for Wrong {
     }
 
     fn starts(&mut self, now: Micros, flash: Flash) -> Flash {
-        let Memory { commits, starts, kept, count, .. } = core::mem::take(&mut self.memory);
+        let Memory { commits, starts, kept, count, measures, .. } = core::mem::take(&mut self.memory);
         let staged = commits.last().copied().unwrap_or_default();
         self.memory = Memory {
             now,
@@ -233,7 +235,8 @@ impl Mutant for Wrong {
             starts: starts + 1,
             kept,
             count,
-            test_mode: true,
+            test_mode: !measures,
+            measures,
             ..Memory::default()
         };
         flash

@@ -14,12 +14,15 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     // Whoever sends sensor values is silenced.
     session.known.senses = true;
     session.set(Parameter::Sensing.number(), [0])?;
+    session.set(Parameter::Reply.number(), [0])?;
     session.idle(Span::from_millis(20))?;
     session.mark();
     session.known.senses = false;
+    session.measure()?;
     identity(session)?;
-    let report = session.exchange_all(&[Message::Report])?;
-    session.about.ports = report.answers.iter().any(|heard| {
+    session.about.ports = true;
+    let report = session.report()?;
+    session.about.ports = report.iter().any(|heard| {
         matches!(heard.message, Message::Network { page: NetworkPage::Tree(_) | NetworkPage::Ports(_), .. })
     });
     options(session)?;

@@ -48,6 +48,11 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
             .check("STATE-1", !exchange.state().has(State::ACTIVE), || "ACTIVE is set after halt".to_owned());
         if round == 1 {
             command(session, Message::Halt, "CMD-1")?;
+        } else {
+            // Nothing but a resume ends it.
+            session.commit(&protocol::parameters::Parameters { period_us: 16_500, ..arm::document(6) })?;
+            session.commit(&arm::document(6))?;
+            session.exchange_all(&[])?;
         }
         let before = session.counters()?.0;
         for _ in 0..4 {
@@ -122,9 +127,7 @@ fn report(session: &mut Session<'_>) -> Result<(), Stop> {
     for _ in 0..3 {
         session.mark();
         let asked = session.say(&[Message::Report])?;
-        let expected = if session.about.ports { 6 } else { 4 };
-        let pages = |heard: &[crate::session::Heard]| heard.iter().filter(|it| it.beat().is_none()).count();
-        session.wait(asked + PATIENT, |heard| pages(heard) >= expected)?;
+        session.pages(asked)?;
         session.idle(Span::from_millis(5))?;
         let answers: Vec<_> = session.answers().iter().filter(|it| it.beat().is_none()).copied().collect();
         session.consume();

@@ -200,7 +200,7 @@ fn rule(
         let contact = [0; 3].map(|_| dice.word() >> shift);
         (contact, (dice.word() >> shift) & i16::MAX)
     };
-    for place in 0..RANDOM {
+    for place in 0..session.attempts(RANDOM) {
         let shift = [0, 2, 4, 7];
         let (Some(known), Some(shift)) = (known.get(place % 4), shift.get(place / 2 % 4)) else { continue };
         press(session, parameters, known, skin(random(*shift)), "FORCE-1")?;
@@ -217,7 +217,7 @@ fn rule(
         if force > 1 && is_rounded_up(&parameters.contact, &skin) && known.j.iter().any(shows) {
             press(session, parameters, known, skin, "FORCE-1")?;
             shown += 1;
-            if shown == SHOWN {
+            if shown >= session.attempts(SHOWN) {
                 break;
             }
         }

@@ -58,7 +58,7 @@ fn one(session: &mut Session<'_>, dice: &mut Dice, parameters: &Parameters) -> R
     }
     let central = Central::of_cell(parameters);
     let format = parameters.torque_format;
-    for _ in 0..POSES {
+    for _ in 0..session.attempts(POSES) {
         let positions = arm::positions(dice, parameters);
         let j = session.pressed(&positions, arm::press(arm::unit_press(format)))?.words();
         look_at_j(session, parameters, &central, &positions, &j);

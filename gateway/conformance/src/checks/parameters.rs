@@ -163,6 +163,12 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
     session.check("CONF-11", reply == Reply::Value(words), || {
         format!("a write to everyone was answered with {reply}")
     });
+    let on = [i16::from(session.about.test_mode), 0, 0, 0, 0, 0];
+    let mode = Request::Write { number: Parameter::Mode.number(), words: on };
+    let reply = session.request(Node::Everyone, mode)?;
+    session.check("CONF-11", reply == Reply::Value(on), || {
+        format!("test mode of everyone was answered with {reply}")
+    });
     let staged = Parameters { pose: other().pose, ..arm::document(2) };
     session.known.staged = Some(staged);
     session.commit(&staged)?;

@@ -114,7 +114,8 @@ fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
     session.stage(&staged)?;
     if session.about.sensing {
         session.known.senses = true;
-        session.set(7, [2])?;
+        // None comes before it is switched off.
+        session.set(7, [1, i16::MAX])?;
         session.set(8, [1, 2, 3, 4, 5])?;
     }
     session.mark();
@@ -170,6 +171,11 @@ fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
     });
     volatile(session)?;
     (session.known.parameters, session.known.staged) = (Some(kept), Some(kept));
+    // The staged copy is one of what is in use.
+    let next = Parameters { period_us: 15_250, ..kept };
+    session.known.active = None;
+    let done = session.commit(&next)?;
+    session.check("CONF-2", done, || "after a restart the staged copy is not what is in use".to_owned());
     let counters = session.counters()?;
     session.check("BEAT-4", counters.1 == protocol::message::Refused::default(), || {
         format!("counters do not begin with 0 after a restart: {counters:?}")
@@ -237,8 +243,8 @@ fn while_claiming(session: &mut Session<'_>) -> Result<(), Stop> {
         format!("a claiming cell counted what it has to ignore: {:?}", counters.1)
     });
     if presses {
-        let report = session.exchange_all(&[Message::Report])?;
-        let skin = report.answers.iter().find_map(|it| match it.sensors() {
+        let report = session.report()?;
+        let skin = report.iter().find_map(|it| match it.sensors() {
             Some((_, SensorPage::Skin(skin))) => Some(*skin),
             _ => None,
         });

@@ -84,6 +84,7 @@ fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
 /// A touch: the torque leaves before the page.
 fn order(session: &mut Session<'_>) -> Result<(), Stop> {
     for sum in [4_096, 0] {
+        session.quiet(Span::from_millis(60))?;
         session.press(arm::press(sum))?;
         let step = session.step(&[0x0321; MAX_JOINTS])?;
         let kinds: Vec<_> = step.exchange.answers.iter().map(|it| it.message.id().kind.name()).collect();
@@ -107,7 +108,7 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
     session.idle(Span::from_millis(10))?;
     session.mark();
     let mut model = Model::new(events);
-    for step in 0..STEPS {
+    for step in 0..session.attempts(STEPS) {
         let (skin, acceleration) = values(&mut dice, &events, &model, step);
         session.press(skin)?;
         if let Some(acceleration) = acceleration {
@@ -138,12 +139,13 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
                 )
             });
         }
-        let is_latched = sent.iter().all(|page| model.has(page));
+        // Those of a regular heartbeat may have come before the joints.
+        let after = came.exchange.answers.iter().filter(|it| it.at > came.exchange.at);
+        let is_latched = after.filter_map(Heard::sensors).all(|(_, page)| model.has(page));
         session.check("SENSE-7", is_latched, || format!("{sent:?} was sent, and is not what is latched"));
         if step % 40 == 39 {
             // What answers a report was sent last, too.
-            let report = session.exchange_all(&[Message::Report])?;
-            for page in report.answers.iter().filter_map(Heard::sensors) {
+            for page in session.report()?.iter().filter_map(Heard::sensors) {
                 model.sends(page.1);
             }
         }

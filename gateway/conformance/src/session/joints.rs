@@ -196,6 +196,8 @@ impl Session<'_> {
         let done = self.commit(parameters)?;
         if self.about.test_mode {
             self.test_mode(true)?;
+        } else {
+            (self.known.skin, self.known.pending) = (None, None);
         }
         self.known.active = None;
         self.step(&[0; MAX_JOINTS])?;

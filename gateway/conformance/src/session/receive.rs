@@ -2,7 +2,7 @@
 
 use protocol::can::Format;
 use protocol::id::{Id, Kind};
-use protocol::message::{Heartbeat, Message};
+use protocol::message::{Heartbeat, Message, State};
 use protocol::packet::{self, Lengths, Packet, PacketError, Reassembly};
 use protocol::time::Micros;
 
@@ -88,6 +88,12 @@ impl Session<'_> {
     /// What holds of every packet: heartbeats know how many there were.
     fn look_at(&mut self, heard: &Heard) {
         if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.beat() {
+            // It has been switched off and on.
+            let begins = state.has(State::CLAIMING) && !self.claiming;
+            self.claiming = state.has(State::CLAIMING);
+            if begins {
+                self.sent = None;
+            }
             if let Some((last, packets)) = self.sent {
                 let expected = last.wrapping_add(packets);
                 self.check("BEAT-4", sent == expected, || format!("sent is {sent}, not {expected}"));

@@ -9,6 +9,8 @@ use protocol::time::{Micros, Span};
 use super::{Heard, PATIENT, Session};
 use crate::bus::Stop;
 
+/// All pages of a report have come by then.
+const REPORT: Span = Span::from_millis(150);
 /// After an answer with another tag the right one may come.
 const LATER: Span = Span::from_millis(30);
 /// A commit writes flash.
@@ -123,6 +125,7 @@ impl Session<'_> {
                 Reply::Refused(reason)
             }
         };
+        self.ended = self.log.len();
         let place = self.heard.iter().rposition(|it| matches!(it.message, Message::Configured { .. }));
         self.consumed = place.map_or(self.heard.len(), |place| place + 1);
         Ok(reply)
@@ -163,11 +166,28 @@ impl Session<'_> {
         Ok(done)
     }
 
+    /// What comes to a report, but for heartbeats.
+    pub(crate) fn report(&mut self) -> Result<Vec<Heard>, Stop> {
+        self.mark();
+        let asked = self.say(&[Message::Report])?;
+        self.pages(asked)
+    }
+
+    /// The pages that come to a report of then.
+    pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<Heard>, Stop> {
+        let expected = if self.about.ports { 6 } else { 4 };
+        let pages = |heard: &[Heard]| heard.iter().filter(|it| it.beat().is_none()).count();
+        self.wait(asked + REPORT, |heard| pages(heard) >= expected)?;
+        let pages: Vec<_> = self.answers().iter().filter(|it| it.beat().is_none()).copied().collect();
+        self.consume();
+        Ok(pages)
+    }
+
     /// Asks for the counters.
     pub(crate) fn counters(&mut self) -> Result<(HeardPage, Refused), Stop> {
-        let report = self.exchange_all(&[Message::Report])?;
+        let report = self.report()?;
         let (mut heard, mut refused) = (None, None);
-        for answer in &report.answers {
+        for answer in &report {
             if let Message::Network { page, .. } = answer.message {
                 match page {
                     NetworkPage::Heard(page) => heard = Some(page),
@@ -179,7 +199,8 @@ impl Session<'_> {
         let is_whole = heard.is_some() && refused.is_some();
         self.check("CMD-4", is_whole, || "network pages 1 and 2 did not come to a report".to_owned());
         let (heard, refused) = (heard.unwrap_or_default(), refused.unwrap_or_default());
-        if let (Some((beat, _)), true) = (report.beat, is_whole) {
+        let sync = self.exchange_all(&[])?;
+        if let (Some((beat, _)), true) = (sync.beat, is_whole) {
             let Refused { length, crc, foreign, meaning, incomplete, stimuli } = refused;
             let sum =
                 [length, crc, foreign, meaning, incomplete, stimuli].into_iter().fold(0, u16::wrapping_add);
