@@ -47,6 +47,32 @@ pub const fn fd_len(len: usize) -> usize {
     }
 }
 
+/// The DLC of so many bytes in an FD frame, or of the next length that CAN FD has.
+#[must_use]
+pub const fn fd_dlc(len: usize) -> u8 {
+    match len {
+        0..=8 => len.to_le_bytes()[0],
+        9..=12 => 9,
+        13..=16 => 10,
+        17..=20 => 11,
+        21..=24 => 12,
+        25..=32 => 13,
+        33..=48 => 14,
+        _ => 15,
+    }
+}
+
+/// How many bytes an FD frame of this DLC (its lower four bits) has.
+#[must_use]
+pub const fn dlc_len(dlc: u8) -> usize {
+    let dlc = (dlc & 15) as usize;
+    match dlc {
+        0..=8 => dlc,
+        9..=12 => 4 * dlc - 24,
+        _ => 16 * dlc - 176,
+    }
+}
+
 /// Classic CAN or CAN FD.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Format {
@@ -332,6 +358,18 @@ mod tests {
         assert_eq!(bytes[..4], 0x22C_u32.to_ne_bytes());
         assert_eq!(bytes[4..10], [2, BIT_RATE_SWITCH | FD_FORMAT, 0, 0, 0xAA, 0xBB]);
         assert_eq!(frame.byte_len(), 72);
+    }
+
+    #[test]
+    fn every_dlc_has_its_length() {
+        let lens = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64];
+        for (dlc, len) in (0..).zip(lens) {
+            assert_eq!(dlc_len(dlc), len);
+            assert_eq!(fd_dlc(len), dlc);
+        }
+        for len in 0..=64 {
+            assert_eq!(dlc_len(fd_dlc(len)), fd_len(len), "{len}");
+        }
     }
 
     #[test]

@@ -17,6 +17,7 @@ pub mod parameters;
 pub mod schema;
 #[cfg(feature = "host")]
 pub mod skin;
+pub mod slcan;
 #[cfg(feature = "host")]
 pub mod stop;
 pub mod time;

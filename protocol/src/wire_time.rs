@@ -22,7 +22,7 @@ mod stuffing;
 pub use extremes::{Coding, Shape};
 pub use rates::{BitRates, BitRatesError, bit_rate};
 
-use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame};
+use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame, fd_dlc};
 use stuffing::Run;
 
 /// CRC-15/CAN: polynomial 0x4599, initial value 0; leading zeros change nothing.
@@ -139,18 +139,4 @@ fn parts(switched: bool, head: u32, bytes: usize, stuffed: u32) -> Bits {
 /// SOF, the first 11 bits of the identifier, SRR and IDE, the other 18 bits.
 const fn extended(id: u64) -> u64 {
     ((id >> 18) << 20) | (0b11 << 18) | (id & 0x3_FFFF)
-}
-
-/// The code of a length that CAN FD has.
-const fn fd_dlc(len: usize) -> u8 {
-    match len {
-        0..=8 => len.to_le_bytes()[0],
-        9..=12 => 9,
-        13..=16 => 10,
-        17..=20 => 11,
-        21..=24 => 12,
-        25..=32 => 13,
-        33..=48 => 14,
-        _ => 15,
-    }
 }

@@ -5,8 +5,8 @@
 //! data stuffs by a rule of its own. In classic CAN the CRC is stuffed too, and the data decides it, so there is a table, which the
 //! test `every_frame` computes from all frames there are. It is one to four bits below the usual formula, which takes the CRC for free.
 
-use super::{Bits, CLASSIC_TAIL, fd_dlc, parts, stuffing};
-use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_len};
+use super::{Bits, CLASSIC_TAIL, parts, stuffing};
+use crate::can::{BIT_RATE_SWITCH, Format, Frame, fd_dlc, fd_len};
 
 /// Which bits a frame consists of, beside its identifier and its data.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]

@@ -1,0 +1,233 @@
+//! slcan: CAN frames and an adapter's commands as lines of ASCII over a serial line (Lawicel's, with CANable's FD).
+//!
+//! ```text
+//!   t 123 2 1122 CR              classic data frame: identifier, DLC, data
+//!   T 12345678 2 1122 CR         the same with 29 bits
+//!   r 123 2 CR, R 12345678 2 CR  remote frame: no data
+//!   d 123 9 (24 digits) CR, D    FD, one bit rate      DLC 9 A B C D E F: 12 16 20 24 32 48 64 bytes
+//!   b 123 9 (24 digits) CR, B    FD, bit rate switched
+//!   t 123 2 1122 0A51 CR         received, with time stamps on: 4 digits (ms), or 8 (µs)
+//!
+//!   C  O  L  S6  Y5  V  N  F  Z1  M00000000  mFFFFFFFF  CR     from the host: [`Command`]
+//!   CR  z CR  Z CR  BEL                                        from the adapter: done, sent, refused
+//! ```
+//!
+//! Spaces are for the reader only. The digits are hexadecimal, of either case when read, upper case when written.
+//!
+//! Dialects differ in what they answer: some firmware acknowledges each line, some none. So who writes never waits for
+//! an acknowledgement, and who reads passes over lines that it does not know.
+
+mod decoder;
+#[cfg(test)]
+mod tests;
+
+use crate::can::{BIT_RATE_SWITCH, Format, Frame, dlc_len, fd_dlc};
+
+pub use decoder::{Decoder, Line, Refusal, Refused};
+
+/// Bytes of the longest line without its end: a switched FD frame of 64 bytes, 29 bits and 8 digits of time.
+pub const MAX_LINE: usize = 1 + 8 + 1 + 2 * 64 + 8;
+/// Ends each line in either direction.
+pub const CR: u8 = b'\r';
+/// The adapter refused a line.
+pub const BEL: u8 = 0x07;
+
+/// A line as it is sent, with its end: 1 to [`MAX_LINE`] bytes.
+#[derive(Clone, Debug, Default, Eq, PartialEq)]
+pub struct Text {
+    bytes: heapless::Vec<u8, MAX_LINE>,
+}
+
+impl Text {
+    /// What to send.
+    #[must_use]
+    pub fn as_bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
+    fn push(&mut self, byte: u8) {
+        // Time stamps are never written, so that there is room for all else and the end.
+        let _ = self.bytes.push(byte);
+    }
+
+    /// The lower four bits.
+    fn digit(&mut self, value: u8) {
+        let value = value & 15;
+        self.push(if value < 10 { b'0' + value } else { b'A' - 10 + value });
+    }
+
+    fn byte(&mut self, value: u8) {
+        self.digit(value >> 4);
+        self.digit(value);
+    }
+
+    fn word(&mut self, value: u32) {
+        value.to_be_bytes().into_iter().for_each(|byte| self.byte(byte));
+    }
+}
+
+/// A frame as a line; `None` for an error frame, which never was on a bus.
+///
+/// An FD frame of a length that CAN FD does not have is filled up with zeros. Its error state is not carried, and of a
+/// classic frame with a DLC of 9 to 15 only that it has 8 bytes.
+#[must_use]
+pub fn encode(frame: &Frame) -> Option<Text> {
+    if frame.is_error() {
+        return None;
+    }
+    let data = frame.on_wire();
+    let (kind, dlc) = match frame.format() {
+        Format::Classic if frame.is_remote() => (b'r', frame.len()),
+        Format::Classic => (b't', frame.len()),
+        Format::Fd if frame.flags() & BIT_RATE_SWITCH != 0 => (b'b', fd_dlc(data.len())),
+        Format::Fd => (b'd', fd_dlc(data.len())),
+    };
+    let mut text = Text::default();
+    if frame.is_extended() {
+        text.push(kind.to_ascii_uppercase());
+        text.word(frame.id());
+    } else {
+        text.push(kind);
+        let [.., high, low] = frame.id().to_be_bytes();
+        text.digit(high);
+        text.byte(low);
+    }
+    text.digit(dlc);
+    data.iter().for_each(|&byte| text.byte(byte));
+    text.push(CR);
+    Some(text)
+}
+
+/// What a host has an adapter do, beside sending frames.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+#[non_exhaustive]
+pub enum Command {
+    /// `C`: leave the bus. The bit rates are set before it is joined.
+    Close,
+    /// `O`: join the bus.
+    Open,
+    /// `L`: join the bus without sending, not even acknowledgements.
+    Listen,
+    /// `S0` to `S9`: the nominal bit rate, see [`Command::nominal`].
+    BitRate(u8),
+    /// `Y0` to `Y9`: the data bit rate, see [`Command::data`].
+    DataBitRate(u8),
+    /// `V` or `v`: which firmware is it?
+    Version,
+    /// `N`: which adapter is it?
+    SerialNumber,
+    /// `F`: what went wrong?
+    Flags,
+    /// `Z0`, `Z1`: time stamps of 4 digits behind received frames.
+    TimeStamps(bool),
+    /// `M` and 8 digits: acceptance code of an SJA1000.
+    Code(u32),
+    /// `m` and 8 digits: acceptance mask of an SJA1000; its ones do not count.
+    Mask(u32),
+}
+
+impl Command {
+    /// Sets this nominal bit rate, in bit/s; `None` when slcan has no command for it.
+    ///
+    /// `S7` is 800 kbit/s by Lawicel and 750 kbit/s by CANable and python-can: it stands for either.
+    #[must_use]
+    pub const fn nominal(bit_rate: u32) -> Option<Self> {
+        Some(Self::BitRate(match bit_rate {
+            10_000 => 0,
+            20_000 => 1,
+            50_000 => 2,
+            100_000 => 3,
+            125_000 => 4,
+            250_000 => 5,
+            500_000 => 6,
+            750_000 | 800_000 => 7,
+            1_000_000 => 8,
+            83_300 | 83_333 => 9,
+            _ => return None,
+        }))
+    }
+
+    /// Sets this data bit rate, in bit/s: 500 k, or 1 M to 8 M; `None` when slcan has no command for it.
+    ///
+    /// All CANable firmware has 2 M and 5 M; the others depend on the firmware.
+    #[must_use]
+    pub const fn data(bit_rate: u32) -> Option<Self> {
+        Some(Self::DataBitRate(match bit_rate {
+            500_000 => 0,
+            1_000_000 => 1,
+            2_000_000 => 2,
+            3_000_000 => 3,
+            4_000_000 => 4,
+            5_000_000 => 5,
+            6_000_000 => 6,
+            7_000_000 => 7,
+            8_000_000 => 8,
+            _ => return None,
+        }))
+    }
+
+    /// The command as a line.
+    #[must_use]
+    pub fn encode(self) -> Text {
+        let mut text = Text::default();
+        let with_digit = |text: &mut Text, letter, digit: u8| {
+            text.push(letter);
+            text.digit(digit);
+        };
+        match self {
+            Self::Close => text.push(b'C'),
+            Self::Open => text.push(b'O'),
+            Self::Listen => text.push(b'L'),
+            Self::BitRate(digit) => with_digit(&mut text, b'S', digit),
+            Self::DataBitRate(digit) => with_digit(&mut text, b'Y', digit),
+            Self::Version => text.push(b'V'),
+            Self::SerialNumber => text.push(b'N'),
+            Self::Flags => text.push(b'F'),
+            Self::TimeStamps(on) => with_digit(&mut text, b'Z', on.into()),
+            Self::Code(code) => {
+                text.push(b'M');
+                text.word(code);
+            }
+            Self::Mask(mask) => {
+                text.push(b'm');
+                text.word(mask);
+            }
+        }
+        text.push(CR);
+        text
+    }
+
+    /// The command that a line without its end is.
+    fn decode(line: &[u8]) -> Option<Self> {
+        Some(match line {
+            b"C" => Self::Close,
+            b"O" => Self::Open,
+            b"L" => Self::Listen,
+            b"V" | b"v" => Self::Version,
+            b"N" => Self::SerialNumber,
+            b"F" => Self::Flags,
+            b"Z0" => Self::TimeStamps(false),
+            b"Z1" => Self::TimeStamps(true),
+            [b'S', digit @ b'0'..=b'9'] => Self::BitRate(digit - b'0'),
+            [b'Y', digit @ b'0'..=b'9'] => Self::DataBitRate(digit - b'0'),
+            [b'M', digits @ ..] if digits.len() == 8 => Self::Code(number(digits)?),
+            [b'm', digits @ ..] if digits.len() == 8 => Self::Mask(number(digits)?),
+            _ => return None,
+        })
+    }
+}
+
+/// A hexadecimal digit's value.
+fn digit(byte: u8) -> Option<u8> {
+    match byte {
+        b'0'..=b'9' => Some(byte - b'0'),
+        b'a'..=b'f' => Some(byte - b'a' + 10),
+        b'A'..=b'F' => Some(byte - b'A' + 10),
+        _ => None,
+    }
+}
+
+/// The value of at most 8 hexadecimal digits.
+fn number(digits: &[u8]) -> Option<u32> {
+    digits.iter().try_fold(0, |number, &byte| Some((number << 4) | u32::from(digit(byte)?)))
+}

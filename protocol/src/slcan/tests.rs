@@ -1,0 +1,300 @@
+use super::*;
+use crate::can::{ERROR, ERROR_STATE, EXTENDED, FD_FORMAT, REMOTE};
+use proptest::prelude::*;
+
+fn lines(bytes: &[u8]) -> Vec<Line> {
+    let mut decoder = Decoder::new();
+    bytes.iter().filter_map(|&byte| decoder.push(byte)).collect()
+}
+
+fn one(text: &str) -> Line {
+    let lines = lines(format!("{text}\r").as_bytes());
+    assert_eq!(lines.len(), 1, "{text}");
+    lines[0]
+}
+
+fn fd(id: u32, flags: u8, data: &[u8]) -> Frame {
+    Frame::fd(id, flags, data).unwrap()
+}
+
+/// Lines by hand and the frames that they are, both ways.
+#[test]
+fn frames_are_these_lines() {
+    let count: Vec<u8> = (0..12).collect();
+    for (text, frame) in [
+        ("t0000", Frame::classic(0, &[]).unwrap()),
+        ("t7FF8FFEEDDCCBBAA9988", Frame::classic(0x7FF, &[255, 238, 221, 204, 187, 170, 153, 136]).unwrap()),
+        ("T000000011A5", Frame::classic(EXTENDED | 1, &[0xA5]).unwrap()),
+        ("T1FFFFFFF0", Frame::classic(EXTENDED | 0x1FFF_FFFF, &[]).unwrap()),
+        ("r1230", Frame::remote(0x123, 0).unwrap()),
+        ("r1238", Frame::remote(0x123, 8).unwrap()),
+        ("R1234ABCD3", Frame::remote(EXTENDED | 0x1234_ABCD, 3).unwrap()),
+        ("d1231AA", fd(0x123, 0, &[0xAA])),
+        ("d1239000102030405060708090A0B", fd(0x123, 0, &count)),
+        ("D000001230", fd(EXTENDED | 0x123, 0, &[])),
+        ("b1230", fd(0x123, BIT_RATE_SWITCH, &[])),
+        ("B000001239000102030405060708090A0B", fd(EXTENDED | 0x123, BIT_RATE_SWITCH, &count)),
+    ] {
+        assert_eq!(one(text), Line::Frame(frame), "{text}");
+        assert_eq!(encode(&frame).unwrap().as_bytes(), format!("{text}\r").as_bytes());
+        assert_eq!(one(&format!("{}{}", &text[..1], text[1..].to_lowercase())), Line::Frame(frame));
+    }
+}
+
+#[test]
+fn every_length_of_fd_has_its_digit() {
+    for (digit, len) in
+        "0123456789ABCDEF".chars().zip([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
+    {
+        let text = format!("b001{digit}{}", "5A".repeat(len));
+        let frame = fd(1, BIT_RATE_SWITCH, &vec![0x5A; len]);
+        assert_eq!(one(&text), Line::Frame(frame));
+        assert_eq!(encode(&frame).unwrap().as_bytes(), format!("{text}\r").as_bytes());
+    }
+}
+
+#[test]
+fn what_is_sent_is_filled_up_to_its_dlc() {
+    assert_eq!(encode(&fd(1, 0, &[7; 9])).unwrap().as_bytes(), b"d0019070707070707070707000000\r");
+    let longest = encode(&fd(EXTENDED | 1, BIT_RATE_SWITCH, &[1; 49])).unwrap();
+    assert_eq!(longest.as_bytes().len(), 139);
+    assert!(longest.as_bytes().starts_with(b"B00000001F0101"));
+    assert!(longest.as_bytes().ends_with(b"01000000000000000000000000000000\r"));
+}
+
+#[test]
+fn what_slcan_cannot_say_is_left_out() {
+    assert_eq!(encode(&Frame::classic(ERROR | 4, &[0; 8]).unwrap()), None);
+    let raw = Frame::classic(1, &[9; 8]).unwrap().with_raw_dlc(15);
+    assert_eq!(encode(&raw).unwrap().as_bytes(), b"t00180909090909090909\r");
+    assert_eq!(encode(&fd(1, ERROR_STATE, &[])).unwrap().as_bytes(), b"d0010\r");
+    // A remote flag means nothing in an FD frame.
+    assert_eq!(encode(&fd(REMOTE | 1, 0, &[2])).unwrap().as_bytes(), b"d001102\r");
+}
+
+#[test]
+fn time_stamps_are_passed_over() {
+    let frame = Frame::classic(0x123, &[1, 2]).unwrap();
+    assert_eq!(one("t12320102EA5F"), Line::Frame(frame));
+    assert_eq!(one("t12320102DEADBEEF"), Line::Frame(frame));
+    assert_eq!(one("r12320000"), Line::Frame(Frame::remote(0x123, 2).unwrap()));
+    assert_eq!(
+        one(&format!("B00000001F{}0123ABCD", "01".repeat(64))),
+        Line::Frame(fd(EXTENDED | 1, BIT_RATE_SWITCH, &[1; 64]))
+    );
+    for (text, refusal) in [
+        ("t12320102E", Refusal::Long),
+        ("t12320102EA5", Refusal::Long),
+        ("t12320102EA5F1", Refusal::Long),
+        ("t12320102EA5G", Refusal::Garbage),
+    ] {
+        assert_eq!(one(text), Line::Refused(refusal), "{text}");
+    }
+}
+
+#[test]
+fn what_is_no_frame_is_refused_for_its_reason() {
+    for (text, refusal) in [
+        ("t", Refusal::Short),
+        ("t12", Refusal::Short),
+        ("t123", Refusal::Short),
+        ("t1231", Refusal::Short),
+        ("t1231A", Refusal::Short),
+        ("T1234567", Refusal::Short),
+        ("b1239000102030405060708090A", Refusal::Short),
+        ("t1239000102030405060708090A0B", Refusal::Dlc),
+        ("r123F", Refusal::Dlc),
+        ("T00000001A", Refusal::Dlc),
+        ("t8000", Refusal::Identifier),
+        ("d8000", Refusal::Identifier),
+        ("T200000000", Refusal::Identifier),
+        ("tXYZ0", Refusal::Garbage),
+        ("t123G", Refusal::Garbage),
+        ("t1231G0", Refusal::Garbage),
+        ("t12310-", Refusal::Garbage),
+        ("t+120", Refusal::Garbage),
+        ("t1230 ", Refusal::Long),
+        ("t12301\u{7f}", Refusal::Garbage),
+        ("C\0", Refusal::Garbage),
+        ("t1230é", Refusal::Garbage),
+    ] {
+        assert_eq!(one(text), Line::Refused(refusal), "{text}");
+    }
+}
+
+#[test]
+fn commands_are_these_lines() {
+    for (text, command) in [
+        ("C", Command::Close),
+        ("O", Command::Open),
+        ("L", Command::Listen),
+        ("S0", Command::BitRate(0)),
+        ("S9", Command::BitRate(9)),
+        ("Y2", Command::DataBitRate(2)),
+        ("Y5", Command::DataBitRate(5)),
+        ("V", Command::Version),
+        ("N", Command::SerialNumber),
+        ("F", Command::Flags),
+        ("Z0", Command::TimeStamps(false)),
+        ("Z1", Command::TimeStamps(true)),
+        ("M0000A5FF", Command::Code(0xA5FF)),
+        ("mFFFFFFFF", Command::Mask(u32::MAX)),
+    ] {
+        assert_eq!(one(text), Line::Command(command), "{text}");
+        assert_eq!(command.encode().as_bytes(), format!("{text}\r").as_bytes());
+    }
+    assert_eq!(one("v"), Line::Command(Command::Version));
+}
+
+#[test]
+fn bit_rates_have_these_commands() {
+    for (bit_rate, digit) in [
+        (10_000, 0),
+        (20_000, 1),
+        (50_000, 2),
+        (100_000, 3),
+        (125_000, 4),
+        (250_000, 5),
+        (500_000, 6),
+        (750_000, 7),
+        (800_000, 7),
+        (1_000_000, 8),
+        (83_300, 9),
+    ] {
+        assert_eq!(Command::nominal(bit_rate), Some(Command::BitRate(digit)), "{bit_rate}");
+    }
+    assert_eq!(Command::nominal(300_000), None);
+    for (bit_rate, digit) in [(500_000, 0), (1_000_000, 1), (2_000_000, 2), (5_000_000, 5), (8_000_000, 8)] {
+        assert_eq!(Command::data(bit_rate), Some(Command::DataBitRate(digit)), "{bit_rate}");
+    }
+    assert_eq!(Command::data(9_000_000), None);
+    assert_eq!(Command::data(2_500_000), None);
+}
+
+#[test]
+fn adapters_answer_as_they_like() {
+    assert_eq!(
+        lines(b"\rz\rZ\r\x07V1013\rNA123\rF00\rS\rSA\rM0\rA1\r?\r"),
+        [
+            Line::Done,
+            Line::Sent,
+            Line::Sent,
+            Line::Failed,
+            Line::Other,
+            Line::Other,
+            Line::Other,
+            Line::Other,
+            Line::Other,
+            Line::Other,
+            Line::Other,
+            Line::Other,
+        ]
+    );
+    let frame = Line::Frame(Frame::classic(0x123, &[]).unwrap());
+    assert_eq!(lines(b"t1230\r\nt1230\n\n\nt1230\r"), [frame; 3]);
+}
+
+#[test]
+fn a_bell_in_a_line_ends_it() {
+    let mut decoder = Decoder::new();
+    let lines: Vec<_> = b"t12\x07t1230\r".iter().filter_map(|&byte| decoder.push(byte)).collect();
+    assert_eq!(lines, [Line::Failed, Line::Frame(Frame::classic(0x123, &[]).unwrap())]);
+    assert_eq!(decoder.refused(), Refused { garbage: 1, ..Refused::default() });
+}
+
+#[test]
+fn what_was_refused_is_counted_by_reason() {
+    let mut decoder = Decoder::new();
+    let long = "0".repeat(MAX_LINE + 1);
+    let text = format!("t12\rt12\rt1239\rt9990\rt1230XX\rt1X3\r\x01\r{long}\rt12");
+    let refused = text.bytes().filter_map(|byte| decoder.push(byte)).count();
+    assert_eq!(refused, 8);
+    assert!(decoder.restart());
+    assert!(!decoder.restart());
+    let expected = Refused { garbage: 2, long: 2, short: 3, dlc: 1, identifier: 1 };
+    assert_eq!(decoder.refused(), expected);
+    assert_eq!(expected.total(), 9);
+}
+
+#[test]
+fn the_longest_line_fits_and_one_byte_more_does_not() {
+    assert_eq!(one(&"x".repeat(MAX_LINE)), Line::Other);
+    assert_eq!(one(&"x".repeat(MAX_LINE + 1)), Line::Refused(Refusal::Long));
+    assert_eq!(one(&"x".repeat(1_000_000)), Line::Refused(Refusal::Long));
+}
+
+/// Any frame that slcan can carry as it is.
+fn frames() -> impl Strategy<Value = Frame> {
+    let id = prop_oneof![0_u32..0x800, (0_u32..0x2000_0000).prop_map(|id| id | EXTENDED)];
+    (id, 0_u8..4, 0_u8..16, any::<[u8; 64]>()).prop_map(|(id, kind, dlc, data)| {
+        let classic = usize::from(dlc).min(8);
+        match kind {
+            0 => Frame::classic(id, &data[..classic]).unwrap(),
+            1 => Frame::remote(id, dlc.min(8)).unwrap(),
+            2 => fd(id, 0, &data[..dlc_len(dlc)]),
+            _ => fd(id, BIT_RATE_SWITCH, &data[..dlc_len(dlc)]),
+        }
+    })
+}
+
+proptest! {
+    #[test]
+    fn every_frame_comes_back(frame in frames()) {
+        prop_assert_eq!(lines(encode(&frame).unwrap().as_bytes()), [Line::Frame(frame)]);
+    }
+
+    #[test]
+    fn whatever_frame_is_sent_its_text_is_read_again(raw: u32, is_fd: bool, flags in 0_u8..8, data in proptest::collection::vec(any::<u8>(), 0..=64)) {
+        let frame = if is_fd {
+            Frame::with_data(raw, Format::Fd, flags | FD_FORMAT, &data).unwrap()
+        } else {
+            Frame::classic(raw, &data[..data.len().min(8)]).unwrap()
+        };
+        match encode(&frame) {
+            None => prop_assert!(frame.is_error()),
+            Some(text) => {
+                let [Line::Frame(again)] = lines(text.as_bytes())[..] else { panic!("{text:?}") };
+                prop_assert_eq!(encode(&again), Some(text));
+                prop_assert_eq!(again.id(), frame.id());
+                prop_assert_eq!(again.is_extended(), frame.is_extended());
+            }
+        }
+    }
+
+    #[test]
+    fn no_bytes_panic_and_each_line_is_counted_or_says_something(bytes in proptest::collection::vec(any::<u8>(), 0..600)) {
+        let mut decoder = Decoder::new();
+        let ended: Vec<_> = bytes.iter().filter_map(|&byte| decoder.push(byte)).collect();
+        let refused = ended.iter().filter(|line| matches!(line, Line::Refused(_))).count() as u64;
+        let bells = bytes.iter().filter(|&&byte| byte == BEL).count() as u64;
+        prop_assert!((refused..=refused + bells).contains(&decoder.refused().total()));
+        prop_assert!(decoder.refused().total() <= bytes.len() as u64);
+    }
+
+    #[test]
+    fn after_any_bytes_and_an_end_the_next_frame_is_read(bytes in proptest::collection::vec(any::<u8>(), 0..600), frame in frames()) {
+        let mut decoder = Decoder::new();
+        for byte in bytes {
+            decoder.push(byte);
+        }
+        decoder.push(CR);
+        let text = encode(&frame).unwrap();
+        let last = text.as_bytes().iter().filter_map(|&byte| decoder.push(byte)).last();
+        prop_assert_eq!(last, Some(Line::Frame(frame)));
+    }
+
+    #[test]
+    fn a_line_that_lost_a_byte_is_no_frame(frame in frames(), at: proptest::sample::Index) {
+        let text = encode(&frame).unwrap();
+        let mut bytes = text.as_bytes().to_vec();
+        bytes.remove(at.index(bytes.len() - 1));
+        prop_assert!(!lines(&bytes).iter().any(|line| matches!(line, Line::Frame(_))));
+    }
+
+    #[test]
+    fn two_lines_that_lost_the_end_between_them_are_no_frame(one in frames(), other in frames()) {
+        let (one, other) = (encode(&one).unwrap(), encode(&other).unwrap());
+        let bytes = [&one.as_bytes()[..one.as_bytes().len() - 1], other.as_bytes()].concat();
+        prop_assert!(matches!(lines(&bytes)[..], [Line::Refused(_)]));
+    }
+}
