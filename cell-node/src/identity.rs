@@ -1,6 +1,6 @@
 //! A cell's identity, and the identifiers that it receives for that.
 
-use protocol::id::{CellId, Command, Id, Kind, Node as Address};
+use protocol::id::{CellId, Id};
 
 /// Identifiers that every cell with a node id receives.
 pub const OWN: usize = 10;
@@ -15,27 +15,10 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// The identifiers that this cell receives whatever the state of the network: halt, joints, sync, resume, report;
-    /// its own heartbeats' (to notice another cell under its number); what configures and presses it, alone
-    /// or with everyone. A cell without a node id receives only what comes in at its ports.
+    /// The identifiers that this cell receives whatever the state of the network ([`Id::of_cell`]). A cell without a
+    /// node id receives only what comes in at its ports.
     #[must_use]
     pub fn hears(&self) -> [Option<Id>; OWN] {
-        let all = |cell| {
-            let cell = Address::Cell(cell);
-            [
-                Id::command(Command::Halt),
-                Id::command(Command::Joints),
-                Id::command(Command::Sync),
-                Id::command(Command::Resume),
-                Id::command(Command::Report),
-                Id::new(Kind::Network, cell),
-                Id::new(Kind::Configure, cell),
-                Id::new(Kind::Configure, Address::Everyone),
-                Id::new(Kind::Stimulus, cell),
-                Id::new(Kind::Stimulus, Address::Everyone),
-            ]
-            .map(Some)
-        };
-        self.cell.map_or([None; OWN], all)
+        self.cell.map_or([None; OWN], |cell| Id::of_cell(cell).map(Some))
     }
 }

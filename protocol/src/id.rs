@@ -254,6 +254,26 @@ impl Id {
         Self { kind, node: node.to_byte() }
     }
 
+    /// What every cell with a node id receives, whatever the state of its network: halt, joints, sync, resume, report;
+    /// its own heartbeats' identifier (to notice another cell under its node id); what configures and presses it, alone
+    /// or with everyone. Beside these a cell receives the sums of the cells at its ports.
+    #[must_use]
+    pub const fn of_cell(cell: CellId) -> [Self; 10] {
+        let cell = Node::Cell(cell);
+        [
+            Self::command(Command::Halt),
+            Self::command(Command::Joints),
+            Self::command(Command::Sync),
+            Self::command(Command::Resume),
+            Self::command(Command::Report),
+            Self::new(Kind::Network, cell),
+            Self::new(Kind::Configure, cell),
+            Self::new(Kind::Configure, Node::Everyone),
+            Self::new(Kind::Stimulus, cell),
+            Self::new(Kind::Stimulus, Node::Everyone),
+        ]
+    }
+
     /// The eleven bits.
     #[must_use]
     pub const fn to_bits(self) -> u16 {
