@@ -151,6 +151,12 @@ impl Bus {
         self.kind
     }
 
+    /// Whether it was opened for CAN FD frames.
+    #[must_use]
+    pub const fn carries_fd(&self) -> bool {
+        self.fd
+    }
+
     /// Whether nothing real hangs on this bus: the embedded one, a vcan or a vxcan.
     ///
     /// # Errors

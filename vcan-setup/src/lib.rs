@@ -8,3 +8,4 @@ pub mod look;
 pub mod namespace;
 pub mod netlink;
 pub mod plan;
+pub mod slcan;

@@ -3,6 +3,7 @@
 
 mod doctor;
 mod serve;
+mod slcan;
 mod status;
 mod up;
 
@@ -29,7 +30,8 @@ use vcan_setup::plan::Target;
   sudo vcan-setup up vcan0         a bus in the kernel
   vcan-setup status                the CAN interfaces of this machine
   sudo vcan-setup down vcan0
-  vcan-setup serve vcan0           a bus where the kernel has no CAN"
+  vcan-setup serve vcan0           a bus where the kernel has no CAN
+  vcan-setup slcan vcan0 /dev/ttyACM0 --cell 12    a cell behind a serial adapter"
 )]
 struct Arguments {
     #[command(subcommand)]
@@ -43,6 +45,7 @@ enum Command {
     Status(status::Status),
     Doctor(doctor::Doctor),
     Serve(serve::Serve),
+    Slcan(slcan::Slcan),
 }
 
 impl Command {
@@ -53,6 +56,7 @@ impl Command {
             Self::Status(command) => command.run(),
             Self::Doctor(command) => command.run(),
             Self::Serve(command) => command.run(),
+            Self::Slcan(command) => command.run(),
         }
     }
 }

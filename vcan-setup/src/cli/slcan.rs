@@ -1,0 +1,139 @@
+//! `vcan-setup slcan`.
+
+use std::io::Write;
+use std::os::unix::net::UnixStream;
+
+use clap::Args;
+use protocol::bus::Choice;
+use protocol::id::CellId;
+use protocol::usage::{Failure, print};
+use protocol::wire_time::BitRates;
+use serde::Serialize;
+use signal_hook::consts::{SIGINT, SIGTERM};
+use vcan_setup::slcan::{Account, Bridge, BridgeError, LineOptions, Settings};
+
+use super::{bus_name, json};
+
+/// Make serial lines that speak slcan participants of a bus, until SIGINT or SIGTERM
+///
+/// A LINE is a terminal (/dev/ttyACM0), unix:PATH or tcp:HOST:PORT, and after commas what holds for it alone:
+/// cell=12 or cell=1-8 (only what these cells receive goes to the line), filter=100:700 (identifier and mask, as
+/// candump has them), rates=1M/5M, baud=115200, classic. Each line has a client of the bus of its own. A line
+/// that goes away is opened again when it is back. Nothing waits for a line: what it cannot carry is dropped, and
+/// counted by reason. Prints one line when all is open, and at the end what has become of every frame.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vcan-setup slcan vcan0 /dev/ttyACM0 --cell 12 --bit-rates 1M/5M
+  vcan-setup slcan vcan0 unix:/tmp/12.sock,cell=12 unix:/tmp/13.sock,cell=13 --wait
+  vcan-setup slcan vcan0 /dev/ttyUSB0,cell=12,baud=57600,classic --bit-rates 500k
+
+docs/how-to/adapters.md says which adapters speak slcan.")]
+pub(crate) struct Slcan {
+    /// The bus
+    #[arg(value_parser = bus_name)]
+    bus: String,
+    /// The lines: PATH, unix:PATH or tcp:HOST:PORT, then options after commas
+    #[arg(value_name = "LINE", required = true)]
+    lines: Vec<LineOptions>,
+    /// The cell behind a line: one for each LINE, in their order
+    #[arg(long, value_name = "N", value_parser = cell)]
+    cell: Vec<CellId>,
+    /// Bit rates to set in adapters, as 500k or 1M/5M; else they keep theirs
+    #[arg(long, value_name = "RATES")]
+    bit_rates: Option<BitRates>,
+    /// Speed of terminals in bit/s; else they keep theirs
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    baud: Option<u32>,
+    /// The adapters have no CAN FD: drop FD frames
+    #[arg(long)]
+    classic: bool,
+    /// Begin without lines that are away
+    #[arg(long)]
+    wait: bool,
+    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
+    bus_kind: Choice,
+    /// Print what has become of the frames as JSON
+    #[arg(long)]
+    json: bool,
+}
+
+fn cell(word: &str) -> Result<CellId, String> {
+    let number = word.parse().map_err(|_| "not a number".to_owned())?;
+    CellId::new(number).map_err(|error| error.to_string())
+}
+
+#[derive(Serialize)]
+struct Report<'a> {
+    bus: &'a str,
+    bus_kind: &'static str,
+    lines: &'a [Account],
+}
+
+impl Slcan {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let lines = self.lines()?;
+        let (stop, stopped) = UnixStream::pair().map_err(no_signals)?;
+        for signal in [SIGINT, SIGTERM] {
+            let stop = stop.try_clone().map_err(no_signals)?;
+            signal_hook::low_level::pipe::register(signal, stop).map_err(no_signals)?;
+        }
+        let settings =
+            Settings { bus: self.bus.clone(), choice: self.bus_kind, directory: None, wait: self.wait };
+        let count = lines.len();
+        let bridge = Bridge::open(settings, lines).map_err(|error| {
+            if matches!(error, BridgeError::Twice(_)) { Failure::usage(error) } else { Failure::run(error) }
+        })?;
+        let (bus, kind, away) = (&self.bus, bridge.kind(), bridge.away());
+        let noun = if count == 1 { "line" } else { "lines" };
+        let mut ready = format!("{count} {noun} on {bus} ({kind})");
+        if !away.is_empty() {
+            ready += &format!(", still away: {}", away.join(", "));
+        }
+        // With JSON, standard output is that alone.
+        if self.json {
+            say(&ready)
+        } else {
+            print(&format!("{ready}\n"))?
+        }
+        let accounts = bridge.run(stopped, |line, event| say(&format!("{line}: {event}")));
+        let accounts = accounts.map_err(Failure::run)?;
+        if self.json {
+            return print(&json(&Report { bus, bus_kind: kind.name(), lines: &accounts })?);
+        }
+        print(&accounts.iter().map(|account| format!("{account}\n")).collect::<String>())
+    }
+
+    /// The lines, each with what holds for all.
+    fn lines(&self) -> Result<Vec<LineOptions>, Failure> {
+        let mut lines = self.lines.clone();
+        if !self.cell.is_empty() && self.cell.len() != lines.len() {
+            return Err(Failure::usage(format!(
+                "{} --cell for {} lines: give one for each, or write /dev/ttyACM0,cell=12",
+                self.cell.len(),
+                lines.len()
+            )));
+        }
+        for (line, cell) in lines.iter_mut().zip(&self.cell) {
+            line.add_cell(*cell);
+        }
+        for line in &mut lines {
+            line.classic |= self.classic;
+            line.baud = line.baud.or(self.baud);
+            if let Some(rates) = self.bit_rates.filter(|_| line.bit_rates.is_none()) {
+                line.set_bit_rates(rates)
+                    .map_err(|error| Failure::usage(format!("--bit-rates {rates}: {error}")))?;
+            }
+        }
+        Ok(lines)
+    }
+}
+
+fn no_signals(error: std::io::Error) -> Failure {
+    Failure::run(format!("cannot catch signals: {error}"))
+}
+
+fn say(text: &str) {
+    // When it is closed, there is no reader.
+    let _ = std::io::stderr().write_all(format!("vcan-setup: {text}\n").as_bytes());
+}

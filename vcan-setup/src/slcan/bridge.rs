@@ -1,0 +1,208 @@
+//! One thread, one `poll` around all lines of a bus.
+
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd};
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use protocol::bus::{BusError, BusKind, Choice};
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::io::Errno;
+use thiserror::Error;
+
+use super::account::Account;
+use super::options::LineOptions;
+use super::participant::{Event, Participant, Ready, open};
+
+/// How long a line may take at the end for what it has begun and for closing its adapter.
+const CLOSING: Duration = Duration::from_millis(500);
+/// Between two attempts at the start.
+const AGAIN: Duration = Duration::from_millis(20);
+
+/// The bus of some lines.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Settings {
+    /// Its name.
+    pub bus: String,
+    /// Its kind.
+    pub choice: Choice,
+    /// Where embedded buses live; `None` is the usual directory.
+    pub directory: Option<PathBuf>,
+    /// Begin without lines that are away, and open them when they are there.
+    pub wait: bool,
+}
+
+/// Why lines cannot be joined to a bus.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum BridgeError {
+    /// Two lines have one address.
+    #[error("{0} is named twice: each line is one participant")]
+    Twice(String),
+    /// The bus cannot be opened.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// A line cannot be opened.
+    #[error("cannot open {line}: {source}{hint}")]
+    Line {
+        /// Its address.
+        line: String,
+        /// What is wrong.
+        source: io::Error,
+        /// What to do, if that does not say it.
+        hint: &'static str,
+    },
+    /// The system cannot wait.
+    #[error("cannot wait for lines: {0}")]
+    Wait(#[source] io::Error),
+}
+
+/// Lines that are participants of a bus.
+#[derive(Debug)]
+pub struct Bridge {
+    settings: Settings,
+    kind: BusKind,
+    participants: Vec<Participant>,
+}
+
+impl Bridge {
+    /// Opens the bus once for each line, and the lines. With [`Settings::wait`] lines may be away.
+    ///
+    /// # Errors
+    /// When the bus or a line cannot be opened.
+    pub fn open(settings: Settings, lines: Vec<LineOptions>) -> Result<Self, BridgeError> {
+        let kind = settings.choice.resolve();
+        let mut participants: Vec<Participant> = Vec::new();
+        for line in lines {
+            let name = line.address.to_string();
+            if participants.iter().any(|other| other.name() == name) {
+                return Err(BridgeError::Twice(name));
+            }
+            let bus = open(&settings, &line)?;
+            let participant = Participant::new(line, bus);
+            participants.push(participant.map_err(|error| refused(name, error))?);
+        }
+        let mut bridge = Self { settings, kind, participants };
+        for participant in &mut bridge.participants {
+            loop {
+                participant.open_line(Instant::now(), &mut |_| {});
+                if participant.is_up() || bridge.settings.wait {
+                    break;
+                }
+                if let Some(error) = participant.take_reason() {
+                    return Err(refused(participant.name(), error));
+                }
+                // TCP, which says in time whether it is connected.
+                std::thread::sleep(AGAIN);
+            }
+        }
+        Ok(bridge)
+    }
+
+    /// What carries the bus.
+    #[must_use]
+    pub const fn kind(&self) -> BusKind {
+        self.kind
+    }
+
+    /// The lines that are away, each with the reason where that is known.
+    #[must_use]
+    pub fn away(&self) -> Vec<String> {
+        let away = self.participants.iter().filter(|it| !it.is_up());
+        let words = |it: &Participant| {
+            it.reason().map_or_else(|| it.name(), |reason| format!("{} ({reason})", it.name()))
+        };
+        away.map(words).collect()
+    }
+
+    /// Passes frames until `stop` can be read or is hung up, then closes the adapters; the accounts, in the order of the
+    /// lines. `report` hears of lines and of buses that go and come, and of losses, at most once a second for each line.
+    ///
+    /// # Errors
+    /// When the system cannot wait.
+    pub fn run(
+        mut self,
+        stop: impl AsFd,
+        mut report: impl FnMut(&str, Event),
+    ) -> Result<Vec<Account>, BridgeError> {
+        loop {
+            let ready = self.wait(Some(stop.as_fd()), None).map_err(BridgeError::Wait)?;
+            let Some(ready) = ready else { return self.close(&mut report) };
+            for (participant, ready) in self.participants.iter_mut().zip(ready) {
+                let name = participant.name();
+                participant.work(&self.settings, ready, &mut |event| report(&name, event));
+            }
+        }
+    }
+
+    fn close(mut self, report: &mut impl FnMut(&str, Event)) -> Result<Vec<Account>, BridgeError> {
+        let until = Instant::now() + CLOSING;
+        self.participants.iter_mut().for_each(Participant::end);
+        loop {
+            // All of them, not only up to the first one that is not done.
+            let left = self.participants.iter_mut().filter_map(|it| (!it.finish()).then_some(())).count();
+            if left == 0 || Instant::now() >= until {
+                break;
+            }
+            self.wait(None, Some(until)).map_err(BridgeError::Wait)?;
+        }
+        for participant in &mut self.participants {
+            if !participant.give_up() {
+                report(&participant.name(), Event::NotClosed);
+            }
+        }
+        Ok(self.participants.iter().map(Participant::account).collect())
+    }
+
+    /// Waits until there is something to do: for each line what can be read; nothing when it is time to stop.
+    fn wait(
+        &mut self,
+        stop: Option<BorrowedFd<'_>>,
+        until: Option<Instant>,
+    ) -> io::Result<Option<Vec<Ready>>> {
+        let now = Instant::now();
+        let mut next = until;
+        let mut interests = Vec::with_capacity(self.participants.len());
+        for participant in &mut self.participants {
+            interests.push(participant.interest());
+            next = [next, participant.timeout(now)].into_iter().flatten().min();
+        }
+        let mut polled = Vec::with_capacity(1 + 2 * interests.len());
+        polled.extend(stop.map(|stop| PollFd::from_borrowed_fd(stop, PollFlags::IN)));
+        for (participant, interest) in self.participants.iter().zip(&interests) {
+            let (line, bus) = participant.ends();
+            polled.extend(
+                line.zip(interest.line).map(|(line, flags)| PollFd::from_borrowed_fd(line.as_fd(), flags)),
+            );
+            polled.extend(bus.map(|bus| PollFd::from_borrowed_fd(bus.as_fd(), PollFlags::IN)));
+        }
+        let timeout = next.and_then(|next| Timespec::try_from(next.saturating_duration_since(now)).ok());
+        match poll(&mut polled, timeout.as_ref()) {
+            Ok(_) | Err(Errno::INTR) => {}
+            Err(errno) => return Err(errno.into()),
+        }
+        let mut came = polled.iter().map(|polled| !polled.revents().is_empty());
+        if stop.is_some() && came.next() == Some(true) {
+            return Ok(None);
+        }
+        let ready = self.participants.iter().zip(&interests).map(|(participant, interest)| {
+            let (line, bus) = participant.ends();
+            let line = line.zip(interest.line).is_some() && came.next() == Some(true);
+            Ready { line, bus: bus.is_some() && came.next() == Some(true) }
+        });
+        Ok(Some(ready.collect()))
+    }
+}
+
+fn refused(line: String, source: io::Error) -> BridgeError {
+    // What is of the wrong kind, or used by others, says so itself.
+    let says_it = matches!(source.kind(), io::ErrorKind::InvalidInput | io::ErrorKind::ResourceBusy);
+    let hint = if says_it {
+        ""
+    } else if source.kind() == io::ErrorKind::PermissionDenied {
+        "; join the group that may use it (`ls -l` names it, often dialout)"
+    } else {
+        "; with --wait it is opened when it is there"
+    };
+    BridgeError::Line { line, source, hint }
+}

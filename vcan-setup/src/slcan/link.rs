@@ -1,0 +1,195 @@
+//! Opening a line: terminals in raw mode, Unix sockets, TCP sockets. Nothing here waits.
+
+use std::io;
+use std::net::{SocketAddr, ToSocketAddrs};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::fs::{FileType, FlockOperation, Mode, OFlags, flock};
+use rustix::io::Errno;
+use rustix::net::{AddressFamily, SocketAddrUnix, SocketFlags, SocketType, sockopt};
+use rustix::termios::{self, ControlModes, InputModes, OptionalActions, QueueSelector, SpecialCodeIndex};
+
+use super::options::{Address, LineOptions};
+
+/// How long a TCP connection may take.
+const CONNECT: Duration = Duration::from_secs(3);
+/// Bytes that a socket may hold on the way: more would only make frames old, and hide that the peer is too slow.
+const SEND_BUFFER: usize = 16 << 10;
+/// A TCP peer that is silent so long is asked whether it is there, every second, three times.
+const SILENT: Duration = Duration::from_secs(5);
+
+/// An open line.
+#[derive(Debug)]
+pub(super) struct Port {
+    fd: OwnedFd,
+    is_tty: bool,
+    /// The connection is not there yet, and given up then.
+    connecting: Option<Instant>,
+}
+
+impl AsFd for Port {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.fd.as_fd()
+    }
+}
+
+/// Opens a line, again and again.
+#[derive(Debug)]
+pub(super) struct Opener {
+    options: LineOptions,
+    /// Of a TCP line: where its host is, found once, because to find out may take long.
+    hosts: Vec<SocketAddr>,
+    next: usize,
+}
+
+impl Opener {
+    pub(super) fn new(options: LineOptions) -> io::Result<Self> {
+        let hosts = match &options.address {
+            Address::Tcp { host, port } => (host.as_str(), *port).to_socket_addrs()?.collect(),
+            Address::Tty(_) | Address::Unix(_) => Vec::new(),
+        };
+        Ok(Self { options, hosts, next: 0 })
+    }
+
+    pub(super) const fn options(&self) -> &LineOptions {
+        &self.options
+    }
+
+    pub(super) fn open(&mut self) -> io::Result<Port> {
+        match &self.options.address {
+            Address::Tty(path) => {
+                let fd = open_tty(path, self.options.baud)?;
+                Ok(Port { fd, is_tty: true, connecting: None })
+            }
+            Address::Unix(path) => {
+                let address = SocketAddrUnix::new(path)?;
+                connect(AddressFamily::UNIX, |fd| rustix::net::connect(fd, &address))
+            }
+            Address::Tcp { .. } => {
+                let host = self.hosts.get(self.next % self.hosts.len().max(1));
+                let host = *host.ok_or_else(|| io::Error::other("its host has no address"))?;
+                self.next += 1;
+                let family = if host.is_ipv4() { AddressFamily::INET } else { AddressFamily::INET6 };
+                let port = connect(family, |fd| rustix::net::connect(fd, &host))?;
+                sockopt::set_tcp_nodelay(&port, true)?;
+                sockopt::set_socket_keepalive(&port, true)?;
+                sockopt::set_tcp_keepidle(&port, SILENT)?;
+                sockopt::set_tcp_keepintvl(&port, Duration::from_secs(1))?;
+                sockopt::set_tcp_keepcnt(&port, 3)?;
+                Ok(port)
+            }
+        }
+    }
+}
+
+impl Port {
+    /// Whether it is still to be connected.
+    pub(super) const fn is_connecting(&self) -> bool {
+        self.connecting.is_some()
+    }
+
+    /// Whether it is connected by now.
+    pub(super) fn connected(&mut self) -> io::Result<bool> {
+        let Some(until) = self.connecting else { return Ok(true) };
+        let mut polled = [PollFd::new(&self.fd, PollFlags::OUT)];
+        if poll(&mut polled, Some(&Timespec::default()))? == 0 {
+            return if Instant::now() < until { Ok(false) } else { Err(Errno::TIMEDOUT.into()) };
+        }
+        sockopt::socket_error(&self.fd)??;
+        self.connecting = None;
+        Ok(true)
+    }
+
+    /// How many bytes came; 0 when none are there yet.
+    pub(super) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
+        match rustix::io::read(&self.fd, buffer) {
+            Ok(0) => Err(io::Error::new(io::ErrorKind::UnexpectedEof, "it was closed")),
+            Ok(count) => Ok(count),
+            Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+            Err(errno) => Err(errno.into()),
+        }
+    }
+
+    /// How many bytes it took.
+    pub(super) fn write(&self, bytes: &[u8]) -> io::Result<usize> {
+        let done = if self.is_tty {
+            rustix::io::write(&self.fd, bytes)
+        } else {
+            rustix::net::send(&self.fd, bytes, rustix::net::SendFlags::NOSIGNAL)
+        };
+        match done {
+            Ok(count) => Ok(count),
+            Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+            Err(errno) => Err(errno.into()),
+        }
+    }
+
+    /// Takes back what a terminal has not sent, so that closing it does not wait for an adapter that takes nothing.
+    pub(super) fn discard(&self) {
+        if self.is_tty {
+            let _ = termios::tcflush(&self.fd, QueueSelector::OFlush);
+        }
+    }
+}
+
+fn connect(
+    family: AddressFamily,
+    connect: impl FnOnce(&OwnedFd) -> rustix::io::Result<()>,
+) -> io::Result<Port> {
+    let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
+    let fd = rustix::net::socket_with(family, SocketType::STREAM, flags, None)?;
+    sockopt::set_socket_send_buffer_size(&fd, SEND_BUFFER)?;
+    let connecting = match connect(&fd) {
+        Ok(()) => None,
+        Err(Errno::INPROGRESS) => Some(Instant::now() + CONNECT),
+        Err(errno) => return Err(errno.into()),
+    };
+    Ok(Port { fd, is_tty: false, connecting })
+}
+
+/// A terminal that passes every byte on as it is, in both directions, and belongs to this process as far as others heed
+/// the lock.
+fn open_tty(path: &Path, baud: Option<u32>) -> io::Result<OwnedFd> {
+    let flags = OFlags::RDWR | OFlags::NOCTTY | OFlags::NONBLOCK | OFlags::CLOEXEC;
+    let other = |hint: String| Err(io::Error::new(io::ErrorKind::InvalidInput, hint));
+    let fd = match rustix::fs::open(path, flags, Mode::empty()) {
+        Ok(fd) => fd,
+        Err(Errno::NXIO) if is_socket(path) => {
+            return other(format!("it is a socket: write unix:{}", path.display()));
+        }
+        Err(errno) => return Err(errno.into()),
+    };
+    // A lock, and not TIOCEXCL: that one holds back no root, and outlives a process that is killed.
+    match flock(&fd, FlockOperation::NonBlockingLockExclusive) {
+        Ok(()) => {}
+        Err(Errno::WOULDBLOCK) => {
+            let used = "another program uses it; stop that one first";
+            return Err(io::Error::new(io::ErrorKind::ResourceBusy, used));
+        }
+        Err(errno) => return Err(errno.into()),
+    }
+    let mut settings = match termios::tcgetattr(&fd) {
+        Ok(settings) => settings,
+        Err(Errno::NOTTY) => return other("it is no terminal".to_owned()),
+        Err(errno) => return Err(errno.into()),
+    };
+    settings.make_raw();
+    settings.input_modes.remove(InputModes::IXOFF | InputModes::IXANY);
+    settings.control_modes.remove(ControlModes::CRTSCTS | ControlModes::CSTOPB);
+    settings.control_modes.insert(ControlModes::CLOCAL | ControlModes::CREAD);
+    settings.special_codes[SpecialCodeIndex::VMIN] = 1;
+    settings.special_codes[SpecialCodeIndex::VTIME] = 0;
+    if let Some(baud) = baud {
+        settings.set_speed(baud)?;
+    }
+    termios::tcsetattr(&fd, OptionalActions::Now, &settings)?;
+    Ok(fd)
+}
+
+fn is_socket(path: &Path) -> bool {
+    let about = rustix::fs::stat(path);
+    about.is_ok_and(|about| FileType::from_raw_mode(about.st_mode) == FileType::Socket)
+}

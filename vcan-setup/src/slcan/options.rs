@@ -1,0 +1,330 @@
+//! A line as the command line names it: its address, and how it is used.
+
+use std::fmt;
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use protocol::bus::Filter;
+use protocol::can::{EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK};
+use protocol::id::{CellId, Id};
+use protocol::slcan::{Command, Text};
+use protocol::wire_time::BitRates;
+use thiserror::Error;
+
+/// Where a line is.
+#[derive(Clone, Debug, Eq, Hash, PartialEq)]
+pub enum Address {
+    /// A terminal: an adapter's device, or a pseudoterminal.
+    Tty(PathBuf),
+    /// A Unix socket that a program listens on.
+    Unix(PathBuf),
+    /// A TCP socket that a program listens on.
+    Tcp {
+        /// A name or an address.
+        host: String,
+        /// The port.
+        port: u16,
+    },
+}
+
+/// How a line is used.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct LineOptions {
+    /// Where it is.
+    pub address: Address,
+    /// Which frames of the bus go to the line: what passes any of these; all when there are none.
+    pub filters: Vec<Filter>,
+    /// The bit rates that the adapter is set to; else it keeps its own.
+    pub bit_rates: Option<BitRates>,
+    /// The speed of a terminal in bit/s; else it keeps its own.
+    pub baud: Option<u32>,
+    /// The adapter has no CAN FD: FD frames are dropped.
+    pub classic: bool,
+}
+
+/// A word that is no line.
+#[derive(Clone, Debug, Eq, Error, PartialEq)]
+#[non_exhaustive]
+pub enum LineError {
+    /// It has no form of an address.
+    #[error("{0:?} is no line: /dev/ttyACM0, unix:/path/to/socket and tcp:localhost:3333 are")]
+    Address(String),
+    /// An option that no line has.
+    #[error(
+        "{line}: {got:?} is no option of a line: cell=12, cell=1-8, filter=100:700, rates=1M/5M, baud=115200 and classic are"
+    )]
+    Unknown {
+        /// The address.
+        line: String,
+        /// The option.
+        got: String,
+    },
+    /// An option with a wrong value.
+    #[error("{line}: {got:?}: {expected}")]
+    Value {
+        /// The address.
+        line: String,
+        /// The option.
+        got: String,
+        /// What would be right.
+        expected: String,
+    },
+}
+
+/// What a line's bit rates may be, in an error.
+const RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k, 125k, 250k, 500k, 750k or 800k, and 1M; \
+                     for data 500k and whole Mbit/s up to 8M";
+
+impl LineOptions {
+    /// A line to which all frames go, that keeps its own speed and bit rates.
+    #[must_use]
+    pub const fn new(address: Address) -> Self {
+        Self { address, filters: Vec::new(), bit_rates: None, baud: None, classic: false }
+    }
+
+    /// Only what a cell with this node id receives goes to the line, beside what its other filters let pass.
+    pub fn add_cell(&mut self, cell: CellId) {
+        for filter in Id::of_cell(cell).map(Filter::exact) {
+            if !self.filters.contains(&filter) {
+                self.filters.push(filter);
+            }
+        }
+    }
+
+    /// Sets the adapter's bit rates.
+    ///
+    /// # Errors
+    /// When slcan has no command for one.
+    pub fn set_bit_rates(&mut self, rates: BitRates) -> Result<(), String> {
+        let data = rates.data();
+        if Command::nominal(rates.nominal()).is_none()
+            || (data != rates.nominal() && Command::data(data).is_none())
+        {
+            return Err(RATES.to_owned());
+        }
+        self.bit_rates = Some(rates);
+        Ok(())
+    }
+
+    /// What opens the adapter: ends whatever it has of a line, leaves the bus, sets the bit rates, joins the bus.
+    #[must_use]
+    pub fn opening(&self) -> Vec<u8> {
+        let rates = self.bit_rates;
+        let data = rates.map(BitRates::data).filter(|&data| rates.is_some_and(|it| it.nominal() != data));
+        let commands = [
+            Some(Command::Close),
+            rates.and_then(|rates| Command::nominal(rates.nominal())),
+            data.filter(|_| !self.classic).and_then(Command::data),
+            Some(Command::Open),
+        ];
+        let texts: Vec<Text> = commands.into_iter().flatten().map(Command::encode).collect();
+        let mut bytes = vec![protocol::slcan::CR];
+        texts.iter().for_each(|text| bytes.extend_from_slice(text.as_bytes()));
+        bytes
+    }
+
+    fn take(&mut self, option: &str) -> Result<(), LineError> {
+        let line = self.address.to_string();
+        let wrong = |expected: &dyn fmt::Display| LineError::Value {
+            line: line.clone(),
+            got: option.to_owned(),
+            expected: expected.to_string(),
+        };
+        let (key, value) = option.split_once('=').unwrap_or((option, ""));
+        match key {
+            "cell" => {
+                let (first, last) = value.split_once('-').unwrap_or((value, value));
+                let cell = |text: &str| text.parse().ok().and_then(|number| CellId::new(number).ok());
+                let expected = "node ids are 1 to 254: cell=12, or cell=1-8";
+                let (first, last) = cell(first).zip(cell(last)).ok_or_else(|| wrong(&expected))?;
+                if first > last {
+                    return Err(wrong(&expected));
+                }
+                CellId::all()
+                    .filter(|cell| (first..=last).contains(cell))
+                    .for_each(|cell| self.add_cell(cell));
+                if self.filters.len() > Filter::MAX {
+                    return Err(wrong(&format!(
+                        "these need {} filters, and a bus has {} for a line: name fewer cells, or none",
+                        self.filters.len(),
+                        Filter::MAX
+                    )));
+                }
+            }
+            "filter" => {
+                let filter = filter(value).ok_or_else(|| {
+                    wrong(&"identifier and mask as candump has them: filter=100:700, or 8 digits each for 29 bits")
+                })?;
+                self.filters.push(filter);
+            }
+            "rates" => {
+                let rates: BitRates = value.parse().map_err(|error| wrong(&error))?;
+                let mut with = self.clone();
+                with.set_bit_rates(rates).map_err(|expected| wrong(&expected))?;
+                *self = with;
+            }
+            "baud" => {
+                let baud = value.parse().ok().filter(|baud| *baud > 0);
+                self.baud = Some(baud.ok_or_else(|| wrong(&"bits in a second: baud=115200"))?);
+            }
+            "classic" if option == "classic" => self.classic = true,
+            _ => {
+                return Err(LineError::Unknown { line: self.address.to_string(), got: option.to_owned() });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Identifier and mask, 3 digits for data frames of 11 bits, 8 for those of 29.
+fn filter(text: &str) -> Option<Filter> {
+    let (id, mask) = text.split_once(':')?;
+    let (max, flag) = match id.len() {
+        3 => (STANDARD_MASK, 0),
+        8 => (EXTENDED_MASK, EXTENDED),
+        _ => return None,
+    };
+    let number = |text: &str| {
+        let is_hex = text.bytes().all(|byte| byte.is_ascii_hexdigit());
+        u32::from_str_radix(text, 16).ok().filter(|number| is_hex && *number <= max)
+    };
+    Some(Filter { id: number(id)? | flag, mask: number(mask)? | EXTENDED | REMOTE })
+}
+
+impl FromStr for LineOptions {
+    type Err = LineError;
+
+    fn from_str(text: &str) -> Result<Self, LineError> {
+        let mut words = text.split(',');
+        let mut options = Self::new(words.next().unwrap_or_default().parse()?);
+        for word in words {
+            options.take(word)?;
+        }
+        Ok(options)
+    }
+}
+
+impl FromStr for Address {
+    type Err = LineError;
+
+    fn from_str(text: &str) -> Result<Self, LineError> {
+        let wrong = || LineError::Address(text.to_owned());
+        match text.split_once(':') {
+            Some(("unix", path)) if !path.is_empty() => Ok(Self::Unix(path.into())),
+            Some(("tcp", rest)) => {
+                let (host, port) = rest.rsplit_once(':').ok_or_else(wrong)?;
+                let host = host.strip_prefix('[').and_then(|host| host.strip_suffix(']')).unwrap_or(host);
+                let port = port.parse().ok().filter(|port| *port > 0 && !host.is_empty());
+                Ok(Self::Tcp { host: host.to_owned(), port: port.ok_or_else(wrong)? })
+            }
+            _ if text.contains('/') && !text.starts_with("unix:") => Ok(Self::Tty(text.into())),
+            _ => Err(wrong()),
+        }
+    }
+}
+
+impl fmt::Display for Address {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Tty(path) => path.display().fmt(f),
+            Self::Unix(path) => write!(f, "unix:{}", path.display()),
+            Self::Tcp { host, port } if host.contains(':') => write!(f, "tcp:[{host}]:{port}"),
+            Self::Tcp { host, port } => write!(f, "tcp:{host}:{port}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(text: &str) -> LineOptions {
+        text.parse().unwrap_or_else(|error| panic!("{error}"))
+    }
+
+    fn wrong(text: &str) -> String {
+        text.parse::<LineOptions>().unwrap_err().to_string()
+    }
+
+    #[test]
+    fn addresses_are_written_as_they_are_read() {
+        for text in
+            ["/dev/ttyACM0", "./pty", "unix:/run/cell.sock", "unix:a", "tcp:localhost:3333", "tcp:[::1]:1"]
+        {
+            assert_eq!(line(text).address.to_string(), text);
+        }
+        for text in
+            ["", "ttyACM0", "unix:", "tcp:", "tcp:host", "tcp::1", "tcp:host:0", "tcp:host:70000", "unix"]
+        {
+            assert_eq!(
+                wrong(text),
+                format!("{text:?} is no line: /dev/ttyACM0, unix:/path/to/socket and tcp:localhost:3333 are")
+            );
+        }
+    }
+
+    #[test]
+    fn a_cells_filters_are_what_a_cell_receives() {
+        let one = line("/dev/ttyACM0,cell=12");
+        let passes =
+            |line: &LineOptions, id: u32| line.filters.iter().any(|it| id & it.mask == it.id & it.mask);
+        for id in [0, 1, 2, 3, 4, 0x40C, 0x50C, 0x5FF, 0x70C, 0x7FF] {
+            assert!(passes(&one, id), "{id:X}");
+        }
+        for id in [5, 0x10C, 0x20C, 0x30C, 0x60C, 0x40D, 0x50D, 0x70D, EXTENDED | 1, REMOTE | 1] {
+            assert!(!passes(&one, id), "{id:X}");
+        }
+        assert_eq!(one.filters.len(), 10);
+        // What all receive is there once.
+        let three = line("/dev/ttyACM0,cell=12-13,cell=40");
+        assert_eq!(three.filters.len(), 7 + 3 * 3);
+        assert!(passes(&three, 0x50D) && passes(&three, 0x728));
+        let with_sums = line("/dev/ttyACM0,cell=12,filter=100:700");
+        assert!(
+            passes(&with_sums, 0x1AB) && !passes(&with_sums, 0x2AB) && !passes(&with_sums, EXTENDED | 0x1AB)
+        );
+        let extended = line("/dev/ttyACM0,filter=00000100:1FFFFF00");
+        assert!(passes(&extended, EXTENDED | 0x1FF) && !passes(&extended, 0x1FF));
+    }
+
+    #[test]
+    fn an_adapter_is_opened_with_what_is_given() {
+        assert_eq!(line("/dev/x").opening(), b"\rC\rO\r");
+        assert_eq!(line("/dev/x,rates=1M/5M").opening(), b"\rC\rS8\rY5\rO\r");
+        assert_eq!(line("/dev/x,rates=1M/5M,classic").opening(), b"\rC\rS8\rO\r");
+        assert_eq!(line("/dev/x,rates=500k").opening(), b"\rC\rS6\rO\r");
+        assert_eq!(line("/dev/x,baud=57600").baud, Some(57_600));
+    }
+
+    #[test]
+    fn what_no_line_has_is_refused_with_what_it_has() {
+        for (text, expected) in [
+            ("/dev/x,cell=0", "/dev/x: \"cell=0\": node ids are 1 to 254: cell=12, or cell=1-8"),
+            ("/dev/x,cell=8-1", "/dev/x: \"cell=8-1\": node ids are 1 to 254: cell=12, or cell=1-8"),
+            (
+                "/dev/x,cell=1-254",
+                "/dev/x: \"cell=1-254\": these need 769 filters, and a bus has 512 for a line: name fewer cells, or none",
+            ),
+            (
+                "/dev/x,filter=100",
+                "/dev/x: \"filter=100\": identifier and mask as candump has them: filter=100:700, or 8 digits each for 29 bits",
+            ),
+            ("/dev/x,baud=fast", "/dev/x: \"baud=fast\": bits in a second: baud=115200"),
+            (
+                "/dev/x,rates=2M",
+                "/dev/x: \"rates=2M\": nominal bit rate 2000000 bit/s: CAN allows 10000 to 1000000 (10k to 1M)",
+            ),
+        ] {
+            assert_eq!(wrong(text), expected);
+        }
+        assert!(
+            wrong("/dev/x,rates=300k")
+                .starts_with("/dev/x: \"rates=300k\": slcan has the bit rates 10k, 20k")
+        );
+        assert!(wrong("/dev/x,rates=500k/2500k").contains("for data 500k and whole Mbit/s up to 8M"));
+        for option in ["", "cel=1", "classic=yes", "listen"] {
+            let expected = format!("/dev/x: {option:?} is no option of a line: cell=12, cell=1-8, ");
+            assert!(wrong(&format!("/dev/x,{option}")).starts_with(&expected), "{option}");
+        }
+    }
+}

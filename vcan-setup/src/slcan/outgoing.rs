@@ -1,0 +1,322 @@
+//! From the bus to a line: frames become text, wait in a queue, and leave no faster than the line carries them.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use protocol::can::{Format, Frame};
+use protocol::slcan::{CR, encode};
+use protocol::wire_time::{BitRates, Bits};
+
+use super::account::ToLine;
+
+/// Frames that wait at most: a tenth of a second of a line at 1 Mbaud.
+pub const QUEUE: usize = 256;
+/// How far the line may be ahead of what its bus or its wire carries: what an adapter buffers.
+pub const AHEAD: Duration = Duration::from_millis(2);
+
+/// How long a frame keeps the line busy.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Pace {
+    /// The adapter's bus.
+    pub bit_rates: Option<BitRates>,
+    /// The wire between the host and the adapter; ten bits a byte.
+    pub baud: Option<u32>,
+}
+
+impl Pace {
+    fn cost(self, frame: &Frame, bytes: usize) -> Duration {
+        let bus = self.bit_rates.zip(Bits::of(frame)).map_or(0, |(rates, bits)| bits.nanoseconds(rates));
+        let wire = self.baud.map_or(0, |baud| bytes as u64 * 10_000_000_000 / u64::from(baud.max(1)));
+        Duration::from_nanos(bus.max(wire))
+    }
+}
+
+/// Text that waits or is being written.
+#[derive(Debug)]
+struct Entry {
+    bytes: usize,
+    cost: Duration,
+    /// A command is no frame of the bus, and not counted.
+    is_frame: bool,
+}
+
+/// The way of frames from the bus to a line.
+#[derive(Debug, Default)]
+pub struct Outgoing {
+    classic: bool,
+    pace: Pace,
+    /// The text of all entries, from the first byte that is not written.
+    text: VecDeque<u8>,
+    entries: VecDeque<Entry>,
+    /// Bytes of the first entry that are written.
+    written: usize,
+    /// Entries that may be written by now, and their bytes, without what is written of the first.
+    released: usize,
+    released_bytes: usize,
+    busy_until: Duration,
+    is_up: bool,
+    /// What became of the frames.
+    pub account: ToLine,
+}
+
+impl Outgoing {
+    /// To a line that is not there yet; `classic` drops FD frames.
+    #[must_use]
+    pub fn new(classic: bool, pace: Pace) -> Self {
+        Self { classic, pace, ..Self::default() }
+    }
+
+    /// The line is there; `opening` is written first.
+    pub fn up(&mut self, opening: &[u8]) {
+        self.down();
+        self.is_up = true;
+        self.push(opening, Duration::ZERO, false);
+    }
+
+    /// The line is gone, with all that waited for it.
+    pub fn down(&mut self) {
+        let waiting = self.clear();
+        self.account.dropped.line_away += waiting;
+        self.is_up = false;
+    }
+
+    /// Takes a frame of the bus.
+    pub fn take(&mut self, frame: &Frame) {
+        self.account.received += 1;
+        let dropped = &mut self.account.dropped;
+        let Some(text) = encode(frame) else {
+            dropped.error_frame += 1;
+            return;
+        };
+        let reason = if self.classic && frame.format() == Format::Fd {
+            &mut dropped.not_classic
+        } else if !self.is_up {
+            &mut dropped.line_away
+        } else if self.entries.len() >= QUEUE {
+            &mut dropped.queue_full
+        } else {
+            self.push(text.as_bytes(), self.pace.cost(frame, text.as_bytes().len()), true);
+            return;
+        };
+        *reason += 1;
+    }
+
+    /// What may be written now; and when there may be more, if something waits that may not yet.
+    pub fn ready(&mut self, now: Duration) -> (&[u8], Option<Duration>) {
+        while let Some(entry) = self.entries.get(self.released) {
+            if self.busy_until > now + AHEAD {
+                break;
+            }
+            self.busy_until = self.busy_until.max(now) + entry.cost;
+            self.released += 1;
+            self.released_bytes += entry.bytes;
+        }
+        let again = (self.released < self.entries.len()).then(|| self.busy_until.saturating_sub(AHEAD));
+        let (text, _) = self.text.as_slices();
+        (text.get(..self.released_bytes.min(text.len())).unwrap_or_default(), again)
+    }
+
+    /// The line took so many bytes of what was ready.
+    pub fn wrote(&mut self, bytes: usize) {
+        let bytes = bytes.min(self.released_bytes);
+        self.text.drain(..bytes);
+        self.released_bytes -= bytes;
+        self.written += bytes;
+        while let Some(entry) = self.entries.front().filter(|entry| entry.bytes <= self.written) {
+            self.written -= entry.bytes;
+            self.account.sent += u64::from(entry.is_frame);
+            self.entries.pop_front();
+            self.released -= 1;
+        }
+    }
+
+    /// The end: what was not begun is dropped, and `closing` follows what was.
+    pub fn end(&mut self, closing: &[u8]) {
+        let begun = usize::from(self.written > 0);
+        let dropped = self.entries.iter().skip(begun).filter(|entry| entry.is_frame).count();
+        self.account.dropped.ended += dropped as u64;
+        let rest = self.entries.front().filter(|_| begun > 0).map_or(0, |entry| entry.bytes - self.written);
+        self.text.truncate(rest);
+        self.entries.truncate(begun);
+        self.released = begun;
+        self.released_bytes = rest;
+        self.busy_until = Duration::ZERO;
+        if self.is_up {
+            self.push(closing, Duration::ZERO, false);
+        }
+    }
+
+    /// Whether nothing waits.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.entries.is_empty()
+    }
+
+    fn push(&mut self, text: &[u8], cost: Duration, is_frame: bool) {
+        self.text.extend(text);
+        self.entries.push_back(Entry { bytes: text.len(), cost, is_frame });
+    }
+
+    /// Forgets what waits; how many frames that were.
+    fn clear(&mut self) -> u64 {
+        let frames = self.entries.iter().filter(|entry| entry.is_frame).count();
+        let (classic, pace, account) = (self.classic, self.pace, self.account);
+        *self = Self { account, ..Self::new(classic, pace) };
+        frames as u64
+    }
+}
+
+/// What closes an adapter.
+#[must_use]
+pub fn closing() -> Vec<u8> {
+    let close = protocol::slcan::Command::Close.encode();
+    debug_assert!(close.as_bytes().ends_with(&[CR]));
+    close.as_bytes().to_vec()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use protocol::can::ERROR;
+
+    const NOW: Duration = Duration::from_secs(1);
+
+    fn frame(number: u8) -> Frame {
+        Frame::classic(0x123, &[number]).unwrap()
+    }
+
+    fn drain(outgoing: &mut Outgoing, now: Duration) -> Vec<u8> {
+        let mut all = Vec::new();
+        loop {
+            let (bytes, _) = outgoing.ready(now);
+            if bytes.is_empty() {
+                return all;
+            }
+            let count = bytes.len();
+            all.extend_from_slice(bytes);
+            outgoing.wrote(count);
+        }
+    }
+
+    #[test]
+    fn frames_follow_the_opening_in_order() {
+        let mut outgoing = Outgoing::new(false, Pace::default());
+        outgoing.take(&frame(0));
+        outgoing.up(b"\rC\rO\r");
+        outgoing.take(&frame(1));
+        outgoing.take(&Frame::fd(1, 1, &[2]).unwrap());
+        outgoing.take(&Frame::classic(ERROR | 4, &[0; 8]).unwrap());
+        assert_eq!(drain(&mut outgoing, NOW), b"\rC\rO\rt123101\rb001102\r");
+        let ToLine { received, sent, dropped, .. } = outgoing.account;
+        assert_eq!((received, sent, dropped.line_away, dropped.error_frame), (4, 2, 1, 1));
+        assert_eq!(dropped.total(), 2);
+    }
+
+    #[test]
+    fn a_classic_line_gets_no_fd_frames() {
+        let mut outgoing = Outgoing::new(true, Pace::default());
+        outgoing.up(b"");
+        outgoing.take(&Frame::fd(1, 1, &[2]).unwrap());
+        outgoing.take(&frame(1));
+        assert_eq!(drain(&mut outgoing, NOW), b"t123101\r");
+        assert_eq!(outgoing.account.dropped.not_classic, 1);
+    }
+
+    #[test]
+    fn what_is_cut_off_is_not_sent_and_what_comes_back_begins_afresh() {
+        let mut outgoing = Outgoing::new(false, Pace::default());
+        outgoing.up(b"O\r");
+        for number in 0..3 {
+            outgoing.take(&frame(number));
+        }
+        outgoing.ready(NOW);
+        outgoing.wrote(2 + 8 + 3);
+        assert_eq!(outgoing.account.sent, 1);
+        outgoing.down();
+        assert_eq!(outgoing.account.dropped.line_away, 2);
+        outgoing.up(b"\rO\r");
+        outgoing.take(&frame(9));
+        assert_eq!(drain(&mut outgoing, NOW), b"\rO\rt123109\r");
+    }
+
+    #[test]
+    fn the_end_finishes_the_line_that_was_begun_and_closes() {
+        let mut outgoing = Outgoing::new(false, Pace::default());
+        outgoing.up(b"");
+        outgoing.take(&frame(1));
+        outgoing.take(&frame(2));
+        outgoing.ready(NOW);
+        outgoing.wrote(3);
+        outgoing.end(&closing());
+        assert_eq!(drain(&mut outgoing, NOW), b"3101\rC\r");
+        assert_eq!((outgoing.account.sent, outgoing.account.dropped.ended), (1, 1));
+        // Nothing is there that could be closed.
+        let mut away = Outgoing::new(false, Pace::default());
+        away.end(&closing());
+        assert!(away.is_empty());
+    }
+
+    #[test]
+    fn a_bus_at_125k_gets_no_more_than_it_carries() {
+        let pace = Pace { bit_rates: Some("125k".parse().unwrap()), baud: None };
+        let mut outgoing = Outgoing::new(true, pace);
+        outgoing.up(b"");
+        // 34 + 8 + 13 bits, and stuff bits.
+        let cost = Duration::from_nanos(Bits::of(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()));
+        let (mut now, mut sent) = (NOW, 0);
+        while now < NOW + Duration::from_secs(1) {
+            outgoing.take(&frame(0xAA));
+            sent += drain(&mut outgoing, now).len() / 8;
+            now += Duration::from_micros(100);
+        }
+        let carried = usize::try_from((Duration::from_secs(1) + AHEAD).as_nanos() / cost.as_nanos()).unwrap();
+        assert!((carried..=carried + 1).contains(&sent), "{sent} of {carried}");
+        let ToLine { received, sent, dropped, .. } = outgoing.account;
+        assert_eq!(received, sent + dropped.queue_full + outgoing.entries.len() as u64);
+        assert!(dropped.queue_full > 5_000);
+        let (_, again) = outgoing.ready(now);
+        assert!(again.unwrap() <= now + cost, "it says when to come again");
+    }
+
+    #[test]
+    fn a_wire_at_9600_baud_is_the_slower_one() {
+        let pace = Pace { bit_rates: Some("1M".parse().unwrap()), baud: Some(9_600) };
+        assert_eq!(pace.cost(&frame(1), 8), Duration::from_nanos(8_333_333));
+        assert_eq!(Pace { baud: None, ..pace }.cost(&frame(1), 8), Duration::from_nanos(58_000));
+    }
+
+    proptest! {
+        #[test]
+        fn every_frame_is_sent_or_dropped_for_a_reason(
+            steps in proptest::collection::vec((0_u8..8, 0_usize..100), 0..100), slow: bool
+        ) {
+            let pace = Pace { bit_rates: slow.then(|| "10k".parse().unwrap()), baud: None };
+            let mut outgoing = Outgoing::new(false, pace);
+            let mut now = NOW;
+            for (kind, amount) in steps {
+                match kind {
+                    0 => outgoing.up(b"\rC\rO\r"),
+                    1 => outgoing.down(),
+                    2 => now += Duration::from_millis(amount as u64),
+                    3 | 4 => {
+                        let bytes = outgoing.ready(now).0.len().min(amount);
+                        outgoing.wrote(bytes);
+                    }
+                    _ => (0..amount).for_each(|_| outgoing.take(&frame(1))),
+                }
+                let waiting = outgoing.entries.iter().filter(|entry| entry.is_frame).count() as u64;
+                let ToLine { received, sent, dropped, .. } = outgoing.account;
+                prop_assert_eq!(received, sent + dropped.total() + waiting);
+                let text: usize = outgoing.entries.iter().map(|entry| entry.bytes).sum();
+                prop_assert_eq!(text, outgoing.text.len() + outgoing.written);
+                prop_assert!(waiting <= QUEUE as u64);
+            }
+            outgoing.end(b"C\r");
+            let rest = drain(&mut outgoing, now);
+            prop_assert!(rest.is_empty() || rest.ends_with(b"C\r"));
+            let ToLine { received, sent, dropped, .. } = outgoing.account;
+            prop_assert_eq!(received, sent + dropped.total());
+        }
+    }
+}

@@ -1,0 +1,424 @@
+//! One line, and its client of the bus.
+
+use std::fmt;
+use std::io;
+use std::time::{Duration, Instant};
+
+use protocol::bus::{Bus, BusError, Filter, Inbox, Options};
+use rustix::event::PollFlags;
+
+use super::account::Account;
+use super::bridge::Settings;
+use super::incoming::Incoming;
+use super::link::{Opener, Port};
+use super::options::LineOptions;
+use super::outgoing::{Outgoing, Pace, closing};
+
+/// From one attempt to open what is away to the next.
+const AGAIN: Duration = Duration::from_millis(100);
+/// How soon a bus that is full is tried again.
+const RETRY: Duration = Duration::from_millis(1);
+/// Between two reports of losses of a line.
+const REPORT: Duration = Duration::from_secs(1);
+/// Batches taken from a bus, and from a line, before the next line's turn.
+const TURNS: usize = 4;
+
+/// What happened to a line.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub enum Event {
+    /// The line is open.
+    LineUp,
+    /// The line is away, or cannot be opened, and why; it is tried again.
+    LineAway(String),
+    /// The bus is open again.
+    BusUp,
+    /// The bus is away, and why; it is tried again.
+    BusAway(String),
+    /// Frames were lost since the last report.
+    Lost {
+        /// Of those from the bus.
+        to_line: u64,
+        /// Of those from the line, and lines that could not be used.
+        to_bus: u64,
+        /// All so far.
+        account: Box<Account>,
+    },
+    /// At the end the line took nothing for so long that its adapter was not closed.
+    NotClosed,
+}
+
+impl fmt::Display for Event {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::LineUp => f.write_str("open"),
+            Self::LineAway(why) => write!(f, "away ({why}); it is opened when it is there"),
+            Self::BusUp => f.write_str("its bus is back"),
+            Self::BusAway(why) => write!(f, "its bus is away ({why}); it is opened when it is there"),
+            Self::Lost { to_line, to_bus, account } => {
+                let one = |count: u64, what, so_far: String| {
+                    (count > 0).then(|| format!("{count} more {what} lost, so far{so_far}"))
+                };
+                let lost = [
+                    one(*to_line, "frames to the line", account.to_line.losses()),
+                    one(*to_bus, "frames to the bus", account.to_bus.losses()),
+                ];
+                f.write_str(&lost.into_iter().flatten().collect::<Vec<_>>().join("; "))
+            }
+            Self::NotClosed => f.write_str("its adapter was not closed: it took nothing at the end"),
+        }
+    }
+}
+
+/// What can be read.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Ready {
+    pub(super) line: bool,
+    pub(super) bus: bool,
+}
+
+/// What to wait for at an open line; of the client only that it can be read.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Interest {
+    pub(super) line: Option<PollFlags>,
+}
+
+/// The state of a line.
+#[derive(Debug)]
+enum Line {
+    Away(Instant),
+    Open(Port),
+}
+
+/// The state of the line's client.
+#[derive(Debug)]
+enum Client {
+    Away(Instant),
+    Open(Box<Bus>),
+}
+
+/// One line, and its client of the bus.
+#[derive(Debug)]
+pub(super) struct Participant {
+    opener: Opener,
+    line: Line,
+    client: Client,
+    inbox: Inbox,
+    outgoing: Outgoing,
+    incoming: Incoming,
+    opened: u64,
+    lost: u64,
+    dropped_before: u64,
+    reported: (u64, u64),
+    report_at: Instant,
+    /// Why the line was away when that was last reported.
+    reason: Option<io::Error>,
+    began: Instant,
+}
+
+impl Participant {
+    pub(super) fn new(options: LineOptions, bus: Bus) -> io::Result<Self> {
+        let pace = Pace { bit_rates: options.bit_rates, baud: options.baud };
+        let outgoing = Outgoing::new(options.classic, pace);
+        let mut incoming = Incoming::new();
+        incoming.up(!bus.carries_fd());
+        let now = Instant::now();
+        Ok(Self {
+            opener: Opener::new(options)?,
+            line: Line::Away(now),
+            client: Client::Open(Box::new(bus)),
+            inbox: Inbox::new(),
+            outgoing,
+            incoming,
+            opened: 0,
+            lost: 0,
+            dropped_before: 0,
+            reported: (0, 0),
+            report_at: now,
+            reason: None,
+            began: now,
+        })
+    }
+
+    pub(super) fn name(&self) -> String {
+        self.opener.options().address.to_string()
+    }
+
+    pub(super) const fn is_up(&self) -> bool {
+        matches!(&self.line, Line::Open(port) if !port.is_connecting())
+    }
+
+    pub(super) fn account(&self) -> Account {
+        let mut to_line = self.outgoing.account;
+        to_line.dropped_by_bus = self.dropped_before + u64::from(self.inbox.dropped());
+        let to_bus = self.incoming.account();
+        Account { line: self.name(), opened: self.opened, lost: self.lost, to_line, to_bus }
+    }
+
+    /// What to wait for at the line.
+    pub(super) fn interest(&mut self) -> Interest {
+        let now = self.began.elapsed();
+        let line = match &self.line {
+            Line::Away(_) => None,
+            Line::Open(port) if port.is_connecting() => Some(PollFlags::OUT),
+            Line::Open(_) if self.outgoing.ready(now).0.is_empty() => Some(PollFlags::IN),
+            Line::Open(_) => Some(PollFlags::IN | PollFlags::OUT),
+        };
+        Interest { line }
+    }
+
+    /// The line, and the client, to wait for.
+    pub(super) const fn ends(&self) -> (Option<&Port>, Option<&Bus>) {
+        let port = match &self.line {
+            Line::Open(port) => Some(port),
+            Line::Away(_) => None,
+        };
+        match &self.client {
+            Client::Open(bus) => (port, Some(bus)),
+            Client::Away(_) => (port, None),
+        }
+    }
+
+    /// When there is something to do, whatever comes.
+    pub(super) fn timeout(&mut self, now: Instant) -> Option<Instant> {
+        let elapsed = now - self.began;
+        let line = match &self.line {
+            Line::Away(at) => Some(*at),
+            Line::Open(port) if port.is_connecting() => Some(now + AGAIN),
+            Line::Open(_) => self.outgoing.ready(elapsed).1.map(|at| self.began + at),
+        };
+        let client = match &self.client {
+            Client::Away(at) => Some(*at),
+            Client::Open(_) if !self.incoming.waiting().is_empty() => Some(now + RETRY),
+            Client::Open(_) => None,
+        };
+        let report = (self.losses() != self.reported).then_some(self.report_at);
+        [line, client, report].into_iter().flatten().min()
+    }
+
+    /// Moves what can be moved.
+    pub(super) fn work(&mut self, settings: &Settings, ready: Ready, report: &mut impl FnMut(Event)) {
+        let now = Instant::now();
+        self.open_line(now, report);
+        if matches!(self.client, Client::Away(at) if at <= now) {
+            self.open_client(settings, now, report);
+        }
+        if ready.line {
+            self.read_line(now, report);
+        }
+        self.write_bus(now, report);
+        if ready.bus {
+            self.read_bus(now, report);
+        }
+        self.write_line(now, report);
+        let losses = self.losses();
+        if losses != self.reported && self.report_at <= now {
+            let (to_line, to_bus) = (losses.0 - self.reported.0, losses.1 - self.reported.1);
+            report(Event::Lost { to_line, to_bus, account: Box::new(self.account()) });
+            self.reported = losses;
+            self.report_at = now + REPORT;
+        }
+    }
+
+    /// Opens the line, if it is time; why it could not be opened.
+    pub(super) fn open_line(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+        let opened = match &mut self.line {
+            Line::Away(at) if *at <= now => self.opener.open(),
+            Line::Open(port) if port.is_connecting() => match port.connected() {
+                Ok(false) => return,
+                Ok(true) => {
+                    self.line_is_up(report);
+                    return;
+                }
+                Err(error) => Err(error),
+            },
+            Line::Away(_) | Line::Open(_) => return,
+        };
+        match opened {
+            Ok(port) => {
+                let up = !port.is_connecting();
+                self.line = Line::Open(port);
+                if up {
+                    self.line_is_up(report);
+                }
+            }
+            Err(error) => {
+                self.line = Line::Away(now + AGAIN);
+                self.report_away(error, report);
+            }
+        }
+    }
+
+    /// Why the line is away; `None` as long as that is not known.
+    pub(super) const fn reason(&self) -> Option<&io::Error> {
+        self.reason.as_ref()
+    }
+
+    /// The same, once.
+    pub(super) const fn take_reason(&mut self) -> Option<io::Error> {
+        self.reason.take()
+    }
+
+    fn line_is_up(&mut self, report: &mut impl FnMut(Event)) {
+        self.opened += 1;
+        self.outgoing.up(&self.opener.options().opening());
+        self.reason = None;
+        report(Event::LineUp);
+    }
+
+    fn line_lost(&mut self, error: io::Error, now: Instant, report: &mut impl FnMut(Event)) {
+        self.outgoing.down();
+        self.incoming.line_lost();
+        self.line = Line::Away(now + AGAIN);
+        self.lost += 1;
+        self.report_away(error, report);
+    }
+
+    fn report_away(&mut self, error: io::Error, report: &mut impl FnMut(Event)) {
+        let why = error.to_string();
+        if self.reason.as_ref().is_none_or(|before| before.to_string() != why) {
+            report(Event::LineAway(why));
+        }
+        self.reason = Some(error);
+    }
+
+    fn read_line(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+        if !self.is_up() {
+            return;
+        }
+        let mut buffer = [0; 4_096];
+        for _ in 0..TURNS {
+            let Line::Open(port) = &self.line else { return };
+            match port.read(&mut buffer) {
+                Ok(0) => return,
+                Ok(count) => self.incoming.take(buffer.get(..count).unwrap_or_default()),
+                Err(error) => return self.line_lost(error, now, report),
+            }
+            self.write_bus(now, report);
+        }
+    }
+
+    fn write_line(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+        if !self.is_up() {
+            return;
+        }
+        loop {
+            let Line::Open(port) = &self.line else { return };
+            let (bytes, _) = self.outgoing.ready(now - self.began);
+            if bytes.is_empty() {
+                return;
+            }
+            match port.write(bytes) {
+                Ok(0) => return,
+                Ok(count) => self.outgoing.wrote(count),
+                Err(error) => return self.line_lost(error, now, report),
+            }
+        }
+    }
+
+    fn read_bus(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+        for _ in 0..TURNS {
+            let Client::Open(bus) = &self.client else { return };
+            match bus.receive(&mut self.inbox) {
+                Ok(0) => return,
+                Ok(_) => {
+                    for received in self.inbox.frames() {
+                        self.outgoing.take(&received.frame);
+                    }
+                }
+                Err(error) => return self.bus_failed(&error, now, report),
+            }
+            self.write_line(now, report);
+        }
+    }
+
+    fn write_bus(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+        let Client::Open(bus) = &self.client else { return };
+        let waiting = self.incoming.waiting();
+        if waiting.is_empty() {
+            return;
+        }
+        match bus.send(waiting) {
+            Ok(()) => {
+                let count = waiting.len();
+                self.incoming.sent(count);
+            }
+            Err(error) => {
+                self.incoming.sent(error.sent);
+                if !matches!(error.cause, BusError::Full { .. }) {
+                    self.bus_failed(&error.cause, now, report);
+                }
+            }
+        }
+    }
+
+    /// An interface that is down, or a bus that has ended: what waits for it is lost.
+    fn bus_failed(&mut self, error: &BusError, now: Instant, report: &mut impl FnMut(Event)) {
+        self.incoming.down();
+        self.dropped_before += u64::from(self.inbox.dropped());
+        self.inbox = Inbox::new();
+        self.client = Client::Away(now + AGAIN);
+        report(Event::BusAway(error.to_string()));
+    }
+
+    fn open_client(&mut self, settings: &Settings, now: Instant, report: &mut impl FnMut(Event)) {
+        match open(settings, self.opener.options()) {
+            Ok(bus) => {
+                self.incoming.up(!bus.carries_fd());
+                self.client = Client::Open(Box::new(bus));
+                report(Event::BusUp);
+            }
+            Err(_) => self.client = Client::Away(now + AGAIN),
+        }
+    }
+
+    fn losses(&self) -> (u64, u64) {
+        let to_line = &self.outgoing.account;
+        let to_bus = self.incoming.account();
+        let by_bus = self.dropped_before + u64::from(self.inbox.dropped());
+        (to_line.dropped.total() + by_bus, to_bus.dropped.total() + to_bus.refused.total())
+    }
+
+    /// Closes the adapter, after what has begun; nothing comes from the bus any more.
+    pub(super) fn end(&mut self) {
+        self.client = Client::Away(Instant::now());
+        self.incoming.end();
+        self.outgoing.end(&closing());
+    }
+
+    /// Writes what is left; whether that is done.
+    pub(super) fn finish(&mut self) -> bool {
+        self.write_line(Instant::now(), &mut |_| {});
+        !self.is_up() || self.outgoing.is_empty()
+    }
+
+    /// There is no more time: whether the adapter was closed.
+    pub(super) fn give_up(&mut self) -> bool {
+        let closed = self.finish();
+        if let Line::Open(port) = &self.line
+            && !closed
+        {
+            port.discard();
+        }
+        self.outgoing.down();
+        closed
+    }
+}
+
+/// Opens the client of a line.
+pub(super) fn open(settings: &Settings, line: &LineOptions) -> Result<Bus, BusError> {
+    let filters = if line.filters.is_empty() { vec![Filter::ALL] } else { line.filters.clone() };
+    let mut options = Options {
+        filters,
+        send_timeout: Duration::ZERO,
+        directory: settings.directory.clone(),
+        ..Options::default()
+    };
+    let open = |options: &Options| Bus::open(&settings.bus, settings.choice, options);
+    match open(&options) {
+        Err(BusError::ClassicOnly { .. }) if line.classic => {
+            options.fd = false;
+            open(&options)
+        }
+        opened => opened,
+    }
+}
