@@ -110,13 +110,21 @@ impl<'a, B: Board> Cell<'a, B> {
         }
     }
 
-    /// Writes what the node has for flash.
-    #[inline(never)]
+    /// Writes what the node has for flash, and tells it.
     fn keep(&mut self) {
-        let Some(kept) = self.node.poll_store() else { return };
+        if let Some(written) = self.write() {
+            self.node.handle_stored(written);
+        }
+    }
+
+    /// Writes what the node has for flash; whether it is there.
+    // Not inlined, so that the image is off the stack when the node takes its parameters into use.
+    #[inline(never)]
+    fn write(&mut self) -> Option<bool> {
+        let kept = self.node.poll_store()?;
         let image = flash::encode(self.node.identity().serial, &kept);
         let written = store::write(self.board.flash(), &image).is_ok();
-        self.node.handle_stored(written && self.board.keep_elsewhere(&image));
+        Some(written && self.board.keep_elsewhere(&image))
     }
 
     /// Writes what the node has for flash, and sends what it has to send.
