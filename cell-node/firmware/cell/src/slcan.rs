@@ -91,7 +91,7 @@ mod tests {
                 waiting.push(byte, at);
             }
         }
-        let line = text(&frames[0]).len() as u32;
+        let line = u32::try_from(text(&frames[0]).len()).unwrap();
         waiting.push(b't', at);
         for (number, frame) in (1..).zip(&frames) {
             assert_eq!(waiting.take(&mut decoder), Some((Line::Frame(*frame), number * line * 10)));

@@ -48,7 +48,7 @@ impl Flash for Simulated {
 }
 
 fn image(of: u8, len: usize) -> Vec<u8> {
-    (0..len).map(|byte| of.wrapping_mul(31).wrapping_add(byte as u8)).collect()
+    (0..=255).cycle().take(len).map(|byte: u8| of.wrapping_mul(31).wrapping_add(byte)).collect()
 }
 
 #[test]
