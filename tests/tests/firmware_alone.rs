@@ -201,7 +201,7 @@ fn what_a_commit_has_answered_survives_a_kill_at_once_and_a_reset() {
 // CONF-8
 #[test]
 #[ignore = "needs tests/firmware/run"]
-fn damaged_flash_is_noticed_and_a_commit_mends_it() {
+fn damaged_flash_is_noticed_and_a_commit_repairs_it() {
     let folder = TempDir::new().unwrap();
     let parameters = parameters();
     let flash = folder.path().join("flash");
