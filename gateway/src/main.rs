@@ -12,6 +12,7 @@ mod buses;
 mod cells;
 mod columns;
 mod commission;
+mod conformance;
 mod convert;
 mod dbc;
 mod dump;
@@ -64,6 +65,7 @@ enum Command {
     Report(report::Report),
     Frame(frame::Frame),
     Commission(commission::Commission),
+    Conformance(conformance::Conformance),
     Cells(cells::Cells),
     Ack(ack::Ack),
     Sensing(sensing::Sensing),
@@ -90,6 +92,7 @@ impl Command {
             Self::Report(command) => command.run(),
             Self::Frame(command) => command.run(),
             Self::Commission(command) => command.run(),
+            Self::Conformance(command) => command.run(),
             Self::Cells(command) => command.run(),
             Self::Ack(command) => command.run(),
             Self::Sensing(command) => command.run(),

@@ -17,7 +17,7 @@
 use nalgebra::{IsometryMatrix3, Matrix4, Point3, Rotation3, Translation3, Vector3};
 use protocol::fixed::{Q, Q1_14};
 use protocol::message::SkinSensors;
-use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, RowKind};
+use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 use protocol::skin::{Base, Cell, Chain, Skin};
 
 /// The reference for the cells of one chain. Cells are named by their index in [`Skin::cells`].
@@ -75,10 +75,7 @@ impl Central {
         let cells = skin.cells.iter().map(|cell| {
             let parameters = skin.parameters(cell);
             if links.is_empty() {
-                links.extend(parameters.table().iter().map(|row| {
-                    let (a, d, alpha) = (row.a.to_f64(), row.d.to_f64(), row.alpha.to_radians());
-                    Link::new(row.kind, a, d, alpha, row.theta_offset, row.theta_offset.to_radians())
-                }));
+                links.extend(parameters.table().iter().map(Link::of_words));
             }
             let pose = parameters.pose;
             Place::new(cell, pose.position.map(Q::to_f64), pose.normal.map(Q::to_f64))
@@ -101,6 +98,17 @@ impl Central {
         let cells = skin.cells.iter().map(|cell| Place::new(cell, cell.position, cell.normal));
         let links = skin.cells.first().map_or_else(Vec::new, |cell| rows(skin.chain(cell.bus)));
         Self { base: base(skin), links, cells: cells.collect() }
+    }
+
+    /// The reference for one cell with these words, its first and only one, seen from frame 0 of its chain.
+    #[must_use]
+    pub fn of_cell(parameters: &Parameters) -> Self {
+        let Parameters { pose, contact, .. } = *parameters;
+        let position = pose.position.map(Q::to_f64).into();
+        let normal = pose.normal.map(Q::to_f64).into();
+        let place = Place { row: parameters.chain().len(), position, normal, contact };
+        let links = parameters.table().iter().map(Link::of_words).collect();
+        Self { base: IsometryMatrix3::identity(), links, cells: vec![place] }
     }
 
     /// Where all links are when the joints of the chain stand as these words say. Bounded work, no allocation.
@@ -224,6 +232,11 @@ impl Frames {
 }
 
 impl Link {
+    fn of_words(row: &Row) -> Self {
+        let (a, d, alpha) = (row.a.to_f64(), row.d.to_f64(), row.alpha.to_radians());
+        Self::new(row.kind, a, d, alpha, row.theta_offset, row.theta_offset.to_radians())
+    }
+
     fn new(kind: RowKind, a: f64, d: f64, alpha: f64, offset_word: Q1_14, offset: f64) -> Self {
         let twist = Rotation3::from_axis_angle(&Vector3::x_axis(), alpha);
         Self { kind, fixed: Translation3::new(a, 0.0, d) * twist, offset_word, offset }

@@ -1,0 +1,240 @@
+//! Configurations to test with, and what the documents say of them: F_z, torque words, and J in floating point.
+
+use model::central::Central;
+use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10, TorqueFormat};
+use protocol::message::SkinSensors;
+use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
+
+/// Numbers that look random, the same ones each time.
+#[derive(Clone, Debug)]
+pub(crate) struct Dice(u64);
+
+impl Dice {
+    pub(crate) const fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
+    }
+
+    /// The next 32 bits (xorshift64*).
+    fn next(&mut self) -> u32 {
+        self.0 ^= self.0 >> 12;
+        self.0 ^= self.0 << 25;
+        self.0 ^= self.0 >> 27;
+        let [_, _, _, _, a, b, c, d] = self.0.wrapping_mul(0x2545_F491_4F6C_DD1D).to_le_bytes();
+        u32::from_le_bytes([a, b, c, d])
+    }
+
+    /// Any word.
+    pub(crate) fn word(&mut self) -> i16 {
+        let [a, b, ..] = self.next().to_le_bytes();
+        i16::from_le_bytes([a, b])
+    }
+
+    /// A number below a bound.
+    pub(crate) fn below(&mut self, bound: u32) -> u32 {
+        self.next() % bound.max(1)
+    }
+
+    /// A number in [-1, 1).
+    fn unit(&mut self) -> f64 {
+        f64::from(self.word()) / 32_768.0
+    }
+
+    /// One of a few.
+    pub(crate) fn one<T: Copy + Default>(&mut self, of: &[T]) -> T {
+        let place = self.below(u32::try_from(of.len()).unwrap_or(u32::MAX));
+        of.get(place as usize).copied().unwrap_or_default()
+    }
+}
+
+/// Gain 1, no proximity, no thresholds: the force is the sum of the three words.
+pub(crate) const PLAIN: Contact = Contact {
+    alpha_c: Q3_12::from_bits(4096),
+    alpha_p: Q5_10::ZERO,
+    contact_threshold: Q5_10::ZERO,
+    proximity_threshold: Q1_14::ZERO,
+    force_threshold: Q5_10::ZERO,
+};
+
+fn row(a: i16, d: i16, alpha: i16, theta_offset: i16) -> Row {
+    let [a, d, alpha, theta_offset] = [a, d, alpha, theta_offset].map(Q1_14::from_bits);
+    Row { kind: RowKind::Revolute, a, d, alpha, theta_offset }
+}
+
+/// The cell of the protocol's complete configuration, on joint k of a UR5, with forces that count as they are.
+pub(crate) fn document(joint: u8) -> Parameters {
+    let mut rows = [Row::default(); MAX_ROWS];
+    let ur5 = [
+        row(0, 0x05B5, 0x4000, 0),
+        row(-0x1B32, 0, 0, 0),
+        row(-0x191B, 0, 0, 0),
+        row(0, 0x06FC, 0x4000, 0),
+        row(0, 0x060F, -0x4000, 0),
+        row(0, 0x0544, 0, 0),
+    ];
+    for (row, ur5) in rows.iter_mut().zip(ur5) {
+        *row = ur5;
+    }
+    Parameters {
+        joint,
+        joints: 6,
+        row: 0,
+        table_rows: 0,
+        torque_format: TorqueFormat::Q3_12,
+        pose: Pose {
+            position: [0x0666, 0x0333, 0x03D7].map(Q1_14::from_bits),
+            normal: [0, 0x3333, 0x2666].map(Q1_14::from_bits),
+        },
+        contact: PLAIN,
+        period_us: 16_000,
+        rows,
+    }
+}
+
+/// The same with the contact's gains and thresholds as they stand in the document.
+pub(crate) fn document_contact() -> Contact {
+    let [alpha_c, threshold] = [4096, 0x67];
+    Contact {
+        alpha_c: Q3_12::from_bits(alpha_c),
+        alpha_p: Q5_10::ZERO,
+        contact_threshold: Q5_10::from_bits(threshold),
+        proximity_threshold: Q1_14::from_bits(0x0334),
+        force_threshold: Q5_10::from_bits(threshold),
+    }
+}
+
+/// What a chain has.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Shape {
+    pub(crate) joints: usize,
+    pub(crate) rows: usize,
+    pub(crate) prismatic: bool,
+}
+
+/// An arm of any shape within reach, and a cell somewhere on it.
+pub(crate) fn random(dice: &mut Dice, shape: Shape) -> Parameters {
+    let mut rows = [Row::default(); MAX_ROWS];
+    let fixed = shape.rows.saturating_sub(shape.joints);
+    // Lengths and slides add up to less than 2 m.
+    let share = 1.9 / f64::from(u32::try_from(2 * shape.rows + 4).unwrap_or(u32::MAX));
+    let mut left = (shape.joints, fixed);
+    for row in rows.iter_mut().take(shape.rows) {
+        let is_fixed = left.0 == 0 || left.1 > 0 && dice.below(2) == 0;
+        let kind = match is_fixed {
+            true => RowKind::Fixed,
+            false if shape.prismatic && dice.below(3) == 0 => RowKind::Prismatic,
+            false => RowKind::Revolute,
+        };
+        if is_fixed {
+            left.1 -= 1
+        } else {
+            left.0 -= 1
+        }
+        let twist = [0x4000, -0x4000, 0, dice.word(), dice.word()];
+        *row = Row {
+            kind,
+            a: Q1_14::nearest(dice.unit() * share),
+            d: Q1_14::nearest(dice.unit() * share / if kind == RowKind::Prismatic { 2.0 } else { 1.0 }),
+            alpha: Q1_14::from_bits(dice.one(&twist)),
+            theta_offset: Q1_14::from_bits(dice.word()),
+        };
+    }
+    let plain = rows.iter().take(shape.rows).all(|row| row.kind == RowKind::Revolute);
+    // The cell is on the last row, or on one after the first joint.
+    let first = rows.iter().position(Row::moves).unwrap_or(0);
+    let span = u32::try_from(shape.rows - first).unwrap_or(1);
+    let place = if dice.below(2) == 0 { shape.rows } else { first + 1 + dice.below(span) as usize };
+    let joint = rows.iter().take(place).filter(|row| row.moves()).count();
+    let byte = |number: usize| u8::try_from(number).unwrap_or_default();
+    let (row, table_rows) = if plain { (0, 0) } else { (byte(place), byte(shape.rows)) };
+    let position = [0; 3].map(|_| Q1_14::nearest(dice.unit() * share));
+    Parameters {
+        joint: byte(joint),
+        joints: byte(shape.joints),
+        row,
+        table_rows,
+        torque_format: TorqueFormat::Q3_12,
+        pose: Pose { position, normal: normal(dice) },
+        contact: PLAIN,
+        period_us: 16_000,
+        rows,
+    }
+}
+
+/// A vector of length 1.
+fn normal(dice: &mut Dice) -> [Q1_14; 3] {
+    loop {
+        let any = [0; 3].map(|_| dice.unit());
+        let length = any.iter().map(|x| x * x).sum::<f64>().sqrt();
+        if (0.1..=1.0).contains(&length) {
+            return any.map(|x| Q1_14::nearest(x / length));
+        }
+    }
+}
+
+/// Joint positions for a chain: prismatic ones slide little.
+pub(crate) fn positions(dice: &mut Dice, parameters: &Parameters) -> [i16; MAX_JOINTS] {
+    let moving: Vec<_> = parameters.table().iter().filter(|row| row.moves()).map(|row| row.kind).collect();
+    let share = 16_384 / i16::try_from(parameters.table().len().max(1) * 3).unwrap_or(i16::MAX);
+    core::array::from_fn(|index| match moving.get(index) {
+        None => 0,
+        Some(RowKind::Prismatic) => dice.word() % share,
+        Some(RowKind::Revolute | RowKind::Fixed) => match dice.below(8) {
+            0 => dice.one(&[0, 0x4000, -0x4000, i16::MIN, i16::MAX]),
+            _ => dice.word(),
+        },
+    })
+}
+
+/// F_z in steps of 2^-16 N, by Algorithm 1 of the document.
+pub(crate) fn force(contact: &Contact, skin: &SkinSensors) -> i64 {
+    let bits = |word: i16| i64::from(word);
+    let f_c: i64 = skin.contact.iter().map(|word| bits(word.to_bits())).sum();
+    let f_c = if f_c < bits(contact.contact_threshold.to_bits()) { 0 } else { f_c };
+    let p = bits(skin.proximity.to_bits());
+    let f_p = if p < bits(contact.proximity_threshold.to_bits()) { 0 } else { p };
+    let f_z = ((bits(contact.alpha_c.to_bits()) * f_c) << 2) + bits(contact.alpha_p.to_bits()) * f_p;
+    let f_z = if f_z < bits(contact.force_threshold.to_bits()) << 14 { 0 } else { f_z.max(0) };
+    (f_z + 128) >> 8
+}
+
+/// A word of the torque of so many steps of 2^-16 N, from a word of J.
+pub(crate) fn word(j: i16, force: i64, format: TorqueFormat) -> i16 {
+    let bits = 30 - i64::from(format.fraction());
+    let held = ((i64::from(j) * force + (1 << (bits - 1))) >> bits).clamp(i16::MIN.into(), i16::MAX.into());
+    i16::try_from(held).unwrap_or_default()
+}
+
+/// Three contact words with this sum.
+pub(crate) fn contact(sum: i32) -> [Q5_10; 3] {
+    let first = (sum / 3).clamp(i16::MIN.into(), i16::MAX.into());
+    let second = ((sum - first) / 2).clamp(i16::MIN.into(), i16::MAX.into());
+    [first, second, sum - first - second]
+        .map(|word| Q5_10::from_bits(i16::try_from(word).unwrap_or_default()))
+}
+
+/// A press with this sum of contact words and nothing else.
+pub(crate) fn press(sum: i32) -> SkinSensors {
+    SkinSensors { contact: contact(sum), ..SkinSensors::default() }
+}
+
+/// The sum of contact words at which, with [`PLAIN`], a torque word is the word of J.
+pub(crate) fn unit_press(format: TorqueFormat) -> i32 {
+    1 << (24 - format.fraction())
+}
+
+/// J in m (of prismatic joints a number), from the words of the parameters and of the joints.
+pub(crate) fn exact_jacobian(central: &Central, positions: &[i16; MAX_JOINTS]) -> [f64; MAX_JOINTS] {
+    let words = positions.map(Q1_14::from_bits);
+    central.torque(0, &central.frames(&words), 1.0)
+}
+
+/// By how many steps a word of J is off the nearest word of the exact one.
+pub(crate) fn off(j: i16, exact: f64) -> u32 {
+    let nearest = Q::<14>::nearest(exact).to_bits();
+    i32::from(j).abs_diff(nearest.into())
+}
+
+/// By how many steps it may be off (J-3): 8, and one more for each row after the sixth.
+pub(crate) fn tolerance(parameters: &Parameters) -> u32 {
+    8 + u32::try_from(parameters.chain().len().saturating_sub(6)).unwrap_or(0)
+}

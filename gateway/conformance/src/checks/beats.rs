@@ -1,0 +1,191 @@
+//! When heartbeats come.
+
+use protocol::message::Message;
+use protocol::parameters::MAX_JOINTS;
+use protocol::time::{Micros, Span};
+
+use super::claims::twin;
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::Session;
+
+const BEAT: u64 = 250_000;
+/// How late a heartbeat may be.
+const LATE: u64 = 20_000;
+/// How far a clock may be off in one of these tests, and time stamps with it.
+const SLACK: u64 = 3_000;
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.ready(&arm::document(2))?;
+    session.settle()?;
+    let first = regular(session)?;
+    shifted(session)?;
+    if session.about.test_mode && session.about.committed {
+        early(session)?;
+    } else {
+        session.findings.not_tested("BEAT-2", "without test mode nothing presses the cell");
+    }
+    let last = regular(session)?;
+    if let (Some(first), Some(last)) = (first, last) {
+        clock(session, first, last);
+    }
+    Ok(())
+}
+
+/// Regular heartbeats that were seen.
+#[derive(Clone, Copy, Debug)]
+struct Grid {
+    /// When the first of them was due at the latest, in us.
+    due: u64,
+    /// The mean time from one to the next.
+    each: u64,
+}
+
+/// Times of heartbeats since the exchange began.
+fn times(session: &Session<'_>) -> Vec<u64> {
+    session.answers().iter().filter(|it| it.beat().is_some()).map(|it| it.at.0).collect()
+}
+
+/// Nothing is asked for 1.3 s: a heartbeat every 250 ms, at most 20 ms late.
+fn regular(session: &mut Session<'_>) -> Result<Option<Grid>, Stop> {
+    for attempt in 0..3 {
+        session.mark();
+        session.idle(Span::from_millis(1_300))?;
+        let late = session.lateness();
+        let times = times(session);
+        session.consume();
+        let apart: Vec<_> = times.windows(2).filter_map(|pair| Some(pair.get(1)? - pair.first()?)).collect();
+        let (from, to) = (BEAT - LATE - SLACK, BEAT + LATE + SLACK);
+        let is_so = (5..=6).contains(&times.len()) && apart.iter().all(|span| (from..=to).contains(span));
+        if is_so || attempt == 2 || late.0 < 1_000 {
+            session.check("BEAT-1", is_so, || {
+                let apart: Vec<_> = apart.iter().map(|span| span / 1_000).collect();
+                format!("{} heartbeats in 1.3 s, {apart:?} ms apart", times.len())
+            });
+            let due = times.iter().zip(0..).map(|(at, place)| at.saturating_sub(place * BEAT)).min();
+            let each = apart.iter().sum::<u64>().checked_div(apart.len() as u64);
+            let grid = due.zip(each).map(|(due, each)| Grid { due, each });
+            return Ok(grid.filter(|_| is_so));
+        }
+    }
+    Ok(None)
+}
+
+/// Heartbeats to a sync and to a claimant between regular ones.
+fn shifted(session: &mut Session<'_>) -> Result<(), Stop> {
+    let claim = twin(session, 1, true);
+    for (what, message, offset) in
+        [("a sync", Message::Sync, 100), ("a claim", claim, 170), ("a sync", Message::Sync, 60)]
+    {
+        for attempt in 0..3 {
+            let Some(grid) = next_beat(session)? else { return Ok(()) };
+            session.idle(Span::from_millis(offset))?;
+            session.mark();
+            let at = session.say(&[message])?;
+            session.idle(Span((grid.0 + 2 * BEAT + 60_000).saturating_sub(session.now().0)))?;
+            let late = session.lateness();
+            let times = times(session);
+            session.consume();
+            // The answer, and two regular ones.
+            let is_so = match times.as_slice() {
+                [answer, first, second] => {
+                    answer - at.0 < LATE + SLACK
+                        && first.abs_diff(grid.0 + BEAT) <= LATE + SLACK
+                        && second.abs_diff(grid.0 + 2 * BEAT) <= LATE + SLACK
+                }
+                _ => false,
+            };
+            if is_so || attempt == 2 || late.0 < 1_000 {
+                session.check("BEAT-3", is_so, || {
+                    let times: Vec<_> = times.iter().map(|at| (at - grid.0) / 1_000).collect();
+                    format!(
+                        "{what} {offset} ms after a regular heartbeat: heartbeats came {times:?} ms after it, and \
+                         {offset}, 250 and 500 are right"
+                    )
+                });
+                break;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The next heartbeat that nothing asked for.
+fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, Stop> {
+    session.settle()?;
+    let until = session.now() + Span(BEAT + LATE + 50_000);
+    let came = session.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    session.check("BEAT-1", came, || "no heartbeat came for 320 ms".to_owned());
+    let at = session.answers().iter().rev().find(|it| it.beat().is_some()).map(|it| it.at);
+    session.consume();
+    Ok(at)
+}
+
+/// While joints come a heartbeat may be early: right after the answer to the last ones before it.
+fn early(session: &mut Session<'_>) -> Result<(), Stop> {
+    const PERIOD: u64 = 16_000;
+    for press in [4_096, 0] {
+        for attempt in 0..3 {
+            let Some(grid) = next_beat(session)? else { return Ok(()) };
+            session.mark();
+            session.press(arm::press(press))?;
+            for step in 1..=64 {
+                let due = grid + Span(5_000 + step * PERIOD);
+                session.wait(due, |_| false)?;
+                let epoch = session.next_epoch();
+                let joints = session.joints(epoch, &[0; MAX_JOINTS]);
+                session.say(&[joints])?;
+                session.known.epoch = Some(epoch);
+            }
+            session.idle(Span::from_millis(40))?;
+            let late = session.lateness();
+            let times = times(session);
+            session.consume();
+            session.known.pending = None;
+            session.known.skin = Some(arm::press(press));
+            session.known.active = Some(press > 0);
+            // 1 024 ms: at most a period and a bit too early, each 250 ms once.
+            let slots: Vec<_> = times
+                .iter()
+                .map(|at| {
+                    let since = at.saturating_sub(grid.0) + PERIOD + SLACK;
+                    (since / BEAT, since % BEAT)
+                })
+                .collect();
+            let is_early = |(place, (slot, rest)): (u64, &(u64, u64))| {
+                *slot == place && *rest <= PERIOD + LATE + 2 * SLACK
+            };
+            let is_so = (4..=5).contains(&slots.len()) && (1..).zip(&slots).all(is_early);
+            if is_so || attempt == 2 || late.0 < 1_000 {
+                session.check("BEAT-2", is_so, || {
+                    let times: Vec<_> = times.iter().map(|at| at.saturating_sub(grid.0) / 1_000).collect();
+                    format!(
+                        "with joints every 16 ms heartbeats came {times:?} ms after a regular one; 250, 500, 750 and \
+                         1000 are right, and up to a period before"
+                    )
+                });
+                break;
+            }
+        }
+    }
+    session.step(&[0; MAX_JOINTS])?;
+    Ok(())
+}
+
+/// The cell's clock by its heartbeats, over some seconds.
+fn clock(session: &mut Session<'_>, first: Grid, last: Grid) {
+    let span = last.due.saturating_sub(first.due);
+    let each = ((first.each + last.each) / 2).max(1);
+    let beats = (span + each / 2) / each;
+    // 1 %, and how late the earliest of five heartbeats may be.
+    let allowed = span / 100 + LATE / 4 + SLACK;
+    let off = span.abs_diff(beats * BEAT);
+    session.start();
+    session.check("TIME-1", off <= allowed, || {
+        format!(
+            "{beats} heartbeats in {} ms: its clock is off by {} us, and {allowed} are allowed",
+            span / 1_000,
+            off
+        )
+    });
+}

@@ -1,0 +1,76 @@
+//! What the cell is and which options it has.
+
+use protocol::message::{Message, NetworkPage, VERSION};
+use protocol::parameters::Parameter;
+use protocol::time::Span;
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::{Reply, Session};
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.mark();
+    session.say(&[Message::Resume])?;
+    // Whoever sends sensor values is silenced.
+    session.known.senses = true;
+    session.set(Parameter::Sensing.number(), [0])?;
+    session.set(Parameter::Reply.number(), [0])?;
+    session.idle(Span::from_millis(20))?;
+    session.mark();
+    session.known.senses = false;
+    session.measure()?;
+    identity(session)?;
+    session.about.ports = true;
+    let report = session.report()?;
+    session.about.ports = report.iter().any(|heard| {
+        matches!(heard.message, Message::Network { page: NetworkPage::Tree(_) | NetworkPage::Ports(_), .. })
+    });
+    options(session)?;
+    let document = arm::document(2);
+    session.about.committed = session.commit(&document)?;
+    session.known.halted = Some(false);
+    Ok(())
+}
+
+fn identity(session: &mut Session<'_>) -> Result<(), Stop> {
+    let reply = session.read(Parameter::Identity.number())?;
+    let Reply::Value([.., version, hash, state, _]) = reply else {
+        session.check("CONF-1", false, || format!("the identity was answered with {reply}"));
+        return Ok(());
+    };
+    session.check("CONF-1", version == i16::from(VERSION), || {
+        format!("version {version} in the identity, not 1")
+    });
+    let exchange = session.exchange_all(&[])?;
+    let Some((beat, _)) = exchange.beat else { return Ok(()) };
+    session.check("CONF-1", hash.cast_unsigned() == beat.configuration, || {
+        format!("configuration {hash:04X} in the identity, {:04X} in a heartbeat", beat.configuration)
+    });
+    session.check("CONF-1", state.cast_unsigned() == beat.state.0, || {
+        format!("state {state:04X} in the identity, {:04X} in a heartbeat", beat.state.0)
+    });
+    session.known.hash = Some(beat.configuration);
+    Ok(())
+}
+
+fn options(session: &mut Session<'_>) -> Result<(), Stop> {
+    let reply = session.set(Parameter::Mode.number(), [1])?;
+    let words = reply.words().map(|[first, ..]| first);
+    session.about.test_mode = words == Some(1);
+    session.known.test_mode = Some(words == Some(1));
+    let is_known = words == Some(1) || reply == Reply::Refused(19);
+    session.check("OPT-1", is_known, || format!("a write of parameter 5 with 1 was answered with {reply}"));
+    if session.about.test_mode {
+        session.test_mode(true)?;
+    }
+    session.known.senses = true;
+    let reply = session.set(Parameter::Sensing.number(), [2])?;
+    session.about.sensing = reply.words().is_some();
+    session.check("OPT-1", session.about.sensing || reply == Reply::Refused(19), || {
+        format!("a write of parameter 7 with 2 was answered with {reply}")
+    });
+    session.set(Parameter::Sensing.number(), [0])?;
+    session.settle()?;
+    session.known.senses = false;
+    Ok(())
+}

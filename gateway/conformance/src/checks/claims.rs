@@ -1,0 +1,136 @@
+//! A settled cell that receives its own `4nn`.
+
+use protocol::id::Node;
+use protocol::message::{Heard as HeardPage, Heartbeat, Message, NetworkPage, Ports, Refused, State, Tree};
+use protocol::packet::Epoch;
+use protocol::time::{Micros, Span};
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::Session;
+
+/// No claim is answered again before this.
+const DEFEND: Span = Span::from_millis(10);
+
+/// A heartbeat of another cell with this node id.
+pub(super) fn twin(session: &Session<'_>, serial: u32, claiming: bool) -> Message {
+    let state = State::default().with(State::CLAIMING, claiming).with_joint(0);
+    let beat = Heartbeat { serial, state, ..Heartbeat::default() };
+    Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
+}
+
+/// A page of another cell with this node id that is no heartbeat.
+pub(super) fn page(session: &Session<'_>, page: NetworkPage) -> Message {
+    Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page }
+}
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.ready(&arm::document(2))?;
+    let own = session.about.serial.unwrap_or_default();
+    for serial in [own.wrapping_sub(1), own.wrapping_add(1), 0, u32::MAX, own] {
+        defended(session, serial)?;
+    }
+    twice(session, own)?;
+    let pages = [
+        NetworkPage::Heard(HeardPage::default()),
+        NetworkPage::Refused(Refused::default()),
+        NetworkPage::Tree(Tree::default()),
+        NetworkPage::Ports(Ports::default()),
+    ];
+    let mut others: Vec<_> = pages.into_iter().map(|it| page(session, it)).collect();
+    others.push(twin(session, own.wrapping_sub(1), false));
+    others.push(twin(session, own, false));
+    for other in others {
+        not_answered(session, &other)?;
+    }
+    session.exchange_all(&[])?;
+    Ok(())
+}
+
+/// How often each state bit came in heartbeats since the exchange began.
+fn beats(session: &Session<'_>) -> Vec<(Micros, State)> {
+    session.answers().iter().filter_map(|it| Some((it.at, it.beat()?.0.state))).collect()
+}
+
+/// A claim is answered at once, with DUPLICATE, which is clear then.
+fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), Stop> {
+    session.quiet(Span::from_millis(80))?;
+    session.mark();
+    let claim = twin(session, serial, true);
+    let at = session.say(&[claim])?;
+    let came =
+        session.wait(at + Span::from_millis(60), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    session.check("CLAIM-6", came, || format!("a claim with serial number {serial} was not answered"));
+    if let Some((answered, state)) = beats(session).first().copied() {
+        session.note_time("heartbeat to a claimant", at, answered);
+        session.check("CLAIM-7", state.has(State::DUPLICATE), || {
+            format!("DUPLICATE is not set in the answer to a claim: {:04X}", state.0)
+        });
+        session.check("CLAIM-6", !state.has(State::CLAIMING), || "a settled cell sends CLAIMING".to_owned());
+    }
+    session.idle(Span::from_millis(5))?;
+    let count = beats(session).len();
+    session.check("CLAIM-6", count <= 1, || format!("a claim was answered with {count} heartbeats"));
+    session.consume();
+    // The sync's heartbeat is looked at as any other.
+    session.exchange_all(&[])?;
+    session.idle(DEFEND)
+}
+
+/// Of two claims within 10 ms one is answered; the next after that again.
+fn twice(session: &mut Session<'_>, own: u32) -> Result<(), Stop> {
+    if session.is_slow() {
+        session.findings.not_tested("CLAIM-6", "claims within 10 ms: the way to the cell takes too long");
+        return Ok(());
+    }
+    for _ in 0..3 {
+        session.quiet(Span::from_millis(120))?;
+        session.mark();
+        let frames: Vec<_> =
+            (1..=3).flat_map(|it| session.frames(&twin(session, own.wrapping_add(it), true))).collect();
+        let times = session.send_all(&frames)?;
+        let apart =
+            times.last().copied().unwrap_or_default().since(times.first().copied().unwrap_or_default());
+        session.idle(Span::from_millis(25))?;
+        let count = beats(session).len();
+        session.consume();
+        if apart > Span::from_millis(7) {
+            continue;
+        }
+        session.check("CLAIM-6", count == 1, || {
+            format!("three claims within {} us were answered with {count} heartbeats", apart.0)
+        });
+        // The later ones are in the next heartbeat.
+        session.mark();
+        let at = session.say(&[Message::Sync])?;
+        session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        let is_set = beats(session).first().is_some_and(|(_, state)| state.has(State::DUPLICATE));
+        session.check("CLAIM-7", is_set, || {
+            "DUPLICATE is not set in the heartbeat after a claim that was not answered".to_owned()
+        });
+        session.consume();
+        session.exchange_all(&[])?;
+        return Ok(());
+    }
+    session.findings.not_tested("CLAIM-6", "claims within 10 ms: the bench was late each time");
+    Ok(())
+}
+
+/// What is no claim is not answered, and sets DUPLICATE in one heartbeat.
+fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), Stop> {
+    session.quiet(Span::from_millis(80))?;
+    session.mark();
+    session.say(&[*other])?;
+    session.idle(Span::from_millis(25))?;
+    let count = beats(session).len();
+    session.check("CLAIM-6", count == 0, || "a 4nn that is no claim was answered".to_owned());
+    let at = session.say(&[Message::Sync])?;
+    session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    let state = beats(session).last().map(|(_, state)| *state).unwrap_or_default();
+    session.check("CLAIM-7", state.has(State::DUPLICATE), || {
+        format!("DUPLICATE is not set after a 4nn of another cell: {:04X}", state.0)
+    });
+    session.consume();
+    session.exchange_all(&[])?;
+    Ok(())
+}

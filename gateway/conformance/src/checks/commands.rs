@@ -1,0 +1,184 @@
+//! Halt, resume, sync and report.
+
+use model::central::Central;
+use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
+use protocol::id::Node;
+use protocol::message::{From, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::parameters::MAX_JOINTS;
+use protocol::time::Span;
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::{Exchange, PATIENT, Session};
+
+const HERE: [i16; MAX_JOINTS] = [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
+const THERE: [i16; MAX_JOINTS] = [-0x1400, 0x1100, -0x0700, 0x2300, -0x1900, 0x0800, 0, 0, 0, 0, 0, 0, 0, 0];
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    if !session.ready(&arm::document(6))? {
+        return Ok(());
+    }
+    halt(session)?;
+    syncs(session)?;
+    report(session)
+}
+
+fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Result<Exchange, Stop> {
+    let is_halt = command == Message::Halt;
+    session.known.halted = Some(is_halt);
+    if is_halt {
+        session.known.active = Some(false);
+    }
+    let exchange = session.exchange_all(&[command])?;
+    session.check(id, exchange.is_silent(), || "it was answered by itself".to_owned());
+    let is_set = exchange.state().has(State::HALTED);
+    session.check(id, is_set == is_halt, || {
+        format!("HALTED is {}set after it", if is_set { "" } else { "not " })
+    });
+    Ok(exchange)
+}
+
+fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
+    let unit = arm::press(arm::unit_press(protocol::fixed::TorqueFormat::Q3_12));
+    let central = Central::of_cell(&arm::document(6));
+    for round in 0..2 {
+        session.pressed(&HERE, unit)?;
+        let exchange = command(session, Message::Halt, "CMD-1")?;
+        session
+            .check("STATE-1", !exchange.state().has(State::ACTIVE), || "ACTIVE is set after halt".to_owned());
+        if round == 1 {
+            command(session, Message::Halt, "CMD-1")?;
+        } else {
+            // Nothing but a resume ends it.
+            session.commit(&protocol::parameters::Parameters { period_us: 16_500, ..arm::document(6) })?;
+            session.commit(&arm::document(6))?;
+            session.exchange_all(&[])?;
+        }
+        let before = session.counters()?.0;
+        for _ in 0..4 {
+            session.step(&HERE)?;
+        }
+        session.step(&THERE)?;
+        let after = session.counters()?.0;
+        let counted = after.joints.wrapping_sub(before.joints);
+        session
+            .check("CMD-1", counted == 5, || format!("5 joints were counted as {counted} by a halted cell"));
+        session.check("CMD-1", after.torques == before.torques, || {
+            "torques were counted while halted".to_owned()
+        });
+        command(session, Message::Resume, "CMD-2")?;
+        let step = session.step(&THERE)?;
+        let exact = arm::exact_jacobian(&central, &THERE);
+        let off =
+            step.words().iter().zip(exact).map(|(word, exact)| arm::off(*word, exact)).max().unwrap_or(0);
+        session.check("CMD-2", off <= 8, || {
+            format!("the first torque after a resume is not of the new joints: {:?}", step.words())
+        });
+        // Released while it was halted: ACTIVE was cleared, so no zeros are due.
+        command(session, Message::Halt, "CMD-1")?;
+        session.pressed(&HERE, arm::press(0))?;
+        command(session, Message::Resume, "CMD-2")?;
+        let step = session.step(&THERE)?;
+        session.check("CMD-1", step.torque.is_none(), || "released while halted: a torque came".to_owned());
+    }
+    // A resume changes nothing in a cell that is not halted.
+    session.pressed(&HERE, unit)?;
+    command(session, Message::Resume, "CMD-2")?;
+    session.pressed(&HERE, arm::press(0))?;
+    session.step(&HERE)?;
+    Ok(())
+}
+
+/// A heartbeat for each, and no more.
+fn syncs(session: &mut Session<'_>) -> Result<(), Stop> {
+    const SYNCS: usize = 8;
+    session.mark();
+    let mut beats = 0;
+    let began = session.now();
+    for _ in 0..SYNCS {
+        let at = session.say(&[Message::Sync])?;
+        let before = beats;
+        let count = |heard: &[crate::session::Heard]| heard.iter().filter(|it| it.beat().is_some()).count();
+        session.wait(at + PATIENT, |heard| count(heard) > before)?;
+        session.idle(Span::from_millis(4))?;
+        beats = count(session.answers());
+    }
+    // Regular ones may come between.
+    let regular = 1 + usize::try_from(session.now().since(began).0 / 250_000).unwrap_or(0);
+    session.check("CMD-3", (SYNCS..=SYNCS + regular).contains(&beats), || {
+        format!("{SYNCS} syncs were answered with {beats} heartbeats")
+    });
+    Ok(())
+}
+
+fn report(session: &mut Session<'_>) -> Result<(), Stop> {
+    let skin = SkinSensors {
+        contact: [100, -200, 300].map(Q5_10::from_bits),
+        proximity: Q1_14::from_bits(0x1234),
+        temperature: [1_600, -64].map(Q9_6::from_bits),
+    };
+    let acceleration = [11, -22, 4_096].map(Q3_12::from_bits);
+    let to = Node::Cell(session.cell);
+    let page = SensorPage::Acceleration(acceleration);
+    session.say(&[Message::Stimulus { to, from: From::Next, page }])?;
+    session.pressed(&HERE, skin)?;
+    // Pending values are not reported yet.
+    session.press(arm::press(77))?;
+    for _ in 0..3 {
+        session.mark();
+        let asked = session.say(&[Message::Report])?;
+        session.pages(asked)?;
+        session.idle(Span::from_millis(5))?;
+        let answers: Vec<_> = session.answers().iter().filter(|it| it.beat().is_none()).copied().collect();
+        session.consume();
+        if let Some(last) = answers.last() {
+            session.note_time("report", asked, last.at);
+        }
+        let names: Vec<_> = answers.iter().map(|heard| name(&heard.message)).collect();
+        let mut order = vec!["network 1", "network 2", "sensors 0", "sensors 1"];
+        if session.about.ports {
+            order.extend(["network 3", "network 4"]);
+        }
+        session.check("CMD-4", names == order, || {
+            format!("a report was answered with {}, not {}", names.join(", "), order.join(", "))
+        });
+        let epochs_right =
+            answers.iter().all(|heard| heard.message.epoch().map(|it| it.0) == session.known.epoch);
+        session.check("JOINTS-3", epochs_right, || "a page of a report has another epoch".to_owned());
+        let sent: Vec<_> =
+            answers.iter().filter_map(|heard| heard.sensors().map(|(_, page)| *page)).collect();
+        let latched = [SensorPage::Skin(skin), SensorPage::Acceleration(acceleration)];
+        session
+            .check("SENSE-1", sent.len() == 2, || format!("{} sensors pages came to a report", sent.len()));
+        session.check("SENSE-2", sent == latched, || {
+            format!("{sent:?} was reported, and {latched:?} is latched")
+        });
+    }
+    session.pressed(&HERE, arm::press(0))?;
+    session.step(&HERE)?;
+    Ok(())
+}
+
+fn name(message: &Message) -> &'static str {
+    match message {
+        Message::Network { page, .. } => match page {
+            NetworkPage::Heartbeat(_) => "heartbeat",
+            NetworkPage::Heard(_) => "network 1",
+            NetworkPage::Refused(_) => "network 2",
+            NetworkPage::Tree(_) => "network 3",
+            NetworkPage::Ports(_) => "network 4",
+        },
+        Message::Sensors { page: SensorPage::Skin(_), .. } => "sensors 0",
+        Message::Sensors { page: SensorPage::Acceleration(_), .. } => "sensors 1",
+        Message::Halt
+        | Message::Joints { .. }
+        | Message::Sync
+        | Message::Resume
+        | Message::Report
+        | Message::Sum { .. }
+        | Message::Torque { .. }
+        | Message::Configure { .. }
+        | Message::Configured { .. }
+        | Message::Stimulus { .. } => message.id().kind.name(),
+    }
+}

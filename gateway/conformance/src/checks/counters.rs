@@ -1,0 +1,228 @@
+//! What cannot be used: dropped, counted by its reason, without any other effect.
+
+use protocol::can::{BIT_RATE_SWITCH, EXTENDED, Format, Frame};
+use protocol::id::{Command, Id, Kind, Node};
+use protocol::message::{Refused, State};
+use protocol::packet::{Epoch, Length, Packet, Words, crc16};
+use protocol::parameters::MAX_JOINTS;
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::Session;
+
+/// A reason of page 2.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Reason {
+    Length,
+    Crc,
+    /// As far as the cell's controller delivers it.
+    MaybeForeign,
+    MaybeLength,
+    Meaning,
+    Incomplete,
+    None,
+}
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.ready(&arm::document(2))?;
+    let mut before = session.counters()?;
+    for (what, frames, reason) in cases(session) {
+        let exchange = session.exchange(&frames)?;
+        session.check("COUNT-1", exchange.is_silent(), || format!("{what} was answered"));
+        let has_effect = exchange.state().has(State::HALTED) || exchange.state().has(State::DUPLICATE);
+        session.check("COUNT-1", !has_effect, || {
+            format!("{what} had an effect: state {:04X}", exchange.state().0)
+        });
+        if has_effect {
+            session.say(&[protocol::message::Message::Resume])?;
+        }
+        let after = session.counters()?;
+        let is_so = is_counted(before.1, after.1, reason) && before.0 == after.0;
+        session.check("COUNT-1", is_so, || {
+            format!("{what} has to be counted as {reason:?} alone: {after:?}, before {before:?}")
+        });
+        before = after;
+    }
+    Ok(())
+}
+
+fn is_counted(before: Refused, after: Refused, reason: Reason) -> bool {
+    let mut expected = before;
+    let field = match reason {
+        Reason::Length | Reason::MaybeLength => &mut expected.length,
+        Reason::Crc => &mut expected.crc,
+        Reason::MaybeForeign => &mut expected.foreign,
+        Reason::Meaning => &mut expected.meaning,
+        Reason::Incomplete => &mut expected.incomplete,
+        Reason::None => return before == after,
+    };
+    *field = field.wrapping_add(1);
+    after == expected || matches!(reason, Reason::MaybeForeign | Reason::MaybeLength) && after == before
+}
+
+/// Packets that would have an effect if they were taken.
+fn packets(session: &Session<'_>) -> Vec<(&'static str, Packet)> {
+    let own = Node::Cell(session.cell);
+    let packet =
+        |id, words: [i16; 6], epoch, count| Packet { id, words: words.into(), epoch: Epoch(epoch), count };
+    let claim = [1, 0, 0, 0, 0, (State::CLAIMING.0 | 1 << 12).cast_signed()];
+    vec![
+        ("a halt", packet(Id::command(Command::Halt), [0; 6], 0, 0)),
+        ("joints", packet(Id::command(Command::Joints), [1, 2, 3, 4, 5, 6], 250, 6)),
+        ("a report", packet(Id::command(Command::Report), [0; 6], 0, 0)),
+        ("a claim of its node id", packet(Id::new(Kind::Network, own), claim, 0, 0)),
+        ("a read", packet(Id::new(Kind::Configure, own), [0; 6], 8, 0)),
+        ("a read of everyone", packet(Id::new(Kind::Configure, Node::Everyone), [0; 6], 8, 0)),
+        ("a stimulus", packet(Id::new(Kind::Stimulus, own), [999, 0, 0, 0, 0, 0], 0, 0x80)),
+        (
+            "a stimulus to everyone",
+            packet(Id::new(Kind::Stimulus, Node::Everyone), [999, 0, 0, 0, 0, 0], 0, 0x80),
+        ),
+    ]
+}
+
+fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, Reason)> {
+    let mut cases = Vec::new();
+    let format = session.format;
+    for (name, packet) in packets(session) {
+        let id = u32::from(packet.id.to_bits());
+        let bytes = packet.encode();
+        let framed = |bytes: &[u8]| frames(format, id, bytes);
+        let wrong = if format == Format::Fd { Reason::Crc } else { Reason::Incomplete };
+        for (what, place, flip) in
+            [("first", 0, 1), ("tenth", 9, 0x40), ("next to last", 14, 0x80), ("last", 15, 1)]
+        {
+            let mut bytes = bytes.clone();
+            if let Some(byte) = bytes.get_mut(place) {
+                *byte ^= flip;
+            }
+            cases.push((format!("{name} with a wrong bit in its {what} byte"), framed(&bytes), wrong));
+        }
+        // A CRC of the right bytes under another identifier, and the right CRC with its bytes swapped.
+        let other = Packet { id: Id { kind: packet.id.kind, node: packet.id.node ^ 1 }, ..packet };
+        cases.push((format!("{name} with the CRC of another identifier"), framed(&other.encode()), wrong));
+        let mut swapped = bytes.clone();
+        swapped.swap(14, 15);
+        if swapped != bytes {
+            cases.push((format!("{name} with its CRC's bytes swapped"), framed(&swapped), wrong));
+        }
+        if format == Format::Fd {
+            fd_lengths(&mut cases, name, &packet);
+        } else {
+            let lengths: &[usize] =
+                if packet.id == Id::command(Command::Joints) { &[0, 5, 7] } else { &[0, 4, 7] };
+            for length in lengths {
+                let short = bytes.get(..*length).unwrap_or_default();
+                let frame = Frame::classic(id, short).into_iter().collect();
+                cases.push((format!("{length} bytes under the identifier of {name}"), frame, Reason::Length));
+            }
+        }
+        foreign(&mut cases, name, format, id, &bytes);
+    }
+    for byte in [0, 0xFF] {
+        let wrong = if format == Format::Fd { Reason::Crc } else { Reason::Incomplete };
+        cases.push((format!("a halt of 16 bytes {byte:02X}"), frames(format, 0, &[byte; 16]), wrong));
+    }
+    pages(session, &mut cases);
+    cases
+}
+
+/// Bytes in the format of a bus.
+fn frames(format: Format, id: u32, bytes: &[u8]) -> Vec<Frame> {
+    match format {
+        Format::Fd => Frame::fd(id, BIT_RATE_SWITCH, bytes).into_iter().collect(),
+        Format::Classic => bytes.chunks(8).filter_map(|bytes| Frame::classic(id, bytes).ok()).collect(),
+    }
+}
+
+/// Lengths that no packet of this kind has, with a right CRC where there is room for one.
+fn fd_lengths(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, packet: &Packet) {
+    let id = u32::from(packet.id.to_bits());
+    let has_long = packet.id == Id::command(Command::Joints);
+    for length in [0, 1, 8, 12, 20, 24, 32, 48, 64] {
+        if has_long && [20, 24, 32].contains(&length) {
+            continue;
+        }
+        let mut bytes: Vec<u8> =
+            packet.encode().iter().copied().chain(core::iter::repeat(0)).take(length).collect();
+        if let Some(body) = length.checked_sub(2) {
+            let head: Vec<u8> = packet
+                .id
+                .to_bits()
+                .to_le_bytes()
+                .into_iter()
+                .chain(bytes.iter().copied().take(body))
+                .collect();
+            let crc = crc16(&head).to_le_bytes();
+            bytes.truncate(body);
+            bytes.extend(crc);
+        }
+        let frame = Frame::fd(id, BIT_RATE_SWITCH, &bytes).into_iter().collect();
+        cases.push((format!("{name} in {length} bytes"), frame, Reason::Length));
+    }
+    let classic = Frame::classic(id, packet.encode().get(..8).unwrap_or_default());
+    cases.push((format!("{name} in a classic frame"), classic.into_iter().collect(), Reason::MaybeLength));
+}
+
+/// Frames that only look like packets.
+fn foreign(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, format: Format, id: u32, bytes: &[u8]) {
+    // Of classic segments only the first would be there.
+    let whole = frames(format, id | EXTENDED, bytes).into_iter().take(1).collect();
+    cases.push((format!("{name} under an identifier of 29 bits"), whole, Reason::MaybeForeign));
+    // The upper 11 of 29 bits; that of a wire's frames has the uppermost bit set.
+    if id < 0x400 {
+        let upper = frames(format, id << 18 | EXTENDED, bytes).into_iter().take(1).collect();
+        cases.push((format!("{name} in the upper bits of 29"), upper, Reason::MaybeForeign));
+    }
+    let remote = Frame::remote(id, 8).into_iter().collect();
+    cases.push((format!("a remote frame of {name}"), remote, Reason::MaybeForeign));
+}
+
+/// Pages and counts that do not exist, and identifiers that are for nobody or for others.
+fn pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Reason)>) {
+    let own = Node::Cell(session.cell);
+    let packet =
+        |id, words: [i16; 6], epoch, count| Packet { id, words: words.into(), epoch: Epoch(epoch), count };
+    let mut add = |what: String, packet: Packet, reason| {
+        cases.push((what, packet.frames(session.format).collect(), reason));
+    };
+    for page in [5, 9, 127, 128, 255] {
+        let claim = [1, 0, 0, 0, 0, (State::CLAIMING.0 | 1 << 12).cast_signed()];
+        add(
+            format!("its own 4nn of page {page}"),
+            packet(Id::new(Kind::Network, own), claim, 0, page),
+            Reason::Meaning,
+        );
+    }
+    for count in [2, 3, 0x7F, 0x82, 0xFF] {
+        for to in [own, Node::Everyone] {
+            let stimulus = packet(Id::new(Kind::Stimulus, to), [999, 0, 0, 0, 0, 0], 0, count);
+            add(format!("a stimulus of count {count:02X} to {to}"), stimulus, Reason::Meaning);
+        }
+    }
+    for command in [5, 6, 0x55, 0xFF] {
+        let id = Id { kind: Kind::Command, node: command };
+        add(format!("command {command}"), packet(id, [0; 6], 0, 0), Reason::None);
+    }
+    for node in [session.cell.get() ^ 3, 0xFE, 1].into_iter().filter(|node| *node != session.cell.get()) {
+        for kind in
+            [Kind::Network, Kind::Configure, Kind::Stimulus, Kind::Torque, Kind::Sum, Kind::Configured]
+        {
+            let count = if kind == Kind::Stimulus { 0x80 } else { 1 };
+            let id = Id { kind, node };
+            add(
+                format!("a {} packet of node {node}", kind.name()),
+                packet(id, [1; 6], 0, count),
+                Reason::None,
+            );
+        }
+    }
+    let everyone = Id { kind: Kind::Network, node: 0 };
+    add("a gateway's heartbeat".to_owned(), packet(everyone, [0; 6], 0, 0), Reason::None);
+    let joints = Id::command(Command::Joints);
+    for count in [0, 7, 14, 200] {
+        let words = Words::new(Length::Six, [3; MAX_JOINTS]);
+        let packet = Packet { id: joints, words, epoch: Epoch(251), count };
+        add(format!("joints of count {count}"), packet, Reason::Meaning);
+    }
+}

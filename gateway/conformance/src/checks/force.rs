@@ -1,0 +1,237 @@
+//! Algorithm 1 and the words of torques, to the bit: J is measured first, with a force under which words are J.
+
+use protocol::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
+use protocol::message::SkinSensors;
+use protocol::parameters::{Contact, MAX_JOINTS, Parameters};
+
+use super::kinematics::look_at_words;
+use crate::arm::{self, Dice};
+use crate::bus::Stop;
+use crate::session::Session;
+
+/// Forces of any size for each of several rules.
+const RANDOM: usize = 40;
+/// Forces at which an error of rounding shows.
+const SHOWN: usize = 12;
+
+/// Contact words and the proximity.
+type Sensed = ([i16; 3], i16);
+
+/// Joint positions at which J is known.
+struct Known {
+    positions: [i16; MAX_JOINTS],
+    j: [i16; MAX_JOINTS],
+}
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    let mut dice = Dice::new(2);
+    let parameters = arm::document(6);
+    if !session.ready(&parameters)? {
+        return Ok(());
+    }
+    let mut known = Vec::new();
+    for _ in 0..4 {
+        let positions = arm::positions(&mut dice, &parameters);
+        let j = session.pressed(&positions, arm::press(arm::unit_press(TorqueFormat::Q3_12)))?.words();
+        known.push(Known { positions, j });
+    }
+    ties(session, &parameters, &known)?;
+    for (contact, crafted) in rules() {
+        let parameters = Parameters { contact, ..parameters };
+        if session.ready(&parameters)? {
+            rule(session, &mut dice, &parameters, &known, &crafted)?;
+        }
+    }
+    for format in [TorqueFormat::Q5_10, TorqueFormat::Q7_8] {
+        let parameters = Parameters { torque_format: format, contact: arm::PLAIN, ..parameters };
+        if session.about.abilities.lacks(&parameters).is_none() && session.ready(&parameters)? {
+            ties(session, &parameters, &known)?;
+        }
+    }
+    Ok(())
+}
+
+/// One press at joints of which J is known.
+fn press(
+    session: &mut Session<'_>,
+    parameters: &Parameters,
+    known: &Known,
+    skin: SkinSensors,
+    id: &'static str,
+) -> Result<(), Stop> {
+    let step = session.pressed(&known.positions, skin)?;
+    let force = arm::force(&parameters.contact, &skin);
+    let is_there = step.torque.is_some_and(|words| !words.is_zero() || force > 0);
+    let sensed =
+        || format!("contact {:?}, proximity {}", skin.contact.map(Q5_10::to_bits), skin.proximity.to_bits());
+    session.check(id, is_there == (force > 0), || {
+        let came = if is_there { "a torque came" } else { "no torque came" };
+        format!("{}: F_z is {force} steps of 2^-16 N, and {came}", sensed())
+    });
+    if is_there {
+        look_at_words(session, parameters, &known.j, force, &step.words(), id);
+    }
+    Ok(())
+}
+
+/// Products that end in just one half of a step, and words at the end of their range.
+fn ties(session: &mut Session<'_>, parameters: &Parameters, known: &[Known]) -> Result<(), Stop> {
+    let format = parameters.torque_format;
+    let bits = 30 - i64::from(format.fraction());
+    let product = |j: i16, sum: i32| i64::from(j) * i64::from(sum) * 64;
+    for known in known {
+        let words: Vec<_> = known.j.iter().copied().filter(|j| *j != 0).collect();
+        let is_tie =
+            |sum: i32| words.iter().any(|j| product(*j, sum).rem_euclid(1 << bits) == 1 << (bits - 1));
+        let is_end = |sum: i32| {
+            words.iter().any(|j| {
+                let word = (product(*j, sum) + (1 << (bits - 1))) >> bits;
+                word == i64::from(i16::MAX) || word == i64::from(i16::MIN)
+            })
+        };
+        let most = 3 * i32::from(i16::MAX);
+        let mut sums: Vec<_> = (1..most).filter(|sum| is_tie(*sum)).step_by(97).take(6).collect();
+        sums.extend((1..most).filter(|sum| is_end(*sum)).take(2));
+        sums.extend([most, 1, 2, 9_000, 40_000]);
+        for sum in sums {
+            press(session, parameters, known, arm::press(sum), "TORQUE-1")?;
+        }
+    }
+    Ok(())
+}
+
+/// Gains and thresholds, each with sensor words at its corners: the three contact words and the proximity.
+fn rules() -> Vec<(Contact, Vec<Sensed>)> {
+    let rule = |words: [i16; 5]| {
+        let [alpha_c, alpha_p, contact, proximity, force] = words;
+        Contact {
+            alpha_c: Q3_12::from_bits(alpha_c),
+            alpha_p: Q5_10::from_bits(alpha_p),
+            contact_threshold: Q5_10::from_bits(contact),
+            proximity_threshold: Q1_14::from_bits(proximity),
+            force_threshold: Q5_10::from_bits(force),
+        }
+    };
+    let big = i16::MAX;
+    let max = i16::MAX;
+    vec![
+        // Thresholds: what equals one counts.
+        (
+            arm::document_contact(),
+            vec![
+                ([103, 0, 0], 0),
+                ([102, 0, 0], 0),
+                ([34, 34, 35], 0),
+                ([34, 34, 34], 0),
+                ([-897, 500, 500], 0),
+                ([-898, 500, 500], 0),
+                ([max, max, max], 0),
+                ([i16::MIN, i16::MIN, i16::MIN], 0),
+                ([max, i16::MIN, 200], 0),
+            ],
+        ),
+        // F_c is wider than a word; nothing pulls.
+        (
+            rule([4096, 1024, 0, 0x0334, 0]),
+            vec![
+                ([0, 0, 0], 0x0334),
+                ([0, 0, 0], 0x0333),
+                ([0, 0, 0], -5),
+                ([0, 0, 0], i16::MIN),
+                ([-3, 1, 1], 0),
+                ([-300, 0, 0], 0x4000),
+                ([big, big, 2], 0x4000),
+                ([big, 1, 0], 0),
+            ],
+        ),
+        // Steps below 2^-16 N: 127 of 2^-24 are none, 128 are one.
+        (
+            rule([1, 1, 0, 0, 0]),
+            vec![
+                ([0, 0, 0], 127),
+                ([0, 0, 0], 128),
+                ([0, 0, 0], 383),
+                ([0, 0, 0], 384),
+                ([31, 0, 0], 3),
+                ([32, 0, 0], 0),
+                ([max, max, max], max),
+            ],
+        ),
+        // F_z,th is compared with all bits of F_z.
+        (
+            rule([5, 3, 0, 0, 1]),
+            vec![([818, 0, 0], 8), ([818, 0, 0], 7), ([819, 0, 0], 1), ([0, 0, 0], 5461), ([0, 0, 0], 5462)],
+        ),
+        // F_c and F_p each have their own threshold, and F_z has another.
+        (
+            rule([0x0CCD, 0x0666, 200, 4000, 300]),
+            vec![
+                ([199, 0, 0], 3999),
+                ([200, 0, 0], 3999),
+                ([199, 0, 0], 4000),
+                ([200, 0, 0], 4000),
+                ([374, 0, 0], 0),
+                ([375, 0, 0], 0),
+                ([100, 100, 170], 0),
+            ],
+        ),
+        (rule([max, max, 0, 0, 0]), vec![([max, max, max], max), ([1, 0, 0], 0), ([0, 0, 0], 1)]),
+    ]
+}
+
+fn rule(
+    session: &mut Session<'_>,
+    dice: &mut Dice,
+    parameters: &Parameters,
+    known: &[Known],
+    crafted: &[Sensed],
+) -> Result<(), Stop> {
+    let skin = |(contact, proximity): Sensed| SkinSensors {
+        contact: contact.map(Q5_10::from_bits),
+        proximity: Q1_14::from_bits(proximity),
+        ..SkinSensors::default()
+    };
+    for (place, words) in crafted.iter().enumerate() {
+        if let Some(known) = known.get(place % known.len().max(1)) {
+            press(session, parameters, known, skin(*words), "FORCE-1")?;
+        }
+    }
+    let mut random = |shift: u32| {
+        let contact = [0; 3].map(|_| dice.word() >> shift);
+        (contact, (dice.word() >> shift) & i16::MAX)
+    };
+    for place in 0..session.attempts(RANDOM) {
+        let shift = [0, 2, 4, 7];
+        let (Some(known), Some(shift)) = (known.get(place % 4), shift.get(place / 2 % 4)) else { continue };
+        press(session, parameters, known, skin(random(*shift)), "FORCE-1")?;
+    }
+    // Where F_z that is cut off instead of rounded gives another word.
+    let mut shown = 0;
+    for attempt in 0..4_000 {
+        let (Some(known), skin) = (known.get(attempt % 4), skin(random(3))) else { continue };
+        let force = arm::force(&parameters.contact, &skin);
+        let shows = |j: &i16| {
+            let word = |force| arm::word(*j, force, parameters.torque_format);
+            word(force) != word(force - 1) && !protocol::fixed::is_saturated(word(force))
+        };
+        if force > 1 && is_rounded_up(&parameters.contact, &skin) && known.j.iter().any(shows) {
+            press(session, parameters, known, skin, "FORCE-1")?;
+            shown += 1;
+            if shown >= session.attempts(SHOWN) {
+                break;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Whether the last step of F_z is from rounding.
+fn is_rounded_up(contact: &Contact, skin: &SkinSensors) -> bool {
+    let bits = |word: i16| i64::from(word);
+    let sum: i64 = skin.contact.iter().map(|word| bits(word.to_bits())).sum();
+    let sum = if sum < bits(contact.contact_threshold.to_bits()) { 0 } else { sum };
+    let p = bits(skin.proximity.to_bits());
+    let p = if p < bits(contact.proximity_threshold.to_bits()) { 0 } else { p };
+    let all = ((bits(contact.alpha_c.to_bits()) * sum) << 2) + bits(contact.alpha_p.to_bits()) * p;
+    all.rem_euclid(256) >= 128
+}

@@ -1,0 +1,275 @@
+//! Which joints are taken, and how they are counted and answered.
+
+use protocol::can::Frame;
+use protocol::message::{SensorPage, SkinSensors};
+use protocol::packet::{Epoch, Length, Packet, Words};
+use protocol::parameters::{MAX_JOINTS, Parameters};
+use protocol::time::{Micros, Span};
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::Session;
+
+const POSITIONS: [i16; MAX_JOINTS] =
+    [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    if !session.ready(&arm::document(6))? {
+        return Ok(());
+    }
+    session.pressed(&POSITIONS, arm::press(4_096))?;
+    epochs(session)?;
+    repeats(session)?;
+    counts(session)?;
+    contacts(session)
+}
+
+/// Every epoch but the last is accepted, whatever its distance; more than 256 in a row.
+fn epochs(session: &mut Session<'_>) -> Result<(), Stop> {
+    let before = session.counters()?.0;
+    let mut count: u16 = 0;
+    let mut torque: Option<Words> = None;
+    let mut epoch = session.known.last_epoch;
+    let jumps: [u8; 13] = [255, 254, 128, 127, 129, 2, 250, 100, 200, 255, 1, 3, 64];
+    for step in jumps.into_iter().chain(core::iter::repeat_n(1, 270)).chain([255, 255, 255]) {
+        epoch = epoch.wrapping_add(step);
+        let came = session.step_at(epoch, &POSITIONS)?.torque;
+        count += 1;
+        session.check("JOINTS-1", came.is_some(), || {
+            format!("joints {epoch}, {} epochs after the last ones, were not answered", step.cast_signed())
+        });
+        let is_same = came.is_none() || torque.is_none() || came == torque;
+        session.check("TORQUE-1", is_same, || format!("the same joints gave {came:?} and {torque:?}"));
+        torque = came;
+    }
+    let after = session.counters()?.0;
+    for (name, id, before, after) in [
+        ("joints", "JOINTS-5", before.joints, after.joints),
+        ("torques", "JOINTS-6", before.torques, after.torques),
+    ] {
+        let expected = before.wrapping_add(count);
+        session.check(id, after == expected, || {
+            format!("{name} is {after} after {count} joints, not {expected}")
+        });
+    }
+    let is_same = (before.joints_repeated, before.joints_late) == (after.joints_repeated, after.joints_late);
+    session.check("JOINTS-5", is_same, || format!("joints were counted as repeated or late: {after:?}"));
+    Ok(())
+}
+
+/// The epoch of the last joints again.
+fn repeats(session: &mut Session<'_>) -> Result<(), Stop> {
+    let before = session.counters()?.0;
+    let first = session.next_epoch();
+    session.step_at(first, &POSITIONS)?;
+    for positions in [POSITIONS, [0x1234; MAX_JOINTS]] {
+        let joints = session.joints(first, &positions);
+        let exchange = session.exchange_all(&[joints])?;
+        session.check("JOINTS-1", exchange.is_silent(), || format!("joints {first} were answered again"));
+    }
+    // What waits for the next joints does not take these for them.
+    session.press(arm::press(2_000))?;
+    let joints = session.joints(first, &POSITIONS);
+    session.exchange_all(&[joints])?;
+    let skin = latched(session)?;
+    session.check("JOINTS-1", skin == Some(arm::press(4_096)), || {
+        format!("repeated joints latched a stimulus: {skin:?}")
+    });
+    let second = session.next_epoch();
+    session.step_at(second, &POSITIONS)?;
+    // Between others the same epoch is another one.
+    session.step_at(first, &POSITIONS)?;
+    session.step_at(second, &POSITIONS)?;
+    let after = session.counters()?.0;
+    let counted = after.joints_repeated.wrapping_sub(before.joints_repeated);
+    session.check("JOINTS-1", counted == 3, || format!("3 repeated joints were counted as {counted}"));
+    let counted = after.joints.wrapping_sub(before.joints);
+    session.check("JOINTS-5", counted == 4, || {
+        format!("4 joints between repeated ones were counted as {counted}")
+    });
+    Ok(())
+}
+
+/// A count that is not that of the chain, or cannot be at all.
+fn counts(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.pressed(&POSITIONS, arm::press(4_096))?;
+    let mut before = session.counters()?;
+    for count in [5, 1, 4, 0, 7, 15, 255] {
+        let epoch = session.next_epoch();
+        // Held from the joints that follow on, whatever their epoch.
+        let sum = 4_096 + i32::from(count) * 8;
+        let before_press = latched(session)?;
+        session.press(arm::press(sum))?;
+        before.0.stimuli = before.0.stimuli.wrapping_add(1);
+        let frames = raw(session, epoch, count, Length::Six);
+        let exchange = session.exchange(&frames)?;
+        let skin = latched(session)?;
+        session.check("JOINTS-2", skin == before_press, || {
+            format!("joints with count {count} latched a stimulus: {skin:?}")
+        });
+        session.check("JOINTS-2", exchange.is_silent(), || {
+            format!("joints with count {count} were answered; the chain has 6")
+        });
+        let after = session.counters()?;
+        let is_so = after.1.meaning == before.1.meaning.wrapping_add(1) && after.0 == before.0;
+        let id = if (1..=6).contains(&count) { "JOINTS-2" } else { "COUNT-1" };
+        session.check(id, is_so, || {
+            format!(
+                "joints with count {count} were not counted as meaning alone: {after:?}, before {before:?}"
+            )
+        });
+        before = after;
+        // Their epoch is not the last one.
+        let step = session.step_at(epoch, &POSITIONS)?;
+        session.check("JOINTS-2", step.torque.is_some(), || {
+            format!("after joints {epoch} with a wrong count those with the right one were not answered")
+        });
+        before.0.joints = before.0.joints.wrapping_add(1);
+        before.0.torques = before.0.torques.wrapping_add(1);
+    }
+    // The order: what cannot be, then a repetition, then the chain.
+    let last = session.known.last_epoch;
+    for (count, is_repeated) in [(5, true), (0, false)] {
+        let frames = raw(session, last, count, Length::Six);
+        session.exchange(&frames)?;
+        let after = session.counters()?;
+        let repeated = after.0.joints_repeated.wrapping_sub(before.0.joints_repeated);
+        let meaning = after.1.meaning.wrapping_sub(before.1.meaning);
+        let id = if is_repeated { "JOINTS-1" } else { "COUNT-1" };
+        session.check(id, (repeated, meaning) == (is_repeated.into(), (!is_repeated).into()), || {
+            format!(
+                "joints of the last epoch with count {count} were counted {repeated} times as repeated and {meaning} \
+                 times as meaning"
+            )
+        });
+        before = after;
+    }
+    if session.format == protocol::can::Format::Fd {
+        let epoch = session.next_epoch();
+        let frames = raw(session, epoch, 7, Length::Eight);
+        session.exchange(&frames)?;
+        let after = session.counters()?;
+        let is_so = after.1.meaning == before.1.meaning.wrapping_add(1) && after.1.length == before.1.length;
+        session.check("JOINTS-2", is_so, || {
+            format!("joints of 7 in 20 bytes have to be counted as meaning: {after:?}, before {before:?}")
+        });
+    }
+    Ok(())
+}
+
+/// What is latched, as a report says it.
+fn latched(session: &mut Session<'_>) -> Result<Option<SkinSensors>, Stop> {
+    let pages = session.report()?;
+    Ok(pages.iter().find_map(|heard| match heard.sensors() {
+        Some((_, SensorPage::Skin(skin))) => Some(*skin),
+        _ => None,
+    }))
+}
+
+/// Joints with any count.
+fn raw(session: &Session<'_>, epoch: u8, count: u8, length: Length) -> Vec<Frame> {
+    let id = session.joints(epoch, &POSITIONS).id();
+    let packet = Packet { id, words: Words::new(length, POSITIONS), epoch: Epoch(epoch), count };
+    packet.frames(session.format).collect()
+}
+
+/// Touches and releases: a torque each time, zeros once, then nothing.
+fn contacts(session: &mut Session<'_>) -> Result<(), Stop> {
+    for round in 0..4 {
+        for sum in [3_000, 3_000, 0, 0, 0, 9_000, 0, 0] {
+            let positions = POSITIONS.map(|word| word.wrapping_add(round * 0x0111));
+            session.pressed(&positions, arm::press(sum))?;
+        }
+        session.press(arm::press(500))?;
+        for _ in 0..3 {
+            session.step(&POSITIONS)?;
+        }
+        session.pressed(&POSITIONS, arm::press(0))?;
+        session.step(&POSITIONS)?;
+    }
+    Ok(())
+}
+
+/// Joints that are older than a period of 1 us when the cell comes to them.
+pub(super) fn old(session: &mut Session<'_>) -> Result<(), Stop> {
+    const BURST: u8 = 24;
+    let parameters = Parameters { period_us: 1, ..arm::document(6) };
+    session.known.active = None;
+    if !session.commit(&parameters)? {
+        return Ok(());
+    }
+    let mut shown = false;
+    for press in [4_096, 1_024] {
+        let before = session.counters()?;
+        session.press(arm::press(press))?;
+        session.mark();
+        let mut sent: Vec<(u8, Micros)> = Vec::new();
+        let mut frames = Vec::new();
+        for _ in 0..BURST {
+            let epoch = session.next_epoch();
+            sent.push((epoch, Micros(0)));
+            frames.extend(session.frames(&session.joints(epoch, &POSITIONS)));
+        }
+        let times = session.send_all(&frames)?;
+        let each = frames.len() / usize::from(BURST);
+        for (sent, at) in sent.iter_mut().zip(times.chunks(each)) {
+            sent.1 = at.last().copied().unwrap_or_default();
+        }
+        session.idle(Span::from_millis(60))?;
+        session.consume();
+        let answers: Vec<_> =
+            session.answers().iter().filter_map(|it| Some((it.at, it.torque()?.0.0))).collect();
+        shown |= look_at_old(session, &sent, &answers);
+        session.known.epoch = None;
+        let after = session.counters()?;
+        let [joints, skipped, torques] = [
+            after.0.joints.wrapping_sub(before.0.joints),
+            after.0.joints_late.wrapping_sub(before.0.joints_late),
+            after.0.torques.wrapping_sub(before.0.torques),
+        ];
+        // Of a burst a cell may lose some.
+        let is_so = joints + skipped <= u16::from(BURST)
+            && usize::from(torques) == answers.len()
+            && joints >= torques;
+        session.check("JOINTS-4", is_so, || {
+            format!(
+                "of {BURST} joints {joints} were counted as joints and {skipped} as skipped; {} were answered",
+                answers.len()
+            )
+        });
+        shown |= skipped > 0;
+        if skipped > 0 {
+            // They latch stimuli all the same.
+            let page = latched(session)?;
+            session.check("STIM-8", page == Some(arm::press(press)), || {
+                format!("skipped joints did not latch a stimulus: {page:?}")
+            });
+        }
+    }
+    if !shown {
+        session.findings.not_tested("JOINTS-4", "the cell came to all joints at once, and skipped none");
+    }
+    session.known.active = None;
+    session.ready(&arm::document(6))?;
+    Ok(())
+}
+
+/// Whoever sends the answer to one joint after another has come, and answers that one too, was late for it; whether one
+/// shows.
+fn look_at_old(session: &mut Session<'_>, sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> bool {
+    const MARGIN: Span = Span(100);
+    let late = answers.windows(2).find(|pair| match pair {
+        [(before, _), (_, epoch)] => sent.iter().any(|(of, at)| of == epoch && before.since(*at) > MARGIN),
+        _ => false,
+    });
+    if let Some([(before, first), (_, epoch)]) = late {
+        session.check("JOINTS-4", false, || {
+            format!(
+                "with a period of 1 us joints {epoch} were answered, which had come before the answer to joints \
+                 {first} at {} us",
+                before.0
+            )
+        });
+    }
+    late.is_some()
+}

@@ -1,0 +1,180 @@
+//! The checks, in groups that each begin with a cell that is ready.
+
+mod beats;
+mod begin;
+mod claims;
+mod commands;
+mod counters;
+mod force;
+mod joints;
+mod kinematics;
+mod options;
+mod parameters;
+mod refusals;
+mod restart;
+mod segments;
+mod sensing;
+mod sensing_model;
+mod stimuli;
+
+use protocol::can::Format;
+
+use crate::bus::Stop;
+use crate::findings::Only;
+use crate::session::Session;
+
+/// What a group of checks needs.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Needs {
+    Nothing,
+    /// Test mode, and a configuration that can be committed.
+    Press,
+    /// The command of a restart.
+    Restart,
+    /// Sensor values without a request.
+    Sensing,
+    /// Classic frames.
+    Classic,
+}
+
+/// A group of checks.
+struct Group {
+    /// The requirements that it is about.
+    about: &'static [&'static str],
+    needs: Needs,
+    run: fn(&mut Session<'_>) -> Result<(), Stop>,
+}
+
+const fn group(
+    about: &'static [&'static str],
+    needs: Needs,
+    run: fn(&mut Session<'_>) -> Result<(), Stop>,
+) -> Group {
+    Group { about, needs, run }
+}
+
+const GROUPS: &[Group] = &[
+    group(&["CONF-1", "CONF-2", "CONF-3", "CONF-4", "CONF-7", "CONF-12"], Needs::Nothing, parameters::run),
+    group(&["CONF-11", "CONF-13", "ID-2", "OPT-1"], Needs::Nothing, parameters::others),
+    group(&["CONF-5", "CONF-6", "COUNT-2"], Needs::Nothing, refusals::run),
+    group(&["CONF-9", "CONF-10", "SENSE-3", "OPT-1", "LINK-1"], Needs::Nothing, options::switches),
+    group(&["OPT-2"], Needs::Nothing, options::ignored),
+    group(&["J-1", "J-2", "J-3", "TORQUE-1"], Needs::Press, kinematics::run),
+    group(&["FORCE-1", "TORQUE-1", "TORQUE-2", "STATE-1"], Needs::Press, force::run),
+    group(&["JOINTS-1", "JOINTS-2", "JOINTS-3", "JOINTS-5", "JOINTS-6"], Needs::Press, joints::run),
+    group(&["JOINTS-4", "STIM-8"], Needs::Press, joints::old),
+    group(
+        &["STIM-1", "STIM-2", "STIM-3", "STIM-4", "STIM-5", "STIM-6", "STIM-7", "STIM-8"],
+        Needs::Press,
+        stimuli::run,
+    ),
+    group(
+        &["CMD-1", "CMD-2", "CMD-3", "CMD-4", "STATE-1", "SENSE-1", "SENSE-2"],
+        Needs::Press,
+        commands::run,
+    ),
+    group(&["COUNT-1", "SEND-1"], Needs::Nothing, counters::run),
+    group(&["COUNT-3"], Needs::Classic, segments::run),
+    group(&["CLAIM-6", "CLAIM-7", "STATE-2"], Needs::Nothing, claims::run),
+    group(&["BEAT-1", "BEAT-2", "BEAT-3", "TIME-1"], Needs::Nothing, beats::run),
+    group(
+        &["SENSE-4", "SENSE-5", "SENSE-6", "SENSE-7", "SENSE-8", "SENSE-9", "SENSE-10", "SENSE-11", "TIME-3"],
+        Needs::Sensing,
+        sensing::run,
+    ),
+    group(
+        &[
+            "CLAIM-1", "CLAIM-2", "CLAIM-3", "CLAIM-4", "CLAIM-5", "CLAIM-7", "CONF-2", "CONF-8", "CONF-9",
+            "ID-3",
+        ],
+        Needs::Restart,
+        restart::run,
+    ),
+];
+
+/// Groups of these count heartbeats themselves.
+const BEATS: &[&str] = &["BEAT-1", "CLAIM-6", "CLAIM-1", "OPT-2"];
+
+/// What no cell can be tested for from its bus, and why.
+const BEYOND: &[(&str, &str)] = &[
+    ("CLAIM-8", "wires cannot be reached from the bus"),
+    ("TIME-3", "only of torques, answers and pages, not of the tree's"),
+    ("CONF-7", "flash that cannot be written: nothing on the bus makes it fail"),
+    ("CONF-8", "damaged flash: nothing on the bus damages it"),
+    ("BEAT-1", "after a hang: nothing on the bus makes a cell hang"),
+    ("ID-1", "that no other cell has it"),
+    ("CLAIM-1", "(serial mod 64) ms after the start: when it started is not on the bus"),
+];
+
+/// Tests what is asked for; [`Session::save`] comes before it, [`Session::restore`] after it.
+///
+/// # Errors
+/// Why the test could not go on.
+pub fn run(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
+    let done = groups(session, only);
+    if done.is_ok() {
+        for (id, why) in BEYOND {
+            session.findings.not_tested(id, *why);
+        }
+    }
+    session.check_times();
+    done
+}
+
+fn groups(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
+    begin::run(session)?;
+    tree(session);
+    for group in GROUPS {
+        if let Err((is_applicable, why)) = met(session, group.needs) {
+            for id in group.about {
+                if is_applicable {
+                    session.findings.not_tested(id, why);
+                } else {
+                    session.findings.not_applicable(id, why);
+                }
+            }
+        } else if group.about.iter().any(|id| only.has(id)) {
+            session.settle()?;
+            let before = session.tally();
+            (group.run)(session)?;
+            session.settle()?;
+            if !group.about.iter().any(|id| BEATS.contains(id)) {
+                session.check_beats(before);
+            }
+        }
+    }
+    if only.has("TIME-2") { session.measure_times_again() } else { Ok(()) }
+}
+
+/// Whether the cell has what a group needs; else whether it might, and why not.
+fn met(session: &Session<'_>, needs: Needs) -> Result<(), (bool, &'static str)> {
+    let about = &session.about;
+    match needs {
+        Needs::Press if !about.test_mode => {
+            Err((true, "without test mode (parameter 5) nothing can press the cell"))
+        }
+        Needs::Press if !about.committed => Err((true, "the cell does not take a configuration")),
+        Needs::Restart if !session.can_restart() => Err((true, "without --restart")),
+        Needs::Sensing if !about.sensing => Err((false, "it sends no sensor values without a request")),
+        Needs::Sensing if !about.test_mode => {
+            Err((true, "without test mode (parameter 5) nothing can press the cell"))
+        }
+        Needs::Classic if session.format == Format::Fd => {
+            Err((false, "the bus is FD: there are no segments"))
+        }
+        Needs::Nothing | Needs::Press | Needs::Restart | Needs::Sensing | Needs::Classic => Ok(()),
+    }
+}
+
+/// What wires are needed for.
+fn tree(session: &mut Session<'_>) {
+    use crate::requirements::{Document, REQUIREMENTS};
+    let ids = REQUIREMENTS.iter().filter(|it| it.document == Document::Tree && it.id != "LINK-1");
+    for id in ids.map(|it| it.id).chain(["CLAIM-8"]) {
+        if session.about.ports {
+            session.findings.not_tested(id, "wires cannot be reached from the bus");
+        } else {
+            session.findings.not_applicable(id, "it has no ports");
+        }
+    }
+}

@@ -1,0 +1,275 @@
+//! What is switched at run time; options that a cell may lack; and what it has to ignore.
+
+use protocol::can::{Format, Frame};
+use protocol::id::{Command, Id, Kind, Node};
+use protocol::message::{Message, State};
+use protocol::packet::{Epoch, Packet, WORDS, words};
+use protocol::parameters::{Events, MAX_JOINTS, Parameter};
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::{Reply, Session};
+
+const REPLY: u8 = 6;
+const SENSING: u8 = 7;
+const EVENTS: u8 = 8;
+const LINKS: u8 = 9;
+
+pub(super) fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.ready(&arm::document(2))?;
+    session.known.senses = true;
+    mode(session)?;
+    reply_mode(session)?;
+    sensing(session)?;
+    links(session)?;
+    rows(session)?;
+    session.set(SENSING, [0])?;
+    session.settle()?;
+    session.known.senses = false;
+    Ok(())
+}
+
+/// A write, and what has to come of it.
+fn expect(
+    session: &mut Session<'_>,
+    id: &'static str,
+    number: u8,
+    written: [i16; WORDS],
+    expected: Reply,
+) -> Result<(), Stop> {
+    let reply = session.write(number, written)?;
+    session.check(id, reply == expected, || {
+        format!("parameter {number} was written with {}: {reply}, not {expected}", Reply::Value(written))
+    });
+    Ok(())
+}
+
+/// A write that cannot be, which changes nothing.
+fn refuse(
+    session: &mut Session<'_>,
+    id: &'static str,
+    number: u8,
+    written: [i16; WORDS],
+) -> Result<(), Stop> {
+    let before = session.read(number)?;
+    expect(session, id, number, written, Reply::Refused(19))?;
+    let after = session.read(number)?;
+    session.check("CONF-5", before == after, || {
+        format!("a refused write of parameter {number} changed it from {before} to {after}")
+    });
+    Ok(())
+}
+
+/// Test mode is on after 1 and off after everything else, at once.
+fn mode(session: &mut Session<'_>) -> Result<(), Stop> {
+    if !session.about.test_mode {
+        expect(session, "OPT-1", 5, [0; WORDS], Reply::Value([0; WORDS]))?;
+        return refuse(session, "OPT-1", 5, words([1]));
+    }
+    for (written, on) in
+        [(2, false), (1, true), (-1, false), (1, true), (0x0101, false), (0, false), (1, true)]
+    {
+        let junk = [written, 7, -7, 9, 0x7FFF, 1];
+        expect(session, "CONF-3", 5, junk, Reply::Value(words([on.into()])))?;
+        session.known.test_mode = Some(on);
+        session.known.skin = on.then(Default::default);
+        let reply = session.read(5)?;
+        session.check("CONF-9", reply == Reply::Value(words([on.into()])), || {
+            format!("mode is read as {reply}")
+        });
+        let state = session.exchange_all(&[])?.state();
+        session.check("CONF-9", state.has(State::TEST_MODE) == on, || {
+            format!("parameter 5 was written with {written}, and the state is {:04X}", state.0)
+        });
+    }
+    Ok(())
+}
+
+fn reply_mode(session: &mut Session<'_>) -> Result<(), Stop> {
+    for bad in [[2, 0, 0, 0, 0, 0], [-1, 0, 0, 0, 0, 0], [1, 0, 3, 0, 0, 0], [1, 500, 254, 0, 0, 0]] {
+        refuse(session, "CONF-10", REPLY, bad)?;
+    }
+    for bad in [[1, 500, -1, 0, 0, 0], [1, 500, 3, 2, 0, 0], [1, 500, 3, -1, 0, 0]] {
+        refuse(session, "CONF-10", REPLY, bad)?;
+    }
+    if session.about.ports {
+        let sum = words([1, 500, 3, 1]);
+        expect(session, "CONF-10", REPLY, sum, Reply::Value(sum))?;
+    } else {
+        refuse(session, "OPT-1", REPLY, words([1, 500, 3, 1]))?;
+    }
+    expect(session, "CONF-3", REPLY, [0, 5, 6, 7, 8, 9], Reply::Value([0; WORDS]))?;
+    let reply = session.read(REPLY)?;
+    session.check("CONF-9", reply == Reply::Value([0; WORDS]), || format!("parameter 6 is read as {reply}"));
+    Ok(())
+}
+
+fn sensing(session: &mut Session<'_>) -> Result<(), Stop> {
+    if !session.about.sensing {
+        for number in [SENSING, EVENTS] {
+            expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
+            let reply = session.read(number)?;
+            session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
+                format!("parameter {number} of an option that it does not have is read as {reply}")
+            });
+            refuse(session, "OPT-1", number, words([1, 50]))?;
+        }
+        session.findings.not_applicable("SENSE-3", "it sends no sensor values without a request");
+        return Ok(());
+    }
+    for bad in [[3, 50], [-1, 50], [1, 0], [i16::MAX, 1]] {
+        refuse(session, "SENSE-3", SENSING, words(bad))?;
+    }
+    expect(session, "CONF-3", SENSING, [2, 50, 3, 4, 5, 6], Reply::Value(words([2])))?;
+    expect(session, "CONF-3", SENSING, [0, 50, 3, 4, 5, 6], Reply::Value([0; WORDS]))?;
+    // 65 535 ms.
+    expect(session, "SENSE-3", SENSING, [1, -1, 3, 4, 5, 6], Reply::Value(words([1, -1])))?;
+    refuse(session, "SENSE-3", SENSING, words([1, 0]))?;
+    expect(session, "SENSE-3", SENSING, [0; WORDS], Reply::Value([0; WORDS]))?;
+    let usual = Events::default().words();
+    for place in 0..5 {
+        let mut bad = usual;
+        bad.iter_mut().skip(place).take(1).for_each(|word| *word = -1);
+        refuse(session, "SENSE-3", EVENTS, bad)?;
+    }
+    let [a, b, c, d, ..] = usual;
+    refuse(session, "SENSE-3", EVENTS, [a, b, c, d, 0x4001, 0])?;
+    for good in [[0, 0, 0, 0, 0x4000, 0], [i16::MAX, i16::MAX, i16::MAX, i16::MAX, 0, 0], usual] {
+        let [a, b, c, d, e, _] = good;
+        expect(session, "SENSE-3", EVENTS, [a, b, c, d, e, 77], Reply::Value(good))?;
+        let reply = session.read(EVENTS)?;
+        session.check("CONF-9", reply == Reply::Value(good), || format!("parameter 8 is read as {reply}"));
+    }
+    Ok(())
+}
+
+fn links(session: &mut Session<'_>) -> Result<(), Stop> {
+    if session.about.test_mode {
+        if session.about.ports {
+            expect(session, "LINK-1", LINKS, words([0x1F]), Reply::Value(words([0x1F])))?;
+        } else {
+            refuse(session, "OPT-1", LINKS, words([1]))?;
+        }
+        // Bits 5 to 15 are not used.
+        expect(session, "CONF-3", LINKS, [-32, 9, 9, 9, 9, 9], Reply::Value([0; WORDS]))?;
+        session.test_mode(false)?;
+    }
+    for written in [words([0]), words([1])] {
+        refuse(session, "LINK-1", LINKS, written)?;
+    }
+    if session.about.test_mode {
+        session.test_mode(true)?;
+    }
+    Ok(())
+}
+
+/// Rows that the cell cannot have.
+fn rows(session: &mut Session<'_>) -> Result<(), Stop> {
+    let most = session.about.abilities.rows();
+    let Some(number) = u8::try_from(most).ok().filter(|most| *most < 32).map(|most| 16 + most) else {
+        return Ok(());
+    };
+    let reply = session.read(number)?;
+    session.check("OPT-1", reply == Reply::Value([0; WORDS]), || {
+        format!("row {} of a cell that can have {most} is read as {reply}", most + 1)
+    });
+    expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
+    refuse(session, "OPT-1", number, words([1, 2, 3, 4]))
+}
+
+/// Words, bytes and bits that mean nothing.
+pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.ready(&arm::document(2))?;
+    let junk = |command| Packet {
+        id: Id::command(command),
+        words: [1, -1, 0x7FFF, 3, 4, 5].into(),
+        epoch: Epoch(77),
+        count: 0x85,
+    };
+    let frames =
+        |session: &Session<'_>, packet: Packet| packet.frames(session.format).collect::<Vec<Frame>>();
+    session.known.halted = Some(true);
+    let halted = session.exchange(&frames(session, junk(Command::Halt)))?;
+    session.check("OPT-2", halted.state().has(State::HALTED), || {
+        "a halt with words, epoch and count that mean nothing had no effect".to_owned()
+    });
+    session.known.halted = Some(false);
+    let resumed = session.exchange(&frames(session, junk(Command::Resume)))?;
+    session.check("OPT-2", !resumed.state().has(State::HALTED), || {
+        "a resume with words, epoch and count that mean nothing had no effect".to_owned()
+    });
+    session.mark();
+    let asked = session.send(&frames(session, junk(Command::Report)))?;
+    let pages = session.pages(asked)?;
+    session
+        .check("OPT-2", !pages.is_empty(), || "a report with words that mean nothing was ignored".to_owned());
+    let frames_of_sync = frames(session, junk(Command::Sync));
+    session.mark();
+    let at = session.send(&frames_of_sync)?;
+    let is_there =
+        session.wait(at + crate::session::PATIENT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    session.check("OPT-2", is_there, || "a sync with words that mean nothing was ignored".to_owned());
+    read_with_words(session)?;
+    if session.format == Format::Fd {
+        // Without bit-rate switch.
+        let sync = Message::Sync.encode();
+        let frame = Frame::fd(sync.id.to_bits().into(), 0, &sync.encode());
+        session.mark();
+        let frames: Vec<_> = frame.into_iter().collect();
+        let at = session.send(&frames)?;
+        let is_there =
+            session.wait(at + crate::session::PATIENT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        session.check("OPT-2", is_there, || "a frame without bit-rate switch was ignored".to_owned());
+    }
+    if session.about.test_mode && session.about.committed {
+        words_beyond(session)?;
+    }
+    Ok(())
+}
+
+/// The words of a read mean nothing.
+fn read_with_words(session: &mut Session<'_>) -> Result<(), Stop> {
+    let id = Id::new(Kind::Configure, Node::Cell(session.cell));
+    let packet = Packet { id, words: [9, 8, 7, 6, 5, 4].into(), epoch: Epoch(3), count: 2 };
+    let frames: Vec<_> = packet.frames(session.format).collect();
+    let exchange = session.exchange(&frames)?;
+    let expected = arm::document(2).words(Parameter::Pose);
+    let answer = protocol::message::Answer::Value { number: 2, written: false, words: expected };
+    let answer = Message::Configured { from: session.cell, tag: 3, answer };
+    let is_so = exchange.answers.iter().any(|heard| heard.message == answer);
+    session.check("OPT-2", is_so, || "a read with words that mean nothing was answered otherwise".to_owned());
+    Ok(())
+}
+
+/// Joints of a shorter chain with words behind it, and a stimulus with words that its page does not have.
+fn words_beyond(session: &mut Session<'_>) -> Result<(), Stop> {
+    let short = protocol::parameters::Parameters { joints: 3, ..arm::document(2) };
+    if !session.ready(&short)? {
+        return Ok(());
+    }
+    let positions = [0x0123, -0x2345, 0x0456, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
+    let expected = session.pressed(&positions, arm::press(4_096))?.words();
+    let epoch = session.next_epoch();
+    let id = Id::command(Command::Joints);
+    let words = [0x0123, -0x2345, 0x0456, 0x7777, -1, 0x1111].into();
+    let packet = Packet { id, words, epoch: Epoch(epoch), count: 3 };
+    let frames: Vec<_> = packet.frames(session.format).collect();
+    session.known.epoch = Some(epoch);
+    let exchange = session.exchange(&frames)?;
+    let got = exchange.answers.iter().find_map(|heard| heard.torque()).map(|(_, words)| words.padded());
+    session.check("OPT-2", got == Some(expected), || {
+        format!("words behind the joints of the chain changed the torque from {expected:?} to {got:?}")
+    });
+    // Page 1 has three words.
+    let id = Id::new(Kind::Stimulus, Node::Cell(session.cell));
+    let packet = Packet { id, words: [1, 2, 3, 4, 5, 6].into(), epoch: Epoch(200), count: 0x81 };
+    let frames: Vec<_> = packet.frames(session.format).collect();
+    session.mark();
+    session.send(&frames)?;
+    let after = session.step(&positions)?.words();
+    session.check("OPT-2", after == expected, || {
+        "a stimulus of the acceleration with words that it does not use changed the torque".to_owned()
+    });
+    session.pressed(&[0; MAX_JOINTS], arm::press(0))?;
+    Ok(())
+}

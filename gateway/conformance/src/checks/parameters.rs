@@ -1,0 +1,217 @@
+//! Parameters: reading, staging, the hash, the commit, and whom a request is for.
+
+use protocol::fixed::{Q1_14, Q3_12};
+use protocol::id::{CellId, Node};
+use protocol::message::{Message, Request};
+use protocol::packet::{WORDS, words};
+use protocol::parameters::{MAX_JOINTS, Parameter, Parameters};
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::{Reply, Session};
+
+/// Another configuration, which differs in each parameter.
+fn other() -> Parameters {
+    let mut other = Parameters { joint: 6, period_us: 20_000, ..arm::document(6) };
+    other.contact.alpha_c = Q3_12::from_bits(5_000);
+    other.pose.position = [0x0777, -0x0333, 0x0123].map(Q1_14::from_bits);
+    for (row, step) in other.rows.iter_mut().zip(1..=6) {
+        row.theta_offset = Q1_14::from_bits(0x0101 * step);
+    }
+    other
+}
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    let (one, other) = (arm::document(2), other());
+    if !session.ready(&one)? {
+        return Ok(());
+    }
+    reads(session, &one, "CONF-1")?;
+    session.stage(&other)?;
+    // What is staged is not read, not hashed and not computed with.
+    reads(session, &one, "CONF-2")?;
+    session.exchange_all(&[])?;
+    computes(session, &one, &other, "CONF-2")?;
+    for wrong in [0x0001, 0x0080, 0x0100, 0x8000, 0xFFFF, one.hash() ^ other.hash(), other.hash()] {
+        let hash = other.hash() ^ wrong;
+        let reply = session.set(Parameter::Commit.number(), [hash.cast_signed()])?;
+        session.check("CONF-7", reply == Reply::Refused(16), || {
+            format!("commit with hash {hash:04X} of {:04X} staged was answered with {reply}", other.hash())
+        });
+    }
+    reads(session, &one, "CONF-5")?;
+    session.known.active = None;
+    session.commit(&other)?;
+    reads(session, &other, "CONF-7")?;
+    session.exchange_all(&[])?;
+    computes(session, &other, &one, "CONF-7")?;
+    let reply = session.read(Parameter::Commit.number())?;
+    session.check("CONF-1", reply == Reply::Value([0; WORDS]), || format!("commit was read as {reply}"));
+    unused(session)?;
+    tags(session)
+}
+
+/// Each stored parameter is read as it is in use.
+fn reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> Result<(), Stop> {
+    for parameter in Parameter::stored(6) {
+        let reply = session.read(parameter.number())?;
+        let words = expected.words(parameter);
+        session.check(id, reply == Reply::Value(words), || {
+            format!("parameter {} is read as {reply}, not {}", parameter.number(), Reply::Value(words))
+        });
+    }
+    Ok(())
+}
+
+/// The torque is that of these parameters, and not of the others.
+fn computes(
+    session: &mut Session<'_>,
+    expected: &Parameters,
+    not: &Parameters,
+    id: &'static str,
+) -> Result<(), Stop> {
+    if !session.about.test_mode {
+        return Ok(());
+    }
+    let positions = [0x0111, -0x1222, 0x2333, 0x0444, -0x0555, 0x0666, 0, 0, 0, 0, 0, 0, 0, 0];
+    debug_assert_eq!(positions.len(), MAX_JOINTS);
+    let press = arm::press(4_096);
+    let step = session.pressed(&positions, press)?;
+    let near = |parameters: &Parameters| {
+        let central = model::central::Central::of_cell(parameters);
+        let exact = arm::exact_jacobian(&central, &positions);
+        let force = arm::force(&parameters.contact, &press);
+        let word =
+            |x: f64| i32::from(arm::word(Q1_14::nearest(x).to_bits(), force, parameters.torque_format));
+        step.words().iter().zip(exact).all(|(got, x)| (i32::from(*got) - word(x)).abs() <= 24)
+    };
+    debug_assert!(!near(expected) || !near(not), "they are apart");
+    session.check(id, near(expected), || format!("the torque {:?} is not of what is in use", step.words()));
+    session.pressed(&positions, arm::press(0))?;
+    Ok(())
+}
+
+/// Words that a parameter does not use.
+fn unused(session: &mut Session<'_>) -> Result<(), Stop> {
+    let expected = Parameters { period_us: 17_001, ..arm::document(3) };
+    session.stage(&expected)?;
+    session.known.staged = None;
+    for parameter in Parameter::stored(6).filter(|it| *it != Parameter::Pose) {
+        let clean = expected.words(parameter);
+        let used = if parameter == Parameter::Timing { 1 } else { 5 };
+        let mut dirty = clean;
+        dirty
+            .iter_mut()
+            .skip(used)
+            .zip([0x1234, -2, 7, 0x7FFF, i16::MIN])
+            .for_each(|(word, junk)| *word = junk);
+        let reply = session.write(parameter.number(), dirty)?;
+        session.check("CONF-3", reply == Reply::Value(clean), || {
+            format!(
+                "parameter {} was written with unused words, and answered with {reply}",
+                parameter.number()
+            )
+        });
+    }
+    let hash = expected.hash();
+    let reply = session.write(Parameter::Commit.number(), [hash.cast_signed(), 1, 2, 3, 4, 5])?;
+    let is_so = reply == Reply::Value(words([hash.cast_signed()]));
+    session.check("CONF-3", is_so, || {
+        format!("unused words were written and have to be hashed as 0: commit {hash:04X} was answered with {reply}")
+    });
+    if is_so {
+        session.known.parameters = Some(expected);
+        session.known.staged = Some(expected);
+        session.known.hash = Some(hash);
+        session.known.active = None;
+        reads(session, &expected, "CONF-3")?;
+    } else {
+        session.known.parameters = None;
+        session.known.hash = None;
+    }
+    Ok(())
+}
+
+fn tags(session: &mut Session<'_>) -> Result<(), Stop> {
+    let own = Node::Cell(session.cell);
+    for tag in [0, 1, 0x7E, 0x7F, 0x80, 0xFE, 0xFF, 0xFF, 0] {
+        session.request_with(own, tag, Request::Read { number: 2 })?;
+        let number = Parameter::Mode.number();
+        session.request_with(
+            own,
+            tag,
+            Request::Write { number, words: words([session.about.test_mode.into()]) },
+        )?;
+        session.request_with(own, tag, Request::Read { number: 99 })?;
+    }
+    session.known.skin = session.about.test_mode.then(Default::default);
+    session.known.pending = None;
+    Ok(())
+}
+
+/// Requests to everyone and to other cells, and parameters that do not exist.
+pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.ready(&arm::document(2))?;
+    let reply = session.request(Node::Everyone, Request::Read { number: 2 })?;
+    let expected = arm::document(2).words(Parameter::Pose);
+    session.check("CONF-11", reply == Reply::Value(expected), || {
+        format!("a read of everyone was answered with {reply}")
+    });
+    let number = Parameter::Pose.number();
+    let words = other().words(Parameter::Pose);
+    let reply = session.request(Node::Everyone, Request::Write { number, words })?;
+    session.check("CONF-11", reply == Reply::Value(words), || {
+        format!("a write to everyone was answered with {reply}")
+    });
+    let on = [i16::from(session.about.test_mode), 0, 0, 0, 0, 0];
+    let mode = Request::Write { number: Parameter::Mode.number(), words: on };
+    let reply = session.request(Node::Everyone, mode)?;
+    session.check("CONF-11", reply == Reply::Value(on), || {
+        format!("test mode of everyone was answered with {reply}")
+    });
+    let staged = Parameters { pose: other().pose, ..arm::document(2) };
+    session.known.staged = Some(staged);
+    session.commit(&staged)?;
+    unknown(session)?;
+    not_its_own(session)
+}
+
+fn unknown(session: &mut Session<'_>) -> Result<(), Stop> {
+    for number in (10..16).chain(48..127) {
+        // Each kind of request every other time.
+        let reply = if number % 2 == 0 { session.read(number)? } else { session.set(number, [1, 2, 3])? };
+        session.check("CONF-13", reply == Reply::Refused(18), || {
+            format!("parameter {number} does not exist, and was answered with {reply}")
+        });
+    }
+    for number in [10, 15, 48, 126] {
+        let replies = [session.read(number)?, session.set(number, [0])?];
+        session.check("CONF-13", replies == [Reply::Refused(18); 2], || {
+            let [read, write] = replies;
+            format!("parameter {number} does not exist, and was answered with {read} and {write}")
+        });
+    }
+    Ok(())
+}
+
+/// What is for another cell is not answered and has no effect.
+fn not_its_own(session: &mut Session<'_>) -> Result<(), Stop> {
+    let before = session.counters()?;
+    let own = session.cell.get();
+    let near = [own ^ 1, own ^ 0x80, own.wrapping_add(1), own.wrapping_sub(1)];
+    let cells = near.into_iter().filter(|node| *node != own);
+    for cell in cells.filter_map(|node| CellId::new(node.into()).ok()) {
+        let to = Node::Cell(cell);
+        let read = Message::Configure { to, tag: 9, request: Request::Read { number: 0 } };
+        let press = protocol::message::SensorPage::Skin(arm::press(4_096));
+        let press = Message::Stimulus { to, from: protocol::message::From::Next, page: press };
+        let exchange = session.exchange_all(&[read, press])?;
+        session.check("ID-2", exchange.is_silent(), || format!("a request to cell {cell} was answered"));
+        session.step(&[0; MAX_JOINTS])?;
+    }
+    let after = session.counters()?;
+    session.check("COUNT-1", before.1 == after.1, || {
+        format!("packets for other cells were counted: {:?}, before {:?}", after.1, before.1)
+    });
+    Ok(())
+}

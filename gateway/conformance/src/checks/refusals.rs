@@ -1,0 +1,178 @@
+//! Writes and commits that cannot be: the reason, and that nothing changes.
+
+use protocol::fixed::{Q1_14, Q3_12, Q5_10};
+
+use protocol::parameters::{Parameter, Parameters};
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::{Reply, Session};
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    if !session.ready(&arm::document(2))? {
+        return Ok(());
+    }
+    let before = session.counters()?;
+    let staged = Parameters { period_us: 15_000, ..arm::document(5) };
+    session.stage(&staged)?;
+    writes(session, &staged)?;
+    // What was refused is not staged.
+    let hash = staged.hash().cast_signed();
+    let reply = session.set(Parameter::Commit.number(), [hash])?;
+    let is_so = reply.words().is_some_and(|words| words.first() == Some(&hash));
+    session.check("CONF-5", is_so, || {
+        format!("after refused writes the staged copy has another hash: commit {hash:04X} was answered with {reply}")
+    });
+    if is_so {
+        session.known.parameters = Some(staged);
+        session.known.hash = Some(staged.hash());
+        session.known.active = None;
+    } else {
+        (session.known.parameters, session.known.hash, session.known.staged) = (None, None, None);
+    }
+    commits(session)?;
+    // In use is still what was, and so is the rest of the staged copy.
+    session.stage(&staged)?;
+    let reply = session.read(Parameter::Timing.number())?;
+    session.check("CONF-5", reply == Reply::Value(staged.words(Parameter::Timing)), || {
+        format!("after refused commits the period in use is {reply}")
+    });
+    session.exchange_all(&[])?;
+    let after = session.counters()?;
+    session.check("COUNT-2", before.1 == after.1, || {
+        format!("refusals were counted: {:?}, before {:?}", after.1, before.1)
+    });
+    Ok(())
+}
+
+/// Refused when they are written: several bad words at once, from the lowest reason.
+fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), Stop> {
+    let mount = |words: [i16; 5], reason| (Parameter::Mount, words, reason);
+    let row = |kind: i16| (Parameter::Row(1), [1, 2, 3, 4, kind], 9);
+    let large = session.about.abilities.word() != 0;
+    let mut all = vec![
+        (Parameter::Identity, [1, 2, 3, 4, 5], 1),
+        mount([1, -1, 0, 0, 0], 2),
+        mount([1, 256, 0, 0, 0], 2),
+        mount([-1, 6, 0, 0, 0], 3),
+        mount([256, 6, 0, 0, 0], 3),
+        mount([300, -300, 0, 0, 0], 2),
+    ];
+    if large {
+        all.extend([
+            mount([1, 6, -1, 0, 0], 8),
+            mount([1, 6, 256, 0, 0], 8),
+            mount([1, 6, 0, -1, 0], 7),
+            mount([1, 6, 0, 256, 0], 7),
+            mount([1, 6, 0, 0, 3], 10),
+            mount([1, 6, 0, 0, -1], 10),
+            mount([-1, -1, -1, -1, -1], 2),
+            mount([-1, 6, -1, -1, -1], 3),
+            mount([1, 6, -1, -1, -1], 7),
+            mount([1, 6, -1, 0, 9], 8),
+            mount([4, 6, 0, 0, 9], 10),
+            row(3),
+            row(-1),
+            row(i16::MAX),
+        ]);
+    }
+    for (parameter, words, reason) in all {
+        let reply = session.set(parameter.number(), words)?;
+        session.check("CONF-6", reply == Reply::Refused(reason), || {
+            format!(
+                "parameter {} with {words:?} has to be refused with {reason}: {reply}",
+                parameter.number()
+            )
+        });
+        if reply.words().is_some() {
+            // Staged after all: put that back.
+            session.write(parameter.number(), good.words(parameter))?;
+        }
+    }
+    Ok(())
+}
+
+/// What is wrong with a configuration, and the reason that a commit gives.
+type Flaw = (i16, fn(&mut Parameters));
+
+const FLAWS: &[Flaw] = &[
+    (2, |it| it.joints = 0),
+    (3, |it| it.joint = 0),
+    (4, |it| it.pose.normal = [Q1_14::ZERO, Q1_14::ZERO, Q1_14::from_bits(16_512)]),
+    (5, |it| it.contact.alpha_p = Q5_10::from_bits(-1)),
+    (6, |it| it.period_us = 0),
+    (7, |it| it.table_rows = 33),
+    (8, |it| it.row = 40),
+];
+
+const MORE: &[Flaw] = &[
+    (2, |it| it.joints = 15),
+    (2, |it| it.joints = 255),
+    (3, |it| it.joint = 7),
+    (4, |it| it.pose.normal = [Q1_14::ZERO; 3]),
+    (4, |it| it.pose.normal = [Q1_14::ZERO, Q1_14::from_bits(-16_255), Q1_14::ZERO]),
+    (4, |it| it.pose.normal = [Q1_14::MIN; 3]),
+    (5, |it| it.contact.alpha_c = Q3_12::from_bits(-1)),
+    (5, |it| it.contact.contact_threshold = Q5_10::MIN),
+    (5, |it| it.contact.proximity_threshold = Q1_14::from_bits(-1)),
+    (5, |it| it.contact.force_threshold = Q5_10::from_bits(-1)),
+    // Right but for the hash.
+    (16, |it| it.pose.normal = [Q1_14::ZERO, Q1_14::ZERO, Q1_14::from_bits(16_511)]),
+    (16, |it| it.pose.normal = [Q1_14::from_bits(-16_256), Q1_14::ZERO, Q1_14::ZERO]),
+    (16, |it| it.period_us = 0xFFFF),
+    (16, |it| it.joint = 6),
+];
+
+/// Flaws of tables of rows.
+const ROWS: &[Flaw] = &[
+    (7, |it| (it.table_rows, it.row) = (5, 2)),
+    (7, |it| it.table_rows = 255),
+    (8, |it| (it.table_rows, it.row) = (6, 0)),
+    (8, |it| (it.table_rows, it.row) = (6, 3)),
+    (8, |it| (it.table_rows, it.row) = (6, 7)),
+    (8, |it| (it.table_rows, it.row) = (0, 2)),
+    (16, |it| (it.table_rows, it.row) = (6, 2)),
+];
+
+/// Refused at the commit. The hash is wrong too, so that nothing is committed whatever the cell thinks.
+fn commits(session: &mut Session<'_>) -> Result<(), Stop> {
+    let can_rows = session.about.abilities.word() != 0;
+    let is_apt = |flaw: &&Flaw| can_rows || !matches!(flaw.0, 7 | 8);
+    let base = arm::document(2);
+    let all = FLAWS.iter().chain(MORE).chain(if can_rows { ROWS } else { &[] }).filter(is_apt);
+    for (reason, flaw) in all {
+        let mut parameters = base;
+        flaw(&mut parameters);
+        refused(session, &parameters, *reason)?;
+    }
+    let apt: Vec<_> = FLAWS.iter().filter(is_apt).collect();
+    for (place, (reason, first)) in apt.iter().enumerate() {
+        for (_, second) in apt.iter().skip(place + 1) {
+            let mut parameters = base;
+            first(&mut parameters);
+            second(&mut parameters);
+            refused(session, &parameters, *reason)?;
+        }
+    }
+    let mut all = base;
+    apt.iter().for_each(|(_, flaw)| flaw(&mut all));
+    refused(session, &all, 2)
+}
+
+fn refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16) -> Result<(), Stop> {
+    session.stage(parameters)?;
+    let hash = !parameters.hash();
+    let reply = session.set(Parameter::Commit.number(), [hash.cast_signed()])?;
+    session.check("CONF-6", reply == Reply::Refused(reason), || {
+        let words = |parameter| Reply::Value(parameters.words(parameter));
+        format!(
+            "a commit with a wrong hash has to be refused with {reason}: {reply}; staged are mount {}, pose {}, \
+             contact {}, timing {}",
+            words(Parameter::Mount),
+            words(Parameter::Pose),
+            words(Parameter::Contact),
+            words(Parameter::Timing)
+        )
+    });
+    Ok(())
+}

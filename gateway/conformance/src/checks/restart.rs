@@ -1,0 +1,386 @@
+//! What shows only at a start: the address claim, and what survives.
+
+use protocol::id::Node;
+use protocol::message::{Message, NetworkPage, Request, SensorPage, State};
+use protocol::packet::{WORDS, words};
+use protocol::parameters::{Events, MAX_JOINTS, Parameter, Parameters};
+use protocol::time::{Micros, Span};
+
+use super::claims::{page, twin};
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::{Heard, Known, PATIENT, Reply, Session};
+
+/// How long a cell may take from being switched off to its first packet.
+const BOOT: Span = Span::from_millis(8_000);
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.ready(&arm::document(2))?;
+    survives(session)?;
+    while_claiming(session)?;
+    stays(session)?;
+    invalid(session)?;
+    let own = session.about.serial.unwrap_or_default();
+    let others = [
+        ("a claim with a lower serial number", twin(session, own.wrapping_sub(1), true)),
+        ("a claim with its own serial number", twin(session, own, true)),
+        ("a heartbeat without CLAIMING", twin(session, own.wrapping_add(1), false)),
+        ("network page 1", page(session, NetworkPage::Heard(protocol::message::Heard::default()))),
+    ];
+    for (what, other) in others.into_iter().filter(|(what, _)| own > 0 || !what.contains("lower")) {
+        gives_way(session, what, &other)?;
+    }
+    in_the_middle(session)
+}
+
+/// When claiming ends after the first heartbeat.
+fn claim(session: &Session<'_>) -> Span {
+    Span(250_000 + u64::from(session.cell.get()) * 250_000 / 255)
+}
+
+/// Switches the cell off and on: when its first packet came.
+fn restart(session: &mut Session<'_>) -> Result<Micros, Stop> {
+    let came = restart_with(session, BOOT, |_| Ok(()))?;
+    came.ok_or_else(|| {
+        let what = "no heartbeat with CLAIMING within 8 s after a restart";
+        session.check("CLAIM-1", false, || what.to_owned());
+        Stop::Restart(what.to_owned())
+    })
+}
+
+/// The same for so long; `meanwhile` is called again and again until that packet.
+fn restart_with(
+    session: &mut Session<'_>,
+    longest: Span,
+    mut meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), Stop>,
+) -> Result<Option<Micros>, Stop> {
+    let keep =
+        Known { last_epoch: session.known.last_epoch, joints: session.known.joints, ..Known::default() };
+    let parameters = session.known.parameters;
+    session.consume();
+    session.begin_restart()?;
+    session.known = Known { may_be_silent: true, ..keep };
+    // What was on its way is of its former life, up to 30 ms after the command began.
+    session.idle(Span::from_millis(1))?;
+    session.forget_counts();
+    session.start();
+    let give_up = session.now() + longest;
+    let is_claim = |it: &Heard| it.beat().is_some_and(|(beat, _)| beat.state.has(State::CLAIMING));
+    while session.is_restarting()? || !session.answers().iter().any(is_claim) {
+        let until = session.now() + Span::from_millis(12);
+        session.wait(until, |heard| heard.last().is_some_and(is_claim))?;
+        if !session.answers().iter().any(is_claim) {
+            meanwhile(session)?;
+        }
+        if session.now() >= give_up {
+            return Ok(None);
+        }
+    }
+    let first = session.answers().iter().position(is_claim).unwrap_or(0);
+    // What came before it was sent before it was switched off: that cell was settled.
+    let before: Vec<_> = session.answers().iter().take(first).copied().collect();
+    let came = session.answers().get(first).map_or_else(|| session.now(), |it| it.at);
+    let stray = before.iter().any(|it| it.beat().is_none());
+    session.check("CLAIM-1", !stray, || {
+        "its first packet after a restart is no heartbeat with CLAIMING".to_owned()
+    });
+    session.known.parameters = parameters;
+    session.known.staged = None;
+    Ok(Some(came))
+}
+
+/// Waits until its node id is settled: when the first heartbeat without CLAIMING came.
+fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>, Stop> {
+    let is_settled =
+        |it: &Heard| it.at > claimed && it.beat().is_some_and(|(beat, _)| !beat.state.has(State::CLAIMING));
+    let until = claimed + claim(session) + Span::from_millis(300);
+    session.wait(until, |heard| heard.iter().any(is_settled))?;
+    let at = session.answers().iter().find(|it| is_settled(it)).map(|it| it.at);
+    session.consume();
+    let expected = claim(session);
+    session.check("CLAIM-5", at.is_some(), || {
+        format!("no heartbeat without CLAIMING {} ms after the first one", expected.0 / 1_000)
+    });
+    session.known.may_be_silent = false;
+    session.extend_life();
+    Ok(at)
+}
+
+/// A plain restart: what is kept, what is lost, what is counted.
+fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
+    let kept = Parameters { period_us: 15_500, ..arm::document(3) };
+    session.ready(&kept)?;
+    let staged = Parameters { period_us: 14_000, ..arm::document(4) };
+    session.stage(&staged)?;
+    if session.about.sensing {
+        session.known.senses = true;
+        // None comes before it is switched off.
+        session.set(7, [1, i16::MAX])?;
+        session.set(8, [1, 2, 3, 4, 5])?;
+    }
+    session.mark();
+    session.say(&[Message::Halt])?;
+    let claimed = restart(session)?;
+    let first =
+        session.answers().iter().find_map(|it| Some((*it.beat()?.0, it.beat()?.1))).unwrap_or_default();
+    let is_new = (first.0.sent, first.0.rejected, first.1.0) == (0, 0, 0);
+    session.check("CLAIM-1", is_new, || {
+        format!(
+            "the first heartbeat after a restart has sent {}, refused {} and epoch {}",
+            first.0.sent, first.0.rejected, first.1
+        )
+    });
+    session
+        .check("STATE-3", !first.0.state.has(State::HALTED), || "HALTED is set after a restart".to_owned());
+    session
+        .check("STATE-1", !first.0.state.has(State::ACTIVE), || "ACTIVE is set after a restart".to_owned());
+    let others = session.answers().iter().filter(|it| it.at >= claimed).count();
+    let at = settled(session, claimed)?;
+    if let Some(at) = at {
+        let (took, expected) = (at.since(claimed).0, claim(session).0);
+        let late = session.lateness().0;
+        let range = expected - expected / 100 - 2_000..=expected + expected / 100 + 22_000 + late;
+        session.check("CLAIM-5", range.contains(&took), || {
+            format!("claiming ended after {:.1} ms, not {:.1}", took as f64 / 1e3, expected as f64 / 1e3)
+        });
+    }
+    session.check("CLAIM-1", others >= 1, || "no heartbeat".to_owned());
+    let same = first.0.configuration == kept.hash() && first.0.state.has(State::CONFIGURED);
+    session.check("CONF-8", same, || {
+        format!(
+            "after a restart the configuration is {:04X}, and {:04X} was committed",
+            first.0.configuration,
+            kept.hash()
+        )
+    });
+    session.check("ID-3", at.is_some(), || "it does not send under its node id after a restart".to_owned());
+    session.known.hash = Some(kept.hash());
+    (session.known.halted, session.known.epoch) = (Some(false), Some(0));
+    session.exchange_all(&[])?;
+    for parameter in Parameter::stored(6) {
+        let reply = session.read(parameter.number())?;
+        session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
+            format!("after a restart parameter {} is {reply}", parameter.number())
+        });
+    }
+    // What was only staged is gone.
+    let hash = staged.hash().cast_signed();
+    let reply = session.set(Parameter::Commit.number(), [hash])?;
+    session.check("CONF-2", reply == Reply::Refused(16), || {
+        format!("after a restart a commit of what was only staged was answered with {reply}")
+    });
+    volatile(session)?;
+    (session.known.parameters, session.known.staged) = (Some(kept), Some(kept));
+    // The staged copy is one of what is in use.
+    let next = Parameters { period_us: 15_250, ..kept };
+    session.known.active = None;
+    let done = session.commit(&next)?;
+    session.check("CONF-2", done, || "after a restart the staged copy is not what is in use".to_owned());
+    let counters = session.counters()?;
+    session.check("BEAT-4", counters.1 == protocol::message::Refused::default(), || {
+        format!("counters do not begin with 0 after a restart: {counters:?}")
+    });
+    Ok(())
+}
+
+/// Volatile parameters are as at a start.
+fn volatile(session: &mut Session<'_>) -> Result<(), Stop> {
+    let events = if session.about.sensing { Events::default().words() } else { [0; WORDS] };
+    for (number, expected) in [(6, [0; WORDS]), (7, [0; WORDS]), (8, events), (9, [0; WORDS])] {
+        let reply = session.read(number)?;
+        session.check("CONF-9", reply == Reply::Value(expected), || {
+            format!("after a restart parameter {number} is {reply}, not {}", Reply::Value(expected))
+        });
+    }
+    // A simulated cell may be started with test mode on.
+    let reply = session.read(5)?;
+    session.known.test_mode = reply.words().map(|words| words.first() == Some(&1));
+    Ok(())
+}
+
+/// What a claiming cell takes, and what it ignores.
+fn while_claiming(session: &mut Session<'_>) -> Result<(), Stop> {
+    let claimed = restart(session)?;
+    let state =
+        session.answers().last().and_then(Heard::beat).map(|(beat, _)| beat.state).unwrap_or_default();
+    let presses = state.has(State::TEST_MODE);
+    session.start();
+    session.press(arm::press(4_096))?;
+    let first = session.next_epoch();
+    let second = session.next_epoch();
+    let own = Node::Cell(session.cell);
+    let request = |number, request| Message::Configure { to: own, tag: number, request };
+    let write = Request::Write { number: 1, words: words([999, 999]) };
+    let all = [
+        session.joints(first, &[0; MAX_JOINTS]),
+        Message::Sync,
+        Message::Report,
+        request(1, Request::Read { number: 0 }),
+        request(2, write),
+        request(3, Request::Read { number: 77 }),
+        session.joints(second, &[0; MAX_JOINTS]),
+        Message::Halt,
+    ];
+    for message in all {
+        session.say(&[message])?;
+        session.idle(Span::from_millis(3))?;
+    }
+    session.idle(Span::from_millis(20))?;
+    let came: Vec<_> = session.answers().iter().map(|it| it.message.id().kind.name()).collect();
+    session.check("CLAIM-2", came.is_empty(), || format!("a claiming cell answered with {came:?}"));
+    let at = settled(session, claimed)?;
+    if at.is_none() {
+        return Ok(());
+    }
+    session.known.epoch = Some(second);
+    session.known.halted = Some(true);
+    session.known.hash = session.known.parameters.map(|it| it.hash());
+    let counters = session.counters()?;
+    let is_so = counters.0.joints == 2 && counters.0.torques == 0;
+    session.check("CLAIM-2", is_so, || format!("a claiming cell takes joints; of 2: {:?}", counters.0));
+    let refused = protocol::message::Refused { stimuli: u16::from(!presses), ..Default::default() };
+    session.check("CLAIM-2", counters.1 == refused, || {
+        format!("a claiming cell counted what it has to ignore: {:?}", counters.1)
+    });
+    if presses {
+        let report = session.report()?;
+        let skin = report.iter().find_map(|it| match it.sensors() {
+            Some((_, SensorPage::Skin(skin))) => Some(*skin),
+            _ => None,
+        });
+        session.check("STIM-8", skin == Some(arm::press(4_096)), || {
+            format!("a claiming cell did not latch a stimulus: {skin:?}")
+        });
+    }
+    session.ready(&arm::document(2))?;
+    Ok(())
+}
+
+/// A claim with a higher serial number, before the first heartbeat and after it.
+fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
+    let own = session.about.serial.unwrap_or_default();
+    let Some(higher) = own.checked_add(1) else {
+        session.findings.not_tested("CLAIM-3", "no serial number is higher than its own");
+        return Ok(());
+    };
+    let rest = twin(session, higher, true);
+    // Not too often: each is answered only if the last answer was 10 ms ago.
+    let longest = Span::from_millis(3_000);
+    let Some(claimed) = restart_with(session, longest, |session| session.say(&[rest]).map(|_| ()))? else {
+        session.check("CLAIM-3", false, || {
+            format!("no heartbeat came while claims with the higher serial number {higher} did: it gave way to them")
+        });
+        return Ok(());
+    };
+    session.idle(Span::from_millis(90))?;
+    for serial in [higher, u32::MAX] {
+        session.start();
+        let claim = twin(session, serial, true);
+        let at = session.say(&[claim])?;
+        let came =
+            session.wait(at + Span::from_millis(60), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        let answer = session.answers().iter().find_map(|it| Some((it.at, it.beat()?.0.state)));
+        session.consume();
+        session.check("CLAIM-3", came, || {
+            format!("a claiming cell did not answer a claim with the higher serial number {serial}")
+        });
+        if let Some((answered, state)) = answer {
+            session.note_time("heartbeat to a claimant", at, answered);
+            session.check("CLAIM-3", state.has(State::CLAIMING), || "its answer has no CLAIMING".to_owned());
+            session
+                .check("CLAIM-7", state.has(State::DUPLICATE), || "its answer has no DUPLICATE".to_owned());
+        }
+        session.idle(Span::from_millis(30))?;
+    }
+    session.start();
+    let at = settled(session, claimed)?;
+    session.check("CLAIM-3", at.is_some(), || "it gave way to a higher serial number".to_owned());
+    session.known.hash = None;
+    session.ready(&arm::document(2))?;
+    Ok(())
+}
+
+/// What is no valid 4nn changes nothing.
+fn invalid(session: &mut Session<'_>) -> Result<(), Stop> {
+    let claimed = restart(session)?;
+    session.start();
+    let mut packet = twin(session, 0, true).encode();
+    packet.count = 7;
+    let mut frames: Vec<_> = packet.frames(session.format).collect();
+    let mut other = twin(session, 0, true).encode();
+    other.count = 9;
+    frames.extend(other.frames(session.format));
+    session.send(&frames)?;
+    let at = settled(session, claimed)?;
+    session
+        .check("CLAIM-3", at.is_some(), || "it gave way to a 4nn of a page that does not exist".to_owned());
+    let is_set =
+        session.answers().iter().filter_map(Heard::beat).any(|(beat, _)| beat.state.has(State::DUPLICATE));
+    session
+        .check("COUNT-1", !is_set, || "DUPLICATE is set by a 4nn of a page that does not exist".to_owned());
+    session.known.hash = None;
+    Ok(())
+}
+
+/// A packet to which a claiming cell gives way, and then silence.
+fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) -> Result<(), Stop> {
+    let claimed = restart(session)?;
+    session.start();
+    session.say(&[*other])?;
+    session.idle(Span::from_millis(3))?;
+    session.consume();
+    session.start();
+    for message in [Message::Sync, Message::Report] {
+        session.say(&[message])?;
+    }
+    let claim = twin(session, u32::MAX, true);
+    session.say(&[claim])?;
+    let until = claimed + claim_end(session);
+    session.wait(until, |_| false)?;
+    let came = session.answers().len();
+    session.consume();
+    let serial = session.about.serial.unwrap_or_default();
+    session.check("CLAIM-3", came == 0, || {
+        format!("it (serial number {serial}) did not give way to {what}: {came} packets came after it")
+    });
+    session.check("CLAIM-4", came == 0, || format!("{came} packets came after it had to give way to {what}"));
+    Ok(())
+}
+
+/// Claiming is over by then, and a heartbeat more is due.
+fn claim_end(session: &Session<'_>) -> Span {
+    Span(claim(session).0 + 60_000)
+}
+
+/// A reset just after a commit was requested: flash has the old or the new, or says that it is damaged.
+fn in_the_middle(session: &mut Session<'_>) -> Result<(), Stop> {
+    let claimed = restart(session)?;
+    settled(session, claimed)?;
+    session.known.hash = None;
+    let (old, new) = (arm::document(2), Parameters { period_us: 14_000, ..arm::document(4) });
+    session.ready(&old)?;
+    session.stage(&new)?;
+    let request =
+        Request::Write { number: Parameter::Commit.number(), words: words([new.hash().cast_signed()]) };
+    session.say(&[Message::Configure { to: Node::Cell(session.cell), tag: 1, request }])?;
+    session.consume();
+    let claimed = restart(session)?;
+    settled(session, claimed)?;
+    session.start();
+    let sync = session.say(&[Message::Sync])?;
+    session.wait(sync + PATIENT, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+    let beat =
+        session.answers().iter().rev().find_map(|it| it.beat().map(|(beat, _)| *beat)).unwrap_or_default();
+    session.consume();
+    let is_whole =
+        beat.state.has(State::CONFIGURED) && [old.hash(), new.hash()].contains(&beat.configuration);
+    let is_noticed = !beat.state.has(State::CONFIGURED) && beat.state.has(State::FLASH_DAMAGED);
+    session.check("CONF-8", is_whole || is_noticed, || {
+        format!(
+            "after a reset during a commit the configuration is {:04X}, the state {:04X}",
+            beat.configuration, beat.state.0
+        )
+    });
+    (session.known.parameters, session.known.staged, session.known.hash) = (None, None, None);
+    Ok(())
+}

@@ -1,0 +1,316 @@
+//! Sensor values without a request: switches, events, continuous mode.
+
+use protocol::fixed::{Q, Q1_14, Q3_12};
+use protocol::id::Node;
+use protocol::message::{From, Message, SensorPage, SkinSensors};
+use protocol::packet::words;
+use protocol::parameters::{Events, MAX_JOINTS};
+use protocol::time::Span;
+
+use super::sensing_model::Model;
+use crate::arm::{self, Dice};
+use crate::bus::Stop;
+use crate::session::{Heard, Session};
+
+const SENSING: u8 = 7;
+const EVENTS: u8 = 8;
+const STEPS: usize = 160;
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.ready(&arm::document(6))?;
+    session.known.senses = true;
+    session.write(EVENTS, Events::default().words())?;
+    let done = switches(session)
+        .and_then(|()| order(session))
+        .and_then(|()| events(session, Events::default(), 3))
+        .and_then(|()| events(session, fine(), 4))
+        .and_then(|()| after_beats(session))
+        .and_then(|()| halted(session))
+        .and_then(|()| continuous(session));
+    done?;
+    session.set(SENSING, [0])?;
+    session.write(EVENTS, Events::default().words())?;
+    session.settle()?;
+    session.known.senses = false;
+    session.idle(Span::from_millis(300))?;
+    session.mark();
+    Ok(())
+}
+
+/// Every change is an event, and a release is at the threshold itself.
+fn fine() -> Events {
+    let [contact, proximity, temperature, acceleration, hysteresis] = [0, 700, 0, 0, 0];
+    Events {
+        contact: Q::from_bits(contact),
+        proximity: Q::from_bits(proximity),
+        temperature: Q::from_bits(temperature),
+        acceleration: Q::from_bits(acceleration),
+        hysteresis: Q::from_bits(hysteresis),
+    }
+}
+
+/// Pages since the exchange began, by number.
+fn pages(heard: &[Heard]) -> Vec<u8> {
+    let number = |page: &SensorPage| u8::from(matches!(page, SensorPage::Acceleration(_)));
+    heard.iter().filter_map(|it| Some(number(it.sensors()?.1))).collect()
+}
+
+/// Writes parameter 7, and sees which pages come at once.
+fn switched(session: &mut Session<'_>, mode: [i16; 2], expected: &[u8], what: &str) -> Result<(), Stop> {
+    session.quiet(Span::from_millis(60))?;
+    session.mark();
+    session.write(SENSING, words(mode))?;
+    session.idle(Span::from_millis(8))?;
+    let pages = pages(session.answers());
+    session.check("SENSE-4", pages == expected, || {
+        format!("{what}: sensors pages {pages:?} came after it, and {expected:?} are right")
+    });
+    session.consume();
+    Ok(())
+}
+
+fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.set(SENSING, [0])?;
+    session.settle()?;
+    switched(session, [2, 0], &[0, 1], "a switch to event mode")?;
+    switched(session, [2, 0], &[], "the same mode again")?;
+    switched(session, [1, 1_000], &[0, 1], "a switch to continuous mode")?;
+    switched(session, [1, 1_000], &[], "the same period again")?;
+    switched(session, [1, 1_001], &[0, 1], "another period")?;
+    switched(session, [0, 0], &[], "a switch off")?;
+    switched(session, [2, 0], &[0, 1], "a switch to event mode")
+}
+
+/// A touch: the torque leaves before the page.
+fn order(session: &mut Session<'_>) -> Result<(), Stop> {
+    for sum in [4_096, 0] {
+        session.quiet(Span::from_millis(60))?;
+        session.press(arm::press(sum))?;
+        let step = session.step(&[0x0321; MAX_JOINTS])?;
+        let kinds: Vec<_> = step.exchange.answers.iter().map(|it| it.message.id().kind.name()).collect();
+        session.check("TIME-3", kinds == ["torque", "sensors"], || {
+            format!("a touch or its end in event mode: {kinds:?} came; a torque and then a page are right")
+        });
+    }
+    Ok(())
+}
+
+/// Random values around the thresholds: a page when the model says so, and only then.
+fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), Stop> {
+    let mut dice = Dice::new(seed);
+    session.set(SENSING, [0])?;
+    session.write(EVENTS, events.words())?;
+    session.test_mode(true)?;
+    session.known.active = None;
+    session.step(&[0; MAX_JOINTS])?;
+    session.known.active = Some(false);
+    session.set(SENSING, [2])?;
+    session.idle(Span::from_millis(10))?;
+    session.mark();
+    let mut model = Model::new(events);
+    for step in 0..session.attempts(STEPS) {
+        let (skin, acceleration) = values(&mut dice, &events, &model, step);
+        session.press(skin)?;
+        if let Some(acceleration) = acceleration {
+            let to = Node::Cell(session.cell);
+            let page = SensorPage::Acceleration(acceleration);
+            session.say(&[Message::Stimulus { to, from: From::Next, page }])?;
+        }
+        // What a regular heartbeat brings is the cell's last word too.
+        for heard in session.unmarked() {
+            if let Some((_, page)) = heard.sensors() {
+                model.sends(page);
+            }
+        }
+        let turned = model.turned();
+        let (expected, ids) = model.latch(skin, acceleration);
+        let came = session.step(&[0; MAX_JOINTS])?;
+        let beats = session.answers().iter().filter(|it| it.beat().is_some()).count();
+        let sent: Vec<_> =
+            came.exchange.answers.iter().filter_map(|it| it.sensors().map(|(_, page)| *page)).collect();
+        let numbers = pages(&came.exchange.answers);
+        sent.iter().for_each(|page| model.sends(page));
+        if beats == 1 {
+            session.check(ids, numbers == expected, || {
+                format!(
+                    "{skin:?}, {acceleration:?} is latched, {} steps of it, {turned}: pages {numbers:?} came, and \
+                     {expected:?} are right",
+                    step + 1
+                )
+            });
+        }
+        // Those of a regular heartbeat may have come before the joints.
+        let after = came.exchange.answers.iter().filter(|it| it.at > came.exchange.at);
+        let is_latched = after.filter_map(Heard::sensors).all(|(_, page)| model.has(page));
+        session.check("SENSE-7", is_latched, || format!("{sent:?} was sent, and is not what is latched"));
+        if step % 40 == 39 {
+            // What answers a report was sent last, too.
+            for page in session.report()?.iter().filter_map(Heard::sensors) {
+                model.sends(page.1);
+            }
+        }
+    }
+    session.pressed(&[0; MAX_JOINTS], arm::press(0))?;
+    session.step(&[0; MAX_JOINTS])?;
+    Ok(())
+}
+
+/// Sensor values near what was sent last, and near the thresholds.
+fn values(dice: &mut Dice, events: &Events, model: &Model, step: usize) -> (SkinSensors, Option<[Q3_12; 3]>) {
+    let sent = model.sent_skin();
+    let mut skin = sent;
+    let near = |dice: &mut Dice, threshold: i16| {
+        let steps =
+            [0, 1, -1, threshold, threshold - 1, -threshold, 1 - threshold, threshold / 2, -threshold / 2];
+        dice.one(&steps)
+    };
+    match step % 5 {
+        0 => skin.contact = [0, 0, 0].map(Q::from_bits),
+        1 => {
+            let [a, b, c] = skin.contact.map(Q::<10>::to_bits);
+            skin.contact = [a.saturating_add(near(dice, events.contact.to_bits())), b, c].map(Q::from_bits);
+        }
+        2 => {
+            let threshold = events.contact.to_bits();
+            let sum = dice.one(&[threshold, threshold - 1, threshold / 2, threshold / 2 - 1, 1, 0, -1]);
+            skin.contact = [sum, 0, 0].map(Q::from_bits);
+        }
+        3 => {
+            let threshold = events.proximity.to_bits();
+            let steps = [0, threshold, threshold - 1, threshold / 2, threshold / 2 - 1, 1, threshold * 2];
+            skin.proximity = Q1_14::from_bits(dice.one(&steps));
+        }
+        _ => {
+            let [a, b] = skin.temperature.map(Q::<6>::to_bits);
+            skin.temperature =
+                [a, b.saturating_add(near(dice, events.temperature.to_bits()))].map(Q::from_bits);
+        }
+    }
+    let acceleration = step.is_multiple_of(3).then(|| {
+        let [x, y, z] = model.sent_acceleration().map(Q::<12>::to_bits);
+        [x, y.saturating_add(near(dice, events.acceleration.to_bits())), z].map(Q::from_bits)
+    });
+    (skin, acceleration)
+}
+
+/// In event mode page 0 follows each regular heartbeat, and page 1 every fourth since the switch.
+fn after_beats(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.set(SENSING, [0])?;
+    session.quiet(Span::from_millis(60))?;
+    session.mark();
+    session.set(SENSING, [2])?;
+    session.idle(Span::from_millis(10))?;
+    session.start();
+    session.idle(Span::from_millis(2_050))?;
+    let mut beats: Vec<Vec<u8>> = Vec::new();
+    for heard in session.answers() {
+        match (heard.beat(), heard.sensors(), beats.last_mut()) {
+            (Some(_), ..) => beats.push(Vec::new()),
+            (None, Some((_, page)), Some(last)) => {
+                last.push(u8::from(matches!(page, SensorPage::Acceleration(_))));
+            }
+            _ => {}
+        }
+    }
+    session.consume();
+    let is_so = beats.len() >= 7
+        && beats.iter().enumerate().all(|(place, pages)| {
+            let expected: &[u8] = if place % 4 == 3 { &[0, 1] } else { &[0] };
+            pages == expected
+        });
+    session.check("SENSE-10", is_so, || {
+        format!("pages after each of {} heartbeats in event mode: {beats:?}; page 0, and page 1 after each fourth", beats.len())
+    });
+    // Others bring none.
+    session.quiet(Span::from_millis(60))?;
+    let sync = session.exchange_all(&[])?;
+    session.check("SENSE-10", sync.is_silent(), || "a page came with the heartbeat to a sync".to_owned());
+    Ok(())
+}
+
+fn halted(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.mark();
+    session.say(&[Message::Halt])?;
+    (session.known.halted, session.known.active) = (Some(true), Some(false));
+    session.quiet(Span::from_millis(60))?;
+    for sum in [5_000, 0] {
+        session.press(arm::press(sum))?;
+        let step = session.step(&[0; MAX_JOINTS])?;
+        let pages = pages(&step.exchange.answers);
+        session.check("SENSE-11", pages == [0], || {
+            format!("halted, in event mode: pages {pages:?} came to a touch or its end, and [0] is right")
+        });
+    }
+    session.say(&[Message::Resume])?;
+    session.known.halted = Some(false);
+    session.set(SENSING, [0])?;
+    session.settle()
+}
+
+fn continuous(session: &mut Session<'_>) -> Result<(), Stop> {
+    for period in [50, 120] {
+        grid(session, period, false)?;
+    }
+    // As short as the period of the joints: none is early.
+    grid(session, 16, true)?;
+    if session.about.committed {
+        grid(session, 40, true)?;
+    }
+    Ok(())
+}
+
+/// Page 0 at `t + P + P n / 255 + i P`; with joints up to their period earlier, where P is longer.
+fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(), Stop> {
+    const JOINTS: u64 = 16_000;
+    const LATE: u64 = 20_000;
+    const SLACK: u64 = 2_000;
+    let (id, early) = match with_joints {
+        true if period * 1_000 > JOINTS => ("SENSE-6", JOINTS),
+        true => ("SENSE-6", 0),
+        false => ("SENSE-5", 0),
+    };
+    for attempt in 0..3 {
+        session.set(SENSING, [0])?;
+        session.settle()?;
+        session.mark();
+        let period_ms = i16::try_from(period).unwrap_or_default();
+        session.set(SENSING, [1, period_ms])?;
+        let Some(began) = session.answers().first().map(|it| it.at) else { return Ok(()) };
+        let span = Span::from_millis(12 * period);
+        let mut due = began + Span(7_000);
+        while with_joints && due < began + span {
+            session.wait(due, |_| false)?;
+            let epoch = session.next_epoch();
+            let joints = session.joints(epoch, &[0; MAX_JOINTS]);
+            session.say(&[joints])?;
+            session.known.epoch = Some(epoch);
+            due = due + Span(JOINTS);
+        }
+        session.wait(began + span, |_| false)?;
+        let late = session.lateness();
+        let all: Vec<_> = session.answers().iter().filter_map(|it| Some((it.at, *it.sensors()?.1))).collect();
+        session.consume();
+        let skin = all.iter().filter(|(_, page)| matches!(page, SensorPage::Skin(_))).skip(1);
+        let times: Vec<_> = skin.map(|(at, _)| at.since(began).0).collect();
+        let first = period * 1_000 + period * 1_000 * u64::from(session.cell.get()) / 255;
+        let is_in_time = |(place, at): (usize, &u64)| {
+            let due = first + place as u64 * period * 1_000;
+            let slack = SLACK + at / 100;
+            (due.saturating_sub(early + slack)..=due + LATE + slack).contains(at)
+        };
+        let is_so = (10..=12).contains(&times.len()) && times.iter().enumerate().all(is_in_time);
+        if is_so || attempt == 2 || late.0 < 1_000 {
+            session.check(id, is_so, || {
+                let times: Vec<_> = times.iter().map(|at| at / 1_000).collect();
+                format!(
+                    "every {period} ms{}: page 0 came {times:?} ms after the switch; {} ms and then every {period} ms \
+                     are right",
+                    if with_joints { ", joints every 16 ms" } else { "" },
+                    first / 1_000
+                )
+            });
+            return Ok(());
+        }
+    }
+    Ok(())
+}

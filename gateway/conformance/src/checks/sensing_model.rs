@@ -1,0 +1,139 @@
+//! What event mode has to send, by the document: SENSE-7, SENSE-8 and SENSE-9.
+
+use protocol::fixed::{Q, Q3_12};
+use protocol::message::{SensorPage, SkinSensors};
+use protocol::parameters::Events;
+
+/// The state of contact or proximity.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+enum Touch {
+    #[default]
+    Free,
+    Touched,
+    Fading,
+}
+
+impl Touch {
+    /// The table of SENSE-9.
+    const fn next(self, v: i64, threshold: i64, hysteresis: i64) -> Self {
+        // A threshold of 0 counts as one step.
+        let threshold = if threshold < 1 { 1 } else { threshold };
+        if v >= threshold {
+            return Self::Touched;
+        }
+        if v == 0 {
+            return Self::Free;
+        }
+        if v > 0 && v << 14 >= threshold * ((1 << 14) - hysteresis) {
+            return self;
+        }
+        match self {
+            Self::Free => Self::Free,
+            Self::Touched | Self::Fading => Self::Fading,
+        }
+    }
+}
+
+/// What is latched, what was sent last, and the states.
+#[derive(Clone, Debug)]
+pub(super) struct Model {
+    events: Events,
+    latched: (SkinSensors, [Q3_12; 3]),
+    sent: (SkinSensors, [Q3_12; 3]),
+    contact: Touch,
+    proximity: Touch,
+}
+
+impl Model {
+    /// At a switch to event mode with nothing latched.
+    pub(super) fn new(events: Events) -> Self {
+        let nothing = (SkinSensors::default(), [Q3_12::ZERO; 3]);
+        let mut model =
+            Self { events, latched: nothing, sent: nothing, contact: Touch::Free, proximity: Touch::Free };
+        model.follow();
+        model
+    }
+
+    pub(super) const fn sent_skin(&self) -> SkinSensors {
+        self.sent.0
+    }
+
+    pub(super) const fn sent_acceleration(&self) -> [Q3_12; 3] {
+        self.sent.1
+    }
+
+    /// The states before a latch, for a message.
+    pub(super) fn turned(&self) -> String {
+        format!("contact {:?}, proximity {:?}", self.contact, self.proximity)
+    }
+
+    /// A page was sent.
+    pub(super) const fn sends(&mut self, page: &SensorPage) {
+        match *page {
+            SensorPage::Skin(skin) => self.sent.0 = skin,
+            SensorPage::Acceleration(acceleration) => self.sent.1 = acceleration,
+        }
+    }
+
+    /// Whether a page is what is latched.
+    pub(super) fn has(&self, page: &SensorPage) -> bool {
+        match *page {
+            SensorPage::Skin(skin) => self.latched.0 == skin,
+            SensorPage::Acceleration(acceleration) => self.latched.1 == acceleration,
+        }
+    }
+
+    /// Whether contact or proximity has turned.
+    fn follow(&mut self) -> bool {
+        let before = (self.contact, self.proximity);
+        let hysteresis = i64::from(self.events.hysteresis.to_bits());
+        let skin = self.latched.0;
+        let sum: i64 = skin.contact.iter().map(|word| i64::from(word.to_bits())).sum();
+        self.contact = self.contact.next(sum, self.events.contact.to_bits().into(), hysteresis);
+        let proximity = skin.proximity.to_bits().into();
+        self.proximity = self.proximity.next(proximity, self.events.proximity.to_bits().into(), hysteresis);
+        before != (self.contact, self.proximity)
+    }
+
+    /// The pages that have to come when this is latched, and the requirement that says so.
+    pub(super) fn latch(
+        &mut self,
+        skin: SkinSensors,
+        acceleration: Option<[Q3_12; 3]>,
+    ) -> (Vec<u8>, &'static str) {
+        let before = self.latched;
+        self.latched = (skin, acceleration.unwrap_or(self.latched.1));
+        let turned = self.follow();
+        let (now, sent, events) = (self.latched.0, self.sent.0, self.events);
+        let has_moved = |from: &SkinSensors| {
+            is_far(&now.contact, &from.contact, events.contact)
+                || is_far(&now.temperature, &from.temperature, events.temperature)
+                || is_far(&[now.proximity], &[from.proximity], events.proximity)
+        };
+        let moved = has_moved(&sent);
+        let mut pages = Vec::new();
+        if now != sent && (turned || moved) {
+            pages.push(0);
+        }
+        if is_far(&self.latched.1, &self.sent.1, events.acceleration) {
+            pages.push(1);
+        }
+        let far = |from: &[Q3_12; 3]| is_far(&self.latched.1, from, events.acceleration);
+        // What was latched last is not what was sent last.
+        let by_sent = moved != has_moved(&before.0) || far(&before.1) != far(&self.sent.1);
+        let id = match (by_sent, turned && !moved) {
+            (true, _) => "SENSE-8",
+            (false, true) => "SENSE-9",
+            (false, false) => "SENSE-7",
+        };
+        (pages, id)
+    }
+}
+
+/// Whether one of them has moved by a threshold or more; 0 counts as one step.
+fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
+    let threshold = i32::from(threshold.to_bits()).max(1);
+    now.iter()
+        .zip(sent)
+        .any(|(now, sent)| (i32::from(now.to_bits()) - i32::from(sent.to_bits())).abs() >= threshold)
+}

@@ -1,0 +1,266 @@
+//! Stimuli: from when they hold, how many wait, and what forgets them.
+
+use protocol::id::Node;
+use protocol::message::{From, Message, SensorPage};
+use protocol::packet::Epoch;
+use protocol::parameters::{MAX_JOINTS, Parameters};
+
+use super::kinematics::look_at_words;
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::Session;
+
+const POSITIONS: [i16; MAX_JOINTS] =
+    [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
+
+/// A cell of which J is known at [`POSITIONS`].
+struct Pressed {
+    parameters: Parameters,
+    j: [i16; MAX_JOINTS],
+}
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    let parameters = arm::document(6);
+    if !session.ready(&parameters)? {
+        return Ok(());
+    }
+    let j = session.pressed(&POSITIONS, arm::press(arm::unit_press(parameters.torque_format)))?.words();
+    let cell = Pressed { parameters, j };
+    let before = session.counters()?;
+    let mut count = next(session, &cell)?;
+    count += first_epoch(session, &cell)?;
+    let late = too_late(session, &cell)?;
+    count += late;
+    count += order(session, &cell)?;
+    let after = session.counters()?;
+    let counted = after.0.stimuli.wrapping_sub(before.0.stimuli);
+    session.check("STIM-3", counted == count, || format!("{count} stimuli were counted as {counted}"));
+    let counted = after.0.stimuli_late.wrapping_sub(before.0.stimuli_late);
+    session.check("STIM-5", counted == late, || format!("{late} late stimuli were counted as {counted}"));
+    let is_same = after.1 == before.1;
+    session.check("STIM-6", is_same, || format!("stimuli that had room were refused: {:?}", after.1));
+    pending(session, &cell)?;
+    forgotten(session, &cell)?;
+    measuring(session)?;
+    halted(session, &cell)
+}
+
+/// Joints of this epoch, at which this force has to be latched.
+fn latched(
+    session: &mut Session<'_>,
+    cell: &Pressed,
+    epoch: u8,
+    sum: i32,
+    id: &'static str,
+) -> Result<(), Stop> {
+    let skin = arm::press(sum);
+    session.known.skin = Some(skin);
+    session.known.pending = None;
+    let step = session.step_at(epoch, &POSITIONS)?;
+    let force = arm::force(&cell.parameters.contact, &skin);
+    let is_there = step.torque.is_some_and(|words| !words.is_zero());
+    session.check(id, is_there == (sum > 0), || {
+        format!(
+            "at joints {epoch} {} N are latched, and the torque is {:?}",
+            f64::from(sum) / 1024.0,
+            step.words()
+        )
+    });
+    if is_there && sum > 0 {
+        look_at_words(session, &cell.parameters, &cell.j, force, &step.words(), id);
+    }
+    Ok(())
+}
+
+/// From the next joints on; how many stimuli that took.
+fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
+    let mut count = 0;
+    let start = session.known.last_epoch;
+    for (jump, sum) in [(1, 1_000), (200, 1_500), (3, 0), (128, 2_000), (255, 2_500)] {
+        let epoch = session.known.last_epoch.wrapping_add(jump);
+        session.press(arm::press(sum))?;
+        latched(session, cell, epoch, sum, "STIM-4")?;
+        latched(session, cell, epoch.wrapping_add(1), sum, "STIM-7")?;
+        count += 1;
+    }
+    // The epoch byte means nothing then, and everyone is meant too.
+    let ahead = session.known.last_epoch.wrapping_add(60);
+    for (epoch, to) in
+        [(start, Node::Cell(session.cell)), (ahead, Node::Everyone), (ahead, Node::Cell(session.cell))]
+    {
+        let sum = 3_000 + i32::from(epoch);
+        let page = SensorPage::Skin(arm::press(sum));
+        let mut packet = Message::Stimulus { to, from: From::Next, page }.encode();
+        packet.epoch = Epoch(epoch);
+        let frames: Vec<_> = packet.frames(session.format).collect();
+        session.send(&frames)?;
+        let epoch = session.next_epoch();
+        latched(session, cell, epoch, sum, "STIM-4")?;
+        count += 1;
+    }
+    Ok(count)
+}
+
+/// The first epoch, near and far, and around the corner.
+fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
+    let mut held = 4_000;
+    let mut count = 1;
+    session.press(arm::press(held))?;
+    let epoch = session.next_epoch();
+    latched(session, cell, epoch, held, "STIM-3")?;
+    for (last, ahead) in [(10, 3), (250, 8), (100, 1), (20, 127), (200, 100)] {
+        latched(session, cell, last, held, "STIM-3")?;
+        let (first, sum) = (u8::wrapping_add(last, ahead), held + 111);
+        session.press_at(first, arm::press(sum))?;
+        count += 1;
+        for step in [1, 2, ahead / 2, ahead - 1].into_iter().filter(|step| (1..ahead).contains(step)) {
+            let epoch = last.wrapping_add(step);
+            if epoch != session.known.last_epoch {
+                latched(session, cell, epoch, held, "STIM-3")?;
+            }
+        }
+        // The epoch itself, or one behind it.
+        let epoch = first.wrapping_add(ahead % 3);
+        latched(session, cell, epoch, sum, "STIM-3")?;
+        held = sum;
+    }
+    // Two at once, each for its own epoch; and joints that go back do not latch what is ahead.
+    let last = session.known.last_epoch;
+    session.press_at(last.wrapping_add(2), arm::press(held + 300))?;
+    session.press_at(last.wrapping_add(3), arm::press(held + 600))?;
+    count += 2;
+    latched(session, cell, last.wrapping_add(1), held, "STIM-3")?;
+    latched(session, cell, last.wrapping_sub(20), held, "STIM-3")?;
+    latched(session, cell, last.wrapping_add(2), held + 300, "STIM-3")?;
+    latched(session, cell, last.wrapping_add(3), held + 600, "STIM-3")?;
+    Ok(count)
+}
+
+/// For joints that have been; how many stimuli that took.
+fn too_late(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
+    let mut count = 0;
+    for (behind, jump) in [(0, 1), (5, 1), (2, 250), (127, 1)] {
+        let last = session.known.last_epoch;
+        let sum = 5_000 + 100 * i32::from(behind) + i32::from(jump);
+        session.press_at(last.wrapping_sub(behind), arm::press(sum))?;
+        count += 1;
+        latched(session, cell, last.wrapping_add(jump), sum, "STIM-5")?;
+    }
+    Ok(count)
+}
+
+/// Several for the same joints; how many stimuli that took.
+fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
+    let mut count = 0;
+    for (first, second, jump) in [(1, 1, 1), (2, 1, 2), (1, 2, 2), (3, 0, 3)] {
+        let last = session.known.last_epoch;
+        for (ahead, sum) in [(first, 6_000), (second, 7_000)] {
+            if ahead > 0 {
+                session.press_at(last.wrapping_add(ahead), arm::press(sum))?;
+            } else {
+                session.press(arm::press(sum))?;
+            }
+            count += 1;
+        }
+        // The acceleration is another page.
+        let to = Node::Cell(session.cell);
+        let page = SensorPage::Acceleration([1, 2, 3].map(protocol::fixed::Q3_12::from_bits));
+        session.say(&[Message::Stimulus { to, from: From::Next, page }])?;
+        count += 1;
+        latched(session, cell, last.wrapping_add(jump), 7_000, "STIM-7")?;
+        // It holds, whatever else comes.
+        session.counters()?;
+        session.read(1)?;
+        for _ in 0..2 {
+            let epoch = session.next_epoch();
+            latched(session, cell, epoch, 7_000, "STIM-7")?;
+        }
+    }
+    Ok(count)
+}
+
+/// Eight wait, and the ninth is refused.
+fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
+    let before = session.counters()?;
+    let last = session.known.last_epoch;
+    let to = Node::Cell(session.cell);
+    for ahead in 1..=10 {
+        let page = if ahead % 4 == 0 {
+            SensorPage::Acceleration([protocol::fixed::Q3_12::from_bits(9); 3])
+        } else {
+            SensorPage::Skin(arm::press(1_000 * i32::from(ahead)))
+        };
+        let first = From::Epoch(Epoch(last.wrapping_add(20 + ahead)));
+        session.say(&[Message::Stimulus { to, from: first, page }])?;
+    }
+    let after = session.counters()?;
+    let counted =
+        (after.0.stimuli.wrapping_sub(before.0.stimuli), after.1.stimuli.wrapping_sub(before.1.stimuli));
+    session.check("STIM-6", counted == (8, 2), || {
+        format!("of 10 stimuli {} were taken and {} refused; 8 can be pending", counted.0, counted.1)
+    });
+    for ahead in [1, 2, 3, 5, 6, 7, 8, 9, 10, 11] {
+        let expected = if ahead < 8 { 1_000 * i32::from(ahead) } else { 7_000 };
+        latched(session, cell, last.wrapping_add(20 + ahead), expected, "STIM-6")?;
+    }
+    // There is room again.
+    session.press(arm::press(1_234))?;
+    let epoch = session.next_epoch();
+    latched(session, cell, epoch, 1_234, "STIM-6")
+}
+
+/// A write of parameter 5 forgets what is latched and what waits.
+fn forgotten(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
+    for on_between in [true, false] {
+        session.press(arm::press(3_333))?;
+        let epoch = session.next_epoch();
+        latched(session, cell, epoch, 3_333, "STIM-2")?;
+        session.press_at(epoch.wrapping_add(2), arm::press(4_444))?;
+        if !on_between {
+            session.test_mode(false)?;
+        }
+        session.test_mode(true)?;
+        latched(session, cell, epoch.wrapping_add(1), 0, "STIM-2")?;
+        latched(session, cell, epoch.wrapping_add(2), 0, "STIM-2")?;
+    }
+    Ok(())
+}
+
+/// A cell that measures obeys none.
+fn measuring(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.test_mode(false)?;
+    let before = session.counters()?;
+    session.press(arm::press(5_555))?;
+    session.known.pending = None;
+    let last = session.known.last_epoch;
+    session.press_at(last.wrapping_add(1), arm::press(6_666))?;
+    let after = session.counters()?;
+    let counted = after.1.stimuli.wrapping_sub(before.1.stimuli);
+    session.check("STIM-1", counted == 2 && after.0.stimuli == before.0.stimuli, || {
+        format!("outside test mode 2 stimuli were counted as {counted} refused: {after:?}")
+    });
+    session.test_mode(true)?;
+    session.known.active = None;
+    session.step(&POSITIONS)?;
+    let step = session.step(&POSITIONS)?;
+    session
+        .check("STIM-1", step.torque.is_none(), || "a stimulus from outside test mode is latched".to_owned());
+    Ok(())
+}
+
+/// A halted cell takes and latches them.
+fn halted(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
+    let epoch = session.next_epoch();
+    session.mark();
+    session.say(&[Message::Halt])?;
+    (session.known.halted, session.known.active) = (Some(true), Some(false));
+    session.press_at(epoch.wrapping_add(1), arm::press(2_222))?;
+    session.step_at(epoch, &POSITIONS)?;
+    session.known.skin = Some(arm::press(2_222));
+    session.step_at(epoch.wrapping_add(1), &POSITIONS)?;
+    session.say(&[Message::Resume])?;
+    session.known.halted = Some(false);
+    latched(session, cell, epoch.wrapping_add(2), 2_222, "STIM-8")?;
+    session.pressed(&POSITIONS, arm::press(0))?;
+    Ok(())
+}

@@ -1,0 +1,147 @@
+//! A real bus, and the command that switches the cell off and on.
+
+mod probe;
+
+use std::collections::VecDeque;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use bench::listen;
+use protocol::bus::{Bus as Socket, BusError, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
+use protocol::can::Frame;
+use protocol::time::{Micros, Span};
+
+use crate::bus::{Bus, Seen, Stop};
+use probe::Probe;
+
+/// How long a signal to end may wait.
+const LOOK: Span = Span::from_millis(50);
+/// How long a restart may take.
+const RESTART: Span = Span::from_millis(15_000);
+
+/// An open bus.
+#[derive(Debug)]
+pub struct Live {
+    socket: Socket,
+    inbox: Inbox,
+    waiting: VecDeque<Seen>,
+    stopped: Arc<AtomicBool>,
+    obeys: bool,
+    late: Span,
+    /// Where the cell may be a process of this computer.
+    probe: Option<Probe>,
+    command: Option<String>,
+    child: Option<(Child, Micros)>,
+}
+
+impl Live {
+    /// Opens a bus. `stopped` interrupts the test; `command` switches the cell off and on.
+    ///
+    /// # Errors
+    /// When it cannot be used as requested.
+    pub fn open(
+        name: &str,
+        kind: Choice,
+        stopped: Arc<AtomicBool>,
+        command: Option<String>,
+    ) -> Result<Self, BusError> {
+        let receive_buffer = GATEWAY_RECEIVE_BUFFER as usize;
+        let options = Options { own_frames: true, receive_buffer, ..Options::default() };
+        let socket = listen::open(name, kind, None, options)?;
+        let (inbox, waiting, late) = (Inbox::new(), VecDeque::new(), Span(0));
+        let probe = socket.is_virtual().unwrap_or(false).then(Probe::new);
+        Ok(Self { socket, inbox, waiting, stopped, obeys: true, late, probe, command, child: None })
+    }
+
+    fn interrupted(&self) -> bool {
+        self.obeys && self.stopped.load(Ordering::Relaxed)
+    }
+}
+
+fn lost(error: impl ToString) -> Stop {
+    Stop::Bus(error.to_string())
+}
+
+impl Bus for Live {
+    fn now(&self) -> Micros {
+        listen::now()
+    }
+
+    fn send(&mut self, frames: &[Frame]) -> Result<(), Stop> {
+        self.socket.send(frames).map_err(lost)
+    }
+
+    fn receive(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
+        loop {
+            if self.interrupted() {
+                return Err(Stop::Interrupted);
+            }
+            if let Some(seen) = self.waiting.pop_front() {
+                return Ok(Some(seen));
+            }
+            let before = self.now();
+            let wait = until.since(before).min(LOOK);
+            let is_there = self.socket.wait(Some(Duration::from_micros(wait.0))).map_err(lost)?;
+            let now = self.now();
+            if !is_there {
+                self.late = self.late.max(now.since(before + wait));
+                if now >= until {
+                    return Ok(None);
+                }
+                continue;
+            }
+            self.socket.receive(&mut self.inbox).map_err(lost)?;
+            for received in self.inbox.frames() {
+                let at = if received.at_nanos == 0 { now } else { Micros(received.at_nanos / 1_000) };
+                self.late = self.late.max(now.since(at));
+                self.waiting.push_back(Seen { at, frame: received.frame, own: received.own });
+            }
+            if self.inbox.dropped() > 0 {
+                let name = self.socket.name();
+                return Err(Stop::Bus(format!("{name}: frames came faster than they were read")));
+            }
+        }
+    }
+
+    fn lateness(&mut self) -> Span {
+        let probed = self.probe.as_ref().map_or(Span(0), Probe::lateness);
+        core::mem::take(&mut self.late).max(probed)
+    }
+
+    fn finish(&mut self) {
+        self.obeys = false;
+    }
+
+    fn can_restart(&self) -> bool {
+        self.command.is_some()
+    }
+
+    fn begin_restart(&mut self) -> Result<(), Stop> {
+        let Some(command) = &self.command else { return Err(Stop::Restart("no command".to_owned())) };
+        let child = Command::new("sh")
+            .args(["-c", command])
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .spawn()
+            .map_err(|error| Stop::Restart(format!("--restart {command:?}: {error}")))?;
+        self.child = Some((child, self.now()));
+        Ok(())
+    }
+
+    fn is_restarting(&mut self) -> Result<bool, Stop> {
+        let now = self.now();
+        let Some((child, began)) = &mut self.child else { return Ok(false) };
+        let failed = |why: String| Err(Stop::Restart(format!("the command of --restart {why}")));
+        match child.try_wait() {
+            Ok(Some(status)) => {
+                self.child = None;
+                if status.success() { Ok(false) } else { failed(format!("failed: {status}")) }
+            }
+            Ok(None) if now.since(*began) > RESTART => failed("did not end within 15 s".to_owned()),
+            Ok(None) => Ok(true),
+            Err(error) => failed(error.to_string()),
+        }
+    }
+}

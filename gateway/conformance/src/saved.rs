@@ -1,0 +1,123 @@
+//! What a cell had before the test, to be put back after it.
+
+use std::collections::BTreeMap;
+
+use protocol::message::{Message, State};
+use protocol::packet::{WORDS, words};
+use protocol::parameters::Parameter;
+use protocol::time::Span;
+use serde::{Deserialize, Serialize};
+
+use crate::bus::Stop;
+use crate::session::{Reply, Session};
+
+/// How long that may take.
+const LONGEST: Span = Span::from_millis(8_000);
+/// Answers to the test have come by then.
+const SETTLE: Span = Span::from_millis(60);
+/// Attempts to put something back.
+const ATTEMPTS: usize = 3;
+
+/// What is switched and not stored.
+const SWITCHES: [Parameter; 5] =
+    [Parameter::Reply, Parameter::Sensing, Parameter::Events, Parameter::LinksDown, Parameter::Mode];
+
+/// What a cell had.
+#[derive(Clone, Debug, Deserialize, Eq, PartialEq, Serialize)]
+pub struct Saved {
+    /// The bus that it was on.
+    pub bus: String,
+    /// Its node id.
+    pub node: u8,
+    /// Its serial number.
+    pub serial: u32,
+    /// The hash of its configuration; 0 for none.
+    pub hash: u16,
+    /// Whether it was halted.
+    pub halted: bool,
+    /// The words of its parameters, by number.
+    pub parameters: BTreeMap<u8, [i16; WORDS]>,
+}
+
+impl Session<'_> {
+    /// Reads all that the cell has; the error says what it does not answer.
+    ///
+    /// # Errors
+    /// When the bus fails, or the test is interrupted.
+    pub fn save(&mut self) -> Result<Result<Saved, String>, Stop> {
+        let Reply::Value(identity) = self.read(Parameter::Identity.number())? else {
+            return Ok(Err("it does not answer a read of parameter 0 (identity)".to_owned()));
+        };
+        let [low, high, _, hash, state, abilities] = identity.map(i16::cast_unsigned);
+        let serial = u32::from(low) | u32::from(high) << 16;
+        let abilities = protocol::parameters::Abilities::from_word(abilities.cast_signed());
+        let mut parameters = BTreeMap::new();
+        let all = Parameter::stored(abilities.rows()).chain(SWITCHES);
+        for parameter in all.collect::<Vec<_>>() {
+            let number = parameter.number();
+            let Reply::Value(words) = self.read(number)? else {
+                return Ok(Err(format!("it does not answer a read of parameter {number}")));
+            };
+            parameters.insert(number, words);
+        }
+        self.about.serial = Some(serial);
+        self.about.abilities = abilities;
+        let halted = State(state).has(State::HALTED);
+        let (bus, node) = (self.bus_name().to_owned(), self.cell.get());
+        Ok(Ok(Saved { bus, node, serial, hash, halted, parameters }))
+    }
+
+    /// Puts back what the cell had; what could not be put back.
+    ///
+    /// # Errors
+    /// When the bus fails.
+    pub fn restore(&mut self, saved: &Saved) -> Result<Vec<String>, Stop> {
+        let mut left = Vec::new();
+        self.extend(LONGEST);
+        // What answers the test is no answer to this.
+        self.idle(SETTLE)?;
+        self.start();
+        self.say(&[Message::Resume])?;
+        if saved.hash == 0 {
+            left.push("it had no configuration, and cannot be made to forget the test's".to_owned());
+        } else if !self.put_back_stored(saved)? {
+            left.push(format!("its configuration {:04X}", saved.hash));
+        }
+        for parameter in SWITCHES {
+            let Some(words) = saved.parameters.get(&parameter.number()) else { continue };
+            // Links are written in test mode only, and are not touched by the test.
+            if parameter == Parameter::LinksDown && *words == [0; WORDS] {
+                continue;
+            }
+            let mut is_back = false;
+            for _ in 0..ATTEMPTS {
+                is_back = self.write(parameter.number(), *words)? == Reply::Value(*words);
+                if is_back {
+                    break;
+                }
+            }
+            if !is_back {
+                left.push(format!("parameter {}", parameter.number()));
+            }
+        }
+        self.say(&[if saved.halted { Message::Halt } else { Message::Resume }])?;
+        Ok(left)
+    }
+
+    fn put_back_stored(&mut self, saved: &Saved) -> Result<bool, Stop> {
+        for _ in 0..ATTEMPTS {
+            let mut is_well = true;
+            for (&number, &words) in &saved.parameters {
+                if Parameter::from_number(number).is_some_and(Parameter::is_stored) {
+                    is_well &= self.write(number, words)? == Reply::Value(words);
+                }
+            }
+            let hash = words([saved.hash.cast_signed()]);
+            is_well &= self.write(Parameter::Commit.number(), hash)? == Reply::Value(hash);
+            if is_well {
+                return Ok(true);
+            }
+        }
+        Ok(false)
+    }
+}

@@ -1,0 +1,479 @@
+//! A conversation with the cell: sends, collects what the cell sends, and checks what holds of every packet.
+
+mod joints;
+mod known;
+mod receive;
+mod request;
+
+use protocol::can::{Format, Frame};
+use protocol::candump::{Record, Timestamp};
+use protocol::id::CellId;
+use protocol::message::{Heartbeat, Joints, Message, NetworkPage, SensorPage, State};
+use protocol::packet::{Epoch, Segment, Words};
+use protocol::parameters::MAX_JOINTS;
+use protocol::time::{Micros, Span};
+
+use crate::bus::{Bus, Seen, Stop};
+use crate::findings::Findings;
+use crate::timing::Timings;
+
+pub(crate) use known::{About, Known};
+pub(crate) use request::Reply;
+
+/// Longer than any answer takes that comes at all.
+pub(crate) const PATIENT: Span = Span::from_millis(300);
+/// After a sync's heartbeat nothing is awaited longer than this.
+pub(crate) const LINGER: Span = Span::from_millis(5);
+/// A cell that sends nothing for so long has fallen silent.
+const SILENT: Span = Span::from_millis(1_500);
+
+/// A packet of the cell.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Heard {
+    /// When it, or its last segment, was on the bus.
+    pub(crate) at: Micros,
+    pub(crate) message: Message,
+}
+
+impl Heard {
+    /// The heartbeat that it is, and its epoch byte.
+    pub(crate) const fn beat(&self) -> Option<(&Heartbeat, Epoch)> {
+        if let Message::Network { page: NetworkPage::Heartbeat(beat), epoch, .. } = &self.message {
+            Some((beat, *epoch))
+        } else {
+            None
+        }
+    }
+
+    pub(crate) const fn torque(&self) -> Option<(Epoch, &Words)> {
+        if let Message::Torque { epoch, torque, .. } = &self.message { Some((*epoch, torque)) } else { None }
+    }
+
+    pub(crate) const fn sensors(&self) -> Option<(Epoch, &SensorPage)> {
+        if let Message::Sensors { epoch, page, .. } = &self.message { Some((*epoch, page)) } else { None }
+    }
+}
+
+/// What came of some packets with a sync after them.
+#[derive(Clone, Debug)]
+pub(crate) struct Exchange {
+    /// When the first of our packets was on the bus as a whole.
+    pub(crate) at: Micros,
+    /// What the cell sent, but for heartbeats.
+    pub(crate) answers: Vec<Heard>,
+    /// The heartbeat to the sync, and its epoch byte.
+    pub(crate) beat: Option<(Heartbeat, Epoch)>,
+}
+
+impl Exchange {
+    /// Whether the cell answered nothing but the sync.
+    pub(crate) fn is_silent(&self) -> bool {
+        self.answers.is_empty()
+    }
+
+    pub(crate) fn state(&self) -> State {
+        self.beat.map(|(beat, _)| beat.state).unwrap_or_default()
+    }
+}
+
+/// Times of the conversation.
+#[derive(Clone, Copy, Debug)]
+struct Clock {
+    /// When the cell was heard last.
+    last: Micros,
+    /// When the time is over.
+    end: Micros,
+    /// By how much the bench was late since the exchange began.
+    late: Span,
+    /// The cell is put back, whoever else is there.
+    finishing: bool,
+    /// A regular heartbeat that nothing asked for.
+    regular: Option<Micros>,
+    /// Syncs that were sent.
+    syncs: usize,
+    /// What an answer takes, with the way there and back.
+    round_trip: Span,
+}
+
+/// The conversation.
+pub struct Session<'a> {
+    bus: &'a mut dyn Bus,
+    name: String,
+    pub(crate) cell: CellId,
+    pub(crate) format: Format,
+    /// Frames of the cell and of the bench.
+    log: Vec<Seen>,
+    /// Where the present exchange begins there: what was sent for it may come before it.
+    since: usize,
+    /// Where the last exchange ended there.
+    ended: usize,
+    /// Packets of the cell.
+    pub(crate) heard: Vec<Heard>,
+    /// Where the present exchange begins there.
+    pub(crate) from: usize,
+    /// Up to where they were expected.
+    consumed: usize,
+    /// Segments that wait for the others, by kind.
+    segments: [Segment; 8],
+    /// What was found.
+    pub findings: Findings,
+    pub(crate) known: Known,
+    pub(crate) about: About,
+    tag: u8,
+    /// Of each heartbeat's *sent*: that of the last heartbeat, and packets since.
+    sent: Option<(u16, u16)>,
+    /// The last heartbeat had CLAIMING.
+    claiming: bool,
+    pub(crate) timings: Timings,
+    clock: Clock,
+}
+
+impl core::fmt::Debug for Session<'_> {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("Session")
+            .field("cell", &self.cell)
+            .field("known", &self.known)
+            .finish_non_exhaustive()
+    }
+}
+
+impl<'a> Session<'a> {
+    /// Speaks to a cell on a bus of this name and format for so long at most.
+    pub fn new(bus: &'a mut dyn Bus, name: &str, cell: CellId, format: Format, longest: Span) -> Self {
+        let now = bus.now();
+        Self {
+            bus,
+            name: name.to_owned(),
+            cell,
+            format,
+            log: Vec::new(),
+            since: 0,
+            ended: 0,
+            heard: Vec::new(),
+            from: 0,
+            consumed: 0,
+            segments: [Segment::NONE; 8],
+            findings: Findings::default(),
+            known: Known::default(),
+            about: About::default(),
+            tag: 0x50,
+            sent: None,
+            claiming: false,
+            timings: Timings::default(),
+            clock: Clock {
+                last: now,
+                end: now + longest,
+                late: Span(0),
+                finishing: false,
+                regular: None,
+                syncs: 0,
+                round_trip: Span(0),
+            },
+        }
+    }
+
+    pub(crate) fn bus_name(&self) -> &str {
+        &self.name
+    }
+
+    pub(crate) fn now(&self) -> Micros {
+        self.bus.now()
+    }
+
+    /// There is so much time from now on, and no signal interrupts.
+    pub(crate) fn extend(&mut self, span: Span) {
+        self.bus.finish();
+        self.clock.finishing = true;
+        self.clock.end = self.bus.now() + span;
+        self.clock.last = self.bus.now();
+    }
+
+    /// How much time is left.
+    pub(crate) fn left(&self) -> Span {
+        self.clock.end.since(self.bus.now())
+    }
+
+    /// The cell was allowed to be silent until now.
+    pub(crate) fn extend_life(&mut self) {
+        self.clock.last = self.bus.now();
+    }
+
+    pub(crate) fn can_restart(&self) -> bool {
+        self.bus.can_restart()
+    }
+
+    /// A check of a requirement.
+    pub(crate) fn check(&mut self, id: &'static str, is_so: bool, what: impl FnOnce() -> String) -> bool {
+        if is_so {
+            self.findings.pass(id);
+        } else {
+            let (log, since, name) = (&self.log, self.since, &self.name);
+            self.findings.fail(id, what(), || {
+                log.get(since..).unwrap_or_default().iter().map(|seen| line(name, seen)).collect()
+            });
+        }
+        is_so
+    }
+
+    /// A new exchange begins. What came since the last one was not expected, unless a cell sends it by itself.
+    pub(crate) fn mark(&mut self) {
+        let strays: Vec<_> = self.heard.get(self.consumed..).unwrap_or_default().to_vec();
+        for stray in strays {
+            if let Some(id) = self.known.unexpected(&stray.message) {
+                let kind = stray.message.id().kind.name();
+                self.check(id, false, || format!("a {kind} packet that nothing asked for"));
+            }
+        }
+        self.start();
+    }
+
+    /// The same where what came is expected.
+    pub(crate) fn start(&mut self) {
+        (self.since, self.from, self.consumed) = (self.ended, self.heard.len(), self.heard.len());
+        self.bus.lateness();
+        self.clock.late = Span(0);
+    }
+
+    /// What came since the exchange began was expected.
+    pub(crate) fn consume(&mut self) {
+        self.consumed = self.heard.len();
+        self.ended = self.log.len();
+    }
+
+    /// What came since the last exchange ended.
+    pub(crate) fn unmarked(&self) -> Vec<Heard> {
+        self.heard.get(self.consumed..).unwrap_or_default().to_vec()
+    }
+
+    /// Packets of the cell since the exchange began.
+    pub(crate) fn answers(&self) -> &[Heard] {
+        self.heard.get(self.from..).unwrap_or_default()
+    }
+
+    /// The cell has been switched off: its counts begin again.
+    pub(crate) fn forget_counts(&mut self) {
+        self.sent = None;
+        self.segments = [Segment::NONE; 8];
+    }
+
+    /// Sends frames, and waits until the last one was on the bus: when that was.
+    pub(crate) fn send(&mut self, frames: &[Frame]) -> Result<Micros, Stop> {
+        let times = self.send_all(frames)?;
+        Ok(times.last().copied().unwrap_or_else(|| self.now()))
+    }
+
+    /// The same; when each was on the bus.
+    pub(crate) fn send_all(&mut self, frames: &[Frame]) -> Result<Vec<Micros>, Stop> {
+        let Some(last) = frames.last() else { return Ok(Vec::new()) };
+        let before = self.log.len();
+        self.bus.send(frames)?;
+        let give_up = self.bus.now() + PATIENT;
+        loop {
+            let own = self.log.get(before..).unwrap_or_default().iter().filter(|seen| seen.own);
+            let own: Vec<_> = own.map(|seen| seen.at).collect();
+            if own.len() >= frames.len() {
+                return Ok(own);
+            }
+            if self.bus.now() >= give_up {
+                return Err(Stop::Bus(format!("{}: {last} was sent and was not on the bus", self.name)));
+            }
+            self.pump(give_up)?;
+        }
+    }
+
+    /// The frames of a packet on this bus.
+    pub(crate) fn frames(&self, message: &Message) -> Vec<Frame> {
+        message.encode().frames(self.format).collect()
+    }
+
+    /// Sends packets: when the first of them was on the bus as a whole.
+    pub(crate) fn say(&mut self, messages: &[Message]) -> Result<Micros, Stop> {
+        let mut at = None;
+        for message in messages {
+            let frames = self.frames(message);
+            let on_bus = self.send(&frames)?;
+            self.clock.syncs += usize::from(*message == Message::Sync);
+            at.get_or_insert(on_bus);
+        }
+        Ok(at.unwrap_or_else(|| self.now()))
+    }
+
+    /// Receives until then, or until something is true of what has come since the exchange began.
+    pub(crate) fn wait(
+        &mut self,
+        until: Micros,
+        mut done: impl FnMut(&[Heard]) -> bool,
+    ) -> Result<bool, Stop> {
+        loop {
+            if done(self.answers()) {
+                return Ok(true);
+            }
+            if self.bus.now() >= until {
+                return Ok(false);
+            }
+            self.pump(until)?;
+        }
+    }
+
+    /// Receives for so long.
+    pub(crate) fn idle(&mut self, span: Span) -> Result<(), Stop> {
+        let until = self.bus.now() + span;
+        self.wait(until, |_| false).map(|_| ())
+    }
+
+    /// Sends frames and then a sync, and collects what comes until the sync is answered.
+    pub(crate) fn exchange(&mut self, frames: &[Frame]) -> Result<Exchange, Stop> {
+        self.mark();
+        let at = self.send(frames)?;
+        self.finish(at)
+    }
+
+    /// The same with packets.
+    pub(crate) fn exchange_all(&mut self, messages: &[Message]) -> Result<Exchange, Stop> {
+        self.mark();
+        let at = self.say(messages)?;
+        self.finish(at)
+    }
+
+    /// A sync, and what came since the exchange began.
+    fn finish(&mut self, at: Micros) -> Result<Exchange, Stop> {
+        let sync = self.say(&[Message::Sync])?;
+        let is_answer = |heard: &Heard| heard.beat().is_some() && heard.at >= sync;
+        let answered = self.wait(sync + PATIENT, |heard| heard.iter().any(is_answer))?;
+        self.check("CMD-3", answered, || "no heartbeat after a sync".to_owned());
+        let beats = |it: &Self| it.answers().iter().filter(|heard| heard.beat().is_some()).count();
+        if self.answers().len() == beats(self) || self.known.senses {
+            // A regular heartbeat may have come between, and a cell that is wrong may answer later.
+            self.idle(LINGER)?;
+        }
+        let first = self.answers().iter().find(|heard| is_answer(heard)).copied();
+        if let (Some(first), 1) = (first, beats(self)) {
+            self.note_time("heartbeat to sync", sync, first.at);
+        }
+        let torque = self.answers().iter().rposition(|heard| heard.torque().is_some());
+        if let Some(torque) = torque {
+            let after = |it: &Self| it.answers().iter().skip(torque).any(|heard| heard.beat().is_some());
+            if !after(self) {
+                self.idle(Span::from_millis(20))?;
+            }
+            let is_after = after(self);
+            self.check("CMD-3", is_after, || "the heartbeat to a sync came before the torque".to_owned());
+        }
+        let beat =
+            self.answers().iter().rev().find_map(|heard| heard.beat().map(|(beat, epoch)| (*beat, epoch)));
+        let answers = self.answers().iter().filter(|heard| heard.beat().is_none()).copied().collect();
+        self.consume();
+        let exchange = Exchange { at, answers, beat };
+        self.look_at_state(&exchange);
+        Ok(exchange)
+    }
+
+    /// What the cell sends late comes now.
+    pub(crate) fn settle(&mut self) -> Result<(), Stop> {
+        self.idle(Span::from_millis(15))?;
+        self.mark();
+        Ok(())
+    }
+
+    /// The time, and how many heartbeats came and syncs were sent until now.
+    pub(crate) fn tally(&self) -> (Micros, usize, usize) {
+        let beats = self.heard.iter().filter(|it| it.beat().is_some()).count();
+        (self.now(), beats, self.clock.syncs)
+    }
+
+    /// A heartbeat for each sync since then, four a second, and no more.
+    pub(crate) fn check_beats(&mut self, (began, beats, syncs): (Micros, usize, usize)) {
+        const EDGE: u64 = 2;
+        let (now, all_beats, all_syncs) = self.tally();
+        let regular = now.since(began).0 / 250_000;
+        let came = (all_beats - beats) as u64;
+        let asked = (all_syncs - syncs) as u64;
+        let range = (asked + regular).saturating_sub(EDGE)..=asked + regular + EDGE;
+        self.check("BEAT-1", range.contains(&came), || {
+            let ms = now.since(began).0 / 1_000;
+            format!("{came} heartbeats in {ms} ms with {asked} syncs; {} are right", asked + regular)
+        });
+    }
+
+    /// By how much the bench was late since the exchange began.
+    pub(crate) fn lateness(&mut self) -> Span {
+        self.clock.late = self.clock.late.max(self.bus.lateness());
+        self.clock.late
+    }
+
+    /// Measures what an answer takes.
+    pub(crate) fn measure(&mut self) -> Result<(), Stop> {
+        const TIMES: u64 = 8;
+        let began = self.now();
+        for _ in 0..TIMES {
+            self.read(0)?;
+        }
+        self.clock.round_trip = Span(self.now().since(began).0 / TIMES);
+        Ok(())
+    }
+
+    /// Whether answers take so long that there is no time for all that could be tried.
+    pub(crate) fn is_slow(&self) -> bool {
+        self.clock.round_trip > Span::from_millis(4)
+    }
+
+    /// So many attempts, or fewer with a slow cell.
+    pub(crate) fn attempts(&self, many: usize) -> usize {
+        if self.is_slow() { many.div_ceil(4) } else { many }
+    }
+
+    /// No regular heartbeat comes for so long, less than 200 ms.
+    pub(crate) fn quiet(&mut self, span: Span) -> Result<(), Stop> {
+        const BEAT: Span = Span::from_millis(250);
+        const EDGE: Span = Span::from_millis(25);
+        let now = self.now();
+        let is_free = self.clock.regular.is_some_and(|at| {
+            let since = now.since(at);
+            since > EDGE && since.0 + span.0 + EDGE.0 < BEAT.0
+        });
+        if !is_free {
+            // Answers to what was asked before have come.
+            self.settle()?;
+            let until = self.now() + BEAT + EDGE + EDGE;
+            self.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+            self.clock.regular = self.answers().iter().rev().find(|it| it.beat().is_some()).map(|it| it.at);
+            self.idle(EDGE)?;
+            self.consume();
+        }
+        Ok(())
+    }
+
+    /// How long an answer took; not if the bench itself was late.
+    pub(crate) fn note_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
+        self.clock.late = self.clock.late.max(self.bus.lateness());
+        self.timings.note(what, answered.since(asked), self.clock.late);
+    }
+
+    pub(crate) fn begin_restart(&mut self) -> Result<(), Stop> {
+        self.bus.begin_restart()
+    }
+
+    pub(crate) fn is_restarting(&mut self) -> Result<bool, Stop> {
+        self.bus.is_restarting()
+    }
+
+    /// Joints of this chain.
+    pub(crate) fn joints(&self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Message {
+        self.joints_of(epoch, positions, self.known.joints)
+    }
+
+    /// Joints with this count; words beyond it are 0.
+    pub(crate) fn joints_of(&self, epoch: u8, positions: &[i16; MAX_JOINTS], in_use: u8) -> Message {
+        let mut words = *positions;
+        words.iter_mut().skip(in_use.into()).for_each(|word| *word = 0);
+        let positions = words.map(protocol::fixed::Q1_14::from_bits);
+        Message::Joints { epoch: Epoch(epoch), joints: Joints { positions, in_use } }
+    }
+}
+
+/// A frame as candump writes it, with T for what the bench sent.
+fn line(name: &str, seen: &Seen) -> String {
+    let time = Timestamp { nanos: seen.at.0 * 1_000, nine_digits: false };
+    let record = Record { time, interface: name, frame: seen.frame, direction: None };
+    format!("{record} {}", if seen.own { 'T' } else { 'R' })
+}

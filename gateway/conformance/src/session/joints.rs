@@ -1,0 +1,207 @@
+//! Joints, and what a cell has to answer them with.
+
+use protocol::message::{From, Message, SensorPage, SkinSensors, State};
+use protocol::packet::{Epoch, Length, Words};
+use protocol::parameters::{MAX_JOINTS, Parameter};
+
+use super::{Exchange, Heard, Session};
+use crate::arm;
+use crate::bus::Stop;
+
+/// What came of joints.
+#[derive(Clone, Debug)]
+pub(crate) struct Step {
+    pub(crate) exchange: Exchange,
+    /// The torque, if one came.
+    pub(crate) torque: Option<Words>,
+}
+
+impl Step {
+    /// The torque's words; zeros if none came.
+    pub(crate) fn words(&self) -> [i16; MAX_JOINTS] {
+        self.torque.map_or([0; MAX_JOINTS], |torque| torque.padded())
+    }
+}
+
+/// What has to come.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Due {
+    Torque,
+    Zeros,
+    Nothing,
+}
+
+impl Session<'_> {
+    /// The epoch after the last one.
+    pub(crate) fn next_epoch(&mut self) -> u8 {
+        self.known.last_epoch = self.known.last_epoch.wrapping_add(1);
+        self.known.last_epoch
+    }
+
+    /// A stimulus that holds from the next joints on.
+    pub(crate) fn press(&mut self, skin: SkinSensors) -> Result<(), Stop> {
+        self.known.pending = Some(skin);
+        let to = protocol::id::Node::Cell(self.cell);
+        self.say(&[Message::Stimulus { to, from: From::Next, page: SensorPage::Skin(skin) }])?;
+        Ok(())
+    }
+
+    /// A stimulus that holds from these joints on.
+    pub(crate) fn press_at(&mut self, first: u8, skin: SkinSensors) -> Result<(), Stop> {
+        let to = protocol::id::Node::Cell(self.cell);
+        self.say(&[Message::Stimulus { to, from: From::Epoch(Epoch(first)), page: SensorPage::Skin(skin) }])?;
+        Ok(())
+    }
+
+    /// Joints of the next epoch.
+    pub(crate) fn step(&mut self, positions: &[i16; MAX_JOINTS]) -> Result<Step, Stop> {
+        let epoch = self.next_epoch();
+        self.step_at(epoch, positions)
+    }
+
+    /// A press from the next joints on, and these.
+    pub(crate) fn pressed(&mut self, positions: &[i16; MAX_JOINTS], skin: SkinSensors) -> Result<Step, Stop> {
+        self.press(skin)?;
+        self.step(positions)
+    }
+
+    /// Joints of this epoch, which is not that of the last ones.
+    pub(crate) fn step_at(&mut self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Result<Step, Stop> {
+        let joints = self.joints(epoch, positions);
+        if let Some(skin) = self.known.pending.take() {
+            self.known.skin = Some(skin);
+        }
+        let due = self.due();
+        (self.known.epoch, self.known.last_epoch) = (Some(epoch), epoch);
+        self.known.active = match due {
+            Some(due) => Some(due == Due::Torque),
+            // Halted, or not known.
+            None if self.known.halted == Some(true) => Some(false),
+            None => None,
+        };
+        let exchange = self.exchange_all(&[joints])?;
+        self.look_at_torques(epoch, due, exchange)
+    }
+
+    /// What has to come after the next joints, as far as it is known.
+    fn due(&self) -> Option<Due> {
+        let known = &self.known;
+        if known.halted == Some(true) {
+            return Some(Due::Nothing);
+        }
+        let force = arm::force(&known.parameters?.contact, &known.skin?);
+        match (force > 0, known.active) {
+            (true, _) => Some(Due::Torque),
+            (false, Some(true)) => Some(Due::Zeros),
+            (false, Some(false)) => Some(Due::Nothing),
+            (false, None) => None,
+        }
+    }
+
+    /// Looks at what came to joints.
+    fn look_at_torques(&mut self, epoch: u8, due: Option<Due>, exchange: Exchange) -> Result<Step, Stop> {
+        let torques: Vec<_> =
+            exchange.answers.iter().filter(|heard| heard.torque().is_some()).copied().collect();
+        let count = torques.len();
+        self.check("JOINTS-6", count <= 1, || format!("{count} torques to joints {epoch}"));
+        for other in exchange.answers.iter().filter(|heard| heard.torque().is_none()) {
+            if let Some(id) = self.known.unexpected(&other.message) {
+                let kind = other.message.id().kind.name();
+                self.check(id, false, || format!("a {kind} packet came to joints"));
+            }
+        }
+        let first = torques.first().and_then(|heard| Some((heard.at, heard.torque()?.0, *heard.torque()?.1)));
+        let expected = match due {
+            Some(Due::Torque) => Some(true),
+            Some(Due::Zeros) => Some(true),
+            Some(Due::Nothing) => Some(false),
+            None => None,
+        };
+        if let Some(expected) = expected {
+            let halted = self.known.halted == Some(true);
+            let id = if halted { "CMD-1" } else { "JOINTS-6" };
+            self.check(id, first.is_some() == expected, || {
+                let what = match due {
+                    Some(Due::Torque) => "in contact: a torque was due, and none came",
+                    Some(Due::Zeros) => "released: one torque of zeros was due, and none came",
+                    _ if halted => "halted: a torque came",
+                    _ => "not in contact: nothing was due, and a torque came",
+                };
+                format!("joints {epoch}, {what}")
+            });
+        }
+        if let Some((at, of, words)) = first {
+            self.note_time("torque", exchange.at, at);
+            self.check("JOINTS-6", of.0 == epoch, || format!("a torque of epoch {of} to joints {epoch}"));
+            if due == Some(Due::Zeros) {
+                self.check("JOINTS-6", words.is_zero(), || "released: the torque is not of zeros".to_owned());
+            }
+            self.look_at_words(&words);
+            self.look_at_saturation(&words);
+        } else {
+            self.look_at_saturation(&Words::zeros(Length::Six));
+        }
+        Ok(Step { torque: first.map(|(.., words)| words), exchange })
+    }
+
+    fn look_at_words(&mut self, words: &Words) {
+        let Some(parameters) = self.known.parameters else { return };
+        let length = Length::for_joints(parameters.joints.into());
+        self.check("SEND-1", words.length() == length, || {
+            format!("a torque of {} words, not {}", words.length().words(), length.words())
+        });
+        let beyond = words.padded().iter().skip(parameters.joint.into()).all(|word| *word == 0);
+        self.check("J-1", beyond, || {
+            format!("a word beyond joint {} is not 0: {:04X?}", parameters.joint, words.as_slice())
+        });
+    }
+
+    /// SATURATED is in the next heartbeat and in no other.
+    fn look_at_saturation(&mut self, words: &Words) {
+        let expected = words.is_saturated();
+        let after = |heard: &[Heard]| {
+            let torque = heard.iter().rposition(|it| it.torque().is_some()).unwrap_or(0);
+            let beats = heard.iter().skip(torque).filter_map(Heard::beat);
+            beats.map(|(beat, _)| beat.state.has(State::SATURATED)).collect::<Vec<_>>()
+        };
+        let beats = after(self.answers());
+        if let [first, rest @ ..] = beats.as_slice() {
+            self.check("TORQUE-2", *first == expected, || {
+                format!(
+                    "SATURATED is {}set after {:04X?}",
+                    if *first { "" } else { "not " },
+                    words.as_slice()
+                )
+            });
+            if expected {
+                let again = rest.contains(&true);
+                self.check("STATE-2", !again, || "SATURATED is set in two heartbeats".to_owned());
+            }
+        }
+    }
+
+    /// Test mode on or off, which forgets all stimuli.
+    pub(crate) fn test_mode(&mut self, on: bool) -> Result<(), Stop> {
+        let reply = self.set(Parameter::Mode.number(), [i16::from(on)])?;
+        self.known.test_mode = reply.words().map(|words| words.first() == Some(&1));
+        (self.known.skin, self.known.pending) = (on.then(SkinSensors::default), None);
+        Ok(())
+    }
+
+    /// Has the cell compute with parameters, in test mode, not in contact and not halted; whether it does.
+    pub(crate) fn ready(&mut self, parameters: &protocol::parameters::Parameters) -> Result<bool, Stop> {
+        self.mark();
+        self.say(&[Message::Resume])?;
+        self.known.halted = Some(false);
+        let done = self.commit(parameters)?;
+        if self.about.test_mode {
+            self.test_mode(true)?;
+        } else {
+            (self.known.skin, self.known.pending) = (None, None);
+        }
+        self.known.active = None;
+        self.step(&[0; MAX_JOINTS])?;
+        self.known.active = Some(false);
+        Ok(done)
+    }
+}

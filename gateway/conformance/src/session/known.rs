@@ -1,0 +1,113 @@
+//! What the bench knows of the cell, and what a heartbeat has to say then.
+
+use protocol::message::{Message, NetworkPage, SkinSensors, State};
+use protocol::parameters::{Abilities, Parameters};
+
+use super::{Exchange, Session};
+
+/// What the cell is.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct About {
+    pub(crate) serial: Option<u32>,
+    pub(crate) abilities: Abilities,
+    /// It sends the pages of a cell with ports.
+    pub(crate) ports: bool,
+    /// It can be in test mode.
+    pub(crate) test_mode: bool,
+    /// It sends sensor values without a request.
+    pub(crate) sensing: bool,
+    /// Its flash takes parameters.
+    pub(crate) committed: bool,
+}
+
+/// How the cell is now. What is `None` is not known.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Known {
+    pub(crate) hash: Option<u16>,
+    /// What is in use, if it was committed by this bench.
+    pub(crate) parameters: Option<Parameters>,
+    /// Joints of the chain.
+    pub(crate) joints: u8,
+    pub(crate) test_mode: Option<bool>,
+    pub(crate) halted: Option<bool>,
+    pub(crate) active: Option<bool>,
+    pub(crate) epoch: Option<u8>,
+    /// Sensors pages come without a request.
+    pub(crate) senses: bool,
+    /// It gave way or is off.
+    pub(crate) may_be_silent: bool,
+    /// The last epoch that was sent.
+    pub(crate) last_epoch: u8,
+    /// What is staged.
+    pub(crate) staged: Option<Parameters>,
+    /// What is latched.
+    pub(crate) skin: Option<SkinSensors>,
+    /// What the next joints latch.
+    pub(crate) pending: Option<SkinSensors>,
+}
+
+impl Known {
+    /// The requirement that says that a cell does not send this by itself.
+    pub(crate) fn unexpected(&self, message: &Message) -> Option<&'static str> {
+        match message {
+            Message::Network { page: NetworkPage::Heard(_) | NetworkPage::Refused(_), .. } => Some("CMD-4"),
+            Message::Network { .. } => None,
+            Message::Sensors { .. } if self.senses => None,
+            Message::Torque { .. } => Some("JOINTS-6"),
+            Message::Sum { .. } | Message::Sensors { .. } | Message::Configured { .. } => Some("SEND-1"),
+            Message::Halt
+            | Message::Joints { .. }
+            | Message::Sync
+            | Message::Resume
+            | Message::Report
+            | Message::Configure { .. }
+            | Message::Stimulus { .. } => Some("SEND-1"),
+        }
+    }
+}
+
+impl Session<'_> {
+    /// A heartbeat to a sync says how the cell is.
+    pub(super) fn look_at_state(&mut self, exchange: &Exchange) {
+        let Some((beat, epoch)) = exchange.beat else { return };
+        let (state, known) = (beat.state, self.known);
+        let bits = [
+            ("HALTED", State::HALTED, known.halted, "STATE-3"),
+            ("TEST_MODE", State::TEST_MODE, known.test_mode, "STATE-3"),
+            ("CLAIMING", State::CLAIMING, Some(false), "STATE-3"),
+            ("DUPLICATE", State::DUPLICATE, Some(false), "STATE-2"),
+            (
+                "FLASH_DAMAGED",
+                State::FLASH_DAMAGED,
+                known.hash.filter(|hash| *hash != 0).map(|_| false),
+                "STATE-3",
+            ),
+            ("CONFIGURED", State::CONFIGURED, known.hash.map(|hash| hash != 0), "STATE-3"),
+            ("ACTIVE", State::ACTIVE, known.active, "STATE-1"),
+        ];
+        for (name, bit, expected, id) in bits {
+            if let Some(expected) = expected {
+                let is_set = state.has(bit);
+                self.check(id, is_set == expected, || {
+                    format!("{name} is {}set in state {:04X}", if is_set { "" } else { "not " }, state.0)
+                });
+            }
+        }
+        if let Some(parameters) = known.parameters {
+            let expected = u16::from(parameters.joint);
+            self.check("STATE-3", state.joint() == expected, || {
+                format!("joint {} in state {:04X}, not {expected}", state.joint(), state.0)
+            });
+        }
+        if let Some(hash) = known.hash {
+            self.check("STATE-3", beat.configuration == hash, || {
+                format!("configuration {:04X}, not {hash:04X}", beat.configuration)
+            });
+        }
+        if let Some(expected) = known.epoch {
+            self.check("JOINTS-3", epoch.0 == expected, || {
+                format!("epoch {epoch} in a heartbeat; the last joints taken were {expected}")
+            });
+        }
+    }
+}

@@ -1,0 +1,114 @@
+//! Frames of the bus become packets of the cell, and are looked at as far as each holds for itself.
+
+use protocol::can::Format;
+use protocol::id::{Id, Kind};
+use protocol::message::{Heartbeat, Message, State};
+use protocol::packet::{self, Lengths, Packet, PacketError, Reassembly};
+use protocol::time::Micros;
+
+use super::{Heard, SILENT, Session};
+use crate::bus::{Seen, Stop};
+
+impl Session<'_> {
+    /// Takes the next frame, if one comes until then.
+    pub(super) fn pump(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
+        let Some(seen) = self.bus.receive(until)? else {
+            self.look_at_time()?;
+            return Ok(None);
+        };
+        if seen.own {
+            self.log.push(seen);
+            return Ok(Some(seen));
+        }
+        self.look_at_time()?;
+        let Ok(id) = packet::data_id(&seen.frame) else { return Ok(Some(seen)) };
+        let is_gateways = match id.kind {
+            Kind::Command | Kind::Configure | Kind::Stimulus => true,
+            Kind::Network => id.node == 0,
+            Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => false,
+        };
+        if is_gateways && !self.clock.finishing {
+            return Err(Stop::Gateway(seen.frame.to_string()));
+        }
+        if id.node == self.cell.get() {
+            self.log.push(seen);
+            self.clock.last = seen.at;
+            self.take(seen, id);
+        }
+        Ok(Some(seen))
+    }
+
+    fn look_at_time(&self) -> Result<(), Stop> {
+        let now = self.bus.now();
+        if now >= self.clock.end {
+            return Err(Stop::Time);
+        }
+        let is_silent = now.since(self.clock.last) > SILENT && !self.known.may_be_silent;
+        if is_silent { Err(Stop::Silent) } else { Ok(()) }
+    }
+
+    /// Takes a frame under an identifier of the cell.
+    fn take(&mut self, seen: Seen, id: Id) {
+        let frame = &seen.frame;
+        if frame.format() != self.format {
+            self.check("SEND-1", false, || format!("a {} frame on this bus", frame.format().name()));
+            return;
+        }
+        let packet = match self.format {
+            Format::Fd => Packet::from_fd(frame),
+            Format::Classic => {
+                let Some(segments) = self.segments.get_mut(id.kind as usize) else { return };
+                match segments.push(seen.at, id, Lengths::of(id), frame.data()) {
+                    Ok(Reassembly::Waiting) => return,
+                    Ok(Reassembly::Complete(packet)) => Ok(packet),
+                    Ok(Reassembly::Incomplete) => Err(PacketError::Incomplete),
+                    Ok(Reassembly::Ambiguous) => Err(PacketError::Ambiguous),
+                    Err(error) => Err(error),
+                }
+            }
+        };
+        let message = packet.map_err(|error| error.to_string()).and_then(|packet| {
+            let message = Message::decode(&packet).map_err(|error| error.to_string())?;
+            let is_clean = message.encode() == packet;
+            if is_clean { Ok(message) } else { Err("something unused is not 0".to_owned()) }
+        });
+        match message {
+            Ok(message) => {
+                self.findings.pass("SEND-1");
+                let heard = Heard { at: seen.at, message };
+                self.heard.push(heard);
+                self.look_at(&heard);
+            }
+            Err(error) => {
+                self.check("SEND-1", false, || format!("{frame} is no packet: {error}"));
+            }
+        }
+    }
+
+    /// What holds of every packet: heartbeats know how many there were.
+    fn look_at(&mut self, heard: &Heard) {
+        if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.beat() {
+            // It has been switched off and on.
+            let begins = state.has(State::CLAIMING) && !self.claiming;
+            self.claiming = state.has(State::CLAIMING);
+            if begins {
+                self.sent = None;
+            }
+            if let Some((last, packets)) = self.sent {
+                let expected = last.wrapping_add(packets);
+                self.check("BEAT-4", sent == expected, || format!("sent is {sent}, not {expected}"));
+            }
+            self.sent = Some((sent, 0));
+            let version = state.version();
+            self.check("STATE-3", version == 1, || format!("version {version}, not 1"));
+            if let Some(expected) = self.about.serial {
+                self.check("ID-1", serial == expected, || {
+                    format!("serial number {serial} in a heartbeat, and {expected} before")
+                });
+            }
+        }
+        if let Some((_, packets)) = &mut self.sent {
+            *packets = packets.wrapping_add(1);
+        }
+    }
+}

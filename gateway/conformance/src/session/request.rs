@@ -1,0 +1,213 @@
+//! Parameters over the bus: every answer is looked at as the documents have it.
+
+use protocol::id::Node;
+use protocol::message::{Answer, Heard as HeardPage, Message, NetworkPage, Refused, Request};
+use protocol::packet::{WORDS, words};
+use protocol::parameters::{Parameter, Parameters};
+use protocol::time::{Micros, Span};
+
+use super::{Heard, PATIENT, Session};
+use crate::bus::Stop;
+
+/// All pages of a report have come by then.
+const REPORT: Span = Span::from_millis(150);
+/// After an answer with another tag the right one may come.
+const LATER: Span = Span::from_millis(30);
+/// A commit writes flash.
+const COMMIT: Span = Span::from_millis(900);
+
+/// What a cell answered a request with.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(crate) enum Reply {
+    Value([i16; WORDS]),
+    Refused(i16),
+    Nothing,
+}
+
+impl Reply {
+    pub(crate) const fn words(self) -> Option<[i16; WORDS]> {
+        if let Self::Value(words) = self { Some(words) } else { None }
+    }
+}
+
+impl core::fmt::Display for Reply {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match self {
+            Self::Value(words) => {
+                for (place, word) in words.iter().enumerate() {
+                    write!(f, "{}{word:04X}", if place == 0 { "" } else { " " })?;
+                }
+                Ok(())
+            }
+            Self::Refused(reason) => write!(f, "a refusal with {reason}"),
+            Self::Nothing => f.write_str("nothing"),
+        }
+    }
+}
+
+/// When an answer to a request came, its tag, and what it is.
+const fn configured(heard: &Heard) -> Option<(Micros, u8, Answer)> {
+    if let Message::Configured { tag, answer, .. } = heard.message {
+        Some((heard.at, tag, answer))
+    } else {
+        None
+    }
+}
+
+impl Session<'_> {
+    fn own(&self) -> Node {
+        Node::Cell(self.cell)
+    }
+
+    /// Reads a parameter.
+    pub(crate) fn read(&mut self, number: u8) -> Result<Reply, Stop> {
+        self.request(self.own(), Request::Read { number })
+    }
+
+    /// Writes a parameter.
+    pub(crate) fn write(&mut self, number: u8, words: [i16; WORDS]) -> Result<Reply, Stop> {
+        self.request(self.own(), Request::Write { number, words })
+    }
+
+    /// Writes the first words of a parameter, and zeros.
+    pub(crate) fn set<const N: usize>(&mut self, number: u8, first: [i16; N]) -> Result<Reply, Stop> {
+        self.write(number, words(first))
+    }
+
+    /// Sends a request with the next tag and waits for the answer.
+    pub(crate) fn request(&mut self, to: Node, request: Request) -> Result<Reply, Stop> {
+        self.tag = self.tag.wrapping_mul(5).wrapping_add(0x35);
+        self.request_with(to, self.tag, request)
+    }
+
+    /// The same with this tag.
+    pub(crate) fn request_with(&mut self, to: Node, tag: u8, request: Request) -> Result<Reply, Stop> {
+        let (number, is_write) = match request {
+            Request::Read { number } => (number, false),
+            Request::Write { number, .. } => (number, true),
+        };
+        let id = if is_write { "CONF-4" } else { "CONF-1" };
+        let is_commit = is_write && number == Parameter::Commit.number();
+        self.mark();
+        let at = self.say(&[Message::Configure { to, tag, request }])?;
+        let longest = if is_commit { COMMIT } else { PATIENT };
+        self.wait(at + longest, |heard| {
+            heard.iter().any(|it| matches!(it.message, Message::Configured { .. }))
+        })?;
+        // That of an earlier request may come first, where that was interrupted.
+        let is_its = |heard: &Heard| heard.message.tag() == Some(tag) && configured(heard).is_some();
+        self.wait(self.now() + LATER, |heard| {
+            heard.iter().any(is_its) || !heard.iter().any(|it| configured(it).is_some())
+        })?;
+        let place = self.answers().iter().position(is_its);
+        let place = place.or_else(|| self.answers().iter().position(|heard| configured(heard).is_some()));
+        let found = place.and_then(|place| configured(self.answers().get(place)?));
+        let Some((answered, came, answer)) = found else {
+            self.check(id, false, || {
+                format!("no answer to parameter {number} within {} ms", longest.0 / 1_000)
+            });
+            return Ok(Reply::Nothing);
+        };
+        self.note_time(if is_commit { "commit" } else { "configured" }, at, answered);
+        self.check("CONF-12", came == tag, || format!("tag {came:02X} in the answer, not {tag:02X}"));
+        let reply = match answer {
+            Answer::Value { number: got, written, words } => {
+                self.check(id, got == number, || format!("the answer is of parameter {got}, not {number}"));
+                self.check(id, written == is_write, || {
+                    format!("0x80 is {}set in the answer", if written { "" } else { "not " })
+                });
+                Reply::Value(words)
+            }
+            Answer::Refused { number: got, reason } => {
+                self.check("CONF-6", got == number, || {
+                    format!("the refusal names parameter {got}, not {number}")
+                });
+                Reply::Refused(reason)
+            }
+        };
+        self.ended = self.log.len();
+        let place = self.heard.iter().rposition(|it| matches!(it.message, Message::Configured { .. }));
+        self.consumed = place.map_or(self.heard.len(), |place| place + 1);
+        Ok(reply)
+    }
+
+    /// Writes all stored parameters that differ from what is staged.
+    pub(crate) fn stage(&mut self, parameters: &Parameters) -> Result<(), Stop> {
+        let before = self.known.staged.take();
+        for parameter in Parameter::stored(parameters.table().len()) {
+            let words = parameters.words(parameter);
+            if before.is_none_or(|before| before.words(parameter) != words) {
+                let reply = self.write(parameter.number(), words)?;
+                self.check("CONF-4", reply == Reply::Value(words), || {
+                    format!("parameter {} was written, and the answer is {reply}", parameter.number())
+                });
+            }
+        }
+        self.known.staged = Some(*parameters);
+        Ok(())
+    }
+
+    /// Has the cell use parameters; whether it does.
+    pub(crate) fn commit(&mut self, parameters: &Parameters) -> Result<bool, Stop> {
+        if self.known.parameters == Some(*parameters) && self.known.staged == Some(*parameters) {
+            return Ok(true);
+        }
+        self.stage(parameters)?;
+        let hash = parameters.hash();
+        let reply = self.set(Parameter::Commit.number(), [hash.cast_signed()])?;
+        let done = reply == Reply::Value(words([hash.cast_signed()]));
+        self.check("CONF-7", done, || format!("commit with hash {hash:04X} was answered with {reply}"));
+        if done {
+            self.known.parameters = Some(*parameters);
+            (self.known.hash, self.known.joints) = (Some(hash), parameters.joints);
+        } else {
+            (self.known.parameters, self.known.hash, self.known.staged) = (None, None, None);
+        }
+        Ok(done)
+    }
+
+    /// What comes to a report, but for heartbeats.
+    pub(crate) fn report(&mut self) -> Result<Vec<Heard>, Stop> {
+        self.mark();
+        let asked = self.say(&[Message::Report])?;
+        self.pages(asked)
+    }
+
+    /// The pages that come to a report of then.
+    pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<Heard>, Stop> {
+        let expected = if self.about.ports { 6 } else { 4 };
+        let pages = |heard: &[Heard]| heard.iter().filter(|it| it.beat().is_none()).count();
+        self.wait(asked + REPORT, |heard| pages(heard) >= expected)?;
+        let pages: Vec<_> = self.answers().iter().filter(|it| it.beat().is_none()).copied().collect();
+        self.consume();
+        Ok(pages)
+    }
+
+    /// Asks for the counters.
+    pub(crate) fn counters(&mut self) -> Result<(HeardPage, Refused), Stop> {
+        let report = self.report()?;
+        let (mut heard, mut refused) = (None, None);
+        for answer in &report {
+            if let Message::Network { page, .. } = answer.message {
+                match page {
+                    NetworkPage::Heard(page) => heard = Some(page),
+                    NetworkPage::Refused(page) => refused = Some(page),
+                    NetworkPage::Heartbeat(_) | NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
+                }
+            }
+        }
+        let is_whole = heard.is_some() && refused.is_some();
+        self.check("CMD-4", is_whole, || "network pages 1 and 2 did not come to a report".to_owned());
+        let (heard, refused) = (heard.unwrap_or_default(), refused.unwrap_or_default());
+        let sync = self.exchange_all(&[])?;
+        if let (Some((beat, _)), true) = (sync.beat, is_whole) {
+            let Refused { length, crc, foreign, meaning, incomplete, stimuli } = refused;
+            let sum =
+                [length, crc, foreign, meaning, incomplete, stimuli].into_iter().fold(0, u16::wrapping_add);
+            self.check("BEAT-4", beat.rejected == sum, || {
+                format!("refused is {} in a heartbeat, and page 2 adds up to {sum}", beat.rejected)
+            });
+        }
+        Ok((heard, refused))
+    }
+}

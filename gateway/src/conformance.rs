@@ -1,0 +1,158 @@
+//! `gateway conformance`.
+
+mod show;
+
+use std::fs;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use clap::Args;
+use conformance::bus::Stop;
+use conformance::findings::Only;
+use conformance::live::Live;
+use conformance::survey::Survey;
+use conformance::{Saved, Session};
+use protocol::can::Format;
+use protocol::id::CellId;
+use protocol::time::Span;
+use protocol::usage::{Failure, print};
+
+use self::show::Whole;
+use super::arguments::{BusKind, FORMATS, one_of};
+use super::output::Force;
+use super::{input, output};
+
+/// How long a test may take, beside listening and putting back.
+const LONGEST: Span = Span::from_millis(80_000);
+
+/// Test one cell, whoever wrote it, against the requirements of its documents
+///
+/// Takes the cell through every numbered requirement of cell.md and sensing.md, in at most 90 s, and prints what came of
+/// each; of a failure also the frames that show it. The test brings its own configurations: it first saves the cell's to a
+/// file, and puts it back at the end, also when it is interrupted. The cell has to be alone with it on the bus. Exit code
+/// 0: nothing failed; 1: something failed, or the test could not be done; 2: wrong use.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway conformance --bus can0 --node 12
+  gateway conformance --bus can0 --node 12 --restart './relay off; sleep 0.2; ./relay on' --junit cell.xml
+  gateway conformance --bus can0 --node 12 --only CONF,COUNT-1
+  gateway conformance --bus can0 --node 12 --restore conformance-can0-12.json")]
+pub(crate) struct Conformance {
+    /// The bus
+    #[arg(long, value_name = "NAME")]
+    bus: String,
+    /// The cell's node id
+    #[arg(long, value_name = "N", value_parser = node)]
+    node: CellId,
+    #[command(flatten)]
+    kind: BusKind,
+    /// The frame format of the bus [default: that of the cell's heartbeats]
+    #[arg(long, value_parser = one_of(FORMATS))]
+    format: Option<Format>,
+    /// Test these requirements only: CONF-7, or CONF for all of that name
+    #[arg(long, value_name = "ID", value_delimiter = ',')]
+    only: Vec<String>,
+    /// A command that switches the cell off and on, for what shows only at a start; run by sh -c
+    #[arg(long, value_name = "COMMAND")]
+    restart: Option<String>,
+    /// Other cells on the bus do not matter: joints and halts of the test reach them too
+    #[arg(long)]
+    others_will_stop: bool,
+    /// Where to save what the cell has [default: conformance-BUS-NODE.json]
+    #[arg(long, value_name = "FILE")]
+    save: Option<PathBuf>,
+    /// Test nothing: put back what an earlier test saved, and delete the file
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["only", "restart", "json", "junit", "save"])]
+    restore: Option<PathBuf>,
+    /// Print one JSON object instead of the table
+    #[arg(long)]
+    json: bool,
+    /// Write a JUnit report too
+    #[arg(long, value_name = "FILE")]
+    junit: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
+}
+
+fn node(text: &str) -> Result<CellId, String> {
+    let number = text.parse().ok().and_then(|number| CellId::new(number).ok());
+    number.ok_or_else(|| format!("{text:?} is no node id: 1 to 254 are"))
+}
+
+impl Conformance {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let only = Only::new(&self.only).map_err(|word| {
+            Failure::usage(format!("--only {word}: no requirement has this id; CONF-7 and CONF are examples"))
+        })?;
+        let stopped = input::stopped()?;
+        let name = self.bus.as_str();
+        let path =
+            self.save.clone().unwrap_or_else(|| format!("conformance-{name}-{}.json", self.node).into());
+        if self.restore.is_none() && path.exists() {
+            let path = path.display();
+            return Err(Failure::usage(format!(
+                "{path} is there from an earlier test that did not put the cell back: do that with --restore {path}, \
+                 or delete it"
+            )));
+        }
+        let junit = self.junit.as_ref().map(|path| self.force.create("--junit", path)).transpose()?;
+        let mut live =
+            Live::open(name, self.kind.bus_kind, stopped, self.restart.clone()).map_err(Failure::usage)?;
+        let survey = Survey::take(&mut live, name).map_err(Failure::run)?;
+        let format = survey
+            .check(self.node, name, self.format, self.others_will_stop || self.restore.is_some())
+            .map_err(Failure::run)?;
+        let mut session = Session::new(&mut live, name, self.node, format, LONGEST);
+        if let Some(path) = &self.restore {
+            return put_back(&mut session, &read(path)?, path);
+        }
+        let began = Instant::now();
+        let saved = session.save().map_err(Failure::run)?;
+        let saved = saved.map_err(|why| Failure::run(format!("cell {} on {name}: {why}", self.node)))?;
+        Force { force: false }.write("--save", &path, &super::print::json(&saved)?)?;
+        let stopped = conformance::run(&mut session, &only).err();
+        let back = put_back(&mut session, &saved, &path);
+        let whole = Whole::new(
+            &saved,
+            format,
+            began.elapsed(),
+            session.findings.list(&only, stopped.as_ref()),
+            stopped.as_ref(),
+        );
+        if let Some((file, out)) = junit {
+            output::finish("--junit", file, out, &whole.junit())?;
+        }
+        print(&if self.json { super::print::json(&whole)? } else { whole.text() })?;
+        back?;
+        match stopped {
+            Some(Stop::Interrupted) => Err(Failure::run("interrupted; the cell has been put back")),
+            Some(stopped) => Err(Failure::run(stopped)),
+            None if whole.has_failed() => Err(Failure::said()),
+            None => Ok(()),
+        }
+    }
+}
+
+/// What an earlier test saved.
+fn read(path: &PathBuf) -> Result<Saved, Failure> {
+    let wrong =
+        |error: &dyn std::fmt::Display| Failure::usage(format!("--restore {}: {error}", path.display()));
+    let text = fs::read_to_string(path).map_err(|error| wrong(&error))?;
+    serde_json::from_str(&text).map_err(|error| wrong(&error))
+}
+
+/// Puts back what the cell had, and deletes the file if that was possible.
+fn put_back(session: &mut Session<'_>, saved: &Saved, path: &PathBuf) -> Result<(), Failure> {
+    let keep = |why: &dyn std::fmt::Display| {
+        let path = path.display();
+        Failure::run(format!(
+            "the cell was not put back: {why}; {path} has what it had: put it back with --restore {path}"
+        ))
+    };
+    let left = session.restore(saved).map_err(|stop| keep(&stop))?;
+    if saved.hash != 0 && !left.is_empty() {
+        return Err(keep(&left.join(", ")));
+    }
+    left.iter().for_each(output::note);
+    fs::remove_file(path).map_err(|error| Failure::run(format!("{}: {error}", path.display())))
+}

@@ -1,0 +1,148 @@
+//! What came of each requirement, as a table, JSON and JUnit.
+
+use std::fmt::Write;
+use std::time::Duration;
+
+use conformance::Saved;
+use conformance::bus::Stop;
+use conformance::findings::{Finding, Verdict};
+use protocol::can::Format;
+use serde::Serialize;
+
+use crate::print::{count, list, table};
+
+/// All that is printed.
+#[derive(Debug, Serialize)]
+pub(super) struct Whole {
+    bus: String,
+    node: u8,
+    serial: u32,
+    format: &'static str,
+    seconds: f64,
+    /// Why it ended early.
+    stopped: Option<String>,
+    passed: usize,
+    failed: usize,
+    not_applicable: usize,
+    not_tested: usize,
+    requirements: Vec<Finding>,
+}
+
+impl Whole {
+    pub(super) fn new(
+        saved: &Saved,
+        format: Format,
+        took: Duration,
+        requirements: Vec<Finding>,
+        stopped: Option<&Stop>,
+    ) -> Self {
+        let count = |is: fn(&Verdict) -> bool| requirements.iter().filter(|it| is(&it.verdict)).count();
+        Self {
+            bus: saved.bus.clone(),
+            node: saved.node,
+            serial: saved.serial,
+            format: format.name(),
+            seconds: (took.as_secs_f64() * 10.0).round() / 10.0,
+            stopped: stopped.map(ToString::to_string),
+            passed: count(|it| matches!(it, Verdict::Passed { .. })),
+            failed: count(|it| matches!(it, Verdict::Failed { .. })),
+            not_applicable: count(|it| matches!(it, Verdict::NotApplicable { .. })),
+            not_tested: count(|it| matches!(it, Verdict::NotTested { .. } | Verdict::Open)),
+            requirements,
+        }
+    }
+
+    pub(super) const fn has_failed(&self) -> bool {
+        self.failed > 0
+    }
+
+    /// A line each, the frames of failures, and what was not tested.
+    pub(super) fn text(&self) -> String {
+        let rows = self.requirements.iter().map(|it| {
+            let (verdict, more) = said(&it.verdict);
+            let title = it.requirement.title;
+            let about = if more.is_empty() { title.to_owned() } else { format!("{title}: {more}") };
+            vec![it.requirement.id.to_owned(), verdict.to_owned(), about]
+        });
+        let mut table = table(["requirement", "", ""], rows, |_| false);
+        if table.width().is_none_or(|width| width > 110) {
+            table.set_width(110);
+        }
+        let mut text = format!("{table}\n");
+        for it in &self.requirements {
+            let Verdict::Failed { what, failures, frames } = &it.verdict else { continue };
+            let times = if *failures > 1 { format!(" ({failures} times)") } else { String::new() };
+            let _ = write!(text, "\n{} failed{times}: {what}\n", it.requirement.id);
+            for frame in frames {
+                let _ = writeln!(text, "  {frame}");
+            }
+        }
+        let untested = self.requirements.iter().filter(|it| matches!(it.verdict, Verdict::NotTested { .. }));
+        let ids = list(untested.map(|it| it.requirement.id));
+        let _ = write!(
+            text,
+            "\ncell {} on {} ({}, serial number {}), {:.1} s: {} passed, {} failed, {} not applicable, {} not tested{}\n",
+            self.node,
+            self.bus,
+            self.format,
+            self.serial,
+            self.seconds,
+            self.passed,
+            self.failed,
+            self.not_applicable,
+            self.not_tested,
+            if ids.is_empty() { String::new() } else { format!(": {ids}") }
+        );
+        text
+    }
+
+    /// A JUnit report: a test case for each requirement.
+    pub(super) fn junit(&self) -> String {
+        let Self { bus, node, failed, seconds, .. } = self;
+        let tests = self.requirements.len();
+        let skipped = self.not_applicable + self.not_tested;
+        let mut text = format!(
+            "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuite name=\"cell {node} on {}\" tests=\"{tests}\" \
+             failures=\"{failed}\" skipped=\"{skipped}\" time=\"{seconds:.1}\">\n",
+            escaped(bus)
+        );
+        for Finding { requirement, verdict } in &self.requirements {
+            let name = escaped(&format!("{} {}", requirement.id, requirement.title));
+            let document = serde_json::to_value(requirement.document).unwrap_or_default();
+            let class = escaped(document.as_str().unwrap_or_default());
+            let _ = write!(text, "  <testcase classname=\"{class}\" name=\"{name}\"");
+            let _ = match verdict {
+                Verdict::Passed { .. } => writeln!(text, "/>"),
+                Verdict::Failed { what, frames, .. } => writeln!(
+                    text,
+                    "><failure message=\"{}\">{}</failure></testcase>",
+                    escaped(what),
+                    escaped(&frames.join("\n"))
+                ),
+                Verdict::NotApplicable { why } | Verdict::NotTested { why } => {
+                    writeln!(text, "><skipped message=\"{}\"/></testcase>", escaped(why))
+                }
+                Verdict::Open => writeln!(text, "><skipped/></testcase>"),
+            };
+        }
+        text + "</testsuite>\n"
+    }
+}
+
+/// The verdict in a word, and what more there is to say.
+fn said(verdict: &Verdict) -> (&'static str, String) {
+    match verdict {
+        Verdict::Passed { checks, but } => {
+            let but = but.as_ref().map_or_else(String::new, |but| format!("; not tested: {but}"));
+            ("passed", format!("{}{but}", count(*checks, "check")))
+        }
+        Verdict::Failed { .. } => ("FAILED", "see below".to_owned()),
+        Verdict::NotApplicable { why } => ("not applicable", why.clone()),
+        Verdict::NotTested { why } => ("not tested", why.clone()),
+        Verdict::Open => ("not tested", String::new()),
+    }
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}

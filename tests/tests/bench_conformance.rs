@@ -1,0 +1,203 @@
+//! The conformance test in virtual time: this project's cell passes, and cells that do one thing wrong are found out, each
+//! by the requirement that says so.
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::wildcard_enum_match_arm,
+    reason = "a test may stop, and a wrong cell changes one kind of packet"
+)]
+
+#[path = "conformance/cell.rs"]
+mod cell;
+#[path = "conformance/lesser.rs"]
+mod lesser;
+#[path = "conformance/mutants/mod.rs"]
+mod mutants;
+#[path = "conformance/wrong.rs"]
+mod wrong;
+
+use cell::{Mutant, Right, Virtual};
+use conformance::Session;
+use conformance::findings::{Finding, Only, Verdict};
+use conformance::survey::Survey;
+use protocol::can::Format;
+use protocol::id::CellId;
+use protocol::time::Span;
+
+/// What came of a cell, and why the test ended early.
+fn test(bus: &mut Virtual, format: Format, number: u8, only: &Only) -> (Vec<Finding>, Vec<&'static str>) {
+    let cell = CellId::new(number.into()).unwrap();
+    let survey = Survey::take(bus, "vcan0").unwrap();
+    assert_eq!(survey.check(cell, "vcan0", None, false), Ok(format));
+    let mut session = Session::new(bus, "vcan0", cell, format, Span::from_millis(80_000));
+    let saved = session.save().unwrap();
+    let stopped = conformance::run(&mut session, only).err();
+    if let Ok(saved) = &saved {
+        let _ = session.restore(saved);
+    }
+    let failed = session.findings.failed();
+    (session.findings.list(only, stopped.as_ref()), failed)
+}
+
+fn failures(findings: &[Finding]) -> String {
+    let of = |it: &Finding| match &it.verdict {
+        Verdict::Failed { what, frames, .. } => {
+            Some(format!("{}: {what}\n  {}", it.requirement.id, frames.join("\n  ")))
+        }
+        _ => None,
+    };
+    findings.iter().filter_map(of).collect::<Vec<_>>().join("\n")
+}
+
+#[test]
+fn this_projects_cell_passes() {
+    for (format, number) in [(Format::Fd, 12), (Format::Classic, 12), (Format::Fd, 254), (Format::Classic, 1)]
+    {
+        let mut bus = Virtual::new(format, number, Box::new(Right) as Box<dyn Mutant>);
+        let (findings, failed) = test(&mut bus, format, number, &Only::default());
+        assert_eq!(failed, [""; 0], "{format:?}\n{}", failures(&findings));
+        let untested: Vec<_> = findings
+            .iter()
+            .filter(|it| matches!(it.verdict, Verdict::NotTested { .. }))
+            .map(|it| it.requirement.id)
+            .collect();
+        assert_eq!(untested, [""; 0], "SEND-1 and all others are tested");
+    }
+}
+
+#[test]
+fn without_a_restart_what_shows_only_at_a_start_is_not_tested() {
+    let mut bus = Virtual::new(Format::Fd, 7, Box::new(Right)).without_restart();
+    let (findings, failed) = test(&mut bus, Format::Fd, 7, &Only::default());
+    assert_eq!(failed, [""; 0], "{}", failures(&findings));
+    let untested: Vec<_> = findings
+        .iter()
+        .filter(|it| matches!(&it.verdict, Verdict::NotTested { why } if why == "without --restart"))
+        .map(|it| it.requirement.id)
+        .collect();
+    assert_eq!(untested, ["ID-3", "CLAIM-1", "CLAIM-2", "CLAIM-3", "CLAIM-4", "CLAIM-5", "CONF-8"]);
+}
+
+/// Cells that are right and have less: no option, few abilities; or take their time.
+#[test]
+fn cells_with_less_pass() {
+    for (name, lessen) in lesser::ALL {
+        for format in [Format::Fd, Format::Classic] {
+            let mut lesser = wrong::Wrong::new(format, mutants::NODE);
+            lessen(&mut lesser);
+            // Of two segments the first has the first words, and they are not changed on the way.
+            let measures = lesser.memory.measures;
+            if measures && format == Format::Classic {
+                continue;
+            }
+            let mut bus = Virtual::new(format, mutants::NODE, Box::new(lesser));
+            if measures {
+                bus = bus.measuring();
+            }
+            let (findings, failed) = test(&mut bus, format, mutants::NODE, &Only::default());
+            assert_eq!(failed, [""; 0], "{name}, {format:?}\n{}", failures(&findings));
+        }
+    }
+}
+
+/// Each wrong cell fails the requirement that it breaks.
+fn are_found(spoilt: &[mutants::Spoilt], format: Format) {
+    let mut found_out = Vec::new();
+    for (name, id, spoil) in spoilt {
+        let mut wrong = wrong::Wrong::new(format, mutants::NODE);
+        spoil(&mut wrong);
+        let mut bus = Virtual::new(format, mutants::NODE, Box::new(wrong));
+        let (findings, failed) = test(&mut bus, format, mutants::NODE, &Only::default());
+        let is_found = findings
+            .iter()
+            .any(|it| it.requirement.id == *id && matches!(it.verdict, Verdict::Failed { .. }));
+        if !is_found {
+            found_out.push(format!("{name}: not {id} but {failed:?}"));
+        }
+        for it in &findings {
+            if let Verdict::Failed { frames, .. } = &it.verdict {
+                // Of a cell that sends nothing there are none, nor of its timing as a whole.
+                let has_none = ["TIME-1", "TIME-2", "BEAT-1"].contains(&it.requirement.id)
+                    || *name == "it is silent after a reset";
+                assert!(!frames.is_empty() || has_none, "{name}: {}", it.requirement.id);
+            }
+        }
+    }
+    assert!(found_out.is_empty(), "{}", found_out.join("\n"));
+}
+
+#[test]
+fn wrong_arithmetic_is_found() {
+    are_found(mutants::arithmetic::ARITHMETIC, Format::Fd);
+}
+
+#[test]
+fn wrong_answers_to_joints_are_found() {
+    are_found(mutants::joints::JOINTS, Format::Fd);
+}
+
+#[test]
+fn wrong_commands_are_found() {
+    are_found(mutants::commands::COMMANDS, Format::Fd);
+}
+
+#[test]
+fn wrong_parameters_are_found() {
+    are_found(mutants::parameters::PARAMETERS, Format::Fd);
+}
+
+#[test]
+fn wrong_stimuli_are_found() {
+    are_found(mutants::stimuli::STIMULI, Format::Fd);
+}
+
+#[test]
+fn wrong_heartbeats_are_found() {
+    are_found(mutants::beats::BEATS, Format::Fd);
+}
+
+#[test]
+fn wrong_defence_of_a_node_id_is_found() {
+    are_found(mutants::beats::CLAIMS, Format::Fd);
+}
+
+#[test]
+fn wrong_counts_are_found() {
+    are_found(mutants::counters::COUNTERS, Format::Fd);
+}
+
+#[test]
+fn wrong_reassembly_is_found() {
+    are_found(mutants::segments::SEGMENTS, Format::Classic);
+}
+
+#[test]
+fn wrong_sensor_pages_are_found() {
+    are_found(mutants::sensing::SENSING, Format::Fd);
+}
+
+#[test]
+fn wrong_starts_are_found() {
+    are_found(mutants::starts::STARTS, Format::Fd);
+}
+
+/// What passes for the right cell is failed by a wrong one; but for what follows from other requirements.
+#[test]
+fn each_requirement_is_broken_by_a_wrong_cell() {
+    let mut passed = std::collections::BTreeSet::new();
+    for format in [Format::Fd, Format::Classic] {
+        let mut bus = Virtual::new(format, 12, Box::new(Right));
+        let (findings, _) = test(&mut bus, format, 12, &Only::default());
+        let is_passed = |it: &&Finding| matches!(it.verdict, Verdict::Passed { .. });
+        passed.extend(findings.iter().filter(is_passed).map(|it| it.requirement.id));
+    }
+    let broken: std::collections::BTreeSet<_> =
+        mutants::ALL.iter().flat_map(|(all, _)| all.iter().map(|(_, id, _)| *id)).collect();
+    let unbroken: Vec<_> = passed.difference(&broken).copied().collect();
+    assert!(passed.len() > 70, "{passed:?}");
+    // A cell without its node id after a reset sends nothing, which is CLAIM-1.
+    assert_eq!(unbroken, ["ID-3"]);
+    let count: usize = mutants::ALL.iter().map(|(all, _)| all.len()).sum();
+    assert!(count >= 24, "{count} wrong cells");
+}

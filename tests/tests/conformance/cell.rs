@@ -1,0 +1,273 @@
+//! A bus in virtual time with one cell on it, which may do something wrong.
+
+use std::collections::VecDeque;
+
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
+use cell_node::node::Node;
+use conformance::bus::{Bus, Seen, Stop};
+use protocol::can::{Format, Frame};
+use protocol::id::CellId;
+use protocol::packet::Packet;
+use protocol::time::{Micros, Span};
+
+/// From one frame on the bus to the next.
+const FRAME: Span = Span(20);
+/// What a cell takes for a frame, or for a timer.
+const THINKS: Span = Span(30);
+/// How long it is off in a restart.
+const OFF: Span = Span::from_millis(40);
+
+/// What a cell does wrong: it changes what goes in and what comes out.
+pub(crate) trait Mutant {
+    /// A frame that came, and its age; what the cell is given in its place.
+    fn hears(&mut self, _now: Micros, age: Span, frame: Frame) -> Vec<(Span, Frame)> {
+        vec![(age, frame)]
+    }
+
+    /// A packet that the cell sends; what is sent in its place, and how much later.
+    fn says(&mut self, _now: Micros, packet: Packet) -> Vec<(Span, Packet)> {
+        vec![(Span(0), packet)]
+    }
+
+    /// What is sent beside that, after each call of the cell.
+    fn adds(&mut self, _now: Micros) -> Vec<(Span, Packet)> {
+        Vec::new()
+    }
+
+    /// The frames of a packet.
+    fn frames(&mut self, packet: &Packet, format: Format) -> Vec<Frame> {
+        packet.frames(format).collect()
+    }
+
+    /// What flash keeps.
+    fn stores(&mut self, flash: Flash) -> Flash {
+        flash
+    }
+
+    /// It is switched on with this flash.
+    fn starts(&mut self, _now: Micros, flash: Flash) -> Flash {
+        flash
+    }
+
+    /// When it has to be called, beside the cell.
+    fn wakes(&self) -> Option<Micros> {
+        None
+    }
+
+    /// Goes silent when the cell gave way.
+    fn obeys_claims(&self) -> bool {
+        true
+    }
+}
+
+/// A cell that does nothing wrong.
+pub(crate) struct Right;
+
+impl Mutant for Right {}
+
+/// The bus.
+pub(crate) struct Virtual {
+    now: Micros,
+    format: Format,
+    identity: Identity,
+    test_mode: bool,
+    node: Option<Node>,
+    flash: Flash,
+    mutant: Box<dyn Mutant>,
+    /// On the bus from then on, in order: the time, the frame, whether the bench sent it.
+    wire: VecDeque<Seen>,
+    /// The bus is free from then on.
+    free: Micros,
+    /// For the cell, and when they came.
+    inbox: VecDeque<(Micros, Frame)>,
+    /// The cell is at work until then.
+    busy: Micros,
+    /// Packets that wait to be sent by the cell.
+    later: Vec<(Micros, Frame)>,
+    restart: Option<Micros>,
+    restarts: bool,
+}
+
+impl Virtual {
+    pub(crate) fn new(format: Format, number: u8, mutant: Box<dyn Mutant>) -> Self {
+        let identity =
+            Identity { cell: CellId::new(number.into()).ok(), serial: 100_000 + u32::from(number) };
+        let mut bus = Self {
+            now: Micros(1_000_000),
+            format,
+            identity,
+            test_mode: true,
+            node: None,
+            flash: Flash::Empty,
+            mutant,
+            wire: VecDeque::new(),
+            free: Micros(0),
+            inbox: VecDeque::new(),
+            busy: Micros(0),
+            later: Vec::new(),
+            restart: None,
+            restarts: true,
+        };
+        bus.start();
+        bus
+    }
+
+    /// A cell that measures when it is switched on.
+    pub(crate) fn measuring(mut self) -> Self {
+        self.test_mode = false;
+        self.start();
+        self
+    }
+
+    pub(crate) fn without_restart(mut self) -> Self {
+        self.restarts = false;
+        self
+    }
+
+    fn start(&mut self) {
+        self.flash = self.mutant.starts(self.now, self.flash);
+        self.node = Some(Node::new(self.identity, self.format, &self.flash, self.test_mode, self.now));
+        self.busy = self.now;
+        self.inbox.clear();
+    }
+
+    /// What the cell has to send goes onto the bus, and into flash what it keeps.
+    fn collect(&mut self, at: Micros) {
+        let Some(node) = &mut self.node else { return };
+        if let Some(kept) = node.poll_store() {
+            self.flash = self.mutant.stores(kept.parameters.map_or(Flash::Empty, Flash::Sound));
+            node.handle_stored(true);
+        }
+        let mut out = Vec::new();
+        while let Some(packet) = node.poll_transmit() {
+            out.extend(self.mutant.says(at, packet));
+        }
+        out.extend(self.mutant.adds(at));
+        for (delay, packet) in out {
+            let frames = self.mutant.frames(&packet, self.format);
+            self.later.extend(frames.into_iter().map(|frame| (at + delay, frame)));
+        }
+        self.later.sort_by_key(|(at, _)| *at);
+        if node.taken().is_some() && self.mutant.obeys_claims() {
+            self.node = None;
+            self.inbox.clear();
+        }
+    }
+
+    fn put(&mut self, at: Micros, frame: Frame, own: bool) {
+        let at = at.max(self.free + FRAME);
+        self.free = at;
+        let place = self.wire.iter().rposition(|seen| seen.at <= at).map_or(0, |place| place + 1);
+        self.wire.insert(place, Seen { at, frame, own });
+        if own {
+            self.inbox.push_back((at, frame));
+        }
+    }
+
+    /// The next thing that happens to the cell, if one does until then.
+    fn next(&self, until: Micros) -> Option<(Micros, Event)> {
+        let heard = self.inbox.front().filter(|_| self.node.is_some());
+        let heard = heard.map(|(at, _)| ((*at).max(self.busy) + THINKS, Event::Hears));
+        let wake = self.node.as_ref().map(|node| (node.poll_timeout().max(self.busy), Event::Wakes));
+        let own =
+            self.mutant.wakes().filter(|_| self.node.is_some()).map(|at| (at.max(self.busy), Event::Wakes));
+        let start = self.restart.map(|at| (at, Event::Starts));
+        let sends = self.later.first().map(|(at, _)| (*at, Event::Sends));
+        let all = [sends, heard, wake, own, start].into_iter().flatten();
+        all.min_by_key(|(at, _)| *at).filter(|(at, _)| *at <= until)
+    }
+
+    fn do_next(&mut self, at: Micros, event: Event) {
+        match event {
+            Event::Sends => {
+                let (at, frame) = self.later.remove(0);
+                self.put(at, frame, false);
+            }
+            Event::Starts => {
+                self.restart = None;
+                self.now = at;
+                self.start();
+            }
+            Event::Wakes => {
+                self.busy = at + Span(1);
+                if let Some(node) = &mut self.node {
+                    node.handle_timeout(at);
+                }
+                self.collect(at);
+            }
+            Event::Hears => {
+                self.busy = at;
+                let Some((came, frame)) = self.inbox.pop_front() else { return };
+                for (age, frame) in self.mutant.hears(at, at.since(came), frame) {
+                    if let Some(node) = &mut self.node {
+                        node.handle_frame(at, age, &frame);
+                    }
+                    self.collect(at);
+                }
+            }
+        }
+    }
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Event {
+    Sends,
+    Hears,
+    Wakes,
+    Starts,
+}
+
+impl Bus for Virtual {
+    fn now(&self) -> Micros {
+        self.now
+    }
+
+    fn send(&mut self, frames: &[Frame]) -> Result<(), Stop> {
+        for frame in frames {
+            // What a real bus does, a frame at a time.
+            self.put(self.now, *frame, true);
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
+        loop {
+            let seen = self.wire.front().map(|seen| seen.at);
+            let limit = seen.map_or(until, |at| at.min(until));
+            if let Some((at, event)) = self.next(limit) {
+                self.do_next(at, event);
+                continue;
+            }
+            if seen.is_some_and(|at| at <= until)
+                && let Some(seen) = self.wire.pop_front()
+            {
+                self.now = self.now.max(seen.at);
+                return Ok(Some(seen));
+            }
+            self.now = self.now.max(until);
+            return Ok(None);
+        }
+    }
+
+    fn lateness(&mut self) -> Span {
+        Span(0)
+    }
+
+    fn finish(&mut self) {}
+
+    fn can_restart(&self) -> bool {
+        self.restarts
+    }
+
+    fn begin_restart(&mut self) -> Result<(), Stop> {
+        self.node = None;
+        self.later.clear();
+        self.restart = Some(self.now + OFF);
+        Ok(())
+    }
+
+    fn is_restarting(&mut self) -> Result<bool, Stop> {
+        Ok(self.restart.is_some())
+    }
+}
