@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use analysis::dbc;
+use bench::emulate::Emulated;
 use bench::record::{self, Candump};
 use bench::remote::Lines;
 use bench::run::launch::in_memory;
@@ -22,7 +23,7 @@ use protocol::time::Span;
 use protocol::usage::{Failure, print, quoted};
 use trace::recording::series::{Attached, Split};
 
-use super::arguments::{BusKinds, Programs, bus_names, seconds, time};
+use super::arguments::{BusKinds, Named, Programs, bus_names, cell, seconds, time};
 use super::buses;
 use super::output::{self, Force, apart, note};
 use super::print::json;
@@ -189,6 +190,13 @@ pub(crate) struct Run {
     /// Let cells keep their parameters in files of this directory
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
+    /// The firmware of a cell (for the micro:bit) that emulated cells run; docs/how-to/firmware.md builds it
+    #[arg(long, value_name = "ELF", requires = "emulate")]
+    firmware: Option<PathBuf>,
+    /// Cells that run the firmware in QEMU instead of a process, by node id or as BUS:NODE. They are commissioned, keep
+    /// their flash in files as other cells do, and end with the run
+    #[arg(long, value_name = "[BUS:]N,...", requires = "firmware", conflicts_with = "no_spawn", value_delimiter = ',', value_parser = cell)]
+    emulate: Vec<Named>,
 }
 
 impl Demo {
@@ -257,10 +265,25 @@ impl Run {
         options.record = recording.options(candump, &options.skin, files);
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
+        options.emulated = emulated(self.firmware, &self.emulate, &options.skin)?;
         options.receive_buffer = self.receive_buffer as usize;
         let page = view.map(|listen| Page::of(&options, listen)).transpose()?;
         bench(&options, summary.as_deref(), recording.force, &read, page)
     }
+}
+
+/// The cells that are emulated, by which firmware.
+fn emulated(firmware: Option<PathBuf>, named: &[Named], skin: &Skin) -> Result<Option<Emulated>, Failure> {
+    let Some(firmware) = firmware else { return Ok(None) };
+    let mut cells = Vec::new();
+    for named in named {
+        let cell = named.find(skin, "--emulate")?;
+        if cells.contains(&cell) {
+            return Err(Failure::usage(format!("--emulate {named} is there twice: name each cell once")));
+        }
+        cells.push(cell);
+    }
+    Ok(Some(Emulated { firmware, cells }))
 }
 
 /// The URDF that goes into a recording.
@@ -284,6 +307,7 @@ impl Common {
             kinds: Kinds::default(),
             directory: None,
             spawn: true,
+            emulated: None,
             cells_per_process: self.programs.cells_per_process.into(),
             flash: None,
             cell_node: self.programs.cell_node.clone(),

@@ -7,6 +7,7 @@ pub mod can;
 pub mod candump;
 #[cfg(feature = "host")]
 pub mod document;
+pub mod factory;
 pub mod fixed;
 pub mod id;
 pub mod message;

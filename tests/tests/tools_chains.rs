@@ -17,6 +17,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use process::{Place, Running};
+use protocol::fixed::Q1_14;
+use protocol::parameters::{Parameter, RowKind};
+use protocol::skin::Skin;
 use serde_json::Value;
 
 /// What the vectors say of each row.
@@ -128,6 +131,48 @@ fn check_moving(robot: &str) {
     );
     assert!(torques >= 1000.0 && moved > 0.2 && saturated < torques, "{said}");
     assert!(mean <= BOUNDS[0] && max <= BOUNDS[1], "{robot}: {said}");
+}
+
+/// The contacts in words, as cells on these robots are configured and receive them.
+fn in_words(robot: &str, text: &mut String) {
+    let place = Place::new();
+    let rows = rows(robot);
+    import(&place, &rows, "Q3.12");
+    let skin = Skin::parse("skin.toml", &place.read("skin.toml")).unwrap();
+    let said = |words: &[i16]| words.iter().map(i16::to_string).collect::<Vec<_>>().join(" ");
+    for (cell, row) in skin.cells.iter().zip(&rows) {
+        let parameters = skin.parameters(cell);
+        let kinds = parameters.table().iter().filter(|row| row.moves()).map(|row| row.kind);
+        let positions = numbers(row[13]).into_iter().zip(kinds).map(|(position, kind)| match kind {
+            RowKind::Prismatic => Q1_14::nearest(position).to_bits(),
+            RowKind::Revolute | RowKind::Fixed => Q1_14::from_radians(position).unwrap().to_bits(),
+        });
+        let pose = said(&parameters.words(Parameter::Pose));
+        let force = (row[11].parse::<f64>().unwrap() * 65_536.0).round();
+        let positions = said(&positions.collect::<Vec<_>>());
+        let table = (0_u8..)
+            .take(parameters.table().len())
+            .flat_map(|row| parameters.words(Parameter::Row(row))[..5].to_vec());
+        let (joint, row) = (parameters.joint, parameters.chain().len());
+        writeln!(
+            text,
+            "{robot},{joint},{row},{pose},{force},{positions},{}",
+            said(&table.collect::<Vec<_>>())
+        )
+        .unwrap();
+    }
+}
+
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn the_words_that_firmware_is_measured_with_are_those_of_the_robots() {
+    let mut text = "robot,joint,row,pose,force,joints,rows\n".to_owned();
+    ["ur10", "panda", "tiago"].into_iter().for_each(|robot| in_words(robot, &mut text));
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join("../cell-node/tests/vectors/chains.csv");
+    if std::env::var_os("SKINBUS_TAKE_OVER").is_some() {
+        fs::write(&file, &text).unwrap();
+    }
+    assert!(fs::read_to_string(&file).unwrap() == text, "SKINBUS_TAKE_OVER=yes writes {}", file.display());
 }
 
 #[test]

@@ -119,11 +119,10 @@ impl Network {
         Self { next_hello: now, ..Self::default() }
     }
 
-    /// The same cell with wires at the ports `wired`; hellos of many cells are spread by serial number.
-    pub(crate) fn wired(mut self, wired: u8, number: Option<CellId>, serial: u32) -> Self {
+    /// Wires are at the ports `wired`; hellos of many cells are spread by serial number.
+    pub(crate) fn wire(&mut self, wired: u8, number: Option<CellId>, serial: u32) {
         (self.wired, self.node_ids.own) = (wired, number);
         self.next_hello = self.next_hello + phase::by_serial(HELLO, serial);
-        self
     }
 
     /// Whether it is wired at all.

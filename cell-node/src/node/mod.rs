@@ -74,6 +74,8 @@ impl Node {
     /// A cell that starts now: its first heartbeat is its address claim, and it obeys stimuli in
     /// `test_mode`.
     #[must_use]
+    // Built where the caller wants it: inlined, it is built on the stack and copied.
+    #[inline(never)]
     pub fn new(identity: Identity, format: Format, flash: &Flash, test_mode: bool, now: Micros) -> Self {
         Self {
             identity,
@@ -100,9 +102,15 @@ impl Node {
     /// gateway's side.
     #[must_use]
     pub fn with_ports(mut self, wired: u8) -> Self {
-        let Identity { cell, serial } = self.identity;
-        self.summing.network = self.summing.network.wired(wired, cell, serial);
+        self.wire(wired);
         self
+    }
+
+    /// The same where the cell must not be moved: it has more than half of a small microcontroller's memory. Before
+    /// anything else.
+    pub fn wire(&mut self, wired: u8) {
+        let Identity { cell, serial } = self.identity;
+        self.summing.network.wire(wired, cell, serial);
     }
 
     /// The next message for a port: to be sent before the packets of the same call.

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`listen`] | an open bus on which others send |
 //! | [`cells`], [`commission`], [`sensing`] | querying cells, writing their parameters, switching what they report |
+//! | [`emulate`] | cells that run a microcontroller's machine code in an emulator |
 //! | [`run`] | a run: processes, buses, loop, and its result ([`summary`]) |
 //! | [`record`] | what a run records, and the thread that writes it |
 //! | [`remote`] | commands to a run from another process, and what that is sent |
@@ -14,6 +15,7 @@
 pub mod answers;
 pub mod cells;
 pub mod commission;
+pub mod emulate;
 pub mod listen;
 pub mod record;
 pub mod remote;

@@ -119,7 +119,12 @@ impl Place {
 
     /// Another client of its bus.
     pub(crate) fn test_client(&self) -> TestClient {
-        TestClient::on(self, "vcan0", protocol::can::Format::Fd)
+        self.test_client_of(protocol::can::Format::Fd)
+    }
+
+    /// The same on a bus of another format.
+    pub(crate) fn test_client_of(&self, format: protocol::can::Format) -> TestClient {
+        TestClient::on(self, "vcan0", format)
     }
 
     /// Processes of this place that live, with their command lines.

@@ -250,7 +250,8 @@ impl Buses {
         }
         let kinds =
             Kinds::exactly(self.bus_links.iter().map(|bus_link| (bus_link.bus.name(), bus_link.bus.kind())));
-        self.processes = Processes::start(&Plan {
+        self.processes = Processes::new()?;
+        self.processes.start(&Plan {
             directory: None,
             program: &program("cell-node", spawn.cell_node.as_deref())?,
             skin_file: &skin_override.file,

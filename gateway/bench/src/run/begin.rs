@@ -13,10 +13,10 @@ use protocol::time::Span;
 
 use super::RunError;
 use super::bench::{Bench, LOOK};
-use super::launch::{Ended, LISTEN, Plan, Processes, STARTING, program};
+use super::launch::{Ended, LISTEN, Plan, STARTING, program};
 use super::progress::say;
 use super::receiver::BusEvent;
-use crate::setup::Timeout;
+use crate::setup::{Timeout, names};
 use crate::view::View;
 use model::repeat::Repeats;
 use model::table::{Notice, Switch};
@@ -39,7 +39,7 @@ impl Bench<'_> {
                 self.find_alone(listened)?;
             }
             let program = program("cell-node", options.cell_node.as_deref())?;
-            self.processes = Processes::start(&Plan {
+            self.processes.start(&Plan {
                 program: &program,
                 skin_file: &options.skin_file,
                 skin: &options.skin,
@@ -107,7 +107,14 @@ impl Bench<'_> {
     /// neither.
     fn find_alone(&mut self, until: Instant) -> Result<(), RunError> {
         self.wait(LISTEN, |_, _| Ok(Instant::now() >= until))?;
-        let cells = self.names(|cell| cell.heard);
+        // Emulated cells are there already, and ours.
+        let others = self.bus_links.iter().enumerate().filter_map(|(bus, bus_link)| {
+            let view = bus_link.view.lock().ok()?;
+            let heard = view.cells.iter().filter(|cell| cell.heard).map(|cell| cell.node);
+            let others: Vec<_> = heard.filter(|node| !self.processes.runs(bus, node.get())).collect();
+            (!others.is_empty()).then(|| names(&others, &format!(" on {}", bus_link.link.name)))
+        });
+        let cells = others.collect::<Vec<_>>().join("; ");
         if cells.is_empty() {
             return Ok(());
         }
@@ -178,7 +185,7 @@ impl Bench<'_> {
         }
         match self.processes.ended().first() {
             None => Ok(()),
-            Some(ended) => Err(RunError::Ended { cells: self.cells_of(ended), status: ended.status }),
+            Some(ended) => Err(RunError::Ended { cells: self.cells_of(ended), how: ended.how() }),
         }
     }
 

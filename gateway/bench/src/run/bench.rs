@@ -20,6 +20,7 @@ use super::launch::{Processes, ServedBus};
 use super::link::{Link, Slot, may_return};
 use super::network::Network;
 use super::receiver::{BusEvent, ReceiverResult};
+use crate::emulate::Emulation;
 use crate::record::Recorder;
 use crate::setup::{names, since};
 use crate::view::{CellView, View};
@@ -88,6 +89,8 @@ pub(super) struct Bench<'a> {
     pub(super) remote: Option<Remote>,
     // In this order they end: the cells before their buses.
     pub(super) processes: Processes,
+    /// Held for its lines and files.
+    pub(super) _emulation: Option<Emulation>,
     pub(super) served: Vec<ServedBus>,
 }
 

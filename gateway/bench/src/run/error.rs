@@ -2,7 +2,6 @@
 
 use std::error::Error;
 use std::path::PathBuf;
-use std::process::ExitStatus;
 
 use model::scenario::{FaultKind, Scenario};
 use protocol::bus::{BusError, BusKind};
@@ -13,6 +12,7 @@ use thiserror::Error;
 
 use super::launch::LaunchError;
 use super::network::TooDeep;
+use crate::emulate::EmulateError;
 use crate::record::OutputError;
 use crate::signals::SignalError;
 use control::external::SocketError;
@@ -128,13 +128,16 @@ pub enum RunError {
         cells: String,
     },
     /// A cell's process ended too early.
-    #[error("{cells} ended while starting ({status}); see the message above")]
+    #[error("{cells} ended while starting ({how}); see the message above")]
     Ended {
         /// Its cells.
         cells: String,
         /// How.
-        status: ExitStatus,
+        how: String,
     },
+    /// Cells are not emulated.
+    #[error(transparent)]
+    Emulate(#[from] EmulateError),
     /// The network is not as it is described, and cannot carry sums.
     #[error("{0}")]
     BrokenTree(String),
@@ -167,6 +170,7 @@ impl RunError {
     #[must_use]
     pub const fn exit_code(&self) -> u8 {
         match self {
+            Self::Emulate(error) => error.exit_code(),
             Self::Document(_)
             | Self::Bus(_)
             | Self::Launch(_)

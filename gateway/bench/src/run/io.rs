@@ -1,4 +1,9 @@
-//! Two calls that have no safe wrapper, without any logic.
+//! Three calls that have no safe wrapper, without any logic.
+
+use std::os::unix::process::CommandExt;
+use std::process::Command;
+
+use rustix::process::{Signal, getpid, getppid, set_parent_process_death_signal};
 
 /// Asks for `SCHED_FIFO` for the calling thread; returns whether it was granted.
 pub(super) fn set_fifo(priority: i32) -> bool {
@@ -11,4 +16,16 @@ pub(super) fn set_fifo(priority: i32) -> bool {
 pub(super) fn set_timer_slack(nanos: u64) {
     // SAFETY: this option takes one integer and touches no memory of ours.
     let _ = unsafe { libc::prctl(libc::PR_SET_TIMERSLACK, nanos) };
+}
+
+/// Has a program be killed when the thread that starts it ends. Programs of this project see to that themselves.
+pub(super) fn end_with_parent(command: &mut Command) {
+    let parent = getpid();
+    let before_exec = move || {
+        set_parent_process_death_signal(Some(Signal::KILL))?;
+        // It may have ended before that.
+        if getppid() == Some(parent) { Ok(()) } else { Err(std::io::ErrorKind::NotFound.into()) }
+    };
+    // SAFETY: between fork and exec only two system calls are made, and nothing is allocated or locked.
+    unsafe { command.pre_exec(before_exec) };
 }

@@ -13,12 +13,13 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, BusError, Choice, Kinds, Options};
-use protocol::skin::Skin;
+use protocol::skin::{Cell, Skin};
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, setrlimit};
 use thiserror::Error;
 
 use super::RunError;
+use super::io::end_with_parent;
 use crate::remote::{Phase, ProcessState};
 use model::scenario::ProcessAction;
 
@@ -205,10 +206,12 @@ struct Process {
     nodes: (u8, u8),
     child: Child,
     phase: Phase,
+    /// Where an emulator writes its messages.
+    log: Option<PathBuf>,
 }
 
 /// A process that ended by itself or was killed; displayed as its cells.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 pub struct Ended {
     /// Its bus.
     pub bus: usize,
@@ -216,6 +219,17 @@ pub struct Ended {
     pub nodes: (u8, u8),
     /// How it ended.
     pub status: ExitStatus,
+    /// The last that an emulator said before that.
+    pub said: Option<String>,
+}
+
+impl Ended {
+    /// How it ended, with what it said, if anything.
+    #[must_use]
+    pub fn how(&self) -> String {
+        let status = self.status;
+        self.said.as_ref().map_or_else(|| status.to_string(), |said| format!("{status}: {said}"))
+    }
 }
 
 impl Display for Ended {
@@ -255,24 +269,54 @@ pub struct Plan<'a> {
 }
 
 impl Processes {
-    /// Starts all cells of a skin. Call it from a thread that lives as long as the cells must.
+    /// None yet.
     ///
     /// # Errors
-    /// When a process does not start; those before it are ended again.
-    pub fn start(plan: &Plan<'_>) -> Result<Self, LaunchError> {
-        let mut processes = Self::default();
+    /// When the ends of processes cannot be noticed.
+    pub fn new() -> Result<Self, LaunchError> {
+        let processes = Self::default();
         let changed = Arc::clone(&processes.changed);
         signal_hook::flag::register(signal_hook::consts::SIGCHLD, changed).map_err(LaunchError::Signal)?;
+        Ok(processes)
+    }
+
+    /// Starts all cells of a skin that have no process yet. Call it from a thread that lives as long as the cells must.
+    ///
+    /// # Errors
+    /// When a process does not start.
+    pub fn start(&mut self, plan: &Plan<'_>) -> Result<(), LaunchError> {
         for (bus, described) in plan.skin.buses.iter().enumerate() {
             let mut nodes: Vec<u8> = plan.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
+            nodes.retain(|&node| !self.runs(bus, node));
             nodes.sort_unstable();
             for nodes in groups(&nodes, plan.per_process) {
                 let mut command = plan.of(&described.name, nodes);
                 let child = spawn(&mut command)?;
-                processes.all.push(Process { command, bus, nodes, child, phase: Phase::Running });
+                let phase = Phase::Running;
+                self.all.push(Process { command, bus, nodes, child, phase, log: None });
             }
         }
-        Ok(processes)
+        Ok(())
+    }
+
+    /// Starts the emulator of a cell, from the same kind of thread; `log` is the file of its messages.
+    ///
+    /// # Errors
+    /// When it does not start.
+    pub fn emulate(&mut self, cell: &Cell, mut command: Command, log: &Path) -> Result<(), LaunchError> {
+        command.process_group(0);
+        end_with_parent(&mut command);
+        let child = spawn(&mut command)?;
+        let nodes = (cell.node.get(), cell.node.get());
+        let (phase, log) = (Phase::Running, Some(log.to_owned()));
+        self.all.push(Process { command, bus: cell.bus, nodes, child, phase, log });
+        Ok(())
+    }
+
+    /// Whether there is a process of this cell.
+    #[must_use]
+    pub fn runs(&self, bus: usize, node: u8) -> bool {
+        self.all.iter().any(|process| process.state().runs(bus, node))
     }
 
     /// The process ids.
@@ -294,7 +338,8 @@ impl Processes {
         for process in self.all.iter_mut().filter(|process| process.lives()) {
             if let Ok(Some(status)) = process.child.try_wait() {
                 process.phase = Phase::Ended;
-                ended.push(Ended { bus: process.bus, nodes: process.nodes, status });
+                let said = process.log.as_deref().and_then(last_line);
+                ended.push(Ended { bus: process.bus, nodes: process.nodes, status, said });
             }
         }
         ended
@@ -377,6 +422,14 @@ impl Plan<'_> {
 
 fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
     command.spawn().map_err(|source| LaunchError::Start { path: command.get_program().into(), source })
+}
+
+/// The last of an emulator's messages that is no mere information.
+fn last_line(log: &Path) -> Option<String> {
+    let text = std::fs::read_to_string(log).ok()?;
+    // After a fault come the registers.
+    let is_message = |line: &&str| line.starts_with("qemu") && !line.contains(": info: ");
+    text.lines().rfind(is_message).map(str::to_owned)
 }
 
 /// Ctrl-C on a terminal signals the whole process group, and is meant for the gateway alone: cells and buses

@@ -40,6 +40,7 @@ use protocol::skin::Skin;
 use self::commanded::Remote;
 pub use self::error::RunError;
 pub use self::network::TooDeep;
+use crate::emulate::Emulated;
 use crate::remote::Lines;
 use crate::summary::Summary;
 use model::scenario::Scenario;
@@ -59,6 +60,8 @@ pub struct Options {
     pub directory: Option<PathBuf>,
     /// Whether cells are started; else they are on the bus already.
     pub spawn: bool,
+    /// Cells that are emulated, and by which firmware; the others are processes.
+    pub emulated: Option<Emulated>,
     /// At most so many cells in a process.
     pub cells_per_process: usize,
     /// Where cells keep their parameters, if they do.

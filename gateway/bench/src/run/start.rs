@@ -21,6 +21,7 @@ use super::progress::say;
 use super::receiver::{BusEvent, Receiver};
 use super::roots::{ReceiveFilter, Roots};
 use super::{Options, RunError, realtime};
+use crate::emulate::{self, Emulation, Emulator};
 use crate::record::feed::{self, Feed, Outlet};
 use crate::record::{Mcap, Outputs, Recorder, backlog, facts};
 use crate::setup::spawn;
@@ -45,7 +46,7 @@ const LIMITED: &str = ", all that net.core.rmem_max allows: a burst of frames ma
 /// Claims files and opens buses; [`Bench::begin`] starts the cells.
 pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let began = Instant::now();
-    refuse(options)?;
+    let emulator = refuse(options)?;
     let skin = &options.skin;
     let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
     // A file at its size limit is an error like others, not a signal.
@@ -64,7 +65,11 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let cycle = Some(Cycle::new(skin, controller, Box::new(arm)));
     let idle = realtime::idle_lateness(skin.timing.tick_nanos());
     let backlog_dropped = backlog::dropped();
-    let mut served = Vec::new();
+    let (mut served, mut processes) = (Vec::new(), Processes::new()?);
+    // Before this run itself is on the buses: it takes who commissions for another gateway.
+    let emulation =
+        emulator.map(|emulator| emulate(options, &emulator, &mut served, &mut processes, &signalled));
+    let emulation = emulation.transpose()?;
     let opened = skin.buses.iter().enumerate().map(|(index, bus)| {
         let receive_filter = ReceiveFilter::of(skin, index, !outputs.is_empty());
         open(options, bus, receive_filter.filters, &mut served)
@@ -96,13 +101,14 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         recorder,
         recorded,
         remote: None,
-        processes: Processes::default(),
+        processes,
+        _emulation: emulation,
         served,
     })
 }
 
 /// Checks for what a description allows and this program cannot do, and for what is missing.
-fn refuse(options: &Options) -> Result<(), RunError> {
+fn refuse(options: &Options) -> Result<Option<Emulator<'_>>, RunError> {
     if options.spawn {
         program("cell-node", options.cell_node.as_deref())?;
     }
@@ -115,7 +121,33 @@ fn refuse(options: &Options) -> Result<(), RunError> {
     let buses = options.skin.buses.len();
     let clients =
         (0..buses).map(|bus| options.skin.cells_of(bus).count().div_ceil(options.cells_per_process));
-    Ok(allow_files(buses, clients.max().unwrap_or(0))?)
+    allow_files(buses, clients.max().unwrap_or(0))?;
+    Ok(options.emulated.as_ref().map(Emulator::new).transpose()?)
+}
+
+/// Starts the emulated cells and commissions them, on buses that are served for that.
+fn emulate(
+    options: &Options,
+    emulator: &Emulator<'_>,
+    served: &mut Vec<ServedBus>,
+    processes: &mut Processes,
+    signalled: &AtomicBool,
+) -> Result<Emulation, RunError> {
+    let Options { skin, kinds, directory, flash, .. } = options;
+    for bus in &skin.buses {
+        let target =
+            BusOptions { filters: Vec::new(), directory: directory.clone(), ..BusOptions::default() };
+        let target = BusOptions { fd: bus.format == Format::Fd, ..target };
+        let (_, own) = open_or_serve(&bus.name, kinds.of(&bus.name), &target, options.vcan_setup.as_deref())?;
+        served.extend(own);
+    }
+    let bench = emulate::Bench { skin, kinds, directory: directory.as_deref(), flash: flash.as_deref() };
+    let emulation = emulator.start(&bench, processes)?;
+    let said = emulator.commission(&bench, processes, signalled)?;
+    if !options.quiet {
+        say(&said);
+    }
+    Ok(emulation)
 }
 
 /// Opens a bus; an embedded one without a server is served.

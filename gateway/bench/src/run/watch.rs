@@ -325,7 +325,7 @@ impl Bench<'_> {
             });
         }
         for ended in self.processes.ended() {
-            progress.note(&format!("the process of {} ended ({})", self.cells_of(&ended), ended.status));
+            progress.note(&format!("the process of {} ended ({})", self.cells_of(&ended), ended.how()));
         }
         Ok(())
     }

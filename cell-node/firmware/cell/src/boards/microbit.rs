@@ -1,0 +1,254 @@
+//! BBC micro:bit: nRF51822, Cortex-M0 at 16 MHz, 256 KiB of flash, 16 KiB of RAM. It has no CAN controller: frames
+//! are lines of slcan over its USB serial line, at 115 200 baud.
+//!
+//! In QEMU's `microbit` the serial line is a `-chardev` of any rate, the watchdog does nothing, and flash ends with the
+//! process: a factory record with `hosted` keeps it in a file by semihosting.
+
+use core::cell::RefCell;
+
+use cortex_m::asm::wfi;
+use cortex_m::interrupt::{Mutex, free};
+use cortex_m::peripheral::NVIC;
+use nrf51_pac::generic::{Reg, RegisterSpec, Writable};
+use nrf51_pac::{self as pac, Interrupt, NVMC, TIMER0, UART0, WDT, interrupt};
+use protocol::can::Frame;
+use protocol::factory::Factory;
+use protocol::slcan::{Decoder, Line};
+use protocol::time::{Micros, Span};
+
+use super::{factory, store};
+use crate::board::{Board, Clock, LONGEST_SLEEP, low};
+use crate::slcan::{self, Waiting};
+use crate::store::{Flash, NotWritten, Page, UNIT};
+
+mod hosted;
+
+/// Bytes of a page of flash.
+const PAGE: usize = 1 << 10;
+/// Pins of the line to the USB interface.
+const TX: u32 = 24;
+const RX: u32 = 25;
+/// The watchdog's clock, in Hz, and the word that feeds it.
+const WATCHDOG_HZ: u32 = 32_768;
+const FEED: u32 = 0x6E52_4635;
+/// A compare that is nearer than this, in µs, may be past when it is set.
+const NEAR: u64 = 10;
+
+static WAITING: Mutex<RefCell<Waiting>> = Mutex::new(RefCell::new(Waiting::new()));
+
+/// The board of this build.
+#[derive(Debug)]
+pub struct Chosen {
+    clock: Clock,
+    decoder: Decoder,
+    flash: Pages,
+    hosted: bool,
+}
+
+impl Chosen {
+    /// The board, started; call it once.
+    #[must_use]
+    pub fn take() -> Self {
+        // SAFETY: the only place that takes the peripherals, and this type is the only one that uses them.
+        let pac = unsafe { pac::Peripherals::steal() };
+        // The crystal: the UART needs it, and so do the 1 % of TIME-1.
+        set(&pac.CLOCK.tasks_hfclkstart, 1);
+        while pac.CLOCK.events_hfclkstarted.read().bits() == 0 {}
+
+        set(&pac.TIMER0.mode, 0);
+        set(&pac.TIMER0.bitmode, 3); // 32 bits
+        set(&pac.TIMER0.prescaler, 4); // 16 MHz / 2^4
+        set(&pac.TIMER0.intenset, 1 << 17); // COMPARE[1]
+        set(&pac.TIMER0.tasks_start, 1);
+
+        set(&pac.WDT.config, 1); // it goes on while the processor sleeps, and stands while a debugger halts it
+        set(&pac.WDT.crv, 2 * WATCHDOG_HZ - 1);
+        set(&pac.WDT.rren, 1);
+        set(&pac.WDT.tasks_start, 1);
+        Self { clock: Clock::default(), decoder: Decoder::new(), flash: Pages, hosted: false }
+    }
+
+    /// Nothing more to do, until somebody loads another program.
+    pub fn rest(&mut self) -> ! {
+        loop {
+            self.feed();
+            let now = self.now();
+            self.sleep_until(now + Span(LONGEST_SLEEP));
+        }
+    }
+}
+
+impl Board for Chosen {
+    type Flash = Pages;
+
+    fn factory(&mut self) -> Option<Factory> {
+        let factory = factory()?;
+        self.hosted = factory.hosted;
+        Some(factory)
+    }
+
+    fn open(&mut self, _: &Factory) {
+        let uart = uart();
+        set(&uart.pseltxd, TX);
+        set(&uart.pselrxd, RX);
+        set(&uart.baudrate, 0x01D7_E000);
+        set(&uart.enable, 4);
+        set(&uart.intenset, 1 << 2); // RXDRDY
+        set(&uart.tasks_startrx, 1);
+        set(&uart.tasks_starttx, 1);
+        // SAFETY: both handlers are below, and everything they share with the loop is behind a mutex.
+        unsafe {
+            NVIC::unmask(Interrupt::UART0);
+            NVIC::unmask(Interrupt::TIMER0);
+        }
+    }
+
+    fn now(&mut self) -> Micros {
+        // An interrupt captures too.
+        free(|_| self.clock.at(counter()))
+    }
+
+    fn receive(&mut self) -> Option<(Frame, Micros)> {
+        loop {
+            let (line, at) = free(|cs| WAITING.borrow(cs).borrow_mut().take(&mut self.decoder))?;
+            if let Line::Frame(frame) = line {
+                return Some((frame, Clock::before(self.now(), at)));
+            }
+        }
+    }
+
+    fn send(&mut self, frame: &Frame) {
+        let uart = uart();
+        slcan::send(frame, |byte| {
+            set(&uart.events_txdrdy, 0);
+            set(&uart.txd, byte.into());
+            while uart.events_txdrdy.read().bits() == 0 {}
+        });
+    }
+
+    fn sleep_until(&mut self, due: Micros) {
+        set(&timer().cc[1], low(due));
+        free(|cs| {
+            let now = self.clock.at(counter());
+            if due.since(now).0 > NEAR && WAITING.borrow(cs).borrow().is_empty() {
+                // It wakes although no handler runs before the end of this block.
+                wfi();
+            }
+        });
+    }
+
+    fn feed(&mut self) {
+        // SAFETY: one word that feeds the watchdog and changes nothing else.
+        set(unsafe { &(*WDT::ptr()).rr[0] }, FEED);
+    }
+
+    fn flash(&mut self) -> &mut Pages {
+        &mut self.flash
+    }
+
+    fn kept_elsewhere(&mut self, into: &mut [u8]) -> Option<usize> {
+        if !self.hosted {
+            return None;
+        }
+        let count = hosted::load(into);
+        if count.is_none() {
+            // The emulator's flash begins with zeros, a real one erased.
+            let erased = [Page::A, Page::B].map(|page| self.flash.erase(page));
+            debug_assert_eq!(erased, [Ok(()); 2], "this board's erase cannot fail");
+        }
+        count
+    }
+
+    fn keep_elsewhere(&mut self, image: &[u8]) -> bool {
+        !self.hosted || hosted::store(image)
+    }
+}
+
+/// The two pages before the factory's.
+#[derive(Debug)]
+pub struct Pages;
+
+impl Pages {
+    fn address(page: Page, at: usize) -> usize {
+        match page {
+            Page::A => store() + at,
+            Page::B => store() + PAGE + at,
+        }
+    }
+
+    /// Has the controller of the flash do something: 1 to write, 2 to erase. Until it is done the processor stands
+    /// still: 46 µs for a word, 21 ms for a page, while which the UART keeps six bytes and loses the rest.
+    fn controlled(enabled: u32, work: impl FnOnce(&pac::nvmc::RegisterBlock)) {
+        // SAFETY: this type alone uses the controller.
+        let nvmc = unsafe { &*NVMC::ptr() };
+        set(&nvmc.config, enabled);
+        work(nvmc);
+        while nvmc.ready.read().bits() == 0 {}
+        set(&nvmc.config, 0);
+    }
+}
+
+impl Flash for Pages {
+    fn unit(&self, page: Page, at: usize) -> [u8; UNIT] {
+        // SAFETY: within a page of flash, which the linker leaves to this type, and aligned.
+        let word =
+            |at| unsafe { core::ptr::read_volatile(Self::address(page, at) as *const u32) }.to_le_bytes();
+        let ([a, b, c, d], [e, f, g, h]) = (word(at), word(at + 4));
+        [a, b, c, d, e, f, g, h]
+    }
+
+    fn erase(&mut self, page: Page) -> Result<(), NotWritten> {
+        let address = u32::try_from(Self::address(page, 0)).map_err(|_| NotWritten)?;
+        Self::controlled(2, |nvmc| set(nvmc.erasepage(), address));
+        Ok(())
+    }
+
+    fn program(&mut self, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten> {
+        let (words, _) = unit.as_chunks();
+        for (index, word) in words.iter().enumerate() {
+            let address = Self::address(page, at + 4 * index) as *mut u32;
+            // SAFETY: as above; the page is erased, and writing is enabled.
+            Self::controlled(1, |_| unsafe { core::ptr::write_volatile(address, u32::from_le_bytes(*word)) });
+        }
+        Ok(())
+    }
+}
+
+/// Writes a register.
+fn set<R: RegisterSpec<Ux = u32> + Writable>(register: &Reg<R>, value: u32) {
+    // SAFETY: the values are the reference manual's, and none of these registers has to do with memory, except for the
+    // flash controller's, which have the address of a page that the linker leaves to this board.
+    unsafe { register.as_ptr().write_volatile(value) };
+}
+
+fn uart() -> &'static pac::uart0::RegisterBlock {
+    // SAFETY: the loop sends by it, the handler receives by it: different registers.
+    unsafe { &*UART0::ptr() }
+}
+
+fn timer() -> &'static pac::timer0::RegisterBlock {
+    // SAFETY: captures, which both use, happen while no handler runs.
+    unsafe { &*TIMER0::ptr() }
+}
+
+/// The counter, in µs; only where no handler interrupts.
+fn counter() -> u32 {
+    set(&timer().tasks_capture[0], 1);
+    timer().cc[0].read().bits()
+}
+
+#[interrupt]
+fn UART0() {
+    let uart = uart();
+    while uart.events_rxdrdy.read().bits() != 0 {
+        set(&uart.events_rxdrdy, 0);
+        let [byte, ..] = uart.rxd.read().bits().to_le_bytes();
+        free(|cs| WAITING.borrow(cs).borrow_mut().push(byte, counter()));
+    }
+}
+
+/// It only wakes.
+#[interrupt]
+fn TIMER0() {
+    set(&timer().events_compare[1], 0);
+}

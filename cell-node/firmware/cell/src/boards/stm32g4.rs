@@ -1,0 +1,263 @@
+//! STM32G431 with a CAN transceiver, as on a Nucleo-G431RB: Cortex-M4 at 80 MHz, FDCAN1 on PA11 and PA12, 1 Mbit/s and
+//! 5 Mbit/s. Built by every test run, and never run: there is no emulator of it.
+//!
+//! By the registers of the reference manual (RM0440), whose names the constants have. The crate `fdcan` 0.2 would not
+//! do: it knows no delay compensation, replaces frames that wait to be sent, and sends empty frames as remote ones.
+
+use core::mem::size_of;
+use core::ptr::{read_volatile, write_volatile};
+
+use cell_node::node::Node;
+use cortex_m::asm::wfi;
+use protocol::can::{self, EXTENDED, Format, Frame};
+use protocol::factory::Factory;
+use protocol::time::{Micros, Span};
+
+use super::{factory, store};
+use crate::board::{Board, Clock, LONGEST_SLEEP, low};
+use crate::store::{Flash, NotWritten, Page, UNIT};
+
+mod can1;
+
+/// Bytes of a page of flash, and where flash begins.
+const PAGE: usize = 2 << 10;
+const FLASH_BASE: usize = 0x0800_0000;
+
+const RCC_CR: usize = 0x4002_1000;
+const RCC_CFGR: usize = RCC_CR + 0x08;
+const RCC_PLLCFGR: usize = RCC_CR + 0x0C;
+const RCC_AHB2ENR: usize = RCC_CR + 0x4C;
+const RCC_APB1ENR1: usize = RCC_CR + 0x58;
+const RCC_CCIPR: usize = RCC_CR + 0x88;
+const FLASH_ACR: usize = 0x4002_2000;
+const FLASH_KEYR: usize = FLASH_ACR + 0x08;
+const FLASH_SR: usize = FLASH_ACR + 0x10;
+const FLASH_CR: usize = FLASH_ACR + 0x14;
+const TIM2_CR1: usize = 0x4000_0000;
+const TIM2_DIER: usize = TIM2_CR1 + 0x0C;
+const TIM2_SR: usize = TIM2_CR1 + 0x10;
+const TIM2_EGR: usize = TIM2_CR1 + 0x14;
+const TIM2_CNT: usize = TIM2_CR1 + 0x24;
+const TIM2_PSC: usize = TIM2_CR1 + 0x28;
+const TIM2_CCR1: usize = TIM2_CR1 + 0x34;
+const IWDG_KR: usize = 0x4000_3000;
+const IWDG_PR: usize = IWDG_KR + 0x04;
+const IWDG_RLR: usize = IWDG_KR + 0x08;
+const GPIOA_MODER: usize = 0x4800_0000;
+const GPIOA_OSPEEDR: usize = GPIOA_MODER + 0x08;
+const GPIOA_AFRH: usize = GPIOA_MODER + 0x24;
+/// Interrupts that wake: enabled in the NVIC, and never taken, because they are masked.
+const NVIC_ISER: usize = 0xE000_E100;
+const NVIC_ICPR: usize = 0xE000_E280;
+const FDCAN1_IT0: u32 = 1 << 21;
+const TIM2_IRQ: u32 = 1 << 28;
+/// Of `FLASH_SR`.
+const BUSY: u32 = 1 << 16;
+const ERRORS: u32 = 0xC3FA;
+
+/// A compare that is nearer than this, in µs, may be past when it is set.
+const NEAR: u64 = 10;
+
+fn read(address: usize) -> u32 {
+    // SAFETY: the address of a register of this microcontroller, or a word of its message RAM.
+    unsafe { read_volatile(address as *const u32) }
+}
+
+fn write(address: usize, value: u32) {
+    // SAFETY: as above; none of them touches memory that the program uses.
+    unsafe { write_volatile(address as *mut u32, value) }
+}
+
+fn change(address: usize, bits: u32, to: u32) {
+    write(address, read(address) & !bits | to);
+}
+
+fn wait(address: usize, bits: u32, value: u32) {
+    while read(address) & bits != value {}
+}
+
+/// The board of this build.
+#[derive(Debug)]
+pub struct Chosen {
+    clock: Clock,
+    flash: Pages,
+}
+
+impl Chosen {
+    /// The board, started; call it once.
+    #[must_use]
+    pub fn take() -> Self {
+        cortex_m::interrupt::disable();
+        // 24 MHz of the crystal / 6 * 80 / 4 = 80 MHz, for which flash waits two cycles.
+        change(RCC_CR, 0, 1 << 16);
+        wait(RCC_CR, 1 << 17, 1 << 17);
+        write(RCC_PLLCFGR, 3 | 5 << 4 | 80 << 8 | 1 << 24 | 1 << 25);
+        change(RCC_CR, 0, 1 << 24);
+        wait(RCC_CR, 1 << 25, 1 << 25);
+        change(FLASH_ACR, 15, 2);
+        wait(FLASH_ACR, 15, 2);
+        change(RCC_CFGR, 3, 3);
+        wait(RCC_CFGR, 3 << 2, 3 << 2);
+
+        change(RCC_AHB2ENR, 0, 1); // GPIOA
+        change(RCC_APB1ENR1, 0, 1 | 1 << 25); // TIM2, FDCAN
+        change(RCC_CCIPR, 3 << 24, 2 << 24); // FDCAN by PCLK1
+        wait(RCC_APB1ENR1, 1, 1);
+
+        write(TIM2_PSC, 80 - 1);
+        write(TIM2_EGR, 1); // take the prescaler over
+        write(TIM2_SR, 0);
+        write(TIM2_DIER, 1 << 1); // compare 1
+        write(TIM2_CR1, 1);
+
+        // 32 kHz / 16, 4000 steps: 2 s.
+        write(IWDG_KR, 0xCCCC);
+        write(IWDG_KR, 0x5555);
+        write(IWDG_PR, 2);
+        write(IWDG_RLR, 4_000 - 1);
+        Self { clock: Clock::default(), flash: Pages }
+    }
+
+    /// Nothing more to do, until somebody loads another program.
+    pub fn rest(&mut self) -> ! {
+        loop {
+            self.feed();
+            let now = self.now();
+            self.sleep_until(now + Span(LONGEST_SLEEP));
+        }
+    }
+}
+
+impl Board for Chosen {
+    type Flash = Pages;
+
+    fn factory(&mut self) -> Option<Factory> {
+        factory()
+    }
+
+    fn open(&mut self, factory: &Factory) {
+        // PA11 and PA12: alternate function 9, fast.
+        change(GPIOA_AFRH, 0xFF << 12, 0x99 << 12);
+        change(GPIOA_OSPEEDR, 0xF << 22, 0xA << 22);
+        change(GPIOA_MODER, 0xF << 22, 0xA << 22);
+        can1::open(factory.format);
+        write(NVIC_ISER, FDCAN1_IT0 | TIM2_IRQ);
+    }
+
+    fn now(&mut self) -> Micros {
+        self.clock.at(read(TIM2_CNT))
+    }
+
+    fn receive(&mut self) -> Option<(Frame, Micros)> {
+        // The loop comes here as soon as something wakes it, so that what waits has just arrived, but for an erase.
+        let frame = can1::receive()?;
+        Some((frame, self.now()))
+    }
+
+    fn send(&mut self, frame: &Frame) {
+        let give_up = self.now() + Span(100_000);
+        while !can1::send(frame) && self.now() < give_up {
+            self.feed();
+        }
+    }
+
+    fn filter(&mut self, node: &Node, factory: &Factory) {
+        let wires =
+            factory.link_ids.into_iter().flatten().map(|link_id| link_id.reversed().raw_id() & !EXTENDED);
+        can1::filter(node.hears().map(|id| id.to_bits().into()), wires);
+    }
+
+    fn sleep_until(&mut self, due: Micros) {
+        write(TIM2_CCR1, low(due));
+        write(TIM2_SR, 0);
+        write(NVIC_ICPR, FDCAN1_IT0 | TIM2_IRQ);
+        // What came before this is seen here, and what comes after it wakes.
+        can1::acknowledge();
+        if due.since(self.now()).0 > NEAR && can1::is_empty() {
+            wfi();
+        }
+    }
+
+    fn feed(&mut self) {
+        write(IWDG_KR, 0xAAAA);
+    }
+
+    fn flash(&mut self) -> &mut Pages {
+        &mut self.flash
+    }
+}
+
+/// The two pages before the factory's.
+#[derive(Debug)]
+pub struct Pages;
+
+impl Pages {
+    fn address(page: Page, at: usize) -> usize {
+        match page {
+            Page::A => store() + at,
+            Page::B => store() + PAGE + at,
+        }
+    }
+
+    /// Has the controller of the flash do something. The processor stands still until it is done, because it runs from
+    /// the same bank: 82 µs for 8 bytes, 22 ms for a page; the controller's FIFO keeps three frames meanwhile.
+    fn controlled(bits: u32, work: impl FnOnce()) -> Result<(), NotWritten> {
+        wait(FLASH_SR, BUSY, 0);
+        write(FLASH_SR, ERRORS);
+        write(FLASH_KEYR, 0x4567_0123);
+        write(FLASH_KEYR, 0xCDEF_89AB);
+        write(FLASH_CR, bits);
+        work();
+        wait(FLASH_SR, BUSY, 0);
+        let errors = read(FLASH_SR) & ERRORS;
+        write(FLASH_CR, 1 << 31); // locked
+        if errors == 0 { Ok(()) } else { Err(NotWritten) }
+    }
+}
+
+impl Flash for Pages {
+    fn unit(&self, page: Page, at: usize) -> [u8; UNIT] {
+        let address = Self::address(page, at);
+        let ([a, b, c, d], [e, f, g, h]) =
+            (read(address).to_le_bytes(), read(address + size_of::<u32>()).to_le_bytes());
+        [a, b, c, d, e, f, g, h]
+    }
+
+    fn erase(&mut self, page: Page) -> Result<(), NotWritten> {
+        let number = u32::try_from((Self::address(page, 0) - FLASH_BASE) / PAGE).map_err(|_| NotWritten)?;
+        let bits = 1 << 1 | number << 3; // PER, PNB
+        Self::controlled(bits, || write(FLASH_CR, bits | 1 << 16))
+    }
+
+    fn program(&mut self, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten> {
+        let address = Self::address(page, at);
+        let [a, b, c, d, e, f, g, h] = unit;
+        // Both words of a unit, one after the other: that programs it, with its check bits.
+        Self::controlled(1, || {
+            write(address, u32::from_le_bytes([a, b, c, d]));
+            write(address + size_of::<u32>(), u32::from_le_bytes([e, f, g, h]));
+        })
+    }
+}
+
+/// The frame of an element of the message RAM, by its first two words.
+fn frame_of(head: [u32; 2], data: &[u8; 64]) -> Option<Frame> {
+    let [first, second] = head;
+    let id = if first & 1 << 30 == 0 {
+        first >> 18 & can::STANDARD_MASK
+    } else {
+        first & can::EXTENDED_MASK | EXTENDED
+    };
+    let dlc = (second >> 16 & 15).to_le_bytes()[0];
+    let format = if second & 1 << 21 == 0 { Format::Classic } else { Format::Fd };
+    if first & 1 << 29 != 0 {
+        return Frame::remote(id, dlc.min(8)).ok();
+    }
+    let flags = if second & 1 << 20 == 0 { 0 } else { can::BIT_RATE_SWITCH };
+    let len = can::dlc_len(dlc).min(format.max_len());
+    let data = data.get(..len)?;
+    match format {
+        Format::Classic => Frame::classic(id, data).ok(),
+        Format::Fd => Frame::fd(id, flags, data).ok(),
+    }
+}

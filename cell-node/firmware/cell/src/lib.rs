@@ -1,0 +1,18 @@
+//! One skin cell as firmware: `cell-node`'s core, a loop around it, and boards.
+//!
+//! | module | what |
+//! |---|---|
+//! | [`board`] | what a board has to offer |
+//! | [`run`] | the cell's loop |
+//! | [`store`] | parameters in two pages of flash, safe against a loss of power |
+//! | [`slcan`] | a board without a CAN controller: frames as lines over a serial line |
+//! | `boards` | the boards: a file each |
+
+#![cfg_attr(not(test), no_std)]
+
+pub mod board;
+#[cfg(target_os = "none")]
+pub mod boards;
+pub mod run;
+pub mod slcan;
+pub mod store;

@@ -1,0 +1,179 @@
+//! The cell's loop: frames and times into the node, packets out, parameters into flash. All decisions are in
+//! `cell_node::node`.
+
+use core::convert::Infallible;
+
+use cell_node::flash::{self, Flash as Held, Kept};
+use cell_node::identity::Identity;
+use cell_node::node::Node;
+use protocol::can::{Format, Frame};
+use protocol::factory::Factory;
+use protocol::id::CellId;
+use protocol::time::{Micros, Span};
+use protocol::wire::LinkId;
+
+use crate::board::{Board, LONGEST_SLEEP};
+use crate::store::{self, Found};
+
+/// A cell on its board.
+#[derive(Debug)]
+pub struct Cell<'a, B> {
+    board: B,
+    factory: Factory,
+    node: &'a mut Node,
+}
+
+/// What a cell begins with: what the factory wrote, and what flash holds.
+#[derive(Debug)]
+pub struct Beginning {
+    factory: Factory,
+    identity: Identity,
+    held: Held,
+}
+
+impl Beginning {
+    /// Reads it; `None` where nobody has written who this is: it must not send.
+    // Not inlined, so that what it needs is off the stack when the cell runs.
+    #[inline(never)]
+    pub fn read<B: Board>(board: &mut B) -> Option<Self> {
+        let factory = board.factory()?;
+        let identity = Identity { cell: factory.node, serial: factory.serial };
+        restore(board);
+        let (number, held) = read(board, identity);
+        let identity = Identity { cell: identity.cell.or(number), ..identity };
+        Some(Self { factory, identity, held })
+    }
+
+    /// The node that begins now. It takes more than a third of a small microcontroller's memory: let it stay where it is
+    /// built.
+    #[must_use]
+    pub fn node(&self, now: Micros) -> Node {
+        // There are no sensors on these boards: contacts come as stimuli.
+        Node::new(self.identity, self.factory.format, &self.held, true, now)
+    }
+}
+
+impl<'a, B: Board> Cell<'a, B> {
+    /// A cell that starts now, and joins its bus.
+    pub fn start(mut board: B, beginning: &Beginning, node: &'a mut Node) -> Self {
+        let factory = beginning.factory;
+        board.open(&factory);
+        let wired = factory.link_ids.iter().enumerate();
+        let wired = wired.fold(0, |wired, (port, link_id)| wired | u8::from(link_id.is_some()) << port);
+        if wired != 0 {
+            node.wire(wired);
+        }
+        board.filter(node, &factory);
+        Self { board, factory, node }
+    }
+
+    /// Runs for ever.
+    pub fn run(&mut self) -> Infallible {
+        loop {
+            self.turn();
+        }
+    }
+
+    /// One turn of the loop: what came, what is due, then sleep. A cell that gave way receives and does nothing.
+    pub fn turn(&mut self) {
+        self.board.feed();
+        while let Some((frame, at)) = self.board.receive() {
+            if self.node.taken().is_some() {
+                continue;
+            }
+            let now = self.board.now();
+            self.take(now, now.since(at), &frame);
+            self.collect();
+        }
+        let now = self.board.now();
+        let longest = now + Span(LONGEST_SLEEP);
+        if self.node.taken().is_some() {
+            return self.board.sleep_until(longest);
+        }
+        if self.node.poll_timeout() <= now {
+            self.node.handle_timeout(now);
+            self.collect();
+            return;
+        }
+        self.board.sleep_until(self.node.poll_timeout().min(longest));
+    }
+
+    /// Gives a frame to the node: one of a simulated wire to the port at its other end.
+    fn take(&mut self, now: Micros, age: Span, frame: &Frame) {
+        let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) else {
+            return self.node.handle_frame(now, age, frame);
+        };
+        let ours = Some(link_id.reversed());
+        let port = self.factory.link_ids.iter().position(|link_id| *link_id == ours);
+        if let (Some(port), Some(message)) = (port, link_id.read(frame)) {
+            self.node.handle_port(now, age, port, message);
+        }
+    }
+
+    /// Writes what the node has for flash, and tells it.
+    fn keep(&mut self) {
+        if let Some(written) = self.write() {
+            self.node.handle_stored(written);
+        }
+    }
+
+    /// Writes what the node has for flash; whether it is there.
+    // Not inlined, so that the image is off the stack when the node takes its parameters into use.
+    #[inline(never)]
+    fn write(&mut self) -> Option<bool> {
+        let kept = self.node.poll_store()?;
+        let image = flash::encode(self.node.identity().serial, &kept);
+        let written = store::write(self.board.flash(), &image).is_ok();
+        Some(written && self.board.keep_elsewhere(&image))
+    }
+
+    /// Writes what the node has for flash, and sends what it has to send.
+    fn collect(&mut self) {
+        if self.node.taken().is_some() {
+            return;
+        }
+        self.keep();
+        while let Some((port, message)) = self.node.poll_port_transmit() {
+            if let Some(link_id) = self.factory.link_ids.get(port).copied().flatten() {
+                self.board.send(&link_id.frame(message));
+            }
+        }
+        let format: Format = self.factory.format;
+        while let Some(packet) = self.node.poll_transmit() {
+            packet.frames(format).for_each(|frame| self.board.send(&frame));
+        }
+        if self.node.poll_hears() {
+            self.board.filter(self.node, &self.factory);
+        }
+    }
+}
+
+/// Takes what another keeper has into flash, where that holds something else.
+#[inline(never)]
+fn restore<B: Board>(board: &mut B) {
+    let mut theirs = [0; flash::MAX_BYTES];
+    let Some(theirs) = board.kept_elsewhere(&mut theirs).and_then(|count| theirs.get(..count)) else {
+        return;
+    };
+    let mut ours = [0; flash::MAX_BYTES];
+    let same = matches!(store::read(board.flash(), &mut ours), Found::Image(count) if ours.get(..count) == Some(theirs));
+    if !same {
+        // What cannot be written is read as it is, and noticed there.
+        let _ = store::write(board.flash(), theirs);
+    }
+}
+
+/// The node id that the network assigned, if it did, and the parameters.
+#[inline(never)]
+fn read<B: Board>(board: &mut B, identity: Identity) -> (Option<CellId>, Held) {
+    let mut image = [0; flash::MAX_BYTES];
+    let image = match store::read(board.flash(), &mut image) {
+        Found::Nothing => return (None, Held::Empty),
+        Found::Damaged => return (None, Held::Damaged),
+        Found::Image(count) => image.get(..count).unwrap_or_default(),
+    };
+    match flash::decode(identity, image) {
+        Ok(Kept { number, parameters }) => (number, parameters.map_or(Held::Empty, Held::Sound)),
+        Err(_) => (None, Held::Damaged),
+    }
+}

@@ -1,0 +1,169 @@
+//! Parameters in two pages of flash. A new image goes into the page that does not hold the present one, and is marked
+//! as complete last: a loss of power at any moment leaves the old image or the new one.
+//!
+//! ```text
+//!   byte 0..3  which image this is: the higher number is the newer one      4..7  bytes of the image
+//!        8..   the image, filled up with 0xFF to a multiple of 8
+//!        last  8 bytes: "COMPLETE"
+//! ```
+//!
+//! Flash is written in units of 8 bytes, each once after its page was erased, as an STM32 demands it.
+
+/// Bytes that flash writes at once.
+pub const UNIT: usize = 8;
+/// The longest image, in bytes.
+pub const MAX_IMAGE: usize = 496;
+
+const COMPLETE: &[u8; UNIT] = b"COMPLETE";
+const ERASED: [u8; UNIT] = [0xFF; UNIT];
+
+/// Flash could not be written.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct NotWritten;
+
+/// One of the two pages.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Page {
+    /// The first.
+    A,
+    /// The second.
+    B,
+}
+
+impl Page {
+    /// The other one.
+    #[must_use]
+    pub const fn other(self) -> Self {
+        match self {
+            Self::A => Self::B,
+            Self::B => Self::A,
+        }
+    }
+}
+
+/// Two pages of flash of at least 512 bytes.
+pub trait Flash {
+    /// The unit that begins at this byte, a multiple of 8.
+    fn unit(&self, page: Page, at: usize) -> [u8; UNIT];
+
+    /// Makes all bytes of a page 0xFF. The processor may stand still meanwhile.
+    ///
+    /// # Errors
+    /// When the controller reports it.
+    fn erase(&mut self, page: Page) -> Result<(), NotWritten>;
+
+    /// Writes a unit that is erased.
+    ///
+    /// # Errors
+    /// When the controller reports it.
+    fn program(&mut self, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten>;
+}
+
+/// What the pages hold.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Found {
+    /// Nothing: they are erased, or the first image was never completed.
+    Nothing,
+    /// An image of so many bytes.
+    Image(usize),
+    /// Something that is none.
+    Damaged,
+}
+
+/// The head of a page that holds a completed image.
+#[derive(Clone, Copy, Debug)]
+struct Head {
+    number: u32,
+    len: usize,
+}
+
+impl Head {
+    /// Where the mark is.
+    const fn mark(&self) -> usize {
+        UNIT + self.len.next_multiple_of(UNIT)
+    }
+}
+
+/// What a page holds: `Err` where it is neither a completed image nor one that was being written.
+fn head(flash: &impl Flash, page: Page) -> Result<Option<Head>, NotWritten> {
+    let unit = flash.unit(page, 0);
+    if unit == ERASED {
+        return Ok(None);
+    }
+    let [n0, n1, n2, n3, l0, l1, l2, l3] = unit;
+    let len = usize::try_from(u32::from_le_bytes([l0, l1, l2, l3])).unwrap_or(usize::MAX);
+    if len > MAX_IMAGE {
+        return Err(NotWritten);
+    }
+    let head = Head { number: u32::from_le_bytes([n0, n1, n2, n3]), len };
+    match flash.unit(page, head.mark()) {
+        mark if mark == *COMPLETE => Ok(Some(head)),
+        ERASED => Ok(None),
+        _ => Err(NotWritten),
+    }
+}
+
+/// The page with the newest image, and whether a page is damaged.
+fn newest(flash: &impl Flash) -> (Option<(Page, Head)>, bool) {
+    let (a, b) = (head(flash, Page::A), head(flash, Page::B));
+    let damaged = a.is_err() || b.is_err();
+    let held = |page, head: Result<Option<Head>, _>| head.ok().flatten().map(|head| (page, head));
+    let newest = match (held(Page::A, a), held(Page::B, b)) {
+        (Some(a), Some(b)) if b.1.number.wrapping_sub(a.1.number).cast_signed() > 0 => Some(b),
+        (a, b) => a.or(b),
+    };
+    (newest, damaged)
+}
+
+/// Reads the newest image. With a damaged page it is unknown whether that held a newer one, so nothing else counts.
+pub fn read(flash: &impl Flash, into: &mut [u8]) -> Found {
+    let (newest, damaged) = newest(flash);
+    if damaged {
+        return Found::Damaged;
+    }
+    let Some((page, Head { len, .. })) = newest else { return Found::Nothing };
+    let Some(into) = into.get_mut(..len) else { return Found::Damaged };
+    for (index, bytes) in into.chunks_mut(UNIT).enumerate() {
+        let unit = flash.unit(page, UNIT * (index + 1));
+        bytes.copy_from_slice(unit.get(..bytes.len()).unwrap_or_default());
+    }
+    Found::Image(len)
+}
+
+/// Writes an image beside the newest one, and reads it back.
+///
+/// # Errors
+/// When it is too long, or flash does not hold it afterwards; then the old one still counts.
+pub fn write(flash: &mut impl Flash, image: &[u8]) -> Result<(), NotWritten> {
+    let (newest, damaged) = newest(flash);
+    let (page, number) = match newest {
+        Some((page, head)) => (page.other(), head.number.wrapping_add(1)),
+        None => (Page::A, 1),
+    };
+    let len = u32::try_from(image.len()).ok().filter(|_| image.len() <= MAX_IMAGE).ok_or(NotWritten)?;
+    let mut unit = [0; UNIT];
+    let (first, second) = unit.split_at_mut(UNIT / 2);
+    first.copy_from_slice(&number.to_le_bytes());
+    second.copy_from_slice(&len.to_le_bytes());
+    flash.erase(page)?;
+    program(flash, page, 0, unit)?;
+    for (index, bytes) in image.chunks(UNIT).enumerate() {
+        let mut unit = ERASED;
+        unit.iter_mut().zip(bytes).for_each(|(unit, byte)| *unit = *byte);
+        program(flash, page, UNIT * (index + 1), unit)?;
+    }
+    program(flash, page, UNIT + image.len().next_multiple_of(UNIT), *COMPLETE)?;
+    // Only now, so that damage is not forgotten before something sound is there.
+    if damaged { flash.erase(page.other()) } else { Ok(()) }
+}
+
+/// Writes a unit and reads it back. Erased ones stay so: some flash cannot write 0xFF and then something else.
+fn program(flash: &mut impl Flash, page: Page, at: usize, unit: [u8; UNIT]) -> Result<(), NotWritten> {
+    if unit != ERASED {
+        flash.program(page, at, unit)?;
+    }
+    if flash.unit(page, at) == unit { Ok(()) } else { Err(NotWritten) }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,86 @@
+//! What is counted, each under a name that stands in the program.
+
+use cell_node::contact::{Force, Torque};
+use cell_node::flash::Flash;
+use cell_node::identity::Identity;
+use cell_node::kernel::{Kernel, Projection, Wrench};
+use cell_node::node::Node;
+use protocol::can::{Format, Frame};
+use protocol::fixed::{Q1_14, Q5_10, TorqueFormat};
+use protocol::id::{CellId, Node as Address};
+use protocol::message::{From, Joints, Message, SensorPage, SkinSensors};
+use protocol::packet::Epoch;
+use protocol::parameters::{MAX_JOINTS, Parameters};
+use protocol::time::{Micros, Span};
+
+/// J of the wrench kernel.
+#[inline(never)]
+#[unsafe(export_name = "measure_wrench")]
+pub(crate) extern "C" fn wrench(
+    kernel: &Wrench,
+    joints: &[Q1_14; MAX_JOINTS],
+    out: &mut [Q1_14; MAX_JOINTS],
+) {
+    *out = kernel.jacobian(joints);
+}
+
+/// J of the projection kernel.
+#[inline(never)]
+#[unsafe(export_name = "measure_projection")]
+pub(crate) extern "C" fn projection(
+    kernel: &Projection,
+    joints: &[Q1_14; MAX_JOINTS],
+    out: &mut [Q1_14; MAX_JOINTS],
+) {
+    *out = kernel.jacobian(joints);
+}
+
+/// The torque's words from J, for a cell that so many joints move, and a force in steps of 2^-16 N.
+#[inline(never)]
+#[unsafe(export_name = "measure_torque_words")]
+pub(crate) extern "C" fn torque_words(
+    jacobian: &[Q1_14; MAX_JOINTS],
+    joints: u8,
+    force: i32,
+    out: &mut [i16; MAX_JOINTS],
+) {
+    let _ = joints;
+    *out = Torque::new(jacobian, Force::from_steps(force.into())).words(TorqueFormat::Q3_12);
+}
+
+/// A configured cell with its node id.
+pub(crate) fn node(parameters: &Parameters) -> Node {
+    let identity = Identity { cell: CellId::new(12).ok(), serial: 100_012 };
+    Node::new(identity, Format::Fd, &Flash::Sound(*parameters), true, Micros(0))
+}
+
+/// Waits until the cell owns its node id and presses it with 3 N; the joints that it has to answer.
+pub(crate) fn pressed(node: &mut Node, joints: Joints) -> Option<Frame> {
+    let mut now = Micros(0);
+    for _ in 0..2 {
+        now = node.poll_timeout();
+        node.handle_timeout(now);
+        while node.poll_transmit().is_some() {}
+    }
+    let skin = SkinSensors { contact: [Q5_10::from_bits(1_024); 3], ..SkinSensors::default() };
+    let to = Address::Cell(node.identity().cell?);
+    let press = Message::Stimulus { to, from: From::Next, page: SensorPage::Skin(skin) };
+    let frame = |message: &Message| message.encode().frames(Format::Fd).next();
+    node.handle_frame(now, Span(0), &frame(&press)?);
+    frame(&Message::Joints { epoch: Epoch(1), joints })
+}
+
+/// When it has to answer, after its address claim and before its next heartbeat.
+const AT: Micros = Micros(600_000);
+
+/// A frame in, the answer's frame out.
+#[inline(never)]
+#[unsafe(export_name = "measure_reply")]
+pub(crate) extern "C" fn reply(node: &mut Node, joints: &Frame, answer: &mut Frame) {
+    node.handle_frame(AT, Span(100), joints);
+    while let Some(packet) = node.poll_transmit() {
+        for frame in packet.frames(Format::Fd) {
+            *answer = frame;
+        }
+    }
+}

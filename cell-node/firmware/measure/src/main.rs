@@ -1,0 +1,101 @@
+//! The cell's arithmetic on emulated microcontrollers and on the host: `tests/firmware/count` runs it.
+//!
+//! Of each row of the vectors it prints the words of J and of the torques by both kernels, for comparison; or it computes
+//! them once while the emulator counts the instructions of what is named `measure_...`. On the host it prints the same
+//! words.
+#![cfg_attr(target_os = "none", no_std, no_main)]
+
+mod cases;
+mod counted;
+mod machine;
+
+use cases::CASES;
+use cell_node::kernel::{Kernel, Projection, Wrench};
+use machine::Machine;
+use protocol::fixed::Q1_14;
+use protocol::message::Joints;
+use protocol::parameters::MAX_JOINTS;
+
+/// Rows of one joint of one chain that are counted.
+const COUNTED: usize = 10;
+
+/// What is asked for on the command line.
+fn run(machine: &mut Machine) {
+    match machine.task() {
+        b'c' => count(machine),
+        b's' => stack(machine),
+        _ => words(machine),
+    }
+}
+
+/// A line for each row: the words of J and of the torques by the wrench kernel, and by the projection kernel.
+fn words(machine: &mut Machine) {
+    for case in CASES {
+        let (parameters, joints) = (case.parameters(), case.joints());
+        let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
+        let mut torque = [0; MAX_JOINTS];
+        let count = usize::from(parameters.joints);
+        counted::wrench(&Wrench::new(&parameters), &joints, &mut jacobian);
+        counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque);
+        machine.words(jacobian.iter().take(count).map(|word| word.to_bits()));
+        machine.words(torque.iter().take(count).copied());
+        counted::projection(&Projection::new(&parameters), &joints, &mut jacobian);
+        counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque);
+        machine.words(jacobian.iter().take(count).map(|word| word.to_bits()));
+        machine.words(torque.iter().take(count).copied());
+        machine.line();
+    }
+}
+
+/// A line for each row that is counted: chain, joint.
+fn count(machine: &mut Machine) {
+    let mut done = [[0; MAX_JOINTS + 1]; 8];
+    for case in CASES.iter().filter(|case| case.is_counted()) {
+        let place =
+            done.get_mut(usize::from(case.chain)).and_then(|chain| chain.get_mut(usize::from(case.joint)));
+        match place {
+            Some(done) if *done < COUNTED => *done += 1,
+            _ => continue,
+        }
+        let (parameters, joints) = (case.parameters(), case.joints());
+        let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
+        let mut torque = [0; MAX_JOINTS];
+        counted::wrench(&Wrench::new(&parameters), &joints, &mut jacobian);
+        counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque);
+        counted::projection(&Projection::new(&parameters), &joints, &mut jacobian);
+        reply(case);
+        machine.text(case.chain().name);
+        machine.words([i16::from(case.joint)].into_iter());
+        machine.line();
+    }
+}
+
+/// How much of the stack one reply took, its cell and those who called it included.
+fn stack(machine: &mut Machine) {
+    let case = CASES.iter().rfind(|case| case.is_counted());
+    case.into_iter().for_each(reply);
+    let used = machine.stack();
+    machine.number(used);
+    machine.line();
+}
+
+/// One reply of a cell on this chain.
+fn reply(case: &cases::Case) {
+    let mut node = counted::node(&case.parameters());
+    let joints = Joints { positions: case.joints(), in_use: case.chain().joints() };
+    let Some(frame) = counted::pressed(&mut node, joints) else { return };
+    let mut answer = frame;
+    counted::reply(&mut node, &frame, &mut answer);
+}
+
+#[cfg(not(target_os = "none"))]
+fn main() {
+    run(&mut Machine::default());
+}
+
+#[cfg(target_os = "none")]
+#[cortex_m_rt::entry]
+fn main() -> ! {
+    run(&mut Machine::default());
+    machine::end()
+}

@@ -1,0 +1,116 @@
+//! A firmware's file: who a cell is goes into it before it is loaded.
+
+use std::path::{Path, PathBuf};
+
+use object::{Architecture, Object, ObjectSection};
+use protocol::factory::{self, Factory};
+use thiserror::Error;
+
+/// Where the flash of the emulated microcontroller is, and how many bytes it has.
+const FLASH: std::ops::Range<u64> = 0..256 << 10;
+
+/// Why a file is no firmware of a cell.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum FirmwareError {
+    /// It cannot be read.
+    #[error("--firmware {path}: {source}; docs/how-to/firmware.md says how one is built")]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// It is none for this kind of microcontroller.
+    #[error(
+        "--firmware {path}: no ELF file of a 32-bit ARM microcontroller; docs/how-to/firmware.md builds one"
+    )]
+    NotArm {
+        /// The file.
+        path: PathBuf,
+    },
+    /// It has no place for the factory's record.
+    #[error("--firmware {path}: it has no section {section}, so it is not the firmware of a cell", section = factory::SECTION)]
+    NoCell {
+        /// The file.
+        path: PathBuf,
+    },
+    /// It is for another board.
+    #[error("--firmware {path}: it is for a board without an emulator; build it with `--features microbit`")]
+    OtherBoard {
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+/// A firmware that was read.
+#[derive(Clone, Debug)]
+pub struct Firmware {
+    bytes: Vec<u8>,
+    /// Where the factory's record is in the file.
+    record: usize,
+}
+
+impl Firmware {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// When it is not there, or not the firmware of a cell for the emulated board.
+    pub fn read(path: &Path) -> Result<Self, FirmwareError> {
+        let path = path.to_owned();
+        match std::fs::read(&path) {
+            Ok(bytes) => Self::parse(path, bytes),
+            Err(source) => Err(FirmwareError::Read { path, source }),
+        }
+    }
+
+    fn parse(path: PathBuf, bytes: Vec<u8>) -> Result<Self, FirmwareError> {
+        let elf = match object::File::parse(&*bytes) {
+            Ok(elf) if elf.architecture() == Architecture::Arm && !elf.is_64() => elf,
+            Ok(_) | Err(_) => return Err(FirmwareError::NotArm { path }),
+        };
+        let Some(section) = elf.section_by_name(factory::SECTION) else {
+            return Err(FirmwareError::NoCell { path });
+        };
+        if !FLASH.contains(&section.address()) {
+            return Err(FirmwareError::OtherBoard { path });
+        }
+        let record = section.file_range().filter(|(_, len)| *len == factory::BYTES as u64);
+        let record = record.and_then(|(at, _)| usize::try_from(at).ok());
+        match record.filter(|at| bytes.get(*at..*at + factory::BYTES).is_some()) {
+            Some(record) => Ok(Self { bytes, record }),
+            None => Err(FirmwareError::NoCell { path }),
+        }
+    }
+
+    /// The file of one cell.
+    #[must_use]
+    pub fn of(&self, factory: &Factory) -> Vec<u8> {
+        let mut bytes = self.bytes.clone();
+        if let Some(record) = bytes.get_mut(self.record..self.record + factory::BYTES) {
+            record.copy_from_slice(&factory.encode());
+        }
+        bytes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn error(bytes: &[u8]) -> String {
+        Firmware::parse("cell".into(), bytes.to_vec()).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn what_is_no_firmware_is_named() {
+        let missing = Firmware::read(Path::new("/nowhere/cell")).unwrap_err().to_string();
+        assert!(missing.starts_with("--firmware /nowhere/cell: No such file"), "{missing}");
+        assert!(error(b"nothing").contains("no ELF file of a 32-bit ARM microcontroller"));
+        let own = std::fs::read(std::env::current_exe().unwrap()).unwrap();
+        assert!(
+            error(&own).contains("no ELF file of a 32-bit ARM microcontroller"),
+            "this test's own program"
+        );
+    }
+}

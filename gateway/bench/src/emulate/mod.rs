@@ -1,0 +1,300 @@
+//! Cells that run the machine code of a microcontroller: an emulator each, wired to the bus by slcan.
+//!
+//! ```text
+//!   bus <── client with the cell's filters ── slcan line (UNIX socket) ──> UART of qemu-system-arm -M microbit
+//!                                                                           └─ flash: a file, by semihosting
+//! ```
+
+mod firmware;
+mod line;
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+use model::commission::{Outcome, Wish};
+use protocol::bus::{Filter, Kinds};
+use protocol::factory::Factory;
+use protocol::id::{Id, Kind, Node};
+use protocol::skin::{Cell, Reply, Skin};
+use tempfile::TempDir;
+use thiserror::Error;
+use vcan_setup::slcan::BridgeError;
+
+use crate::commission;
+use crate::run::launch::{LaunchError, Processes, STARTING};
+use crate::setup::Timeout;
+
+pub use firmware::{Firmware, FirmwareError};
+use line::{Lines, Planned};
+
+/// The emulator.
+const QEMU: &str = "qemu-system-arm";
+
+/// Which cells are emulated.
+#[derive(Clone, Debug)]
+pub struct Emulated {
+    /// The firmware's file.
+    pub firmware: PathBuf,
+    /// The cells, as indices into the skin's.
+    pub cells: Vec<usize>,
+}
+
+/// Why cells are not emulated.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum EmulateError {
+    /// The firmware is none.
+    #[error(transparent)]
+    Firmware(#[from] FirmwareError),
+    /// There is no emulator.
+    #[error("{QEMU} is not in PATH, and --emulate needs it: apt-get install {QEMU}")]
+    NoEmulator,
+    /// There is no room for files.
+    #[error("files of emulated cells: {0}; set TMPDIR to a folder with room")]
+    Files(#[source] std::io::Error),
+    /// A path has what the emulator's command line cannot carry.
+    #[error("--flash {0}: paths of emulated cells have at most 240 bytes, UTF-8 and no spaces")]
+    Path(PathBuf),
+    /// A line or a process does not start.
+    #[error(transparent)]
+    Launch(#[from] LaunchError),
+    /// Lines are not joined to a bus.
+    #[error(transparent)]
+    Bridge(#[from] BridgeError),
+    /// The system gives no thread, or no pipe.
+    #[error("lines of emulated cells: {0}")]
+    Lines(#[source] std::io::Error),
+    /// A bus does not open.
+    #[error(transparent)]
+    Bus(#[from] protocol::bus::BusError),
+    /// A cell was not commissioned.
+    #[error("the emulated {cell} was not commissioned: it {why}")]
+    NotCommissioned {
+        /// The cell and its bus.
+        cell: String,
+        /// Why.
+        why: String,
+    },
+    /// Commissioning came to no end.
+    #[error("emulated cells were not commissioned: {0}")]
+    Commission(String),
+    /// An emulator ended.
+    #[error("the emulator of {cells} ended before its cell was commissioned ({how})")]
+    Ended {
+        /// The cell and its bus.
+        cells: String,
+        /// How it ended.
+        how: String,
+    },
+    /// It was interrupted.
+    #[error("interrupted while starting")]
+    Interrupted,
+}
+
+impl EmulateError {
+    /// 2 for wrong use or configuration, 1 for cells that failed.
+    #[must_use]
+    pub const fn exit_code(&self) -> u8 {
+        match self {
+            Self::Firmware(_)
+            | Self::NoEmulator
+            | Self::Files(_)
+            | Self::Path(_)
+            | Self::Launch(_)
+            | Self::Bridge(_)
+            | Self::Bus(_) => 2,
+            Self::Lines(_)
+            | Self::NotCommissioned { .. }
+            | Self::Commission(_)
+            | Self::Ended { .. }
+            | Self::Interrupted => 1,
+        }
+    }
+}
+
+/// A firmware, and the emulator for it.
+#[derive(Debug)]
+pub(crate) struct Emulator<'a> {
+    firmware: Firmware,
+    qemu: PathBuf,
+    cells: &'a [usize],
+}
+
+/// Emulated cells: their files and lines. Their processes are among the others; end those first.
+#[derive(Debug)]
+pub(crate) struct Emulation {
+    /// The lines hang up before their sockets go away.
+    _lines: Lines,
+    _files: TempDir,
+}
+
+/// What emulated cells share.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Bench<'a> {
+    pub(crate) skin: &'a Skin,
+    pub(crate) kinds: &'a Kinds,
+    pub(crate) directory: Option<&'a Path>,
+    pub(crate) flash: Option<&'a Path>,
+}
+
+impl<'a> Emulator<'a> {
+    /// Reads the firmware and looks for the emulator.
+    ///
+    /// # Errors
+    /// When one of them is not there.
+    pub(crate) fn new(emulated: &'a Emulated) -> Result<Self, EmulateError> {
+        let firmware = Firmware::read(&emulated.firmware)?;
+        let path = std::env::var_os("PATH").unwrap_or_default();
+        let qemu = std::env::split_paths(&path).map(|folder| folder.join(QEMU)).find(|path| path.is_file());
+        Ok(Self { firmware, qemu: qemu.ok_or(EmulateError::NoEmulator)?, cells: &emulated.cells })
+    }
+
+    /// Starts the cells, adds their processes to the others, and joins them to their buses, which are there.
+    ///
+    /// # Errors
+    /// When something does not start.
+    pub(crate) fn start(
+        &self,
+        bench: &Bench<'_>,
+        processes: &mut Processes,
+    ) -> Result<Emulation, EmulateError> {
+        let files =
+            tempfile::Builder::new().prefix("skinbus-cells-").tempdir().map_err(EmulateError::Files)?;
+        let mut planned = Planned::default();
+        for cell in self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell)) {
+            let place = Place::of(bench, files.path(), cell)?;
+            fs::write(&place.program, self.firmware.of(&factory(bench.skin, cell)))
+                .map_err(EmulateError::Files)?;
+            let log = File::create(&place.log).map_err(EmulateError::Files)?;
+            processes.emulate(cell, self.command(&place, log), &place.log)?;
+            let name = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
+            planned.add(name, bench.kinds.of(name), place.socket, filters(bench.skin, cell));
+        }
+        let _lines = planned.join(bench.directory)?;
+        Ok(Emulation { _lines, _files: files })
+    }
+
+    /// Starts an emulator. It waits for its line.
+    fn command(&self, place: &Place, log: File) -> Command {
+        let mut command = Command::new(&self.qemu);
+        command.args(["-M", "microbit", "-display", "none", "-monitor", "none", "-serial", "chardev:line"]);
+        let socket = place.socket.display();
+        command.arg("-chardev").arg(format!("socket,id=line,path={socket},server=on,wait=on"));
+        let flash = place.flash.replace(',', ",,");
+        command.arg("-semihosting-config").arg(format!("enable=on,target=native,arg={flash}"));
+        command.arg("-kernel").arg(&place.program);
+        command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
+        command
+    }
+
+    /// Writes the skin's parameters into the cells, as into any others, which are the only ones on their buses yet.
+    ///
+    /// # Errors
+    /// When a cell does not take them, or an emulator ends.
+    pub(crate) fn commission(
+        &self,
+        bench: &Bench<'_>,
+        processes: &mut Processes,
+        signalled: &AtomicBool,
+    ) -> Result<String, EmulateError> {
+        let began = Instant::now();
+        let mut skin = bench.skin.clone();
+        skin.cells = self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell).cloned()).collect();
+        // They have their node ids: no walk over wires assigns them.
+        skin.buses.iter_mut().for_each(|bus| bus.reply = Reply::Torque);
+        let mut buses: Vec<_> = skin.cells.iter().map(|cell| cell.bus).collect();
+        buses.sort_unstable();
+        buses.dedup();
+        let benches = buses.into_iter().map(|bus| commission::open(&skin, bus, bench.kinds));
+        let benches = benches.collect::<Result<Vec<_>, _>>()?;
+        let stop = AtomicBool::new(false);
+        let (mut ended, mut timeout, mut is_over) = (None, Timeout::new(STARTING), false);
+        let wish = Wish { dry_run: false, verify: false };
+        let done = commission::commission(benches, &skin, wish, &stop, |far| {
+            ended = ended.take().or_else(|| processes.ended().into_iter().next());
+            // A cell that starts again and again would be written for ever.
+            is_over |= timeout.is_over(far.iter().map(|far| far.found + far.done).sum());
+            if ended.is_some() || is_over || signalled.load(Ordering::Relaxed) {
+                stop.store(true, Ordering::Relaxed);
+            }
+        });
+        if signalled.load(Ordering::Relaxed) {
+            return Err(EmulateError::Interrupted);
+        }
+        if let Some(ended) = ended {
+            let bus = skin.buses.get(ended.bus).map_or("", |bus| bus.name.as_str());
+            return Err(EmulateError::Ended { cells: format!("{ended} on {bus}"), how: ended.how() });
+        }
+        for done in &done {
+            if let Some(failure) = &done.failure {
+                return Err(EmulateError::Commission(failure.clone()));
+            }
+            let failed = done.report.cells.iter().find_map(|cell| match cell.outcome {
+                Outcome::Failed(why) => Some((cell.described, why)),
+                Outcome::Written | Outcome::AlreadySo | Outcome::Verified | Outcome::WouldWrite => None,
+            });
+            if let Some((node, why)) = failed {
+                let cell = format!("cell {node} on {}", done.name);
+                return Err(EmulateError::NotCommissioned { cell, why: why.to_string() });
+            }
+        }
+        let cells: Vec<_> = skin.cells.iter().map(|cell| cell.node.to_string()).collect();
+        let (s, cells) = (if cells.len() == 1 { "" } else { "s" }, cells.join(", "));
+        let took = began.elapsed().as_secs_f64();
+        Ok(format!("cell{s} {cells} emulated by {}, commissioned in {took:.1} s", self.qemu.display()))
+    }
+}
+
+/// The files of one cell.
+struct Place {
+    program: PathBuf,
+    socket: PathBuf,
+    log: PathBuf,
+    flash: String,
+}
+
+impl Place {
+    fn of(bench: &Bench<'_>, files: &Path, cell: &Cell) -> Result<Self, EmulateError> {
+        let bus = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
+        let name = format!("{bus}-{}", cell.node);
+        let flash = bench.flash.unwrap_or(files);
+        let too = || EmulateError::Path(flash.to_owned());
+        let flash = fs::canonicalize(flash).map_err(EmulateError::Files)?.join(format!("{name}.flash"));
+        let flash = flash.to_str().filter(|path| path.len() <= 240 && !path.contains(' ')).ok_or_else(too)?;
+        Ok(Self {
+            program: files.join(format!("{name}.elf")),
+            socket: files.join(format!("{name}.sock")),
+            log: files.join(format!("{name}.log")),
+            flash: flash.to_owned(),
+        })
+    }
+}
+
+/// What the factory would write into a cell.
+fn factory(skin: &Skin, cell: &Cell) -> Factory {
+    let bus = skin.buses.get(cell.bus);
+    let sums = bus.is_some_and(|bus| bus.reply != Reply::Torque);
+    Factory {
+        node: Some(cell.node),
+        serial: cell.serial,
+        format: bus.map_or(protocol::can::Format::Fd, |bus| bus.format),
+        hosted: true,
+        link_ids: if sums { skin.wires(cell.bus).of_cell(cell.node) } else { Default::default() },
+    }
+}
+
+/// What a cell's CAN controller would pass: its own identifiers, what comes over its simulated wires, and the sums of
+/// the cells at their other ends.
+fn filters(skin: &Skin, cell: &Cell) -> Vec<Filter> {
+    let mut filters: Vec<_> = Id::of_cell(cell.node).map(Filter::exact).into();
+    let link_ids = factory(skin, cell).link_ids;
+    if link_ids.iter().any(Option::is_some) {
+        filters.extend(link_ids.into_iter().flatten().map(|link_id| Filter::link_id(link_id.reversed())));
+        let sums = cell.neighbors.iter().flatten().map(|neighbor| Id::new(Kind::Sum, Node::Cell(*neighbor)));
+        filters.extend(sums.map(Filter::exact));
+    }
+    filters
+}

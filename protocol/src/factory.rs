@@ -1,0 +1,140 @@
+//! What a cell of firmware knows from the factory: a record in its flash, which whoever makes the cell writes into the
+//! program's file before it is loaded.
+//!
+//! ```text
+//!   byte 0..3  "CELL"                         4  version, 1       5  the node id, 0 for none
+//!        6     flags: 1 classic frames, 2 an emulator that keeps the cell's flash in a file
+//!        7     0                           8..11 serial number, little endian
+//!        12    by port, whether it is wired (bit 4: to the gateway's side)
+//!        13    by port, which direction of the wire it sends in
+//!        14..23 by port, the wire's number, little endian
+//!        24..29 0                          30..31 CRC-16 over all bytes before it, little endian
+//! ```
+//!
+//! Only cells on a bench have wires here: they are simulated by frames ([`crate::wire`]).
+
+use crate::can::Format;
+use crate::id::CellId;
+use crate::packet::crc16;
+use crate::wire::{LinkId, PORTS};
+
+/// Bytes of a record.
+pub const BYTES: usize = 32;
+/// The section of the program that holds it.
+pub const SECTION: &str = ".factory";
+/// A record that nobody has written: erased flash.
+pub const ERASED: [u8; BYTES] = [0xFF; BYTES];
+
+const MAGIC: &[u8; 4] = b"CELL";
+const VERSION: u8 = 1;
+const CLASSIC: u8 = 1;
+const HOSTED: u8 = 2;
+
+/// What a cell knows from the factory.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Factory {
+    /// Its node id, if it has one.
+    pub node: Option<CellId>,
+    /// Its serial number.
+    pub serial: u32,
+    /// The format of its bus.
+    pub format: Format,
+    /// Whether it runs in an emulator that keeps its flash in a file.
+    pub hosted: bool,
+    /// By port, the link id that it sends with; the last one leads to the gateway's side.
+    pub link_ids: [Option<LinkId>; PORTS + 1],
+}
+
+impl Factory {
+    /// The record.
+    #[must_use]
+    pub fn encode(&self) -> [u8; BYTES] {
+        let flag = |set, flag| if set { flag } else { 0 };
+        let flags = flag(self.format == Format::Classic, CLASSIC) | flag(self.hosted, HOSTED);
+        let [s0, s1, s2, s3] = self.serial.to_le_bytes();
+        let (mut wired, mut back, mut wires) = (0, 0, [0; 2 * (PORTS + 1)]);
+        for ((port, link_id), wire) in self.link_ids.iter().enumerate().zip(wires.as_chunks_mut().0) {
+            let Some(link_id) = link_id else { continue };
+            wired |= 1 << port;
+            back |= flag(link_id.back, 1 << port);
+            *wire = link_id.wire.to_le_bytes();
+        }
+        let head = [VERSION, self.node.map_or(0, CellId::get), flags, 0, s0, s1, s2, s3, wired, back];
+        let body: [&[u8]; 3] = [MAGIC, &head, &wires];
+        let mut bytes = [0; BYTES];
+        for (byte, value) in bytes.iter_mut().zip(body.into_iter().flatten()) {
+            *byte = *value;
+        }
+        if let Some((body, crc)) = bytes.split_last_chunk_mut() {
+            *crc = crc16(body).to_le_bytes();
+        }
+        bytes
+    }
+
+    /// Reads a record; `None` when it was never written, or is damaged. Never panics.
+    #[must_use]
+    pub fn decode(bytes: &[u8; BYTES]) -> Option<Self> {
+        let (body, crc) = bytes.split_last_chunk()?;
+        let (magic, rest) = body.split_first_chunk::<4>()?;
+        let (&[version, node, flags, _, s0, s1, s2, s3, wired, back], rest) = rest.split_first_chunk()?;
+        if magic != MAGIC || version != VERSION || crc16(body) != u16::from_le_bytes(*crc) {
+            return None;
+        }
+        let (wires, _) = rest.as_chunks();
+        let link_id = |port: usize| {
+            let bit = 1 << port;
+            let wire = u16::from_le_bytes(*wires.get(port)?);
+            (wired & bit != 0).then_some(LinkId { wire, back: back & bit != 0 })
+        };
+        Some(Self {
+            node: CellId::new(node.into()).ok(),
+            serial: u32::from_le_bytes([s0, s1, s2, s3]),
+            format: if flags & CLASSIC == 0 { Format::Fd } else { Format::Classic },
+            hosted: flags & HOSTED != 0,
+            link_ids: core::array::from_fn(link_id),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn link_id() -> impl Strategy<Value = Option<LinkId>> {
+        proptest::option::of((any::<u16>(), any::<bool>()).prop_map(|(wire, back)| LinkId { wire, back }))
+    }
+
+    #[test]
+    fn a_record_is_laid_out_as_its_table_says() {
+        let mut link_ids = [None; PORTS + 1];
+        link_ids[1] = Some(LinkId { wire: 0x0203, back: false });
+        link_ids[4] = Some(LinkId { wire: 7, back: true });
+        let node = CellId::new(12).ok();
+        let factory = Factory { node, serial: 100_012, format: Format::Classic, hosted: true, link_ids };
+        let bytes = factory.encode();
+        assert_eq!(bytes[..14], *b"CELL\x01\x0c\x03\0\xac\x86\x01\0\x12\x10");
+        assert_eq!(bytes[14..30], [0, 0, 3, 2, 0, 0, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0]);
+    }
+
+    #[test]
+    fn erased_flash_is_no_record() {
+        assert_eq!(Factory::decode(&ERASED), None);
+        assert_eq!(Factory::decode(&[0; BYTES]), None);
+    }
+
+    proptest! {
+        #[test]
+        fn every_record_comes_back_and_no_wrong_bit_passes(
+            node in 0_i64..=254, serial: u32, classic: bool, hosted: bool,
+            link_ids in proptest::array::uniform5(link_id()), bit in 0..BYTES * 8,
+        ) {
+            let format = if classic { Format::Classic } else { Format::Fd };
+            let factory = Factory { node: CellId::new(node).ok(), serial, format, hosted, link_ids };
+            let mut bytes = factory.encode();
+            prop_assert_eq!(Factory::decode(&bytes), Some(factory));
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            prop_assert_eq!(Factory::decode(&bytes), None);
+        }
+    }
+}
