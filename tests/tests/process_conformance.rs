@@ -10,6 +10,9 @@ use std::time::Duration;
 
 use process::{Place, Running, program, until};
 use protocol::can::Format;
+use protocol::id::Node;
+use protocol::message::{Heartbeat, Message, NetworkPage, State};
+use protocol::packet::Epoch;
 use rustix::process::Signal;
 use serde_json::Value;
 
@@ -216,4 +219,63 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     let tolerated = cell.conformance("--others-will-stop --only CMD").end().well();
     assert!(tolerated.stdout.contains("4 passed, 0 failed"), "{tolerated:#?}");
     drop(other);
+}
+
+/// A heartbeat under the cell's node id, of another cell.
+fn twin() -> Message {
+    let beat = Heartbeat { serial: 77, state: State::default().with_joint(0), ..Heartbeat::default() };
+    let from = Node::from_byte(5);
+    Message::Network { from, epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
+}
+
+#[test]
+fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
+    let cell = Cell::new(Format::Fd);
+    let before = cell.has();
+    let client = cell.place.test_client();
+    let test = cell.conformance("--only CMD");
+    for _ in 0..40 {
+        client.sends(&twin());
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    assert_eq!(
+        test.end().refusal(1),
+        "gateway: 2 cells send as node 5 on vcan0, with the serial numbers 77 and 100005: take away all but one"
+    );
+    // One that begins to command in the middle.
+    let test = cell.conformance("");
+    cell.is_tested();
+    client.sends(&Message::Resume);
+    let ended = test.end();
+    assert_eq!(ended.code(), Some(1), "{ended:#?}");
+    assert_eq!(
+        ended.stderr,
+        "gateway: 003##500000000000000000000000000004782 was sent by somebody else: stop the gateway that is on this bus\n"
+    );
+    assert_eq!(cell.has(), before);
+    let test = cell.conformance("--only CMD");
+    for _ in 0..20 {
+        client.sends(&Message::Resume);
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let said = test.end();
+    assert!(said.refusal(1).starts_with("gateway: a gateway is on vcan0 (003##5"), "{said:#?}");
+}
+
+#[test]
+fn other_cells_that_send_much_do_not_matter_if_they_are_tolerated() {
+    let cell = Cell::new(Format::Fd);
+    let client = cell.place.test_client();
+    let test = cell.conformance("--only CMD,STIM,CONF --others-will-stop");
+    let from = protocol::id::CellId::new(9).unwrap();
+    let torque = protocol::packet::Words::zeros(protocol::packet::Length::Six);
+    let flood = Message::Torque { from, epoch: Epoch(1), torque };
+    let mut sent = 0;
+    while cell.place.path("conformance-vcan0-5.json").exists() || sent < 2_000 {
+        client.sends(&flood);
+        sent += 1;
+        std::thread::sleep(Duration::from_micros(300));
+    }
+    let ended = test.end();
+    assert!(ended.stdout.contains(" 0 failed"), "{ended:#?}");
 }

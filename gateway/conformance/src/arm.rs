@@ -46,6 +46,9 @@ impl Dice {
     }
 }
 
+/// Joints that are older are skipped: a cell that is a process may wait for a processor.
+const PERIOD_US: u16 = 60_000;
+
 /// Gain 1, no proximity, no thresholds: the force is the sum of the three words.
 pub(crate) const PLAIN: Contact = Contact {
     alpha_c: Q3_12::from_bits(4096),
@@ -85,12 +88,17 @@ pub(crate) fn document(joint: u8) -> Parameters {
             normal: [0, 0x3333, 0x2666].map(Q1_14::from_bits),
         },
         contact: PLAIN,
-        period_us: 16_000,
+        period_us: PERIOD_US,
         rows,
     }
 }
 
-/// The same with the contact's gains and thresholds as they stand in the document.
+/// The same at 62.5 joints a second, where times matter.
+pub(crate) fn in_time(joint: u8) -> Parameters {
+    Parameters { period_us: 16_000, ..document(joint) }
+}
+
+/// The gains and thresholds of the document's contact.
 pub(crate) fn document_contact() -> Contact {
     let [alpha_c, threshold] = [4096, 0x67];
     Contact {
@@ -155,7 +163,7 @@ pub(crate) fn random(dice: &mut Dice, shape: Shape) -> Parameters {
         torque_format: TorqueFormat::Q3_12,
         pose: Pose { position, normal: normal(dice) },
         contact: PLAIN,
-        period_us: 16_000,
+        period_us: PERIOD_US,
         rows,
     }
 }

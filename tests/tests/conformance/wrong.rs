@@ -42,8 +42,7 @@ pub(crate) struct Memory {
     pub(crate) measures: bool,
     segments: Vec<(u16, Segment)>,
     /// Packets that are sent, and those that the right cell inside sent before its present one.
-    sent: u16,
-    own: u16,
+    sent: [u16; 2],
 }
 
 impl Memory {
@@ -206,7 +205,7 @@ impl Mutant for Wrong {
         }
         // The count of packets is right, whatever is left out or added; unless it is what is wrong.
         let all = all.into_iter().map(|(delay, message)| (Span(delay), self.counted(message))).collect();
-        self.memory.own = self.memory.own.wrapping_add(1);
+        self.memory.sent[1] = self.memory.sent[1].wrapping_add(1);
         all
     }
 
@@ -251,9 +250,9 @@ impl Wrong {
     fn counted(&mut self, mut message: Message) -> Packet {
         if let Message::Network { page: NetworkPage::Heartbeat(beat), .. } = &mut message {
             // What a mutant has added to it stays.
-            beat.sent = beat.sent.wrapping_sub(self.memory.own).wrapping_add(self.memory.sent);
+            beat.sent = beat.sent.wrapping_sub(self.memory.sent[1]).wrapping_add(self.memory.sent[0]);
         }
-        self.memory.sent = self.memory.sent.wrapping_add(1);
+        self.memory.sent[0] = self.memory.sent[0].wrapping_add(1);
         message.encode()
     }
 }

@@ -16,7 +16,7 @@ const LATE: u64 = 20_000;
 const SLACK: u64 = 3_000;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::document(2))?;
+    session.ready(&arm::in_time(2))?;
     session.settle()?;
     let first = regular(session)?;
     shifted(session)?;

@@ -50,7 +50,7 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
             command(session, Message::Halt, "CMD-1")?;
         } else {
             // Nothing but a resume ends it.
-            session.commit(&protocol::parameters::Parameters { period_us: 16_500, ..arm::document(6) })?;
+            session.commit(&protocol::parameters::Parameters { period_us: 46_500, ..arm::document(6) })?;
             session.commit(&arm::document(6))?;
             session.exchange_all(&[])?;
         }

@@ -12,7 +12,7 @@ use crate::session::{Reply, Session};
 
 /// Another configuration, which differs in each parameter.
 fn other() -> Parameters {
-    let mut other = Parameters { joint: 6, period_us: 20_000, ..arm::document(6) };
+    let mut other = Parameters { joint: 6, period_us: 50_000, ..arm::document(6) };
     other.contact.alpha_c = Q3_12::from_bits(5_000);
     other.pose.position = [0x0777, -0x0333, 0x0123].map(Q1_14::from_bits);
     for (row, step) in other.rows.iter_mut().zip(1..=6) {
@@ -93,7 +93,7 @@ fn computes(
 
 /// Words that a parameter does not use.
 fn unused(session: &mut Session<'_>) -> Result<(), Stop> {
-    let expected = Parameters { period_us: 17_001, ..arm::document(3) };
+    let expected = Parameters { period_us: 57_001, ..arm::document(3) };
     session.stage(&expected)?;
     session.known.staged = None;
     for parameter in Parameter::stored(6).filter(|it| *it != Parameter::Pose) {

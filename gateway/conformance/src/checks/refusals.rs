@@ -13,7 +13,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
         return Ok(());
     }
     let before = session.counters()?;
-    let staged = Parameters { period_us: 15_000, ..arm::document(5) };
+    let staged = Parameters { period_us: 45_000, ..arm::document(5) };
     session.stage(&staged)?;
     writes(session, &staged)?;
     // What was refused is not staged.

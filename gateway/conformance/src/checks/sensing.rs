@@ -17,7 +17,7 @@ const EVENTS: u8 = 8;
 const STEPS: usize = 160;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
-    session.ready(&arm::document(6))?;
+    session.ready(&arm::in_time(6))?;
     session.known.senses = true;
     session.write(EVENTS, Events::default().words())?;
     let done = switches(session)

@@ -79,8 +79,16 @@ impl Session<'_> {
             None if self.known.halted == Some(true) => Some(false),
             None => None,
         };
+        let active = self.known.active.take();
         let exchange = self.exchange_all(&[joints])?;
-        self.look_at_torques(epoch, due, exchange)
+        let step = self.look_at_torques(epoch, due, exchange)?;
+        self.known.active = active;
+        self.look_at_state(&step.exchange);
+        if self.clock.skipped {
+            // It stays as it was before them.
+            self.known.active = None;
+        }
+        Ok(step)
     }
 
     /// What has to come after the next joints, as far as it is known.
@@ -111,6 +119,7 @@ impl Session<'_> {
             }
         }
         let first = torques.first().and_then(|heard| Some((heard.at, heard.torque()?.0, *heard.torque()?.1)));
+        self.clock.skipped = first.is_none() && self.came_late(&exchange);
         let expected = match due {
             Some(Due::Torque) => Some(true),
             Some(Due::Zeros) => Some(true),
@@ -131,7 +140,10 @@ impl Session<'_> {
             });
         }
         if let Some((at, of, words)) = first {
-            self.note_time("torque", exchange.at, at);
+            // A quarter of the period, and that of the test is long but for what measures times.
+            if self.known.parameters.is_some_and(|it| it.period_us == arm::in_time(1).period_us) {
+                self.note_time("torque", exchange.at, at);
+            }
             self.check("JOINTS-6", of.0 == epoch, || format!("a torque of epoch {of} to joints {epoch}"));
             if due == Some(Due::Zeros) {
                 self.check("JOINTS-6", words.is_zero(), || "released: the torque is not of zeros".to_owned());
@@ -142,6 +154,14 @@ impl Session<'_> {
             self.look_at_saturation(&Words::zeros(Length::Six));
         }
         Ok(Step { torque: first.map(|(.., words)| words), exchange })
+    }
+
+    /// Whether the cell came to the joints, as the answer to the sync shows, when they were older than a period: then it
+    /// skipped them, and nothing that follows from them can be expected.
+    fn came_late(&self, exchange: &Exchange) -> bool {
+        let period = self.known.parameters.map_or(u64::MAX, |it| it.period_us.into());
+        let beat = self.answers().iter().rev().find(|heard| heard.beat().is_some());
+        beat.is_some_and(|heard| heard.at.since(exchange.at).0 > period && period > 1_000)
     }
 
     fn look_at_words(&mut self, words: &Words) {
