@@ -57,23 +57,28 @@ impl Force {
 
 /// What one cell does to the joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Torque {
-    exact: [Acc<30>; MAX_JOINTS],
+pub struct Torque<'a> {
+    jacobian: &'a [Q1_14],
+    force: Force,
 }
 
-impl Torque {
-    /// `tau_l = J_l F_z` (Eq. 8), exactly: J in m, Q1.14, as a [`Kernel`](crate::kernel::Kernel) gives it.
+impl<'a> Torque<'a> {
+    /// `tau_l = J_l F_z` (Eq. 8), exactly: J in m, Q1.14, as a [`Kernel`](crate::kernel::Kernel) gives it, or as much of
+    /// it as is not zero.
     #[must_use]
-    pub fn new(jacobian: &[Q1_14; MAX_JOINTS], force: Force) -> Self {
-        // At most 2^15 * 2^31 steps.
-        let product = |row: Q1_14| Acc::from_steps(row.widen().steps() * i64::from(force.0));
-        Self { exact: jacobian.map(product) }
+    pub const fn new(jacobian: &'a [Q1_14], force: Force) -> Self {
+        Self { jacobian, force }
     }
 
     /// The torques in Nm at full width, as they enter a sum inside the cell.
     #[must_use]
-    pub const fn exact(&self) -> [Acc<30>; MAX_JOINTS] {
-        self.exact
+    pub fn exact(&self) -> [Acc<30>; MAX_JOINTS] {
+        let mut exact = [Acc::ZERO; MAX_JOINTS];
+        for (exact, row) in exact.iter_mut().zip(self.jacobian) {
+            // At most 2^15 * 2^31 steps.
+            *exact = Acc::from_steps(row.widen().steps() * i64::from(self.force.0));
+        }
+        exact
     }
 
     /// The torques in Nm as words for the bus, rounded once, ties up; what does not fit in [-8, 8)
@@ -81,7 +86,18 @@ impl Torque {
     /// most half a step, 1.3e-4 Nm.
     #[must_use]
     pub fn words(&self, format: TorqueFormat) -> [i16; MAX_JOINTS] {
-        self.exact.map(|exact| format.round(exact))
+        // Products of 16 and 32 bits in 32: (J high + (J low >> 16)) 2^16 is below J F by less than that, and so little is
+        // cut off by the shift too.
+        let (high, low) = (self.force.0 >> 16, self.force.0 & 0xFFFF);
+        let shift = 14 - format.fraction(); // of 2^-14 Nm
+        let half = (1 << shift) >> 1;
+        let mut words = [0; MAX_JOINTS];
+        for (word, row) in words.iter_mut().zip(self.jacobian) {
+            let row = i32::from(row.to_bits());
+            let steps = (row.wrapping_mul(high) + (row.wrapping_mul(low) >> 16) + half) >> shift;
+            *word = i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX });
+        }
+        words
     }
 }
 
@@ -213,6 +229,9 @@ mod tests {
                     prop_assert_eq!(exact.to_f64(), real);
                     let held = real.clamp(Q3_12::MIN.to_f64(), Q3_12::MAX.to_f64());
                     prop_assert!((Q3_12::from_bits(word).to_f64() - held).abs() <= 0.5 / 4_096.0);
+                }
+                for format in TorqueFormat::ALL {
+                    prop_assert_eq!(torque.words(format), torque.exact().map(|exact| format.round(exact)));
                 }
             }
         }

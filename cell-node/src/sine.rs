@@ -70,6 +70,40 @@ pub fn paper_cosine(angle: Q1_14) -> Q1_14 {
     paper_sine(angle.wrapping_add(QUARTER))
 }
 
+/// [`sine`] and [`cosine`] of one angle together, in steps of 2^-14: bit for bit the same, in less time.
+#[inline]
+pub(crate) fn sine_cosine(angle: Q1_14) -> [i32; 2] {
+    both(angle, SEVENTH)
+}
+
+/// [`paper_sine`] and [`paper_cosine`] of one angle.
+#[inline]
+pub(crate) fn paper_sine_cosine(angle: Q1_14) -> [i32; 2] {
+    both(angle, FIFTH)
+}
+
+/// Sine and cosine by the odd polynomial whose coefficients sum up to one. With |z| folded into one quarter turn, |sin z|
+/// is the polynomial of that and |cos z| the polynomial of what is left of the quarter; nothing below is negative but what
+/// coefficients make it.
+#[inline]
+fn both<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2] {
+    let quarter = 1 << 14;
+    let z = i32::from(angle.to_bits());
+    let negative = z >> 31;
+    let left = quarter - ((z ^ negative) - negative); // of the first quarter; below zero in the second
+    let beyond = left >> 31;
+    let left_over = (left ^ beyond) - beyond;
+    let folded = quarter - left_over;
+    let squares = [product(folded, folded) >> 13, product(left_over, left_over) >> 13];
+    let horner = |[s, c]: [i32; 2], [coefficient, _]: [i32; 2]| {
+        [coefficient + (product(squares[0], s) >> 15), coefficient + (product(squares[1], c) >> 15)]
+    };
+    let factors = coefficients.map(|it| [it, it]).into_iter().rev().reduce(horner).unwrap_or([0; 2]);
+    let sine = (product(folded, factors[0]) + (1 << 15)) >> 16; // ties away from zero, as the sign is put on later
+    let cosine = (product(left_over, factors[1]) + (1 << 15)) >> 16;
+    [(sine ^ negative) - negative, (cosine ^ beyond) - beyond]
+}
+
 /// The same sine as a word within [-1, 1] quarter turns.
 fn fold(angle: Q1_14) -> i32 {
     let z = angle.to_bits();
@@ -160,6 +194,17 @@ mod tests {
     fn rounding_alone_costs_what_the_table_says() {
         let (mean, _) = errors(|z| Q1_14::nearest(z.to_radians().sin()).to_f64(), f64::sin);
         assert!((1.4e-5..1.55e-5).contains(&mean), "{mean:e}");
+    }
+
+    #[test]
+    fn both_together_are_each_of_them_at_every_angle() {
+        for bits in i16::MIN..=i16::MAX {
+            let angle = Q1_14::from_bits(bits);
+            let each =
+                |functions: [fn(Q1_14) -> Q1_14; 2]| functions.map(|it| i32::from(it(angle).to_bits()));
+            assert_eq!(sine_cosine(angle), each([sine, cosine]), "at {bits}");
+            assert_eq!(paper_sine_cosine(angle), each([paper_sine, paper_cosine]), "at {bits}");
+        }
     }
 
     #[test]

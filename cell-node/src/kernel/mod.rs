@@ -40,7 +40,7 @@ mod scalar;
 mod wrench;
 
 pub use projection::Projection;
-pub use scalar::{Operations, PaperWord, Scalar, Word};
+pub use scalar::{Number, Operations, PaperWord, Scalar, Steps, Word};
 pub use wrench::Wrench;
 
 use protocol::fixed::Q1_14;
@@ -63,25 +63,19 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
 }
 
 /// A length of the robot's table; none where it is zero, for then it costs nothing.
-fn length<S: Scalar>(word: Q1_14) -> Option<S> {
-    (word != Q1_14::ZERO).then(|| S::word(word))
-}
-
-/// A joint's angle from its position and its offset, an addition that a zero does not cost.
-#[inline]
-fn angle<S: Scalar>(position: Q1_14, offset: Q1_14) -> Q1_14 {
-    if offset == Q1_14::ZERO { position } else { S::plus_angle(position, offset) }
+fn length<N: Number>(word: Q1_14) -> Option<N> {
+    (word != Q1_14::ZERO).then(|| N::word(word))
 }
 
 /// Sine and cosine of a constant angle.
-fn settled_turn<S: Scalar>(angle: Q1_14) -> [S; 2] {
-    let [sine, cosine, _] = S::fine_turn(angle);
-    [S::settle::<FINE>(sine), S::settle::<FINE>(cosine)]
+fn settled_turn<N: Number>(angle: Q1_14) -> [N; 2] {
+    let [sine, cosine, _] = N::fine_turn(angle);
+    [N::settle::<FINE>(sine), N::settle::<FINE>(cosine)]
 }
 
 /// How a link's twist alpha turns y and z into each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Twist<S> {
+enum Twist<N> {
     /// Not at all.
     None,
     /// By a quarter turn.
@@ -91,10 +85,10 @@ enum Twist<S> {
     /// By a quarter turn the other way.
     Back,
     /// By any other angle.
-    Other { sine: S, cosine: S },
+    Other { sine: N, cosine: N },
 }
 
-impl<S: Scalar> Twist<S> {
+impl<N: Number> Twist<N> {
     fn new(alpha: Q1_14) -> Self {
         match alpha.to_bits() {
             0 => Self::None,

@@ -4,10 +4,18 @@ use std::cell::Cell;
 
 use protocol::fixed::Q1_14;
 
-use super::{Operations, Scalar, Word};
+use super::{Number, Operations, Scalar, Word};
+
+impl Scalar for f64 {
+    type Number = Self;
+
+    fn from_number(number: Self) -> Self {
+        number
+    }
+}
 
 /// The oracle: real numbers, the library's sine and cosine, no rounding.
-impl Scalar for f64 {
+impl Number for f64 {
     type Wide = Self;
     type Fine = Self;
 
@@ -39,12 +47,8 @@ impl Scalar for f64 {
         -self
     }
 
-    fn sine(angle: Q1_14) -> Self {
-        angle.to_radians().sin()
-    }
-
-    fn cosine(angle: Q1_14) -> Self {
-        angle.to_radians().cos()
+    fn sine_cosine(angle: Q1_14) -> [Self; 2] {
+        [angle.to_radians().sin(), angle.to_radians().cos()]
     }
 
     fn fine(word: Q1_14) -> Self {
@@ -52,7 +56,7 @@ impl Scalar for f64 {
     }
 
     fn fine_turn(angle: Q1_14) -> [Self; 3] {
-        [Scalar::sine(angle), Scalar::cosine(angle), 1.0]
+        [angle.to_radians().sin(), angle.to_radians().cos(), 1.0]
     }
 
     fn settle<const F: u32>(constant: Self) -> Self {

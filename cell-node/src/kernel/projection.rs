@@ -20,39 +20,39 @@
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
-use super::{Kernel, Scalar, Twist, angle, length};
+use super::{Kernel, Number, Scalar, Twist, length};
 
 /// The projection kernel, of one cell.
 ///
 /// For a UR5 and a cell on its last link: 103 multiplications, 56 additions or subtractions, 6 sines and
 /// 6 cosines; the paper counts 103, 57, 6 and 6 (Eq. 27).
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Projection<S = Q1_14> {
+pub struct Projection<S: Scalar = Q1_14> {
     /// The joint that moves the cell; 0 when there is none.
     joint: usize,
     /// Whether all axes are upright: then the cell's height and the vertical force are unused.
     upright: bool,
     /// The cell in the frame of joint k.
-    position: [S; 3],
+    position: [S::Number; 3],
     /// Where the contact pushes, in the same frame.
-    force: [S; 3],
+    force: [S::Number; 3],
     /// From the first row up; those of `rows` are in use.
-    links: [Link<S>; MAX_ROWS],
+    links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
 }
 
 /// One row of the robot's table.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Link<S> {
+struct Link<N> {
     kind: RowKind,
     /// d of a prismatic joint, to which its position is added.
     slide: Q1_14,
     /// theta_offset.
     offset: Q1_14,
-    twist: Twist<S>,
-    a: Option<S>,
+    twist: Twist<N>,
+    a: Option<N>,
     /// Absent for joint 1 too: it shifts along the axis of joint 1, which has no moment about it.
-    d: Option<S>,
+    d: Option<N>,
     /// Whether x_l is used.
     x: bool,
     /// Whether this ends a group of parallel axes; then v_l is used.
@@ -61,7 +61,7 @@ struct Link<S> {
 
 /// A component of an axis in the base frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
-enum Component<S> {
+enum Component<N> {
     /// 0, whatever the joints are.
     Zero,
     /// 1, whatever the joints are.
@@ -69,16 +69,16 @@ enum Component<S> {
     /// -1, whatever the joints are.
     MinusOne,
     /// It depends on the joints.
-    Varies(S),
+    Varies(N),
 }
 
-type Axis<S> = [Component<S>; 3];
+type Axis<N> = [Component<N>; 3];
 
 /// What the way down needs of joint l: x_l and z_(l-1).
 #[derive(Clone, Copy, Debug)]
-struct Step<S> {
-    x: Axis<S>,
-    z: Axis<S>,
+struct Step<N> {
+    x: Axis<N>,
+    z: Axis<N>,
     /// The joint's; zero of a fixed row.
     position: Q1_14,
 }
@@ -97,16 +97,16 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
             joint: if chain.is_empty() { 0 } else { parameters.joint.into() },
             rows: chain.len(),
             upright: !slides && below.unwrap_or_default().iter().all(upright),
-            position: parameters.pose.position.map(S::word),
-            force: parameters.pose.normal.map(|word| S::word(word).negative()),
+            position: parameters.pose.position.map(S::Number::word),
+            force: parameters.pose.normal.map(|word| S::Number::word(word).negative()),
             links,
         }
     }
 
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
-        let mut jacobian = [S::zero(); MAX_JOINTS];
+        let mut jacobian = [S::from_number(S::Number::zero()); MAX_JOINTS];
         let links = self.links.get(..self.rows).unwrap_or_default();
-        let position_of = |link: &Link<S>, moving: &mut core::slice::Iter<'_, Q1_14>| {
+        let position_of = |link: &Link<S::Number>, moving: &mut core::slice::Iter<'_, Q1_14>| {
             if link.kind == RowKind::Fixed { None } else { moving.next() }.copied().unwrap_or_default()
         };
 
@@ -122,7 +122,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
             if !link.x {
                 continue;
             }
-            let (sine, cosine) = (S::sine(angle), S::cosine(angle));
+            let [sine, cosine] = S::Number::sine_cosine(angle);
             step.x = combine(x, y, |x, y| Sum::Nothing.plus(cosine, x).plus(sine, y));
             if link.ends {
                 let v = combine(x, y, |x, y| Sum::Nothing.plus(cosine, y).minus(sine, x));
@@ -132,9 +132,9 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
         }
 
         let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (x, y, z);
-        let to_base = |[a, b, c]: [S; 3]| {
+        let to_base = |[a, b, c]: [S::Number; 3]| {
             let row = |x, y, z| Sum::Nothing.plus(a, x).plus(b, y).plus(c, z).component().number();
-            [row(x0, y0, z0), row(x1, y1, z1), if self.upright { S::zero() } else { row(x2, y2, z2) }]
+            [row(x0, y0, z0), row(x1, y1, z1), if self.upright { S::Number::zero() } else { row(x2, y2, z2) }]
         };
         let force = to_base(self.force);
         let mut position = to_base(self.position);
@@ -147,14 +147,14 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
                 RowKind::Fixed => continue,
             };
             if let Some(row) = moving.next() {
-                *row = entry;
+                *row = S::from_number(entry);
             }
         }
         jacobian
     }
 }
 
-impl<S: Scalar> Link<S> {
+impl<N: Number> Link<N> {
     fn new(row: &Row, first: bool, last: bool) -> Self {
         let ends = last || row.alpha != Q1_14::ZERO;
         let a = length(row.a);
@@ -173,18 +173,18 @@ impl<S: Scalar> Link<S> {
     /// The angle from the axes before the group of parallel joints to this joint's.
     fn angle(&self, group: Option<Q1_14>, position: Q1_14) -> Q1_14 {
         let own = match self.kind {
-            RowKind::Revolute => angle::<S>(position, self.offset),
+            RowKind::Revolute => N::plus_angle(position, self.offset),
             RowKind::Prismatic | RowKind::Fixed => self.offset,
         };
-        group.map_or(own, |group| S::plus_angle(group, own))
+        group.map_or(own, |group| N::plus_angle(group, own))
     }
 
     /// p_(l-1) from p_l (Eq. 24).
-    fn shift(&self, [p0, p1, p2]: [S; 3], step: &Step<S>, upright: bool) -> [S; 3] {
+    fn shift(&self, [p0, p1, p2]: [N; 3], step: &Step<N>, upright: bool) -> [N; 3] {
         let ([x0, x1, x2], [z0, z1, z2]) = (step.x, step.z);
         let slides = self.kind == RowKind::Prismatic;
-        let d = if slides { Some(S::word(self.slide.saturating_add(step.position))) } else { self.d };
-        let shift = |p: S, x, z| {
+        let d = if slides { Some(N::word(self.slide.saturating_add(step.position))) } else { self.d };
+        let shift = |p: N, x, z| {
             let sum = self.a.map_or(Sum::Word(p), |a| Sum::Word(p).plus(a, x));
             d.map_or(sum, |d| sum.plus(d, z)).component().number()
         };
@@ -192,9 +192,9 @@ impl<S: Scalar> Link<S> {
     }
 }
 
-impl<S: Scalar> Twist<S> {
+impl<N: Number> Twist<N> {
     /// The second and the third axis after the twist, from those before it.
-    fn turn_axes(self, v: Axis<S>, z: Axis<S>) -> [Axis<S>; 2] {
+    fn turn_axes(self, v: Axis<N>, z: Axis<N>) -> [Axis<N>; 2] {
         match self {
             Self::None => [v, z],
             Self::Ahead => [z, v.map(Component::negative)],
@@ -209,12 +209,12 @@ impl<S: Scalar> Twist<S> {
 }
 
 /// z . f, of a prismatic joint.
-fn along<S: Scalar>([z0, z1, z2]: Axis<S>, [f0, f1, f2]: [S; 3]) -> S {
+fn along<N: Number>([z0, z1, z2]: Axis<N>, [f0, f1, f2]: [N; 3]) -> N {
     Sum::Nothing.plus(f0, z0).plus(f1, z1).plus(f2, z2).component().number()
 }
 
 /// (z x p) . f (Eq. 8).
-fn triple_product<S: Scalar>([z0, z1, z2]: Axis<S>, [p0, p1, p2]: [S; 3], [f0, f1, f2]: [S; 3]) -> S {
+fn triple_product<N: Number>([z0, z1, z2]: Axis<N>, [p0, p1, p2]: [N; 3], [f0, f1, f2]: [N; 3]) -> N {
     let m0 = Sum::Nothing.plus(p2, z1).minus(p1, z2).component();
     let m1 = Sum::Nothing.plus(p0, z2).minus(p2, z0).component();
     let m2 = Sum::Nothing.plus(p1, z0).minus(p0, z1).component();
@@ -222,17 +222,17 @@ fn triple_product<S: Scalar>([z0, z1, z2]: Axis<S>, [p0, p1, p2]: [S; 3], [f0, f
 }
 
 /// One sum for each component of two axes.
-fn combine<S: Scalar>(
-    [a0, a1, a2]: Axis<S>,
-    [b0, b1, b2]: Axis<S>,
-    sum: impl Fn(Component<S>, Component<S>) -> Sum<S>,
-) -> Axis<S> {
+fn combine<N: Number>(
+    [a0, a1, a2]: Axis<N>,
+    [b0, b1, b2]: Axis<N>,
+    sum: impl Fn(Component<N>, Component<N>) -> Sum<N>,
+) -> Axis<N> {
     [sum(a0, b0).component(), sum(a1, b1).component(), sum(a2, b2).component()]
 }
 
-impl<S: Scalar> Component<S> {
+impl<N: Number> Component<N> {
     /// The base frame's own axes.
-    const BASE: [Axis<S>; 3] = [
+    const BASE: [Axis<N>; 3] = [
         [Self::One, Self::Zero, Self::Zero],
         [Self::Zero, Self::One, Self::Zero],
         [Self::Zero, Self::Zero, Self::One],
@@ -247,11 +247,11 @@ impl<S: Scalar> Component<S> {
         }
     }
 
-    fn number(self) -> S {
+    fn number(self) -> N {
         match self {
-            Self::Zero => S::zero(),
-            Self::One => S::one(),
-            Self::MinusOne => S::one().negative(),
+            Self::Zero => N::zero(),
+            Self::One => N::one(),
+            Self::MinusOne => N::one().negative(),
             Self::Varies(number) => number,
         }
     }
@@ -259,42 +259,42 @@ impl<S: Scalar> Component<S> {
 
 /// A sum of products that is as wide as it has to be.
 #[derive(Clone, Copy)]
-enum Sum<S: Scalar> {
+enum Sum<N: Number> {
     Nothing,
-    Word(S),
-    Wide(S::Wide),
+    Word(N),
+    Wide(N::Wide),
 }
 
-impl<S: Scalar> Sum<S> {
+impl<N: Number> Sum<N> {
     /// With the product of a number and a component.
-    fn plus(self, factor: S, component: Component<S>) -> Self {
+    fn plus(self, factor: N, component: Component<N>) -> Self {
         match component {
             Component::Zero => self,
             Component::One => match self.wide() {
                 None => Self::Word(factor),
-                Some(sum) => Self::Wide(S::plus(sum, factor.widen())),
+                Some(sum) => Self::Wide(N::plus(sum, factor.widen())),
             },
             Component::MinusOne => match self.wide() {
                 None => Self::Word(factor.negative()),
-                Some(sum) => Self::Wide(S::minus(sum, factor.widen())),
+                Some(sum) => Self::Wide(N::minus(sum, factor.widen())),
             },
             Component::Varies(number) => Self::Wide(match self.wide() {
                 None => factor.times(number),
-                Some(sum) => S::plus(sum, factor.times(number)),
+                Some(sum) => N::plus(sum, factor.times(number)),
             }),
         }
     }
 
     /// Without the product of a number and a component.
-    fn minus(self, factor: S, component: Component<S>) -> Self {
+    fn minus(self, factor: N, component: Component<N>) -> Self {
         let Component::Varies(number) = component else { return self.plus(factor, component.negative()) };
         Self::Wide(match self.wide() {
             None => factor.negative().times(number),
-            Some(sum) => S::minus(sum, factor.times(number)),
+            Some(sum) => N::minus(sum, factor.times(number)),
         })
     }
 
-    fn wide(self) -> Option<S::Wide> {
+    fn wide(self) -> Option<N::Wide> {
         match self {
             Self::Nothing => None,
             Self::Word(word) => Some(word.widen()),
@@ -303,11 +303,11 @@ impl<S: Scalar> Sum<S> {
     }
 
     /// The sum, rounded once.
-    fn component(self) -> Component<S> {
+    fn component(self) -> Component<N> {
         match self {
             Self::Nothing => Component::Zero,
             Self::Word(word) => Component::Varies(word),
-            Self::Wide(sum) => Component::Varies(S::round(sum)),
+            Self::Wide(sum) => Component::Varies(N::round(sum)),
         }
     }
 }

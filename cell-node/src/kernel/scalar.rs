@@ -1,19 +1,30 @@
 //! The number that a kernel computes with: fixed point on the cell; other types for tests and counts.
 
+use core::fmt::Debug;
+use core::marker::PhantomData;
 use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::{Acc, Q1_14};
 
-use crate::sine::{FINE, QUARTER, fine_sine_cosine, paper_sine, sine};
+use crate::sine::{FINE, QUARTER, fine_sine_cosine, paper_sine_cosine, sine_cosine};
+
+/// What a kernel returns, and by which numbers it computes it.
+pub trait Scalar: Copy {
+    /// What it is computed with.
+    type Number: Number;
+
+    /// A result.
+    fn from_number(number: Self::Number) -> Self;
+}
 
 /// A number that the kernels can compute with, and the wider sums of products in which they do it.
 ///
 /// Words of state are rounded once per sum of products; nothing else loses bits.
-pub trait Scalar: Copy {
+pub trait Number: Copy + Debug + PartialEq {
     /// A sum of products, before it is rounded.
     type Wide: Copy;
     /// What constants are computed with, once, when a kernel is built. An integer here counts steps
-    /// whose size the program follows; see [`Scalar::settle`].
+    /// whose size the program follows; see [`Number::settle`].
     type Fine: Copy
         + Add<Output = Self::Fine>
         + Sub<Output = Self::Fine>
@@ -42,12 +53,22 @@ pub trait Scalar: Copy {
     fn minus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide;
     /// Rounds a sum to the nearest word, ties up, and saturates.
     fn round(sum: Self::Wide) -> Self;
+    /// The sum of two products, or of a number and a product, that is rounded: quicker than [`Number::plus`]. In each of
+    /// two products one factor must be within 1, as sines are.
+    #[must_use]
+    fn rounded_sum(lhs: Self::Wide, rhs: Self::Wide) -> Self {
+        Self::round(Self::plus(lhs, rhs))
+    }
+    /// The difference of the same, rounded.
+    #[must_use]
+    fn rounded_difference(lhs: Self::Wide, rhs: Self::Wide) -> Self {
+        Self::round(Self::minus(lhs, rhs))
+    }
     /// The negative.
+    #[must_use]
     fn negative(self) -> Self;
-    /// The sine of an angle in quarter turns.
-    fn sine(angle: Q1_14) -> Self;
-    /// The cosine of an angle in quarter turns.
-    fn cosine(angle: Q1_14) -> Self;
+    /// Sine and cosine of an angle in quarter turns.
+    fn sine_cosine(angle: Q1_14) -> [Self; 2];
     /// The sum of two angles, wrapped into one turn.
     #[must_use]
     fn plus_angle(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
@@ -62,16 +83,16 @@ pub trait Scalar: Copy {
     fn settle<const F: u32>(constant: Self::Fine) -> Self;
 }
 
-/// A number of 16 bits in the format Q1.14; as a [`Scalar`] its products and sums take 32 bits.
-pub trait Word: Copy {
+/// A number of 16 bits in the format Q1.14, computed with as [`Steps`].
+pub trait Word: Copy + Debug + PartialEq {
     /// The number that a word means.
     fn from_word(word: Q1_14) -> Self;
     /// The word.
     fn to_word(self) -> Q1_14;
-    /// The sine of an angle in quarter turns, of seventh order unless it says otherwise.
+    /// Sine and cosine of an angle in quarter turns, in steps of 2^-14, of seventh order unless it says otherwise.
     #[must_use]
-    fn sine_word(angle: Q1_14) -> Q1_14 {
-        sine(angle)
+    fn sine_cosine(angle: Q1_14) -> [i32; 2] {
+        sine_cosine(angle)
     }
     /// Takes note of an operation, if it counts them.
     fn note(_operation: impl FnOnce(&mut Operations)) {}
@@ -120,62 +141,117 @@ impl Word for PaperWord {
         self.0
     }
 
-    fn sine_word(angle: Q1_14) -> Q1_14 {
-        paper_sine(angle)
+    fn sine_cosine(angle: Q1_14) -> [i32; 2] {
+        paper_sine_cosine(angle)
     }
 }
 
 impl<W: Word> Scalar for W {
+    type Number = Steps<W>;
+
+    #[inline]
+    fn from_number(number: Steps<W>) -> Self {
+        let [low, high, ..] = number.steps.to_le_bytes();
+        Self::from_word(Q1_14::from_bits(i16::from_le_bytes([low, high])))
+    }
+}
+
+/// Steps of 2^-14 within the range of a word, as wide as a processor's register; products and sums take 32 bits too.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Steps<W> {
+    steps: i32,
+    of: PhantomData<W>,
+}
+
+impl<W> Steps<W> {
+    #[inline]
+    const fn new(steps: i32) -> Self {
+        Self { steps, of: PhantomData }
+    }
+
+    /// Steps of 2^-28 that are already half a step of 2^-14 too many.
+    #[inline]
+    fn held(sum: i32) -> Self {
+        let steps = sum >> 14;
+        let [low, high, ..] = steps.to_le_bytes();
+        let fits = i32::from(i16::from_le_bytes([low, high])) == steps;
+        Self::new(if fits { steps } else { (steps >> 31) ^ 0x7FFF })
+    }
+}
+
+/// Half a step of 2^-14 in steps of 2^-28.
+const HALF: i32 = 1 << 13;
+
+impl<W: Word> Number for Steps<W> {
     type Wide = i32;
     type Fine = i64;
 
+    #[inline]
     fn word(word: Q1_14) -> Self {
-        Self::from_word(word)
+        Self::new(word.to_bits().into())
     }
 
+    #[inline]
     fn times(self, rhs: Self) -> i32 {
-        Self::note(|done| done.multiplications += 1);
-        i32::from(self.to_word().to_bits()) * i32::from(rhs.to_word().to_bits()) // at most 2^30
+        W::note(|done| done.multiplications += 1);
+        self.steps.wrapping_mul(rhs.steps) // at most 2^30
     }
 
+    #[inline]
     fn widen(self) -> i32 {
-        i32::from(self.to_word().to_bits()) << 14
+        self.steps << 14
     }
 
+    #[inline]
     fn plus(lhs: i32, rhs: i32) -> i32 {
-        Self::note(|done| done.additions += 1);
+        W::note(|done| done.additions += 1);
         lhs.saturating_add(rhs)
     }
 
+    #[inline]
     fn minus(lhs: i32, rhs: i32) -> i32 {
-        Self::note(|done| done.additions += 1);
+        W::note(|done| done.additions += 1);
         lhs.saturating_sub(rhs)
     }
 
+    #[inline]
     fn round(sum: i32) -> Self {
-        Self::note(|done| done.roundings += 1);
-        let steps = sum.saturating_add(1 << 13) >> 14;
-        let bits = i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX });
-        Self::from_word(Q1_14::from_bits(bits))
+        W::note(|done| done.roundings += 1);
+        Self::held(sum.saturating_add(HALF))
     }
 
+    /// At most 2^29 + 2^30 steps of 2^-28.
+    #[inline]
+    fn rounded_sum(lhs: i32, rhs: i32) -> Self {
+        W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
+        debug_assert!(lhs.checked_add(rhs).and_then(|sum| sum.checked_add(HALF)).is_some(), "{lhs} + {rhs}");
+        Self::held(lhs.wrapping_add(rhs).wrapping_add(HALF))
+    }
+
+    #[inline]
+    fn rounded_difference(lhs: i32, rhs: i32) -> Self {
+        W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
+        debug_assert!(lhs.checked_sub(rhs).and_then(|sum| sum.checked_add(HALF)).is_some(), "{lhs} - {rhs}");
+        Self::held(lhs.wrapping_sub(rhs).wrapping_add(HALF))
+    }
+
+    /// The smallest word becomes the largest.
+    #[inline]
     fn negative(self) -> Self {
-        Self::note(|done| done.negations += 1);
-        Self::from_word(self.to_word().saturating_neg())
+        W::note(|done| done.negations += 1);
+        let negative = -self.steps;
+        Self::new(if negative > 0x7FFF { 0x7FFF } else { negative })
     }
 
-    fn sine(angle: Q1_14) -> Self {
-        Self::note(|done| done.sines += 1);
-        Self::from_word(Self::sine_word(angle))
+    #[inline]
+    fn sine_cosine(angle: Q1_14) -> [Self; 2] {
+        W::note(|done| (done.sines, done.cosines) = (done.sines + 1, done.cosines + 1));
+        W::sine_cosine(angle).map(Self::new)
     }
 
-    fn cosine(angle: Q1_14) -> Self {
-        Self::note(|done| done.cosines += 1);
-        Self::from_word(Self::sine_word(angle.wrapping_add(QUARTER)))
-    }
-
+    #[inline]
     fn plus_angle(lhs: Q1_14, rhs: Q1_14) -> Q1_14 {
-        Self::note(|done| done.angle_additions += 1);
+        W::note(|done| done.angle_additions += 1);
         lhs.wrapping_add(rhs)
     }
 
@@ -189,6 +265,6 @@ impl<W: Word> Scalar for W {
     }
 
     fn settle<const F: u32>(constant: i64) -> Self {
-        Self::from_word(Acc::<F>::from_steps(constant).round())
+        Self::word(Acc::<F>::from_steps(constant).round())
     }
 }

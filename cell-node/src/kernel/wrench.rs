@@ -21,20 +21,20 @@ use core::ops::{Add, Mul, Neg, Sub};
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
-use super::{Kernel, Scalar, Twist, angle, length, settled_turn};
+use super::{Kernel, Number, Scalar, Twist, length, settled_turn};
 
 /// The wrench kernel, of one cell.
 ///
 /// For a UR5 and a cell on its last link: 40 multiplications, 24 additions or subtractions, 5 sines and
 /// 5 cosines. Over 300 poses of a UR5 the torques err by 1.2e-4 Nm in the mean and 1.5e-3 Nm at most.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Wrench<S = Q1_14> {
+pub struct Wrench<S: Scalar = Q1_14> {
     /// The joint that moves the cell; 0 when there is none.
     joint: usize,
     /// The contact's wrench, twisted and shifted by the row of joint k.
-    contact: Wrenched<S>,
+    contact: Wrenched<S::Number>,
     /// From joint k's row down to the base, in the table's order; the first `rows` are in use.
-    links: [Link<S>; MAX_ROWS],
+    links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
 }
 
@@ -61,22 +61,20 @@ impl Live {
 
 /// The steps from the frame of a row to the one below.
 #[derive(Clone, Copy, Debug, PartialEq)]
-struct Link<S> {
+struct Link<N> {
     kind: RowKind,
     /// What the twist computes.
     twisted: Live,
-    twist: Twist<S>,
-    a: Option<S>,
+    twist: Twist<N>,
+    a: Q1_14,
     /// Without the position of a prismatic joint.
-    d: Option<S>,
-    /// d, to which the position of a prismatic joint is added.
-    d_word: Q1_14,
+    d: Q1_14,
     /// What the turn computes.
     turned: Live,
     /// theta_offset.
     offset: Q1_14,
     /// Sine and cosine of theta_offset, where the row does not turn; none of a zero.
-    constant: Option<[S; 2]>,
+    constant: Option<[N; 2]>,
 }
 
 impl<S: Scalar> Kernel<S> for Wrench<S> {
@@ -88,13 +86,14 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
             (link, read) = Link::new(&chain.get(index).copied().unwrap_or_default(), read);
             link
         });
-        let nothing = Wrenched { force: [S::zero(); 3], moment: [S::zero(); 3] };
+        let nothing = Wrenched { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
         let mut contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
         // Fixed rows between the cell and the joint that moves it.
         let mut rows = chain.len();
         let is_fixed = |row: Option<&Row>| row.is_some_and(|row| row.kind == RowKind::Fixed);
         while is_fixed(rows.checked_sub(1).and_then(|last| chain.get(last))) {
-            let above: Link<S> = Link::new(&chain.get(rows - 1).copied().unwrap_or_default(), Live::ALL).0;
+            let above: Link<S::Number> =
+                Link::new(&chain.get(rows - 1).copied().unwrap_or_default(), Live::ALL).0;
             rows -= 1;
             contact = above.turn(contact, Q1_14::ZERO);
             if let Some(row) = rows.checked_sub(1).and_then(|last| chain.get(last)) {
@@ -106,7 +105,7 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
     }
 
     fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
-        let mut jacobian = [S::zero(); MAX_JOINTS];
+        let mut jacobian = [S::from_number(S::Number::zero()); MAX_JOINTS];
         let mut wrench = self.contact;
         let links = self.links.get(..self.rows).unwrap_or_default();
         let moving = jacobian.get_mut(..self.joint).unwrap_or_default();
@@ -119,12 +118,12 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
                 wrench = link.twist_and_shift(wrench, slide);
             } else if slide.is_some() {
                 // Its own row is folded, without the slide.
-                let moment = link.shift_along(wrench.force, wrench.moment, slide.map(S::word));
+                let moment = link.shift_along(wrench.force, wrench.moment, slide.map(S::Number::word));
                 wrench = Wrenched { moment, ..wrench };
             }
             let Wrenched { force: [.., force], moment: [.., moment] } = wrench;
             if let Some((row, _)) = joint {
-                *row = if slide.is_some() { force } else { moment };
+                *row = S::from_number(if slide.is_some() { force } else { moment });
             }
             wrench = link.turn(wrench, position);
         }
@@ -132,11 +131,11 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
     }
 }
 
-impl<S: Scalar> Link<S> {
+impl<N: Number> Link<N> {
     /// The link of a row, when the rows below it read `read` of what it turned; and what it reads itself.
     fn new(row: &Row, read: Live) -> (Self, Live) {
         let twist = Twist::new(row.alpha);
-        let (a, d) = (length(row.a), length(row.d));
+        let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
         let turns = row.kind == RowKind::Revolute;
         let constant = (!turns && row.theta_offset != Q1_14::ZERO).then(|| settled_turn(row.theta_offset));
         let slides = row.kind == RowKind::Prismatic;
@@ -145,22 +144,17 @@ impl<S: Scalar> Link<S> {
         let shifted = if turns || constant.is_some() { read.each(before_turn) } else { read };
         let ([fx, fy, mut fz], [mx, my, mut mz]) = (shifted.force, shifted.moment);
         (fz, mz) = (fz || slides, mz || turns);
-        let moves = slides || d.is_some();
+        let moves = slides || d;
         let twisted = Live {
-            force: [
-                fx || (my && moves),
-                fy || (mx && moves) || (mz && a.is_some()),
-                fz || (my && a.is_some()),
-            ],
+            force: [fx || (my && moves), fy || (mx && moves) || (mz && a), fz || (my && a)],
             moment: [mx, my, mz],
         };
         let link = Self {
             kind: row.kind,
             twisted,
             twist,
-            a,
-            d,
-            d_word: row.d,
+            a: row.a,
+            d: row.d,
             turned: read,
             offset: row.theta_offset,
             constant,
@@ -170,32 +164,29 @@ impl<S: Scalar> Link<S> {
 
     /// `Tz(d) Tx(a) Rx(alpha)`, but only what is live.
     #[inline]
-    fn twist_and_shift(&self, wrench: Wrenched<S>, slide: Option<Q1_14>) -> Wrenched<S> {
+    fn twist_and_shift(&self, wrench: Wrenched<N>, slide: Option<Q1_14>) -> Wrenched<N> {
         let force = self.twist.apply(wrench.force, self.twisted.force);
         let moment = self.twist.apply(wrench.moment, self.twisted.moment);
-        let d = slide.map_or(self.d, |slide| Some(S::word(self.d_word.saturating_add(slide))));
+        let d = slide.map_or_else(|| length(self.d), |slide| Some(N::word(self.d.saturating_add(slide))));
         Wrenched { force, moment: self.shift(force, moment, d) }
     }
 
     /// `Rz(theta)`, but only what is live.
     #[inline]
-    fn turn(&self, wrench: Wrenched<S>, position: Q1_14) -> Wrenched<S> {
+    fn turn(&self, wrench: Wrenched<N>, position: Q1_14) -> Wrenched<N> {
         let ([fx, fy, _], [mx, my, _]) = (self.turned.force, self.turned.moment);
         if !(fx || fy || mx || my) {
             return wrench;
         }
         let [sine, cosine] = match (self.kind, self.constant) {
-            (RowKind::Revolute, _) => {
-                let angle = angle::<S>(position, self.offset);
-                [S::sine(angle), S::cosine(angle)]
-            }
+            (RowKind::Revolute, _) => N::sine_cosine(N::plus_angle(position, self.offset)),
             (RowKind::Prismatic | RowKind::Fixed, Some(constant)) => constant,
             (RowKind::Prismatic | RowKind::Fixed, None) => return wrench,
         };
-        let turn = |[x, y, z]: [S; 3], [live_x, live_y, _]: [bool; 3]| {
+        let turn = |[x, y, z]: [N; 3], [live_x, live_y, _]: [bool; 3]| {
             [
-                if live_x { S::round(S::minus(cosine.times(x), sine.times(y))) } else { x },
-                if live_y { S::round(S::plus(sine.times(x), cosine.times(y))) } else { y },
+                if live_x { N::rounded_difference(cosine.times(x), sine.times(y)) } else { x },
+                if live_y { N::rounded_sum(sine.times(x), cosine.times(y)) } else { y },
                 z,
             ]
         };
@@ -207,41 +198,42 @@ impl<S: Scalar> Link<S> {
 
     /// The moment about an origin that lies (a, 0, d) further down, but only what is live.
     #[inline]
-    fn shift(&self, force: [S; 3], moment: [S; 3], d: Option<S>) -> [S; 3] {
+    fn shift(&self, force: [N; 3], moment: [N; 3], d: Option<N>) -> [N; 3] {
         let ([fx, fy, fz], [mut mx, mut my, mut mz]) = (force, moment);
+        let a: Option<N> = length(self.a);
         let [live_x, live_y, live_z] = self.twisted.moment;
         if live_y {
-            my = match (d, self.a) {
+            my = match (d, a) {
                 (None, None) => my,
-                (Some(d), None) => S::round(S::plus(my.widen(), d.times(fx))),
-                (None, Some(a)) => S::round(S::minus(my.widen(), a.times(fz))),
-                (Some(d), Some(a)) => S::round(S::minus(S::plus(my.widen(), d.times(fx)), a.times(fz))),
+                (Some(d), None) => N::rounded_sum(my.widen(), d.times(fx)),
+                (None, Some(a)) => N::rounded_difference(my.widen(), a.times(fz)),
+                (Some(d), Some(a)) => N::round(N::minus(N::plus(my.widen(), d.times(fx)), a.times(fz))),
             };
         }
         if let Some(d) = d
             && live_x
         {
-            mx = S::round(S::minus(mx.widen(), d.times(fy)));
+            mx = N::rounded_difference(mx.widen(), d.times(fy));
         }
-        if let Some(a) = self.a
+        if let Some(a) = a
             && live_z
         {
-            mz = S::round(S::plus(mz.widen(), a.times(fy)));
+            mz = N::rounded_sum(mz.widen(), a.times(fy));
         }
         [mx, my, mz]
     }
 
     /// The moment about an origin that lies so far along z.
-    fn shift_along(&self, force: [S; 3], moment: [S; 3], d: Option<S>) -> [S; 3] {
-        Self { a: None, ..*self }.shift(force, moment, d)
+    fn shift_along(&self, force: [N; 3], moment: [N; 3], d: Option<N>) -> [N; 3] {
+        Self { a: Q1_14::ZERO, ..*self }.shift(force, moment, d)
     }
 }
 
-impl<S: Scalar> Twist<S> {
+impl<N: Number> Twist<N> {
     /// `Rx(alpha)`, but only what is live.
     #[inline]
-    fn apply(self, [x, y, z]: [S; 3], [_, live_y, live_z]: [bool; 3]) -> [S; 3] {
-        let negative = |number: S, live: bool| if live { number.negative() } else { number };
+    fn apply(self, [x, y, z]: [N; 3], [_, live_y, live_z]: [bool; 3]) -> [N; 3] {
+        let negative = |number: N, live: bool| if live { number.negative() } else { number };
         match self {
             Self::None => [x, y, z],
             Self::Ahead => [x, negative(z, live_y), y],
@@ -249,15 +241,15 @@ impl<S: Scalar> Twist<S> {
             Self::Back => [x, z, negative(y, live_z)],
             Self::Other { sine, cosine } => [
                 x,
-                if live_y { S::round(S::minus(cosine.times(y), sine.times(z))) } else { y },
-                if live_z { S::round(S::plus(sine.times(y), cosine.times(z))) } else { z },
+                if live_y { N::rounded_difference(cosine.times(y), sine.times(z)) } else { y },
+                if live_z { N::rounded_sum(sine.times(y), cosine.times(z)) } else { z },
             ],
         }
     }
 }
 
 /// What must be there before a twist, for these to be there after it.
-fn before_twist<S>(twist: Twist<S>, [x, y, z]: [bool; 3]) -> [bool; 3] {
+fn before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
     match twist {
         Twist::None | Twist::Half => [x, y, z],
         Twist::Ahead | Twist::Back => [x, z, y],
@@ -271,15 +263,15 @@ fn before_turn([x, y, z]: [bool; 3]) -> [bool; 3] {
 }
 
 /// The contact's wrench, twisted and shifted by joint k's row, rounded once.
-fn fold<S: Scalar>(pose: &Pose, row: &Row) -> Wrenched<S> {
+fn fold<N: Number>(pose: &Pose, row: &Row) -> Wrenched<N> {
     let (force, moment) = folded(
-        pose.normal.map(S::fine),
-        pose.position.map(S::fine),
-        S::fine_turn(row.alpha),
-        (S::fine(row.a), S::fine(row.d)),
+        pose.normal.map(N::fine),
+        pose.position.map(N::fine),
+        N::fine_turn(row.alpha),
+        (N::fine(row.a), N::fine(row.d)),
     );
     // 14 bits of a word and 28 of the twist; and for the moment 14 more of a length.
-    Wrenched { force: force.map(S::settle::<42>), moment: moment.map(S::settle::<56>) }
+    Wrenched { force: force.map(N::settle::<42>), moment: moment.map(N::settle::<56>) }
 }
 
 /// The same before rounding. Words of 16 bits give no number above 2^61.

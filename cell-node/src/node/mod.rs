@@ -295,8 +295,14 @@ impl Node {
         let Some(in_use) = in_use.filter(|_| answers) else { return self.summing.sum.skip() };
         let skin = &self.stimuli.sensed.skin;
         let force = Force::fuse(skin.contact, skin.proximity, &in_use.parameters.contact);
-        let torque =
-            force.is_active().then(|| Torque::new(&in_use.kernel.jacobian(&joints.positions), force));
+        let jacobian;
+        let torque = if force.is_active() {
+            jacobian = in_use.kernel.jacobian(&joints.positions);
+            let moved = jacobian.get(..in_use.parameters.joint.into()).unwrap_or_default();
+            Some(Torque::new(moved, force))
+        } else {
+            None
+        };
         if self.summing.sum.is_on() {
             self.active = torque.is_some();
             self.summing.begin(now, age, (epoch, in_use.period()), torque);
@@ -306,7 +312,7 @@ impl Node {
     }
 
     /// Answers with its own torque; one answer of zero marks the end of a contact.
-    fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque>) {
+    fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque<'_>>) {
         let (Some(from), Some(in_use)) = (self.identity.cell, &self.configuration.in_use) else { return };
         let (length, format) = (in_use.length(), in_use.parameters.torque_format);
         let torque = match torque {

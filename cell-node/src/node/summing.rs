@@ -166,7 +166,7 @@ impl Summing {
         now: Micros,
         age: Span,
         (epoch, period): (Epoch, Span),
-        own: Option<Torque>,
+        own: Option<Torque<'_>>,
     ) {
         let (at, up) = (now - age, self.network.up());
         self.said_before = self.sum.said_in(epoch.before());

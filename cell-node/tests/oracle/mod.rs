@@ -106,7 +106,8 @@ impl Errors {
     ) -> Self {
         Self::of(|case| {
             let force = Force::from_steps((case.force * 65_536.0) as i64);
-            let torque = Torque::new(&jacobian(&case.parameters(), &case.words()), force);
+            let jacobian = jacobian(&case.parameters(), &case.words());
+            let torque = Torque::new(&jacobian, force);
             torque.words(TorqueFormat::Q3_12).map(|word| TorqueFormat::Q3_12.real(word))
         })
     }

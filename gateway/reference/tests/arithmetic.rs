@@ -4,8 +4,7 @@
 use cell_node::contact::{Force, Torque};
 use cell_node::sum::{Begin, Sum, Words};
 use protocol::fixed::{Q, Q1_14, TorqueFormat};
-use protocol::packet::padded;
-use protocol::packet::{Epoch, WORDS};
+use protocol::packet::{Epoch, WORDS, padded};
 use protocol::parameters::{Parameter, Parameters, Slots};
 use protocol::time::{Micros, Span};
 use serde_json::Value;
@@ -25,9 +24,9 @@ fn words<const N: usize>(value: &Value) -> [i16; N] {
     words.try_into().unwrap()
 }
 
-fn torque(of: &Value) -> Torque {
-    let jacobian = words::<WORDS>(&of["jacobian"]).map(Q1_14::from_bits);
-    Torque::new(&padded(&jacobian), Force::from_steps(of["force"].as_i64().unwrap()))
+/// J, and the force on it.
+fn pressed(of: &Value) -> ([Q1_14; WORDS], Force) {
+    (words(&of["jacobian"]).map(Q1_14::from_bits), Force::from_steps(of["force"].as_i64().unwrap()))
 }
 
 // FORCE-1, TORQUE-1
@@ -41,7 +40,9 @@ fn forces_and_torques_are_those_of_the_other_program() {
         let force =
             Force::fuse([c1, c2, c3].map(Q::from_bits), Q1_14::from_bits(proximity), &rule.contact).steps();
         assert_eq!(Some(i64::from(force)), row["force"].as_i64(), "{row}");
-        assert_eq!(torque(&row).words(TorqueFormat::Q3_12)[..6], words::<6>(&row["torque"]), "{row}");
+        let (jacobian, force) = pressed(&row);
+        let torque = Torque::new(&jacobian, force);
+        assert_eq!(torque.words(TorqueFormat::Q3_12)[..6], words::<6>(&row["torque"]), "{row}");
     }
 }
 
@@ -65,7 +66,10 @@ fn sums_and_what_rounding_carries_are_those_of_the_other_program() {
                 speaks: true,
                 children: (1 << children.len()) - 1,
             };
-            let own = step["own"].as_object().map(|_| torque(&step["own"]).exact());
+            let own = step["own"].as_object().map(|_| {
+                let (jacobian, force) = pressed(&step["own"]);
+                Torque::new(&jacobian, force).exact()
+            });
             sum.begin(&begin, own.as_ref());
             for (port, child) in children.iter().enumerate() {
                 let count = u8::try_from(child["count"].as_u64().unwrap()).unwrap();

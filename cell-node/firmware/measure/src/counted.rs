@@ -44,8 +44,8 @@ pub(crate) extern "C" fn torque_words(
     force: i32,
     out: &mut [i16; MAX_JOINTS],
 ) {
-    let _ = joints;
-    *out = Torque::new(jacobian, Force::from_steps(force.into())).words(TorqueFormat::Q3_12);
+    let moved = jacobian.get(..joints.into()).unwrap_or_default();
+    *out = Torque::new(moved, Force::from_steps(force.into())).words(TorqueFormat::Q3_12);
 }
 
 /// A configured cell with its node id.

@@ -57,12 +57,7 @@ fn count(machine: &mut Machine) {
             Some(done) if *done < COUNTED => *done += 1,
             _ => continue,
         }
-        let (parameters, joints) = (case.parameters(), case.joints());
-        let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
-        let mut torque = [0; MAX_JOINTS];
-        counted::wrench(&Wrench::new(&parameters), &joints, &mut jacobian);
-        counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque);
-        counted::projection(&Projection::new(&parameters), &joints, &mut jacobian);
+        kernels(case);
         reply(case);
         machine.text(case.chain().name);
         machine.words([i16::from(case.joint)].into_iter());
@@ -79,7 +74,19 @@ fn stack(machine: &mut Machine) {
     machine.line();
 }
 
+/// Both kernels and the torque's words of a row.
+#[inline(never)]
+fn kernels(case: &cases::Case) {
+    let (parameters, joints) = (case.parameters(), case.joints());
+    let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
+    let mut torque = [0; MAX_JOINTS];
+    counted::projection(&Projection::new(&parameters), &joints, &mut jacobian);
+    counted::wrench(&Wrench::new(&parameters), &joints, &mut jacobian);
+    counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque);
+}
+
 /// One reply of a cell on this chain.
+#[inline(never)]
 fn reply(case: &cases::Case) {
     let mut node = counted::node(&case.parameters());
     let joints = Joints { positions: case.joints(), in_use: case.chain().joints() };
