@@ -86,18 +86,47 @@ impl<'a> Torque<'a> {
     /// most half a step, 1.3e-4 Nm.
     #[must_use]
     pub fn words(&self, format: TorqueFormat) -> [i16; MAX_JOINTS] {
+        let mut words = [0; MAX_JOINTS];
+        self.write_words(format, &mut words);
+        words
+    }
+
+    /// The same; words beyond those of J stay as they are.
+    #[inline]
+    pub fn write_words(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
+        let mut beyond = 0;
+        for (word, row) in words.iter_mut().zip(self.jacobian) {
+            let steps = self.steps(*row, format);
+            // Its magnitude, or one less: none of them is beyond a word where all bits together are not.
+            beyond |= steps ^ (steps >> 31);
+            let [low, high, ..] = steps.to_le_bytes();
+            *word = i16::from_le_bytes([low, high]);
+        }
+        if beyond > i16::MAX.into() {
+            self.saturate(format, words);
+        }
+    }
+
+    /// Holds the words that do not fit.
+    #[cold]
+    #[inline(never)]
+    fn saturate(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
+        for (word, row) in words.iter_mut().zip(self.jacobian) {
+            let steps = self.steps(*row, format);
+            *word = i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX });
+        }
+    }
+
+    /// One torque, rounded, in steps of a format.
+    #[inline(always)]
+    fn steps(&self, row: Q1_14, format: TorqueFormat) -> i32 {
         // Products of 16 and 32 bits in 32: (J high + (J low >> 16)) 2^16 is below J F by less than that, and so little is
         // cut off by the shift too.
         let (high, low) = (self.force.0 >> 16, self.force.0 & 0xFFFF);
         let shift = 14 - format.fraction(); // of 2^-14 Nm
         let half = (1 << shift) >> 1;
-        let mut words = [0; MAX_JOINTS];
-        for (word, row) in words.iter_mut().zip(self.jacobian) {
-            let row = i32::from(row.to_bits());
-            let steps = (row.wrapping_mul(high) + (row.wrapping_mul(low) >> 16) + half) >> shift;
-            *word = i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX });
-        }
-        words
+        let row = i32::from(row.to_bits());
+        (row.wrapping_mul(high) + (row.wrapping_mul(low) >> 16) + half) >> shift
     }
 }
 

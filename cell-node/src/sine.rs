@@ -99,8 +99,9 @@ fn both<const TERMS: usize>(angle: Q1_14, coefficients: [i32; TERMS]) -> [i32; 2
         [coefficient + (product(squares[0], s) >> 15), coefficient + (product(squares[1], c) >> 15)]
     };
     let factors = coefficients.map(|it| [it, it]).into_iter().rev().reduce(horner).unwrap_or([0; 2]);
-    let sine = (product(folded, factors[0]) + (1 << 15)) >> 16; // ties away from zero, as the sign is put on later
-    let cosine = (product(left_over, factors[1]) + (1 << 15)) >> 16;
+    // Rounded, ties away from zero, as the sign is put on later.
+    let sine = ((product(folded, factors[0]) >> 15) + 1) >> 1;
+    let cosine = ((product(left_over, factors[1]) >> 15) + 1) >> 1;
     [(sine ^ negative) - negative, (cosine ^ beyond) - beyond]
 }
 

@@ -55,11 +55,19 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
     /// Never panics, whatever the words are.
     fn new(parameters: &Parameters) -> Self;
 
-    /// J_l in m, [-2, 2), for joints l = 1..=14 (zero for l > k), from joint positions in quarter turns; of prismatic
-    /// joints a number, from positions in m.
+    /// Writes J_l in m, [-2, 2), for the joints l = 1..=k that move the cell, and leaves the others as they are: from
+    /// joint positions in quarter turns; of prismatic joints a number, from positions in m.
     ///
     /// Never panics and never wraps: what does not fit is held at the ends of its range. Bounded work.
-    fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS];
+    fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]);
+
+    /// The same, returned; zero for l > k.
+    #[must_use]
+    fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
+        let mut jacobian = [S::from_number(S::Number::zero()); MAX_JOINTS];
+        self.write_jacobian(joints, &mut jacobian);
+        jacobian
+    }
 }
 
 /// A length of the robot's table; none where it is zero, for then it costs nothing.

@@ -47,6 +47,10 @@ impl Number for f64 {
         -self
     }
 
+    fn norm(_: [Self; 3]) -> Option<u32> {
+        None
+    }
+
     fn sine_cosine(angle: Q1_14) -> [Self; 2] {
         [angle.to_radians().sin(), angle.to_radians().cos()]
     }

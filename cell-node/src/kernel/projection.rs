@@ -103,8 +103,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
         }
     }
 
-    fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
-        let mut jacobian = [S::from_number(S::Number::zero()); MAX_JOINTS];
+    fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
         let links = self.links.get(..self.rows).unwrap_or_default();
         let position_of = |link: &Link<S::Number>, moving: &mut core::slice::Iter<'_, Q1_14>| {
             if link.kind == RowKind::Fixed { None } else { moving.next() }.copied().unwrap_or_default()
@@ -150,7 +149,6 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
                 *row = S::from_number(entry);
             }
         }
-        jacobian
     }
 }
 

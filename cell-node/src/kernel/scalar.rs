@@ -67,6 +67,36 @@ pub trait Number: Copy + Debug + PartialEq {
     /// The negative.
     #[must_use]
     fn negative(self) -> Self;
+    /// The sum, where it is known to be within the range of a word.
+    fn bounded_plus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide {
+        Self::plus(lhs, rhs)
+    }
+    /// The difference, where it is known to be within the range of a word.
+    fn bounded_minus(lhs: Self::Wide, rhs: Self::Wide) -> Self::Wide {
+        Self::minus(lhs, rhs)
+    }
+    /// Rounds a sum that is known to be within the range of a word.
+    #[must_use]
+    fn bounded(sum: Self::Wide) -> Self {
+        Self::round(sum)
+    }
+    /// The number and a product, rounded, where it is known to be within the range of a word.
+    #[must_use]
+    fn bounded_more(self, product: Self::Wide) -> Self {
+        Self::round(Self::plus(self.widen(), product))
+    }
+    /// The number less a product, of the same kind.
+    #[must_use]
+    fn bounded_less(self, product: Self::Wide) -> Self {
+        Self::round(Self::minus(self.widen(), product))
+    }
+    /// The negative of a number that is known not to be the smallest word.
+    #[must_use]
+    fn bounded_negative(self) -> Self {
+        self.negative()
+    }
+    /// The length of a vector in steps of 2^-14, rounded up; none where it is not known.
+    fn norm(vector: [Self; 3]) -> Option<u32>;
     /// Sine and cosine of an angle in quarter turns.
     fn sine_cosine(angle: Q1_14) -> [Self; 2];
     /// The sum of two angles, wrapped into one turn.
@@ -179,6 +209,19 @@ impl<W> Steps<W> {
     }
 }
 
+/// Steps of 2^-28 in steps of 2^-14, rounded, ties up. In two steps, because the half that is added fits an instruction.
+#[inline]
+const fn to_steps(sum: i32) -> i32 {
+    ((sum >> 13) + 1) >> 1
+}
+
+/// What is known to be a word.
+#[inline]
+fn within_word(steps: i32) -> i32 {
+    debug_assert!(i16::try_from(steps).is_ok(), "{steps} is no word");
+    steps
+}
+
 /// Half a step of 2^-14 in steps of 2^-28.
 const HALF: i32 = 1 << 13;
 
@@ -233,6 +276,49 @@ impl<W: Word> Number for Steps<W> {
         W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
         debug_assert!(lhs.checked_sub(rhs).and_then(|sum| sum.checked_add(HALF)).is_some(), "{lhs} - {rhs}");
         Self::held(lhs.wrapping_sub(rhs).wrapping_add(HALF))
+    }
+
+    #[inline]
+    fn bounded_plus(lhs: i32, rhs: i32) -> i32 {
+        W::note(|done| done.additions += 1);
+        lhs.wrapping_add(rhs)
+    }
+
+    #[inline]
+    fn bounded_minus(lhs: i32, rhs: i32) -> i32 {
+        W::note(|done| done.additions += 1);
+        lhs.wrapping_sub(rhs)
+    }
+
+    #[inline]
+    fn bounded(sum: i32) -> Self {
+        W::note(|done| done.roundings += 1);
+        Self::new(within_word(to_steps(sum)))
+    }
+
+    #[inline]
+    fn bounded_more(self, product: i32) -> Self {
+        W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
+        Self::new(within_word(self.steps + to_steps(product)))
+    }
+
+    #[inline]
+    fn bounded_less(self, product: i32) -> Self {
+        W::note(|done| (done.additions, done.roundings) = (done.additions + 1, done.roundings + 1));
+        Self::new(within_word(self.steps + to_steps(product.wrapping_neg())))
+    }
+
+    #[inline]
+    fn bounded_negative(self) -> Self {
+        W::note(|done| done.negations += 1);
+        debug_assert!(self.steps > -0x8000);
+        Self::new(-self.steps)
+    }
+
+    fn norm(vector: [Self; 3]) -> Option<u32> {
+        // At most 3 * 2^30.
+        let square: u32 = vector.iter().map(|it| it.steps.unsigned_abs().pow(2)).sum();
+        Some(square.isqrt() + 1)
     }
 
     /// The smallest word becomes the largest.

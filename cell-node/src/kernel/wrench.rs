@@ -16,11 +16,14 @@
 //! that carries the cell are constant, but for a slide, as are fixed rows right below it: they are folded into the six
 //! stored words. What nobody reads further down the chain is not computed: [`Live`] says what is, worked out once.
 
+mod range;
+
 use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
+use self::range::{Bounded, Held, Rounding, is_bounded};
 use super::{Kernel, Number, Scalar, Twist, length, settled_turn};
 
 /// The wrench kernel, of one cell.
@@ -33,9 +36,11 @@ pub struct Wrench<S: Scalar = Q1_14> {
     joint: usize,
     /// The contact's wrench, twisted and shifted by the row of joint k.
     contact: Wrenched<S::Number>,
-    /// From joint k's row down to the base, in the table's order; the first `rows` are in use.
+    /// From joint k's row down to the base; the first `rows` are in use.
     links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
+    /// Whether no number on the way can leave the range of a word, wherever the joints are; then nothing is held.
+    is_bounded: bool,
 }
 
 /// A force of one newton and its moment in m (that is, Nm per N); or something that is known of each of their
@@ -60,30 +65,66 @@ impl Live {
 }
 
 /// The steps from the frame of a row to the one below.
+// In this order: what is read first lies where a short instruction of a Cortex-M0 reaches it.
+#[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Link<N> {
+    /// What has to be computed: bits of [`due`].
+    due: u32,
+    /// Which joint moves it, from 0; of a fixed row the one above it.
+    joint: u8,
     kind: RowKind,
-    /// What the twist computes.
-    twisted: Live,
-    twist: Twist<N>,
     a: Q1_14,
     /// Without the position of a prismatic joint.
     d: Q1_14,
-    /// What the turn computes.
-    turned: Live,
     /// theta_offset.
     offset: Q1_14,
+    twist: Twist<N>,
     /// Sine and cosine of theta_offset, where the row does not turn; none of a zero.
     constant: Option<[N; 2]>,
+}
+
+/// What of a row is computed, because its own row of J or a row further down reads it.
+mod due {
+    /// Each of what the turn computes.
+    pub(super) const FX: u32 = 1;
+    pub(super) const FY: u32 = 2;
+    pub(super) const MX: u32 = 4;
+    pub(super) const MY: u32 = 8;
+    /// All of it.
+    pub(super) const TURN: u32 = FX | FY | MX | MY;
+    /// The moments that d shifts.
+    pub(super) const D: u32 = 16;
+    /// The moments that a shifts.
+    pub(super) const A: u32 = 32;
+    /// Each of what a twist computes that is none by quarter turns.
+    pub(super) const TWISTED_FY: u32 = 64;
+    pub(super) const TWISTED_FZ: u32 = 128;
+    pub(super) const TWISTED_MY: u32 = 256;
+    pub(super) const TWISTED_MZ: u32 = 512;
+    /// By how much it is twisted.
+    pub(super) const AHEAD: u32 = 1 << 11;
+    pub(super) const BACK: u32 = 1 << 12;
+    pub(super) const HALF: u32 = 1 << 13;
+    /// A row without a joint.
+    pub(super) const PASS: u32 = 1 << 14;
+    /// All that a turn can compute.
+    pub(super) const ALL: u32 = 1 << 15;
+    /// A twist, or no joint.
+    pub(super) const MORE: u32 = 1 << 16;
 }
 
 impl<S: Scalar> Kernel<S> for Wrench<S> {
     fn new(parameters: &Parameters) -> Self {
         let chain = parameters.chain();
         let mut read = Live::NOTHING; // by the rows further down: nothing below joint 1
-        let links = core::array::from_fn(|index| {
+        let mut joint = 0;
+        let mut links = core::array::from_fn(|index| {
+            let row = chain.get(index).copied().unwrap_or_default();
             let link;
-            (link, read) = Link::new(&chain.get(index).copied().unwrap_or_default(), read);
+            (link, read) = Link::new(&row, read);
+            let link = Link { joint, ..link };
+            joint += u8::from(row.kind != RowKind::Fixed);
             link
         });
         let nothing = Wrenched { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
@@ -95,39 +136,98 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
             let above: Link<S::Number> =
                 Link::new(&chain.get(rows - 1).copied().unwrap_or_default(), Live::ALL).0;
             rows -= 1;
-            contact = above.turn(contact, Q1_14::ZERO);
+            above.turn_by_offset(&mut contact);
             if let Some(row) = rows.checked_sub(1).and_then(|last| chain.get(last)) {
                 // Not the slide of a prismatic joint.
-                contact = Link::new(row, Live::ALL).0.twist_and_shift(contact, None);
+                let link = Link::new(row, Live::ALL).0;
+                link.twist_and_shift::<Held>(&mut contact, length(row.d));
             }
         }
-        Self { joint: if rows == 0 { 0 } else { parameters.joint.into() }, contact, links, rows }
+        links.get_mut(..rows).unwrap_or_default().reverse();
+        let is_bounded = chain.iter().all(|row| row.kind != RowKind::Prismatic)
+            && is_bounded(&contact, chain.get(..rows).unwrap_or_default());
+        Self { joint: if rows == 0 { 0 } else { parameters.joint.into() }, contact, links, rows, is_bounded }
     }
 
-    fn jacobian(&self, joints: &[Q1_14; MAX_JOINTS]) -> [S; MAX_JOINTS] {
-        let mut jacobian = [S::from_number(S::Number::zero()); MAX_JOINTS];
-        let mut wrench = self.contact;
+    #[inline(always)]
+    fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
         let links = self.links.get(..self.rows).unwrap_or_default();
-        let moving = jacobian.get_mut(..self.joint).unwrap_or_default();
-        let mut moving = moving.iter_mut().zip(joints).rev();
-        for (index, link) in links.iter().rev().enumerate() {
-            let joint = if link.kind == RowKind::Fixed { None } else { moving.next() };
-            let position = joint.as_ref().map_or(Q1_14::ZERO, |(_, position)| **position);
-            let slide = (link.kind == RowKind::Prismatic).then_some(position);
-            if index > 0 {
-                wrench = link.twist_and_shift(wrench, slide);
-            } else if slide.is_some() {
-                // Its own row is folded, without the slide.
-                let moment = link.shift_along(wrench.force, wrench.moment, slide.map(S::Number::word));
-                wrench = Wrenched { moment, ..wrench };
-            }
-            let Wrenched { force: [.., force], moment: [.., moment] } = wrench;
-            if let Some((row, _)) = joint {
-                *row = S::from_number(if slide.is_some() { force } else { moment });
-            }
-            wrench = link.turn(wrench, position);
+        if self.is_bounded {
+            down_bounded(self.contact, links, joints, jacobian);
+        } else {
+            let moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
+            let positions = joints.get(..self.joint).unwrap_or_default().iter().rev();
+            seldom();
+            down(self.contact, links, moving, positions);
         }
-        jacobian
+    }
+}
+
+/// The contact's wrench down to the base, and J on the way, of revolute joints and fixed rows: where no number can leave
+/// its range.
+#[inline(always)]
+fn down_bounded<S: Scalar>(
+    mut wrench: Wrenched<S::Number>,
+    links: &[Link<S::Number>],
+    joints: &[Q1_14; MAX_JOINTS],
+    jacobian: &mut [S; MAX_JOINTS],
+) {
+    let mut links = links.iter();
+    let Some(mut link) = links.next() else { return };
+    loop {
+        let joint = usize::from(link.joint);
+        let (Some(row), Some(position)) = (jacobian.get_mut(joint), joints.get(joint)) else { return };
+        let [.., moment] = wrench.moment;
+        *row = S::from_number(moment);
+        let Some(next) = links.next() else { return };
+        link.turn::<Bounded>(&mut wrench, *position);
+        link = next;
+        if link.is_due(due::MORE) {
+            while link.is_due(due::PASS) {
+                seldom();
+                link.pass(&mut wrench);
+                let Some(next) = links.next() else { return };
+                link = next;
+            }
+            link.twist_by_alpha::<Bounded>(&mut wrench);
+        }
+        // Only now: it would be in the way of the twist.
+        Link::shift::<Bounded>(&mut wrench, link.own_d(), link.own_a());
+    }
+}
+
+/// The same of any chain.
+#[inline(never)]
+fn down<'a, S: Scalar + 'a>(
+    mut wrench: Wrenched<S::Number>,
+    links: &[Link<S::Number>],
+    mut moving: impl Iterator<Item = &'a mut S>,
+    mut positions: impl Iterator<Item = &'a Q1_14>,
+) {
+    for (index, link) in links.iter().enumerate() {
+        let (mut row, mut position) = (None, Q1_14::ZERO);
+        if link.kind != RowKind::Fixed {
+            (row, position) = (moving.next(), positions.next().copied().unwrap_or_default());
+        }
+        let slide = (link.kind == RowKind::Prismatic).then_some(position);
+        if index > 0 {
+            let d = slide
+                .map_or_else(|| link.own_d(), |slide| Some(S::Number::word(link.d.saturating_add(slide))));
+            link.twist_and_shift::<Held>(&mut wrench, d);
+        } else if let Some(slide) = slide {
+            // Its own row is folded, without the slide.
+            let d = Some(S::Number::word(slide));
+            Link::shift::<Held>(&mut wrench, d, None);
+        }
+        let Wrenched { force: [.., force], moment: [.., moment] } = wrench;
+        if let Some(row) = &mut row {
+            **row = S::from_number(if slide.is_some() { force } else { moment });
+        }
+        match link.kind {
+            RowKind::Revolute if link.is_due(due::TURN) => link.turn::<Held>(&mut wrench, position),
+            RowKind::Revolute => {}
+            RowKind::Prismatic | RowKind::Fixed => link.turn_by_offset(&mut wrench),
+        }
     }
 }
 
@@ -149,101 +249,188 @@ impl<N: Number> Link<N> {
             force: [fx || (my && moves), fy || (mx && moves) || (mz && a), fz || (my && a)],
             moment: [mx, my, mz],
         };
-        let link = Self {
-            kind: row.kind,
-            twisted,
-            twist,
-            a: row.a,
-            d: row.d,
-            turned: read,
-            offset: row.theta_offset,
-            constant,
-        };
+        let [_, twisted_fy, twisted_fz] = twisted.force;
+        let ([turned_fx, turned_fy, _], [turned_mx, turned_my, _]) = (read.force, read.moment);
+        let due = [
+            (turned_fx, due::FX),
+            (turned_fy, due::FY),
+            (turned_mx, due::MX),
+            (turned_my, due::MY),
+            ((mx || my) && moves, due::D),
+            ((my || mz) && a, due::A),
+            (twisted_fy, due::TWISTED_FY),
+            (twisted_fz, due::TWISTED_FZ),
+            (my, due::TWISTED_MY),
+            (mz, due::TWISTED_MZ),
+            (twist == Twist::Ahead, due::AHEAD),
+            (twist == Twist::Back, due::BACK),
+            (twist == Twist::Half, due::HALF),
+            (row.kind == RowKind::Fixed, due::PASS),
+            (row.kind == RowKind::Fixed || twist != Twist::None, due::MORE),
+            (turned_fx && turned_fy && turned_mx && turned_my, due::ALL),
+        ];
+        let due = due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all });
+        let (kind, offset) = (row.kind, row.theta_offset);
+        let link = Self { kind, joint: 0, due, twist, a: row.a, d: row.d, offset, constant };
         (link, twisted.each(|live| before_twist(twist, live)))
     }
 
-    /// `Tz(d) Tx(a) Rx(alpha)`, but only what is live.
-    #[inline]
-    fn twist_and_shift(&self, wrench: Wrenched<N>, slide: Option<Q1_14>) -> Wrenched<N> {
-        let force = self.twist.apply(wrench.force, self.twisted.force);
-        let moment = self.twist.apply(wrench.moment, self.twisted.moment);
-        let d = slide.map_or_else(|| length(self.d), |slide| Some(N::word(self.d.saturating_add(slide))));
-        Wrenched { force, moment: self.shift(force, moment, d) }
+    fn is_due(&self, bit: u32) -> bool {
+        self.due & bit != 0
     }
 
-    /// `Rz(theta)`, but only what is live.
-    #[inline]
-    fn turn(&self, wrench: Wrenched<N>, position: Q1_14) -> Wrenched<N> {
-        let ([fx, fy, _], [mx, my, _]) = (self.turned.force, self.turned.moment);
-        if !(fx || fy || mx || my) {
-            return wrench;
-        }
-        let [sine, cosine] = match (self.kind, self.constant) {
-            (RowKind::Revolute, _) => N::sine_cosine(N::plus_angle(position, self.offset)),
-            (RowKind::Prismatic | RowKind::Fixed, Some(constant)) => constant,
-            (RowKind::Prismatic | RowKind::Fixed, None) => return wrench,
-        };
-        let turn = |[x, y, z]: [N; 3], [live_x, live_y, _]: [bool; 3]| {
-            [
-                if live_x { N::rounded_difference(cosine.times(x), sine.times(y)) } else { x },
-                if live_y { N::rounded_sum(sine.times(x), cosine.times(y)) } else { y },
-                z,
-            ]
-        };
-        Wrenched {
-            force: turn(wrench.force, self.turned.force),
-            moment: turn(wrench.moment, self.turned.moment),
+    /// d where the row does not slide, and where somebody reads what it shifts.
+    #[inline(always)]
+    fn own_d(&self) -> Option<N> {
+        self.is_due(due::D).then(|| N::word(self.d))
+    }
+
+    /// a, where somebody reads what it shifts.
+    #[inline(always)]
+    fn own_a(&self) -> Option<N> {
+        self.is_due(due::A).then(|| N::word(self.a))
+    }
+
+    /// `Tz(d) Tx(a) Rx(alpha)`.
+    #[inline(always)]
+    fn twist_and_shift<R: Rounding>(&self, wrench: &mut Wrenched<N>, d: Option<N>) {
+        self.twist_by_alpha::<R>(wrench);
+        Self::shift::<R>(wrench, d, self.own_a());
+    }
+
+    /// `Rx(alpha)`.
+    #[inline(always)]
+    fn twist_by_alpha<R: Rounding>(&self, wrench: &mut Wrenched<N>) {
+        let Wrenched { force: [_, fy, fz], moment: [_, my, mz] } = wrench;
+        if self.is_due(due::AHEAD) {
+            (*fy, *fz) = (R::negative(*fz), *fy);
+            (*my, *mz) = (R::negative(*mz), *my);
+        } else if self.is_due(due::BACK) {
+            (*fy, *fz) = (*fz, R::negative(*fy));
+            (*my, *mz) = (*mz, R::negative(*my));
+        } else if self.is_due(due::HALF) {
+            (*fy, *fz) = (R::negative(*fy), R::negative(*fz));
+            (*my, *mz) = (R::negative(*my), R::negative(*mz));
+        } else if let Twist::Other { sine, cosine } = self.twist {
+            seldom();
+            self.twist_by([sine, cosine], wrench);
         }
     }
 
-    /// The moment about an origin that lies (a, 0, d) further down, but only what is live.
-    #[inline]
-    fn shift(&self, force: [N; 3], moment: [N; 3], d: Option<N>) -> [N; 3] {
-        let ([fx, fy, fz], [mut mx, mut my, mut mz]) = (force, moment);
-        let a: Option<N> = length(self.a);
-        let [live_x, live_y, live_z] = self.twisted.moment;
-        if live_y {
-            my = match (d, a) {
-                (None, None) => my,
-                (Some(d), None) => N::rounded_sum(my.widen(), d.times(fx)),
-                (None, Some(a)) => N::rounded_difference(my.widen(), a.times(fz)),
-                (Some(d), Some(a)) => N::round(N::minus(N::plus(my.widen(), d.times(fx)), a.times(fz))),
-            };
+    /// `Rx` of an angle that is no quarter turn, but only what is due.
+    #[inline(never)]
+    fn twist_by(&self, [sine, cosine]: [N; 2], wrench: &mut Wrenched<N>) {
+        let Wrenched { force: [_, fy, fz], moment: [_, my, mz] } = *wrench;
+        let along = |y: N, z: N| N::rounded_difference(cosine.times(y), sine.times(z));
+        let across = |y: N, z: N| N::rounded_sum(sine.times(y), cosine.times(z));
+        let Wrenched { force: [_, new_fy, new_fz], moment: [_, new_my, new_mz] } = wrench;
+        if self.is_due(due::TWISTED_FY) {
+            *new_fy = along(fy, fz);
         }
-        if let Some(d) = d
-            && live_x
+        if self.is_due(due::TWISTED_FZ) {
+            *new_fz = across(fy, fz);
+        }
+        if self.is_due(due::TWISTED_MY) {
+            *new_my = along(my, mz);
+        }
+        if self.is_due(due::TWISTED_MZ) {
+            *new_mz = across(my, mz);
+        }
+    }
+
+    /// The moment about an origin that lies (a, 0, d) further down.
+    #[inline(always)]
+    fn shift<R: Rounding>(wrench: &mut Wrenched<N>, d: Option<N>, a: Option<N>) {
+        let Wrenched { force: [fx, fy, fz], moment: [mx, my, mz] } = wrench;
+        match (d, a) {
+            (None, None) => {}
+            (Some(d), None) => {
+                *mx = R::less(*mx, d.times(*fy));
+                *my = R::more(*my, d.times(*fx));
+            }
+            (None, Some(a)) => {
+                *my = R::less(*my, a.times(*fz));
+                *mz = R::more(*mz, a.times(*fy));
+            }
+            (Some(d), Some(a)) => {
+                *mx = R::less(*mx, d.times(*fy));
+                *my = R::more_and_less(*my, d.times(*fx), a.times(*fz));
+                *mz = R::more(*mz, a.times(*fy));
+            }
+        }
+    }
+
+    /// `Rz(theta)` of a revolute joint at this position, but only what is due.
+    #[inline(always)]
+    fn turn<R: Rounding>(&self, wrench: &mut Wrenched<N>, position: Q1_14) {
+        let turn = Turn(N::sine_cosine(N::plus_angle(position, self.offset)));
+        if self.is_due(due::ALL) {
+            turn.all::<R>(wrench);
+        } else {
+            turn.some::<R>(wrench, self.due);
+        }
+    }
+
+    /// `Rz(theta)` of a row that does not turn.
+    fn turn_by_offset(&self, wrench: &mut Wrenched<N>) {
+        if let Some(turn) = self.constant
+            && self.is_due(due::TURN)
         {
-            mx = N::rounded_difference(mx.widen(), d.times(fy));
+            Turn(turn).some::<Held>(wrench, self.due);
         }
-        if let Some(a) = a
-            && live_z
-        {
-            mz = N::rounded_sum(mz.widen(), a.times(fy));
-        }
-        [mx, my, mz]
     }
 
-    /// The moment about an origin that lies so far along z.
-    fn shift_along(&self, force: [N; 3], moment: [N; 3], d: Option<N>) -> [N; 3] {
-        Self { a: Q1_14::ZERO, ..*self }.shift(force, moment, d)
+    /// A whole row without a joint.
+    #[inline(never)]
+    fn pass(&self, wrench: &mut Wrenched<N>) {
+        self.twist_and_shift::<Held>(wrench, self.own_d());
+        self.turn_by_offset(wrench);
     }
 }
 
-impl<N: Number> Twist<N> {
-    /// `Rx(alpha)`, but only what is live.
-    #[inline]
-    fn apply(self, [x, y, z]: [N; 3], [_, live_y, live_z]: [bool; 3]) -> [N; 3] {
-        let negative = |number: N, live: bool| if live { number.negative() } else { number };
-        match self {
-            Self::None => [x, y, z],
-            Self::Ahead => [x, negative(z, live_y), y],
-            Self::Half => [x, negative(y, live_y), negative(z, live_z)],
-            Self::Back => [x, z, negative(y, live_z)],
-            Self::Other { sine, cosine } => [
-                x,
-                if live_y { N::rounded_difference(cosine.times(y), sine.times(z)) } else { y },
-                if live_z { N::rounded_sum(sine.times(y), cosine.times(z)) } else { z },
-            ],
+/// Where this is called the compiler keeps out of the straight path.
+#[cold]
+#[inline(always)]
+const fn seldom() {}
+
+/// `Rz` by its sine and cosine.
+struct Turn<N>([N; 2]);
+
+impl<N: Number> Turn<N> {
+    #[inline(always)]
+    fn x<R: Rounding>(&self, x: N, y: N) -> N {
+        let Self([sine, cosine]) = self;
+        R::difference(cosine.times(x), sine.times(y))
+    }
+
+    #[inline(always)]
+    fn y<R: Rounding>(&self, x: N, y: N) -> N {
+        let Self([sine, cosine]) = self;
+        R::sum(sine.times(x), cosine.times(y))
+    }
+
+    #[inline(always)]
+    fn all<R: Rounding>(&self, Wrenched { force: [fx, fy, _], moment: [mx, my, _] }: &mut Wrenched<N>) {
+        (*fx, *fy) = (self.x::<R>(*fx, *fy), self.y::<R>(*fx, *fy));
+        (*mx, *my) = (self.x::<R>(*mx, *my), self.y::<R>(*mx, *my));
+    }
+
+    /// Only what is due.
+    #[inline(always)]
+    fn some<R: Rounding>(&self, wrench: &mut Wrenched<N>, due: u32) {
+        let Wrenched { force: [fx, fy, _], moment: [mx, my, _] } = *wrench;
+        let Wrenched { force: [new_fx, new_fy, _], moment: [new_mx, new_my, _] } = wrench;
+        if due & due::FX != 0 {
+            *new_fx = self.x::<R>(fx, fy);
+        }
+        if due & due::FY != 0 {
+            *new_fy = self.y::<R>(fx, fy);
+        }
+        if due & due::MX != 0 {
+            *new_mx = self.x::<R>(mx, my);
+        }
+        if due & due::MY != 0 {
+            *new_my = self.y::<R>(mx, my);
         }
     }
 }

@@ -21,7 +21,7 @@ pub(crate) extern "C" fn wrench(
     joints: &[Q1_14; MAX_JOINTS],
     out: &mut [Q1_14; MAX_JOINTS],
 ) {
-    *out = kernel.jacobian(joints);
+    kernel.write_jacobian(joints, out);
 }
 
 /// J of the projection kernel.
@@ -32,7 +32,7 @@ pub(crate) extern "C" fn projection(
     joints: &[Q1_14; MAX_JOINTS],
     out: &mut [Q1_14; MAX_JOINTS],
 ) {
-    *out = kernel.jacobian(joints);
+    kernel.write_jacobian(joints, out);
 }
 
 /// The torque's words from J, for a cell that so many joints move, and a force in steps of 2^-16 N.
@@ -45,7 +45,7 @@ pub(crate) extern "C" fn torque_words(
     out: &mut [i16; MAX_JOINTS],
 ) {
     let moved = jacobian.get(..joints.into()).unwrap_or_default();
-    *out = Torque::new(moved, Force::from_steps(force.into())).words(TorqueFormat::Q3_12);
+    Torque::new(moved, Force::from_steps(force.into())).write_words(TorqueFormat::Q3_12, out);
 }
 
 /// A configured cell with its node id.
