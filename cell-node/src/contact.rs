@@ -121,7 +121,7 @@ impl<'a> Torque<'a> {
     #[inline(always)]
     fn steps(&self, row: Q1_14, format: TorqueFormat) -> i32 {
         // Products of 16 and 32 bits in 32: (J high + (J low >> 16)) 2^16 is below J F by less than that, and so little is
-        // cut off by the shift too.
+        // lost in the shift too.
         let (high, low) = (self.force.0 >> 16, self.force.0 & 0xFFFF);
         let shift = 14 - format.fraction(); // of 2^-14 Nm
         let half = (1 << shift) >> 1;

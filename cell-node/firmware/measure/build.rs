@@ -7,7 +7,7 @@ use std::{env, fs};
 
 const UR5: &str = "../../tests/vectors/ur5_torque.csv";
 const CHAINS: &str = "../../tests/vectors/chains.csv";
-/// Flash and RAM. The micro:bit's nRF51822 has the least; the boards of Arm's FPGA images have more than enough.
+/// Flash and RAM. The micro:bit's nRF51822 is the smallest; the boards of Arm's FPGA images have more than enough.
 const MICROBIT: &str =
     "MEMORY { FLASH : ORIGIN = 0, LENGTH = 256K  RAM : ORIGIN = 0x20000000, LENGTH = 16K }";
 const MPS2: &str = "MEMORY { FLASH : ORIGIN = 0, LENGTH = 4M  RAM : ORIGIN = 0x20000000, LENGTH = 4M }";
