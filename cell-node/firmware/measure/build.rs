@@ -1,5 +1,8 @@
 //! Turns the vectors into tables of words, and says where the machines' memory is.
 
+#![allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "wrapped or held before")]
+#![allow(clippy::indexing_slicing, clippy::unwrap_used, clippy::panic, reason = "a build may stop")]
+
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::fmt::Write as _;
 use std::path::PathBuf;

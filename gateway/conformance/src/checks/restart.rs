@@ -123,8 +123,9 @@ fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
     session.mark();
     session.say(&[Message::Halt])?;
     let claimed = restart(session)?;
-    let first =
-        session.answers().iter().find_map(|it| Some((*it.beat()?.0, it.beat()?.1))).unwrap_or_default();
+    // What came before is of its former life.
+    let mut new = session.answers().iter().filter(|it| it.at >= claimed);
+    let first = new.find_map(|it| Some((*it.beat()?.0, it.beat()?.1))).unwrap_or_default();
     let is_new = (first.0.sent, first.0.rejected, first.1.0) == (0, 0, 0);
     session.check("CLAIM-1", is_new, || {
         format!(
