@@ -18,7 +18,7 @@ pub(crate) type Word<T> = (&'static str, &'static str, T);
 
 /// The frame format of a packet.
 pub(crate) const FORMATS: &[Word<Format>] =
-    &[("fd", "One CAN FD frame", Format::Fd), ("classic", "Two classic frames", Format::Classic)];
+    &[("fd", "One CAN FD frame", Format::Fd), ("classic", "Two to four classic frames", Format::Classic)];
 
 /// Parses one of a few words.
 pub(crate) fn one_of<T: Copy + Send + Sync + 'static>(

@@ -105,7 +105,7 @@ type Packets = Option<Format>;
 const ANY_FORMAT: &[Word<Packets>] = &[
     ("auto", "Both", None),
     ("fd", "One CAN FD frame", Some(Format::Fd)),
-    ("classic", "Two classic frames", Some(Format::Classic)),
+    ("classic", "Two to four classic frames", Some(Format::Classic)),
 ];
 
 impl Dump {
