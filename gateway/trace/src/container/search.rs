@@ -75,7 +75,9 @@ pub fn first_record(
         for start in 0..starts {
             let at = from + start as u64;
             let bytes = window.get(start..(start + BEGINNING).min(window.len())).unwrap_or_default();
-            if is_certain(bytes, size - at) || (any && may_be(bytes, size - at) && is_row(input, at, size)?) {
+            if is_certain(bytes, size - at)
+                || (any && head(bytes, size - at).is_some() && is_row(input, at, size)?)
+            {
                 return Ok(Some(at));
             }
         }
@@ -90,10 +92,6 @@ fn head(bytes: &[u8], leftover: u64) -> Option<(u8, u64)> {
     let length = u64::from_le_bytes(*length);
     (min_length(opcode).is_some_and(|min| length >= min) && length <= leftover.checked_sub(HEAD as u64)?)
         .then_some((opcode, length))
-}
-
-fn may_be(bytes: &[u8], leftover: u64) -> bool {
-    head(bytes, leftover).is_some()
 }
 
 /// Whether a chunk or an attachment begins with these bytes: each of its lengths is in it twice.

@@ -4,9 +4,9 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
 use mcap::records::op;
 
-use super::field::attachment_name;
+use super::field::{Record, attachment_name, parse};
 use super::search::is_known;
-use super::{LONGEST, MAGIC};
+use super::{Damage, LONGEST, MAGIC};
 
 /// Bytes that are kept of a record that is longer than anything that is taken into memory.
 const BEGINNING: u64 = 64 << 10;
@@ -90,13 +90,25 @@ impl<R: Read> Source<R> {
         attachment_name(&self.body)
     }
 
-    /// The checksum of all before the end of the data section, when that has come; or of the summary, when the footer
-    /// has; once, and if nothing was left out.
-    pub fn section_checksum(&mut self) -> Option<u32> {
-        self.checksum.take().map(crc32fast::Hasher::finalize)
+    /// Compares a section with the checksum in the record that was read last: the data section when its end has come, or
+    /// the summary when the footer has. Nothing is wrong where the file has none, or where something was left out.
+    ///
+    /// # Errors
+    /// When the record or the checksum is wrong.
+    pub fn check_section(&mut self, code: u8) -> Result<(), Damage> {
+        let found = self.checksum.take().map(crc32fast::Hasher::finalize);
+        let (Record::DataEnd { crc: saved } | Record::Footer { crc: saved }) = parse(code, &self.body)?
+        else {
+            return Ok(());
+        };
+        let what = if code == op::FOOTER { "the summary" } else { "the data section" };
+        match found {
+            Some(found) if saved != 0 && saved != found => Err(Damage::Checksum { what, saved, found }),
+            _ => Ok(()),
+        }
     }
 
-    /// The summary section begins here: the next checksum is of it, and of the footer before its own.
+    /// The summary section begins here: what is compared next is that, and the footer before its checksum.
     pub fn begin_summary(&mut self) {
         self.checksum = Some(crc32fast::Hasher::new());
     }

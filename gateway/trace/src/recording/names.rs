@@ -68,9 +68,7 @@ const DAMAGED: &str = "damaged";
 /// # Errors
 /// When it is another file now, or cannot have another name.
 pub fn keep_damaged(part: &Path, from: &File) -> io::Result<PathBuf> {
-    if !is_still(part, identity(&from.metadata()?)) {
-        return Err(io::Error::other(format!("{} is another file now", part.display())));
-    }
+    is_its_own(part, from)?;
     let goal = goal_of(part);
     for number in 0_u32.. {
         let mut name = goal.file_name().unwrap_or_default().to_owned();
@@ -298,10 +296,16 @@ fn look(path: &Path) -> Orphan {
 /// # Errors
 /// When it is not, or cannot be taken away.
 pub fn remove(path: &Path, file: &File) -> io::Result<()> {
-    if !is_still(path, identity(&file.metadata()?)) {
-        return Err(io::Error::other("another file has its name now, and stays"));
-    }
+    is_its_own(path, file)?;
     fs::remove_file(path)
+}
+
+/// Makes sure that a name is still that of a file.
+fn is_its_own(path: &Path, file: &File) -> io::Result<()> {
+    if is_still(path, identity(&file.metadata()?)) {
+        return Ok(());
+    }
+    Err(io::Error::other("another file has its name now, and stays"))
 }
 
 #[cfg(test)]

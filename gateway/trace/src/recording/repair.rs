@@ -26,8 +26,7 @@ pub struct Repaired {
 }
 
 /// Makes a complete file of one that broke off, and removes the latter, or keeps it under another name if it is damaged
-/// before its end. `goal` gives a name for the new one at each
-/// attempt; it replaces another file only with `force`.
+/// before its end. `goal` gives a name for the new one at each attempt; it replaces another file only with `force`.
 ///
 /// # Errors
 /// When nothing can be recovered or written; the file stays as it is.

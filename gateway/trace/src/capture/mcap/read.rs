@@ -125,15 +125,7 @@ impl McapReader {
                     chunk.unpack(source.body(), source.read())?;
                     (*place, *anchor) = (Place::InChunk, (began, 0));
                 }
-                Framed::Record(op::DATA_END) => {
-                    let found = source.section_checksum();
-                    if let (Record::DataEnd { crc: saved @ 1.. }, Some(found)) =
-                        (parse(op::DATA_END, source.body())?, found)
-                        && saved != found
-                    {
-                        return Err(Damage::Checksum { what: "the data section", saved, found }.into());
-                    }
-                }
+                Framed::Record(op::DATA_END) => source.check_section(op::DATA_END)?,
                 Framed::Record(op::FOOTER) => {
                     *place = Place::Over;
                     self.take_magic()?;
