@@ -3,7 +3,7 @@
 use cell_node::node::Node;
 use protocol::can::Frame;
 use protocol::factory::Factory;
-use protocol::time::Micros;
+use protocol::time::{Micros, Span};
 
 use crate::store::Flash;
 
@@ -34,6 +34,15 @@ pub trait Board {
 
     /// Sleeps until then, or until something comes; may return earlier. At most [`LONGEST_SLEEP`].
     fn sleep_until(&mut self, due: Micros);
+
+    /// Nothing more to do, until somebody loads another program.
+    fn rest(&mut self) -> ! {
+        loop {
+            self.feed();
+            let now = self.now();
+            self.sleep_until(now + Span(LONGEST_SLEEP));
+        }
+    }
 
     /// Tells the watchdog that the loop turns; it must bite after 2 s without.
     fn feed(&mut self);

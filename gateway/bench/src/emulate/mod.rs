@@ -166,12 +166,12 @@ impl<'a> Emulator<'a> {
         let mut planned = Planned::default();
         for cell in self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell)) {
             let place = Place::of(bench, files.path(), cell)?;
-            fs::write(&place.program, self.firmware.of(&factory(bench.skin, cell)))
-                .map_err(EmulateError::Files)?;
+            let factory = factory(bench.skin, cell);
+            fs::write(&place.program, self.firmware.of(&factory)).map_err(EmulateError::Files)?;
             let log = File::create(&place.log).map_err(EmulateError::Files)?;
             processes.emulate(cell, self.command(&place, log), &place.log)?;
             let name = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
-            planned.add(name, bench.kinds.of(name), place.socket, filters(bench.skin, cell));
+            planned.add(name, bench.kinds.of(name), place.socket, filters(cell, &factory));
         }
         let _lines = planned.join(bench.directory)?;
         Ok(Emulation { _lines, _files: files })
@@ -288,9 +288,8 @@ fn factory(skin: &Skin, cell: &Cell) -> Factory {
 
 /// What a cell's CAN controller would pass: its own identifiers, what comes over its simulated wires, and the sums of
 /// the cells at their other ends.
-fn filters(skin: &Skin, cell: &Cell) -> Vec<Filter> {
+fn filters(cell: &Cell, &Factory { link_ids, .. }: &Factory) -> Vec<Filter> {
     let mut filters: Vec<_> = Id::of_cell(cell.node).map(Filter::exact).into();
-    let link_ids = factory(skin, cell).link_ids;
     if link_ids.iter().any(Option::is_some) {
         filters.extend(link_ids.into_iter().flatten().map(|link_id| Filter::link_id(link_id.reversed())));
         let sums = cell.neighbors.iter().flatten().map(|neighbor| Id::new(Kind::Sum, Node::Cell(*neighbor)));

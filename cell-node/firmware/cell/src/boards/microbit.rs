@@ -14,10 +14,10 @@ use nrf51_pac::{self as pac, Interrupt, NVMC, TIMER0, UART0, WDT, interrupt};
 use protocol::can::Frame;
 use protocol::factory::Factory;
 use protocol::slcan::{Decoder, Line};
-use protocol::time::{Micros, Span};
+use protocol::time::Micros;
 
 use super::{factory, store};
-use crate::board::{Board, Clock, LONGEST_SLEEP, low};
+use crate::board::{Board, Clock, low};
 use crate::slcan::{self, Waiting};
 use crate::store::{Flash, NotWritten, Page, UNIT};
 
@@ -66,15 +66,6 @@ impl Chosen {
         set(&pac.WDT.rren, 1);
         set(&pac.WDT.tasks_start, 1);
         Self { clock: Clock::default(), decoder: Decoder::new(), flash: Pages, hosted: false }
-    }
-
-    /// Nothing more to do, until somebody loads another program.
-    pub fn rest(&mut self) -> ! {
-        loop {
-            self.feed();
-            let now = self.now();
-            self.sleep_until(now + Span(LONGEST_SLEEP));
-        }
     }
 }
 

@@ -14,7 +14,7 @@ use protocol::factory::Factory;
 use protocol::time::{Micros, Span};
 
 use super::{factory, store};
-use crate::board::{Board, Clock, LONGEST_SLEEP, low};
+use crate::board::{Board, Clock, low};
 use crate::store::{Flash, NotWritten, Page, UNIT};
 
 mod can1;
@@ -116,15 +116,6 @@ impl Chosen {
         write(IWDG_PR, 2);
         write(IWDG_RLR, 4_000 - 1);
         Self { clock: Clock::default(), flash: Pages }
-    }
-
-    /// Nothing more to do, until somebody loads another program.
-    pub fn rest(&mut self) -> ! {
-        loop {
-            self.feed();
-            let now = self.now();
-            self.sleep_until(now + Span(LONGEST_SLEEP));
-        }
     }
 }
 
