@@ -127,10 +127,13 @@ pub(crate) fn cell(text: &str) -> Result<Named, String> {
         Some((bus, number)) => (Some(bus.to_owned()), number),
         None => (None, text),
     };
-    match number.parse().ok().and_then(|number| CellId::new(number).ok()) {
-        Some(node) => Ok(Named { bus, node }),
-        None => Err(format!("{number:?} is no node id: 1 to 254 are")),
-    }
+    Ok(Named { bus, node: node(number)? })
+}
+
+/// Parses a node id.
+pub(crate) fn node(text: &str) -> Result<CellId, String> {
+    let number = text.parse().ok().and_then(|number| CellId::new(number).ok());
+    number.ok_or_else(|| format!("{text:?} is no node id: 1 to 254 are"))
 }
 
 impl fmt::Display for Named {

@@ -18,7 +18,7 @@ use protocol::time::Span;
 use protocol::usage::{Failure, print};
 
 use self::show::Whole;
-use super::arguments::{BusKind, FORMATS, one_of};
+use super::arguments::{BusKind, FORMATS, node, one_of};
 use super::output::Force;
 use super::{input, output};
 
@@ -72,11 +72,6 @@ pub(crate) struct Conformance {
     junit: Option<PathBuf>,
     #[command(flatten)]
     force: Force,
-}
-
-fn node(text: &str) -> Result<CellId, String> {
-    let number = text.parse().ok().and_then(|number| CellId::new(number).ok());
-    number.ok_or_else(|| format!("{text:?} is no node id: 1 to 254 are"))
 }
 
 impl Conformance {

@@ -87,6 +87,14 @@ pub(crate) fn table<H: Into<String>>(
     table
 }
 
+/// The table as wide as the terminal, and not wider than is good to read.
+pub(crate) fn readable(mut table: Table) -> Table {
+    if table.width().is_none_or(|width| width > WIDTH) {
+        table.set_width(WIDTH);
+    }
+    table
+}
+
 /// The columns in which there is something, and what stands there in each row; `nothing` where there is nothing.
 pub(crate) fn filled<H, T, F: Fn(&T) -> Option<String>>(
     columns: impl IntoIterator<Item = (H, F)>,
@@ -111,13 +119,9 @@ pub(crate) fn filled<H, T, F: Fn(&T) -> Option<String>>(
 pub(crate) struct Rows(Table);
 
 impl Rows {
-    /// A table with this head and no rows, as wide as the terminal and not wider than is good to read.
+    /// A [`readable`] table with this head and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
-        let mut table = table([name.to_string(), value.to_string(), beside.to_string()], [], |_| false);
-        if table.width().is_none_or(|width| width > WIDTH) {
-            table.set_width(WIDTH);
-        }
-        Self(table)
+        Self(readable(table([name.to_string(), value.to_string(), beside.to_string()], [], |_| false)))
     }
 
     /// The same where names are not broken, however narrow the terminal.

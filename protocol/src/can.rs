@@ -38,13 +38,7 @@ pub const FD_BYTES: usize = 72;
 /// The length on the wire of so many bytes in an FD frame: the next one that CAN FD has, up to 64.
 #[must_use]
 pub const fn fd_len(len: usize) -> usize {
-    match len {
-        0..=8 => len,
-        9..=24 => len.next_multiple_of(4),
-        25..=32 => 32,
-        33..=48 => 48,
-        _ => 64,
-    }
+    dlc_len(fd_dlc(len))
 }
 
 /// The DLC of so many bytes in an FD frame, or of the next length that CAN FD has.
@@ -368,7 +362,7 @@ mod tests {
             assert_eq!(fd_dlc(len), dlc);
         }
         for len in 0..=64 {
-            assert_eq!(dlc_len(fd_dlc(len)), fd_len(len), "{len}");
+            assert_eq!(Some(fd_len(len)), lens.into_iter().find(|&it| it >= len), "{len}");
         }
     }
 

@@ -3,13 +3,14 @@
 use std::fmt::Write;
 use std::time::Duration;
 
+use analysis::report::svg::escaped;
 use conformance::Saved;
 use conformance::bus::Stop;
 use conformance::findings::{Finding, Verdict};
 use protocol::can::Format;
 use serde::Serialize;
 
-use crate::print::{count, list, table};
+use crate::print::{count, list, readable, table};
 
 /// All that is printed.
 #[derive(Debug, Serialize)]
@@ -64,10 +65,7 @@ impl Whole {
             let about = if more.is_empty() { title.to_owned() } else { format!("{title}: {more}") };
             vec![it.requirement.id.to_owned(), verdict.to_owned(), about]
         });
-        let mut table = table(["requirement", "", ""], rows, |_| false);
-        if table.width().is_none_or(|width| width > 110) {
-            table.set_width(110);
-        }
+        let table = readable(table(["requirement", "", ""], rows, |_| false));
         let mut text = format!("{table}\n");
         for it in &self.requirements {
             let Verdict::Failed { what, failures, frames } = &it.verdict else { continue };
@@ -141,8 +139,4 @@ fn said(verdict: &Verdict) -> (&'static str, String) {
         Verdict::NotTested { why } => ("not tested", why.clone()),
         Verdict::Open => ("not tested", String::new()),
     }
-}
-
-fn escaped(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

@@ -291,13 +291,10 @@ impl Player {
                 Step::Hungry => self.tape.feed(&mut self.reader)?,
                 Step::Looked => {}
                 Step::Applied { epoch } => {
-                    if epoch
-                        && self
-                            .history
-                            .back()
-                            .is_none_or(|(at, _)| self.tape.at().saturating_sub(*at) >= SAMPLE_NS)
-                    {
-                        self.history.push_back((self.tape.at(), self.tape.live().torques()));
+                    let at = self.tape.at();
+                    let is_due = |(last, _): &(u64, _)| at.saturating_sub(*last) >= SAMPLE_NS;
+                    if epoch && self.history.back().is_none_or(is_due) {
+                        self.history.push_back((at, self.tape.live().torques()));
                     }
                     if epoch && to_epoch && self.tape.at() > self.at {
                         break;
@@ -346,7 +343,7 @@ impl Player {
     #[must_use]
     pub fn said(&self) -> Playback {
         let progress = self.index.progress();
-        let (of, read) = (self.last().saturating_sub(self.origin), progress.at.saturating_sub(self.origin));
+        let (of, read) = (self.last() - self.origin, progress.at.saturating_sub(self.origin));
         Playback {
             at_s: seconds(self.at.saturating_sub(self.origin)),
             at_ns: self.at.to_string(),

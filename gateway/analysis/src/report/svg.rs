@@ -137,7 +137,8 @@ fn classed(body: &str) -> String {
 }
 
 /// Text as XML has it.
-pub(crate) fn escaped(text: &str) -> String {
+#[must_use]
+pub fn escaped(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for letter in text.chars() {
         match letter {

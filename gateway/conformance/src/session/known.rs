@@ -54,8 +54,10 @@ impl Known {
             Message::Network { .. } => None,
             Message::Sensors { .. } if self.senses => None,
             Message::Torque { .. } => Some("JOINTS-6"),
-            Message::Sum { .. } | Message::Sensors { .. } | Message::Configured { .. } => Some("SEND-1"),
-            Message::Halt
+            Message::Sum { .. }
+            | Message::Sensors { .. }
+            | Message::Configured { .. }
+            | Message::Halt
             | Message::Joints { .. }
             | Message::Sync
             | Message::Resume
