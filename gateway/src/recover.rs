@@ -1,9 +1,9 @@
 //! `gateway recover`: makes a recording whole whose writer was killed.
 
-use std::fs::File;
 use std::path::PathBuf;
 
 use clap::Args;
+use protocol::input;
 use protocol::usage::{Failure, print};
 use trace::recording::recover::RecoverError;
 use trace::recording::{names, repair};
@@ -30,7 +30,7 @@ pub(crate) struct Recover {
 impl Recover {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let name = self.file.display();
-        let file = File::open(&self.file).map_err(|error| Failure::usage(format!("{name}: {error}")))?;
+        let file = input::open(&self.file).map_err(|error| Failure::usage(format!("{name}: {error}")))?;
         if names::is_held(&file) {
             return Err(Failure::usage(format!("{name} is being recorded: wait for the run's end")));
         }

@@ -10,6 +10,8 @@ pub mod document;
 pub mod factory;
 pub mod fixed;
 pub mod id;
+#[cfg(feature = "host")]
+pub mod input;
 pub mod message;
 pub mod packet;
 pub mod parameters;

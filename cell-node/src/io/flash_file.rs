@@ -1,16 +1,15 @@
 //! Flash as a file.
 
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, Read, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::fs::{self, File};
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-use rustix::fs::OFlags;
+use protocol::input::{self, folder_of};
 
 use crate::flash::{self, FlashError, Kept};
 use crate::identity::Identity;
 
-/// Bytes that are read of a file; what flash holds is far less.
+/// The most bytes that are read of a file; what flash holds is far less.
 const LONGEST: u64 = 64 << 10;
 
 /// Where a cell keeps its parameters; without a directory, in memory only.
@@ -46,7 +45,7 @@ impl FlashFile {
     /// When the file is there and cannot be read.
     pub fn load(&self) -> io::Result<Result<Kept, FlashError>> {
         let Some(path) = &self.path else { return Ok(Ok(Kept::default())) };
-        match read(path) {
+        match input::bytes(path, LONGEST) {
             Ok(bytes) => Ok(flash::decode(self.identity, &bytes)),
             Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(Ok(Kept::default())),
             Err(error) => Err(error),
@@ -71,23 +70,10 @@ impl FlashFile {
             file.sync_all()?;
             fs::rename(&part, path)?;
             // Its name outlives a loss of power too, where the file system can promise that.
-            let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
-            let _ = File::open(folder.unwrap_or_else(|| Path::new("."))).and_then(|folder| folder.sync_all());
+            let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
             Ok(())
         };
         // It may not even have been made.
         store().inspect_err(|_| drop(fs::remove_file(&part)))
     }
-}
-
-/// The bytes of a regular file, up to one more than are allowed. Does not wait for a pipe.
-fn read(path: &Path) -> io::Result<Vec<u8>> {
-    let no_wait = i32::try_from(OFlags::NONBLOCK.bits()).unwrap_or_default();
-    let file = OpenOptions::new().read(true).custom_flags(no_wait).open(path)?;
-    if !file.metadata()?.is_file() {
-        return Err(io::Error::other("it is no regular file: move it away"));
-    }
-    let mut bytes = Vec::new();
-    file.take(LONGEST).read_to_end(&mut bytes)?;
-    Ok(bytes)
 }

@@ -4,10 +4,14 @@ use std::path::{Path, PathBuf};
 
 use object::{Architecture, Object, ObjectSection};
 use protocol::factory::{self, Factory};
+use protocol::input;
 use thiserror::Error;
 
 /// Where the flash of the emulated microcontroller is, and how many bytes it has.
 const FLASH: std::ops::Range<u64> = 0..256 << 10;
+
+/// The most bytes that are read of a file; with all debug information a firmware has 4 MB.
+const LONGEST: u64 = 64 << 20;
 
 /// Why a file is no firmware of a cell.
 #[derive(Debug, Error)]
@@ -58,7 +62,7 @@ impl Firmware {
     /// When it is not there, or not the firmware of a cell for the emulated board.
     pub fn read(path: &Path) -> Result<Self, FirmwareError> {
         let path = path.to_owned();
-        match std::fs::read(&path) {
+        match input::bytes(&path, LONGEST) {
             Ok(bytes) => Self::parse(path, bytes),
             Err(source) => Err(FirmwareError::Read { path, source }),
         }

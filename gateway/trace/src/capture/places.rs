@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 
 use ::mcap::records::op;
 use protocol::candump::{Line, parse_bytes};
+use protocol::input;
 
 use super::log::LONGEST as LONGEST_LINE;
 use super::mcap::{Fault, State};
@@ -106,7 +107,7 @@ impl Places {
     }
 
     fn add(&mut self, path: &Path) -> io::Result<()> {
-        let mut file = File::open(path)?;
+        let mut file = input::open(path)?;
         if !file.metadata()?.is_file() {
             let why = "it is no regular file, and cannot be gone back in: write it to a file first";
             return Err(io::Error::new(io::ErrorKind::NotSeekable, why));

@@ -6,6 +6,7 @@ use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
+use protocol::input;
 use thiserror::Error;
 
 use super::log::LogReader;
@@ -91,11 +92,8 @@ impl Source {
     fn open(path: &Path, through: &Through, mut state: State) -> Result<(String, Self), CaptureError> {
         let name = path.display().to_string();
         let failed = |source| CaptureError::Io { name: name.clone(), source };
-        let mut file = File::open(path).map_err(failed)?;
+        let mut file = input::open(path).map_err(failed)?;
         let about = file.metadata().map_err(failed)?;
-        if about.is_dir() {
-            return Err(failed(io::ErrorKind::IsADirectory.into()));
-        }
         if about.is_file() && is_mcap(&mut file).map_err(failed)? {
             state.find_files(&mut file).and_then(|()| file.rewind()).map_err(failed)?;
         }
@@ -262,7 +260,7 @@ impl Reader {
         let name = self.file.clone();
         let failed = |source| CaptureError::Io { name: name.clone(), source };
         if place.offset > 0 {
-            let mut file = File::open(path).map_err(failed)?;
+            let mut file = input::open(path).map_err(failed)?;
             file.seek(SeekFrom::Start(place.offset)).map_err(failed)?;
             let input = (self.through)(file);
             let empty = Source::Log(LogReader::new(&[], Box::new(io::empty())));

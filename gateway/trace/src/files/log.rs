@@ -5,11 +5,12 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
+use protocol::input::folder_of;
 use protocol::stop::Stoppable;
 use rustix::fs::{Access, access};
 
 use super::target::{
-    Target, folder_of, hold, identity, is_still, open_stream, open_unfollowed, or_exists, part_of, suffixed,
+    Target, hold, identity, is_still, open_stream, open_unfollowed, or_exists, part_of, suffixed,
     sync_folder, with_hint,
 };
 

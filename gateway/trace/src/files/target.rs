@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use protocol::input::{folder_of, own_descriptor};
 use rustix::fs::{
     AtFlags, CWD, FlockOperation, Mode, OFlags, RenameFlags, fcntl_getfl, fcntl_setfl, flock, linkat, open,
     renameat_with,
@@ -97,21 +98,6 @@ fn is_stream(kind: FileType) -> bool {
     kind.is_fifo() || kind.is_char_device()
 }
 
-/// Which of this program's own descriptors a name such as `/dev/stdout` stands for.
-fn own_descriptor(path: &Path) -> Option<u32> {
-    let own = fs::canonicalize("/proc/self/fd").ok()?;
-    let mut path = path.to_owned();
-    // More links than this lead nowhere.
-    for _ in 0..40 {
-        let folder = fs::canonicalize(folder_of(&path)).ok()?;
-        if folder == own {
-            return path.file_name()?.to_str()?.parse().ok();
-        }
-        path = folder.join(fs::read_link(&path).ok()?);
-    }
-    None
-}
-
 /// Opens what is written to as it is. A FIFO is waited for until somebody reads it, or until `stopped`.
 pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File> {
     let own: Option<OwnedFd> = match own_descriptor(path) {
@@ -139,12 +125,6 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
     }
     fcntl_setfl(&file, fcntl_getfl(&file)? - OFlags::NONBLOCK)?;
     Ok(file)
-}
-
-/// The folder of a file.
-#[must_use]
-pub fn folder_of(path: &Path) -> &Path {
-    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
 }
 
 /// A file's name with something between its stem and its end.

@@ -3,6 +3,7 @@ use crate::capture::log::{Digits, Style};
 use crate::capture::{Entry, Format, convert::Output};
 use protocol::can::Frame;
 use protocol::candump::{Record, Timestamp};
+use std::os::fd::AsRawFd;
 
 const COUNT: u32 = 20_000;
 const MS: u64 = 1_000_000;
@@ -101,8 +102,10 @@ fn messages_outside_chunks_and_files_without_an_end_have_places() {
 
 #[test]
 fn what_cannot_be_gone_back_in_is_named() {
-    let error = Places::of(&[PathBuf::from("/dev/null")]).unwrap_err().to_string();
-    assert!(error.starts_with("/dev/null: it is no regular file"), "{error}");
+    let (reader, _writer) = io::pipe().unwrap();
+    let pipe = format!("/dev/fd/{}", reader.as_raw_fd());
+    let error = Places::of(&[PathBuf::from(&pipe)]).unwrap_err().to_string();
+    assert!(error.starts_with(&format!("{pipe}: it is no regular file")), "{error}");
     let folder = tempfile::tempdir().unwrap();
     for (name, bytes) in
         [("empty", &b""[..]), ("text", b"nothing\n"), ("head", MAGIC), ("cut", b"\x89MCAP0\r\n\x06\xFF")]

@@ -1,0 +1,129 @@
+//! Files from outside, opened in one place: regular files, and what the shell hands over. Nothing else is read, because
+//! nothing else has to end: a named pipe waits for a writer who may never come, a device has no last byte.
+
+use std::fs::{self, File, FileType, OpenOptions};
+use std::io::{self, Read};
+use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
+use std::path::Path;
+
+use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
+
+/// Opens a regular file for reading, or one of this program's own descriptors (`/dev/stdin`, and `<(...)` of a shell),
+/// whatever that is. Does not wait.
+///
+/// # Errors
+/// When it is a folder, a named pipe, a socket or a device, or cannot be opened.
+pub fn open(path: &Path) -> io::Result<File> {
+    let flags = (OFlags::NONBLOCK | OFlags::NOCTTY).bits().cast_signed();
+    // A socket cannot be opened at all, and the error says only that there is no such device.
+    let is_socket = fs::metadata(path).is_ok_and(|about| about.file_type().is_socket());
+    if is_socket {
+        return Err(io::Error::other("it is a socket, a file is needed"));
+    }
+    let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
+    let kind = file.metadata()?.file_type();
+    if !kind.is_file() {
+        if own_descriptor(path).is_none() {
+            return Err(refused(kind));
+        }
+        fcntl_setfl(&file, fcntl_getfl(&file)? - OFlags::NONBLOCK)?;
+    }
+    Ok(file)
+}
+
+fn refused(kind: FileType) -> io::Error {
+    let what = if kind.is_dir() {
+        "it is a folder, a file is needed"
+    } else if kind.is_fifo() {
+        "it is a named pipe, a file is needed; a pipe is read as /dev/stdin (< PIPE)"
+    } else {
+        "it is a device, a file is needed"
+    };
+    io::Error::other(what)
+}
+
+/// All bytes of a file that [`open`] opens.
+///
+/// # Errors
+/// As [`open`]; when there are more than `longest` bytes.
+pub fn bytes(path: &Path, longest: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?.take(longest.saturating_add(1)).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > longest {
+        return Err(io::Error::other(format!("it is longer than {longest} bytes, the most that are read")));
+    }
+    Ok(bytes)
+}
+
+/// Which of this program's own descriptors a name such as `/dev/stdout` stands for.
+#[must_use]
+pub fn own_descriptor(path: &Path) -> Option<u32> {
+    let own = fs::canonicalize("/proc/self/fd").ok()?;
+    let mut path = path.to_owned();
+    // More links than this lead nowhere.
+    for _ in 0..40 {
+        let folder = fs::canonicalize(folder_of(&path)).ok()?;
+        if folder == own {
+            return path.file_name()?.to_str()?.parse().ok();
+        }
+        path = folder.join(fs::read_link(&path).ok()?);
+    }
+    None
+}
+
+/// The folder of a file.
+#[must_use]
+pub fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or_else(|| Path::new("."))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rustix::fs::{CWD, FileType as Kind, Mode, mknodat};
+    use std::os::fd::AsRawFd;
+    use std::os::unix::net::UnixListener;
+
+    fn error(path: &Path) -> String {
+        open(path).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn what_need_not_end_is_not_opened() {
+        let folder = std::env::temp_dir().join(format!("skinbus-input-{}", std::process::id()));
+        fs::create_dir(&folder).unwrap();
+        let (pipe, socket, link) = (folder.join("pipe"), folder.join("socket"), folder.join("link"));
+        mknodat(CWD, &pipe, Kind::Fifo, Mode::RUSR, 0).unwrap();
+        let _listener = UnixListener::bind(&socket).unwrap();
+        std::os::unix::fs::symlink("pipe", &link).unwrap();
+        assert!(error(&pipe).starts_with("it is a named pipe"));
+        assert!(error(&link).starts_with("it is a named pipe"));
+        assert_eq!(error(&socket), "it is a socket, a file is needed");
+        assert_eq!(error(&folder), "it is a folder, a file is needed");
+        assert_eq!(error(Path::new("/dev/zero")), "it is a device, a file is needed");
+        fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_pipe_of_the_shell_is_read_and_waited_for() {
+        let (reader, mut writer) = io::pipe().unwrap();
+        let mut file = open(Path::new(&format!("/dev/fd/{}", reader.as_raw_fd()))).unwrap();
+        let writing = std::thread::spawn(move || {
+            std::thread::sleep(std::time::Duration::from_millis(20));
+            io::Write::write_all(&mut writer, b"late")
+        });
+        drop(reader);
+        let mut text = String::new();
+        file.read_to_string(&mut text).unwrap();
+        assert_eq!(text, "late");
+        writing.join().unwrap().unwrap();
+    }
+
+    #[test]
+    fn more_bytes_than_allowed_are_an_error() {
+        let own = std::env::current_exe().unwrap();
+        let length = fs::metadata(&own).unwrap().len();
+        assert_eq!(bytes(&own, length).unwrap().len() as u64, length);
+        assert!(bytes(&own, length - 1).unwrap_err().to_string().starts_with("it is longer than"));
+    }
+}
