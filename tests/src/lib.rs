@@ -18,6 +18,7 @@ mod agenda;
 pub mod bench;
 pub mod cell_slot;
 pub mod fault;
+pub mod fuzz;
 pub mod gateway;
 mod life;
 pub mod network;

@@ -1,0 +1,145 @@
+//! What stands in files: captures, recordings, flash, descriptions, robots, meshes.
+
+use std::io::{Cursor, Write as _};
+use std::path::PathBuf;
+use std::sync::LazyLock;
+
+use analysis::report::run;
+use cell_node::flash;
+use cell_node::identity::Identity;
+use cover::mesh::{Mesh, UpAxis};
+use model::scenario::Scenario;
+use protocol::candump::{self, Line};
+use protocol::id::CellId;
+use protocol::packet::crc16;
+use protocol::skin::Skin;
+use robots::{Import, Urdf};
+use tempfile::NamedTempFile;
+use trace::capture::{Item, Reader};
+use trace::recording::recover::recover as recover_into;
+
+/// The skin that scenarios are read for.
+static SKIN: LazyLock<Skin> =
+    LazyLock::new(|| Skin::parse("skin.toml", include_str!("../../fuzz/seeds/skin/generated.toml")).unwrap());
+
+/// Each line on its own: a frame that it says is written as a line that says the same.
+pub(super) fn candump(data: &[u8]) {
+    for line in data.split(|&byte| byte == b'\n') {
+        let Ok(Line::Frame(record)) = candump::parse_bytes(line) else { continue };
+        let mut text = String::new();
+        candump::write_record(&mut text, &record).unwrap();
+        let Ok(Line::Frame(again)) = candump::parse(&text) else { panic!("{text}") };
+        assert_eq!(
+            (again.time, again.interface, again.frame),
+            (record.time, record.interface, record.frame),
+            "{text}"
+        );
+    }
+}
+
+/// Everything that comes out of a capture, with a limit so that a small file that unpacks to much ends too.
+fn read(reader: &mut Reader) -> u64 {
+    let mut frames = 0;
+    for _ in 0..100_000 {
+        match reader.next_item() {
+            Ok(Some(Item::Entry(_))) => frames += 1,
+            Ok(Some(Item::Other(_))) => {}
+            Ok(None) | Err(_) => break,
+        }
+    }
+    let _ = reader.extras().skin();
+    frames
+}
+
+/// A file of any kind, from a pipe and from a regular file: both give the same frames.
+pub(super) fn capture(data: &[u8]) {
+    let piped =
+        Reader::from_read("data", Cursor::new(data.to_owned())).map_or(0, |mut reader| read(&mut reader));
+    let file = file_of(data);
+    let frames = Reader::open(file.path()).map_or(0, |mut reader| read(&mut reader));
+    assert_eq!(piped, frames);
+}
+
+fn file_of(data: &[u8]) -> NamedTempFile {
+    let mut file = NamedTempFile::new().unwrap();
+    file.write_all(data).unwrap();
+    file
+}
+
+/// What is recovered is a whole file, which is read without a complaint and has as many messages as were counted.
+pub(super) fn recover(data: &[u8]) {
+    let mut out = Vec::new();
+    let Ok(recovered) = recover_into(Cursor::new(data), &mut out) else { return };
+    let again = recover_into(Cursor::new(&out), std::io::sink()).unwrap();
+    assert_eq!(again.messages, recovered.messages);
+    let mut reader = Reader::from_read("recovered", Cursor::new(out)).unwrap();
+    while reader.next_item().is_ok_and(|item| item.is_some()) {}
+}
+
+/// A recording with any damage has a report, or one line why not.
+pub(super) fn report(data: &[u8]) {
+    let file = file_of(data);
+    let report = run::report(&[PathBuf::from(file.path())], &run::Options::default());
+    if let Err(error) = report {
+        assert!(!error.to_string().contains('\n'), "{error}");
+    }
+}
+
+/// An image whose CRC is right is refused, or kept and written again as itself.
+pub(super) fn flash(data: &[u8]) {
+    let identity = Identity { cell: CellId::new(12).ok(), serial: 0x0102_0304 };
+    let _ = flash::decode(identity, data);
+    let crc = crc16(data).to_le_bytes();
+    let whole = [data, &crc].concat();
+    let Ok(kept) = flash::decode(identity, &whole) else { return };
+    let bytes = flash::encode(identity.serial, &kept);
+    assert_eq!(flash::decode(identity, &bytes), Ok(kept));
+}
+
+/// A skin that is accepted can be computed with.
+pub(super) fn skin(data: &[u8]) {
+    let Ok(text) = std::str::from_utf8(data) else { return };
+    let skin = match Skin::parse("skin.toml", text) {
+        Ok(skin) => skin,
+        Err(error) => return assert!(!error.to_string().contains('\n'), "{error}"),
+    };
+    for cell in &skin.cells {
+        let parameters = skin.parameters(cell);
+        assert_eq!(parameters.check(), Ok(()), "{cell:?}");
+    }
+}
+
+/// A scenario that is accepted belongs to its skin.
+pub(super) fn scenario(data: &[u8]) {
+    let Ok(text) = std::str::from_utf8(data) else { return };
+    match Scenario::parse("scenario.toml", text, &SKIN) {
+        Ok(scenario) => {
+            let _ = scenario.mode_at(protocol::time::Micros(0));
+        }
+        Err(error) => assert!(!error.to_string().contains('\n'), "{error}"),
+    }
+}
+
+/// A robot whose chains are accepted is written as a skin that is accepted.
+pub(super) fn urdf(data: &[u8]) {
+    let Ok(text) = std::str::from_utf8(data) else { return };
+    let Ok(urdf) = Urdf::parse("robot.urdf", text) else { return };
+    let leaves: Vec<_> = urdf.leaves().take(4).map(str::to_owned).collect();
+    for tip in leaves {
+        let Ok(chain) = urdf.chain(None, &tip) else { continue };
+        let import = Import { name: "robot", command: "import", urdf: None, chains: &[chain], cells: &[] };
+        let Ok(skin) = import.toml() else { continue };
+        Skin::parse("skin.toml", &skin).unwrap_or_else(|error| panic!("{error}: {skin}"));
+    }
+}
+
+/// A mesh of any kind, by the first byte.
+pub(super) fn mesh(data: &[u8]) {
+    let Some((kind, bytes)) = data.split_first() else { return };
+    let name = ["mesh.stl", "mesh.dae", "mesh.obj"].get(usize::from(kind % 3)).copied().unwrap_or_default();
+    if let Ok(mesh) = Mesh::parse(name, bytes, UpAxis::Follow) {
+        let finite =
+            |triangle: &cover::mesh::Triangle| triangle.iter().flat_map(|p| p.iter()).all(|v| v.is_finite());
+        assert!(!mesh.triangles().is_empty() && mesh.triangles().iter().all(finite));
+    }
+}

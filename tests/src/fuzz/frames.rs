@@ -1,0 +1,177 @@
+//! What stands on a bus: packets, segments, serial lines, the readers of traffic.
+
+use std::fmt::Write as _;
+
+use analysis::shadow::{Options, Shadow};
+use analysis::stats::Stats;
+use arbitrary::{Result, Unstructured};
+use model::decode::json;
+use model::decode::settle::Settler;
+use protocol::can::Format;
+use protocol::candump::{Record, Timestamp};
+use protocol::id::Id;
+use protocol::message::Message;
+use protocol::packet::{Length, Lengths, Packet, Reassembly, Segment};
+use protocol::schema::Units;
+use protocol::slcan::{self, Decoder, Line};
+use protocol::time::Micros;
+use protocol::wire_time::BitRates;
+
+use super::{frame, packet as any_packet};
+
+/// What is read as a packet is written as the same bytes, and what is read as a message as the same packet.
+pub(super) fn packet(data: &[u8]) {
+    let Some((id, bytes)) = data.split_first_chunk() else { return };
+    let id = Id::from_bits(u16::from_le_bytes(*id) & 0x7FF);
+    if let Ok(packet) = Packet::decode(id, bytes) {
+        assert_eq!(packet.encode().as_slice(), bytes);
+    }
+    let Ok(packet) = any_packet(&mut Unstructured::new(data)) else { return };
+    assert_eq!(Packet::decode(packet.id, &packet.encode()), Ok(packet));
+    for frame in packet.frames(Format::Fd) {
+        assert_eq!(Packet::from_fd(&frame), Ok(packet));
+    }
+    if let Ok(message) = Message::decode(&packet) {
+        // Bits without a meaning are not kept.
+        let again = message.encode();
+        assert_eq!(Message::decode(&again), Ok(message));
+        assert_eq!((again.id, message.id()), (packet.id, packet.id));
+    }
+}
+
+/// A complete packet is one of those that were sent, and no segment is kept for ever.
+pub(super) fn reassembly(data: &[u8]) {
+    let _ = reassemble(&mut Unstructured::new(data));
+}
+
+fn reassemble(from: &mut Unstructured<'_>) -> Result<()> {
+    let id = Id::from_bits(from.arbitrary::<u16>()? & 0x7FF);
+    let lengths = Lengths::of(id);
+    let (mut segment, mut now) = (Segment::NONE, Micros(0));
+    let mut sent = Vec::new();
+    while !from.is_empty() {
+        now.0 += u64::from(from.arbitrary::<u16>()?);
+        if from.ratio(1, 4)? {
+            let length = from.int_in_range(0..=8)?;
+            let bytes = from.bytes(length)?.to_vec();
+            // A CRC of 16 bits may be right by chance.
+            if let Ok(Reassembly::Complete(packet)) = segment.push(now, id, lengths, &bytes) {
+                assert_eq!(Packet::decode(id, &packet.encode()), Ok(packet));
+            }
+        } else {
+            let packet = Packet { id, ..any_packet(from)? };
+            if !lengths.iter().any(|length| length == packet.words.length()) {
+                continue;
+            }
+            let frames: Vec<_> = packet.frames(Format::Classic).collect();
+            let lost = from.int_in_range(0..=3 * frames.len())?;
+            sent.push(packet);
+            for (index, frame) in frames.iter().enumerate().filter(|(index, _)| *index != lost) {
+                let taken = segment.push(now, id, lengths, frame.data());
+                if let Ok(Reassembly::Complete(complete)) = taken {
+                    assert!(sent.contains(&complete) || Packet::decode(id, &complete.encode()).is_ok());
+                    assert!(index + 1 == frames.len() || complete != packet);
+                }
+            }
+        }
+        assert!(segment.waiting() < Length::MAX_SEGMENTS);
+    }
+    Ok(())
+}
+
+/// A frame that a line says is written as a line that says the same frame; all bytes are counted.
+pub(super) fn slcan(data: &[u8]) {
+    let mut decoder = Decoder::new();
+    for &byte in data {
+        match decoder.push(byte) {
+            Some(Line::Frame(frame)) => again(&frame),
+            Some(Line::Command(command)) => {
+                let mut other = Decoder::new();
+                let lines: Vec<_> =
+                    command.encode().as_bytes().iter().filter_map(|&byte| other.push(byte)).collect();
+                assert_eq!(lines, [Line::Command(command)]);
+            }
+            Some(Line::Refused(_)) => assert!(decoder.refused().total() > 0),
+            _ => {}
+        }
+    }
+    if let Ok(frame) = frame(&mut Unstructured::new(data)) {
+        again(&frame);
+    }
+}
+
+fn again(frame: &protocol::can::Frame) {
+    let Some(text) = slcan::encode(frame) else { return };
+    let mut decoder = Decoder::new();
+    let lines: Vec<_> = text.as_bytes().iter().filter_map(|&byte| decoder.push(byte)).collect();
+    assert_eq!(lines.len(), 1, "{text:?}");
+    let [Line::Frame(read)] = lines[..] else { panic!("{lines:?}") };
+    assert_eq!((read.raw_id(), read.format(), read.data()), (frame.raw_id(), frame.format(), frame.data()));
+}
+
+/// Some frames with their times and buses.
+fn traffic(
+    from: &mut Unstructured<'_>,
+    mut take: impl FnMut(&'static str, u64, protocol::can::Frame),
+) -> Result<()> {
+    let mut now = 1_700_000_000_000_000_000_u64;
+    while !from.is_empty() {
+        let step = from.arbitrary::<u32>()?;
+        // Now and then backwards, or a long time.
+        now = if from.ratio(1, 16)? {
+            now.wrapping_sub(u64::from(step) << 8)
+        } else {
+            now.wrapping_add(step.into())
+        };
+        let bus = *from.choose(&["vcan0", "vcan1", "can2"])?;
+        take(bus, now, frame(from)?);
+    }
+    Ok(())
+}
+
+/// Every frame comes out of the decoder once, in order, with a text and as JSON.
+pub(super) fn decoder(data: &[u8]) {
+    let mut settler = Settler::new(None);
+    let (mut sent, mut came) = (0_u64, 0_u64);
+    let mut stats = Stats::default();
+    let mut out = |settler: &mut Settler<(u64, u64, &'static str, protocol::can::Frame)>| {
+        while let Some(((number, nanos, bus, frame), decoded)) = settler.pop() {
+            assert_eq!(number, came, "in order");
+            came += 1;
+            let mut text = String::new();
+            write!(text, "{decoded}").unwrap();
+            let time = Timestamp { nanos, nine_digits: true };
+            let record = Record { time, interface: bus, frame, direction: None };
+            let mut line = Vec::new();
+            json::write(&mut line, &record, &decoded, Units::default()).unwrap();
+            let _: serde_json::Value = serde_json::from_slice(&line).unwrap();
+            stats.take(&record, &decoded);
+        }
+    };
+    let _ = traffic(&mut Unstructured::new(data), |bus, nanos, frame| {
+        settler.push(Micros(nanos / 1_000), bus, &frame, (sent, nanos, bus, frame));
+        sent += 1;
+        out(&mut settler);
+    });
+    settler.finish();
+    out(&mut settler);
+    assert_eq!(came, sent);
+    assert_eq!(stats.report().frames, sent);
+}
+
+/// The model of a bus ends, whatever traffic it is given, and each frame has one place in it.
+pub(super) fn shadow(data: &[u8]) {
+    let options = Options { each_frame: true, ..Options::new(BitRates::new(1_000_000, 5_000_000).unwrap()) };
+    let mut shadow = Shadow::new(options).unwrap();
+    let (mut sent, mut came) = (0_u64, 0_u64);
+    let _ = traffic(&mut Unstructured::new(data), |bus, nanos, frame| {
+        shadow.frame(bus, nanos, &frame);
+        sent += 1;
+        came += std::iter::from_fn(|| shadow.poll()).count() as u64;
+    });
+    shadow.finish();
+    came += std::iter::from_fn(|| shadow.poll()).count() as u64;
+    let report = shadow.report();
+    assert!(came <= sent, "{came} of {sent}");
+    let _ = serde_json::to_string(&report).unwrap();
+}
