@@ -12,7 +12,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use analysis::explain::series::SeriesError;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use protocol::skin::Skin;
 use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;
 use trace::capture::convert::{ConvertError, Converted, Output, convert};
@@ -21,7 +20,7 @@ use trace::capture::{Format, ORIGIN, Reader};
 use trace::files::WholeFile;
 
 use super::arguments::{Word, one_of};
-use super::input::{captures, no_frame, place, skin_of};
+use super::input::{captures, no_frame, place, skin_for};
 use super::output::{Force, apart, note, refused};
 use super::print::list;
 
@@ -168,10 +167,7 @@ impl Convert {
         }
         apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
         self.force.check("", &self.to)?;
-        let skin = match &self.skin {
-            Some(path) => Skin::read(path).map_err(Failure::usage)?,
-            None => skin_of(&self.from)?,
-        };
+        let skin = skin_for(&self.from, self.skin.as_deref())?;
         let (mut reader, bar, live) = self.open()?;
         let stopped = stop::flag();
         let name = reader.name().to_owned();

@@ -25,7 +25,7 @@ use trace::capture::{Entry, Extras, NoteKind, Reader, Topic};
 use self::show::{How, Show};
 use super::arguments::{BusKind, Word, nanos, one_of};
 use super::input::{
-    self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame, place, skin_beside, stopped,
+    self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame, place, remark_another, skin_beside, stopped,
 };
 use super::output;
 use super::print::{json, list};
@@ -126,7 +126,9 @@ impl Dump {
         let to_out = BufWriter::new(Stoppable::new(&out));
         let mut show = Show::new(to_out, self.format, pick, self.contact, how, max);
         if let Some(path) = &self.skin {
-            show.describe(&Skin::read(path).map_err(Failure::usage)?);
+            let skin = Skin::read(path).map_err(Failure::usage)?;
+            remark_another(&self.sources, path, &skin);
+            show.describe(&skin);
         }
         let (what, extras, done) = if is_capture {
             let mut reader = captures(&self.sources, |file| Box::new(file))?;

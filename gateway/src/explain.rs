@@ -13,7 +13,7 @@ use serde::Serialize;
 use trace::capture::Reader;
 
 use super::arguments::{Named, cell, nanos};
-use super::input::skin_of;
+use super::input::skin_for;
 use super::output;
 use super::print::json;
 
@@ -66,10 +66,7 @@ struct Whole<'a> {
 
 impl Explain {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let skin = match &self.skin {
-            Some(path) => Skin::read(path).map_err(Failure::usage)?,
-            None => skin_of(&self.files)?,
-        };
+        let skin = skin_for(&self.files, self.skin.as_deref())?;
         self.check(&skin)?;
         let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
         let name = reader.name().to_owned();

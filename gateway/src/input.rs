@@ -12,7 +12,7 @@ use bench::listen::{self, Listener};
 use bench::signals::caught;
 use protocol::bus::{Bus, BusError, Choice, Options, Received};
 use protocol::can::{self, EXTENDED_MASK};
-use protocol::skin::Skin;
+use protocol::skin::{Cell, Skin};
 use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -47,6 +47,57 @@ pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
         ));
     }
     Failure::usage(format!("there is no file {name}, and as a bus: {error}"))
+}
+
+/// The skin that is named, else the one that a recording has with it. That the named one is another than the recording's is
+/// remarked.
+pub(crate) fn skin_for(files: &[PathBuf], named: Option<&Path>) -> Result<Skin, Failure> {
+    let Some(path) = named else { return skin_of(files) };
+    let skin = Skin::read(path).map_err(Failure::usage)?;
+    remark_another(files, path, &skin);
+    Ok(skin)
+}
+
+/// Remarks that a skin is another than the one that a recording has with it, if that is found at its beginning.
+pub(crate) fn remark_another(files: &[PathBuf], path: &Path, skin: &Skin) {
+    // What is read once is not opened twice.
+    if !files.iter().all(|file| file.is_file()) {
+        return;
+    }
+    let Ok(reader) = Reader::open_all(files) else { return };
+    let Some(Ok(own)) = reader.extras().skin() else { return };
+    if let Some((what, is, was)) = difference(skin, &own) {
+        let (path, name) = (path.display(), reader.name());
+        output::note(format_args!(
+            "--skin {path} is not the skin that {name} was recorded with: {what} {is}, recorded {was}"
+        ));
+    }
+}
+
+/// The first thing in which two skins differ, and what each has.
+fn difference(one: &Skin, other: &Skin) -> Option<(String, String, String)> {
+    let buses = |skin: &Skin| skin.buses.iter().map(|bus| bus.name.clone()).collect::<Vec<_>>().join(", ");
+    let joints = |skin: &Skin| skin.robot.joints.len().to_string();
+    let cells = |skin: &Skin| skin.cells.len().to_string();
+    let all = [
+        ("joints", joints(one), joints(other)),
+        ("cells", cells(one), cells(other)),
+        ("buses", buses(one), buses(other)),
+    ];
+    if let Some((what, is, was)) = all.into_iter().find(|(_, is, was)| is != was) {
+        return Some((what.to_owned(), is, was));
+    }
+    let changed = one.cells.iter().find(|cell| {
+        let same = |it: &&Cell| it.bus == cell.bus && it.node == cell.node;
+        let before = other.cells.iter().find(same);
+        before.is_none_or(|before| other.parameters(before) != one.parameters(cell))
+    })?;
+    let bus = one.buses.get(changed.bus).map_or("", |bus| &bus.name);
+    Some((
+        format!("parameters of cell {} on {bus}", changed.node),
+        "as described".to_owned(),
+        "others".to_owned(),
+    ))
 }
 
 /// The skin that a recording has with it.

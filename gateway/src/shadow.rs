@@ -19,7 +19,9 @@ use trace::capture::{Entry, Format, NoteKind, Reader};
 
 use self::show::write_frames;
 use super::arguments::{BusKind, nanos};
-use super::input::{self, LOOK, Missing, ReceiveEnd, captures, is_file, place, skin_beside, stopped};
+use super::input::{
+    self, LOOK, Missing, ReceiveEnd, captures, is_file, place, remark_another, skin_beside, stopped,
+};
 use super::output;
 use super::print::list;
 
@@ -104,6 +106,9 @@ struct Taken {
 impl ShadowCommand {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let skin = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
+        if let (Some(path), Some(skin)) = (&self.skin, &skin) {
+            remark_another(&self.sources, path, skin);
+        }
         let mut out = BufWriter::new(Stoppable::new(io::stdout()));
         let name = list(self.sources.iter().map(|source| source.display()));
         let mut title = name.clone();

@@ -23,7 +23,7 @@ use view::serve::{Options, serve};
 use view::server::Access;
 
 use super::arguments::{BusKinds, bus_names, bus_of, nanos};
-use super::input::{skin_of, stopped};
+use super::input::{remark_another, skin_for, skin_of, stopped};
 use super::output::note;
 use super::surface::{Placed, Surface};
 use super::visuals::Packages;
@@ -177,7 +177,11 @@ impl View {
     /// The skin of a recording; of the one in it the URDF is not beside it.
     fn recorded_skin(&self) -> Result<(Skin, Vec<Shell>), Failure> {
         match &self.skin {
-            Some(path) => self.read(path),
+            Some(path) => {
+                let (skin, shells) = self.read(path)?;
+                remark_another(&self.sources, path, &skin);
+                Ok((skin, shells))
+            }
             None => Ok((skin_of(&self.sources)?, Vec::new())),
         }
     }
@@ -246,10 +250,7 @@ impl Page {
         kinds: &Kinds,
         listen: Option<SocketAddr>,
     ) -> Result<(Self, Lines), Failure> {
-        let known = match skin {
-            Some(path) => Skin::read(path).map_err(Failure::usage)?,
-            None => skin_of(files)?,
-        };
+        let known = skin_for(files, skin)?;
         let given = skin.into_iter().flat_map(|path| [OsStr::new("--skin"), path.as_os_str()]);
         let words = ["--replayed", "--read-only"].map(OsStr::new).into_iter().chain(given);
         Self::start(words.chain(files.iter().map(|file| file.as_os_str())), &known, kinds, None, listen)

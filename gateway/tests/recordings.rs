@@ -5,6 +5,8 @@ use std::fs;
 use std::path::PathBuf;
 use std::process::{Command, Output};
 
+use trace::capture::{Reader, SKIN};
+
 /// Where the recordings are.
 fn recordings() -> PathBuf {
     PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../tests/recordings")
@@ -67,5 +69,37 @@ fn explanations_are_unchanged() {
         ("split-1", "--epoch 80 --cell 2"),
     ] {
         is_expected(&format!("{name}.explain.txt"), &output(&format!("explain {name}.mcap {options}")));
+    }
+}
+
+#[test]
+fn another_skin_than_the_recorded_one_is_remarked() {
+    let folder = tempfile::tempdir().unwrap();
+    let said = |skin: &str, command: &str| {
+        let path = folder.path().join("skin.toml");
+        fs::write(&path, skin).unwrap();
+        let mut gateway = Command::new(env!("CARGO_BIN_EXE_gateway"));
+        gateway.args(command.split(' ')).arg("--skin").arg(path).current_dir(recordings());
+        String::from_utf8(gateway.output().unwrap().stderr).unwrap()
+    };
+    let mut reader = Reader::open(&recordings().join("fd.mcap")).unwrap();
+    reader.next().unwrap();
+    let attached = &reader.extras().attachments;
+    let (_, own) = attached.iter().find(|(name, _)| name == SKIN).unwrap();
+    let own = String::from_utf8(own.clone()).unwrap();
+    for command in ["dump fd.mcap --brief", "explain fd.mcap --epoch 9", "shadow fd.mcap"] {
+        let same = said(&own, command);
+        assert!(!same.contains("is not the skin"), "{command}: {same}");
+        let moved = own.replacen("position = [", "position = [0.001, ", 1);
+        let start = moved.find("[0.001, ").unwrap() + 8;
+        let end = start + moved.get(start..).unwrap().find(", ").unwrap() + 2;
+        let moved = [moved.get(..start).unwrap(), moved.get(end..).unwrap()].concat();
+        let parameters = said(&moved, command);
+        assert!(parameters.contains("was recorded with: parameters of cell"), "{command}: {parameters}");
+        let without_wires = |line: &&str| !line.starts_with("neighbors") && !line.starts_with("root");
+        let cells = own.rsplit_once("[[cell]]").unwrap().0.lines().filter(without_wires);
+        let cells: String = cells.map(|line| format!("{line}\n")).collect();
+        let fewer = said(&cells, command);
+        assert!(fewer.contains("was recorded with: cells 2, recorded 3"), "{command}: {fewer}");
     }
 }
