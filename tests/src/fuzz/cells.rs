@@ -157,20 +157,23 @@ fn grow(from: &mut Unstructured<'_>) -> Result<()> {
         wiring.start(cell);
         wiring.run(Span(u64::from(from.arbitrary::<u8>()?) * 100));
     }
+    wiring.run(Span::from_millis(2_000));
+    wiring.switch(from.int_in_range(0..=6)?, false);
+    // Only now: a press goes to a node id, and cells have theirs.
+    (0..cells).for_each(|cell| wiring.press(cell, true));
     wiring.begin();
     for _ in 0..12 {
         if from.is_empty() {
             break;
         }
         let cell = from.int_in_range(0..=cells - 1)?;
-        match from.int_in_range(0..=6)? {
+        match from.int_in_range(0..=5)? {
             0 => wiring.kill(cell),
             1 => wiring.hang(cell),
             2 => wiring.go_on(cell),
             3 if !wiring.runs(cell) => wiring.start(cell),
             4 => wiring.set_link_down(cell, from.int_in_range(0..=PORTS - 1)?, from.arbitrary()?),
-            5 => wiring.switch(from.int_in_range(0..=6)?, false),
-            _ => wiring.press(cell, from.arbitrary()?),
+            _ => wiring.switch(from.int_in_range(0..=6)?, false),
         }
         wiring.run(Span(u64::from(from.arbitrary::<u8>()?) * 1_000));
     }
