@@ -23,8 +23,9 @@ use core::ops::{Add, Mul, Neg, Sub};
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
-use self::range::{Bounded, Held, Rounding, is_bounded};
-use super::{Kernel, Number, Scalar, Twist, length, settled_turn};
+use self::range::{Bounded, Held, Rounding, bound};
+use super::{Kernel, Number, Scalar, Twist, chain, length, settled_turn};
+use crate::contact::{MAX_J, TorqueRounding};
 
 /// The wrench kernel, of one cell.
 ///
@@ -39,8 +40,11 @@ pub struct Wrench<S: Scalar = Q1_14> {
     /// From joint k's row down to the base; the first `rows` are in use.
     links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
-    /// Whether no number on the way can leave the range of a word, wherever the joints are; then nothing is held.
-    is_bounded: bool,
+    /// What no |J| is beyond, in steps of 2^-14, wherever the joints are. Below [`MAX_J`] no number on the way can leave the
+    /// range of a word either; then nothing is held.
+    bound: u16,
+    /// How torques of this J become words.
+    rounding: TorqueRounding,
 }
 
 /// A force of one newton and its moment in m (that is, Nm per N); or something that is known of each of their
@@ -114,9 +118,23 @@ mod due {
     pub(super) const MORE: u32 = 1 << 16;
 }
 
+impl<S: Scalar> Wrench<S> {
+    /// What no |J| is beyond, in steps of 2^-14, wherever the joints are; [`MAX_J`] where that is not known.
+    #[must_use]
+    pub const fn bound(&self) -> u16 {
+        self.bound
+    }
+
+    /// How torques of J become words, in the format of the parameters.
+    #[must_use]
+    pub const fn rounding(&self) -> &TorqueRounding {
+        &self.rounding
+    }
+}
+
 impl<S: Scalar> Kernel<S> for Wrench<S> {
     fn new(parameters: &Parameters) -> Self {
-        let chain = parameters.chain();
+        let chain = chain(parameters);
         let mut read = Live::NOTHING; // by the rows further down: nothing below joint 1
         let mut joint = 0;
         let mut links = core::array::from_fn(|index| {
@@ -144,15 +162,18 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
             }
         }
         links.get_mut(..rows).unwrap_or_default().reverse();
-        let is_bounded = chain.iter().all(|row| row.kind != RowKind::Prismatic)
-            && is_bounded(&contact, chain.get(..rows).unwrap_or_default());
-        Self { joint: if rows == 0 { 0 } else { parameters.joint.into() }, contact, links, rows, is_bounded }
+        let slides = chain.iter().any(|row| row.kind == RowKind::Prismatic);
+        let below = chain.get(..rows.saturating_sub(1)).unwrap_or_default();
+        let bound = if slides { None } else { bound(&contact, below) }.unwrap_or(MAX_J);
+        let rounding = TorqueRounding::new(parameters.torque_format, bound);
+        let joint = if rows == 0 { 0 } else { parameters.joint.into() };
+        Self { joint, contact, links, rows, bound, rounding }
     }
 
     #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
         let links = self.links.get(..self.rows).unwrap_or_default();
-        if self.is_bounded {
+        if self.bound < MAX_J {
             down_bounded(self.contact, links, joints, jacobian);
         } else {
             let moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
