@@ -75,8 +75,8 @@ impl Live {
 struct Link<N> {
     /// What has to be computed: bits of [`due`].
     due: u32,
-    /// Which joint moves it, from 0; of a fixed row the one above it.
-    joint: u8,
+    /// Which joint moves it; of a fixed row the one above it.
+    joint: Joint,
     kind: RowKind,
     a: Q1_14,
     /// Without the position of a prismatic joint.
@@ -86,6 +86,45 @@ struct Link<N> {
     twist: Twist<N>,
     /// Sine and cosine of theta_offset, where the row does not turn; none of a zero.
     constant: Option<[N; 2]>,
+}
+
+/// A joint. There are no more than an array of joints has, so that no access to one is checked.
+#[repr(u8)]
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Joint {
+    J1,
+    J2,
+    J3,
+    J4,
+    J5,
+    J6,
+    J7,
+    J8,
+    J9,
+    J10,
+    J11,
+    J12,
+    J13,
+    J14,
+}
+
+impl Joint {
+    #[rustfmt::skip]
+    const ALL: [Self; MAX_JOINTS] = [
+        Self::J1, Self::J2, Self::J3, Self::J4, Self::J5, Self::J6, Self::J7,
+        Self::J8, Self::J9, Self::J10, Self::J11, Self::J12, Self::J13, Self::J14,
+    ];
+
+    /// It, of one thing for each joint.
+    #[inline(always)]
+    fn of<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
+        joints.get(self as usize)
+    }
+
+    #[inline(always)]
+    fn of_mut<T>(self, joints: &mut [T; MAX_JOINTS]) -> Option<&mut T> {
+        joints.get_mut(self as usize)
+    }
 }
 
 /// What of a row is computed, because its own row of J or a row further down reads it.
@@ -136,14 +175,13 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
     fn new(parameters: &Parameters) -> Self {
         let chain = chain(parameters);
         let mut read = Live::NOTHING; // by the rows further down: nothing below joint 1
-        let mut joint = 0;
+        let mut joints = Joint::ALL.into_iter().peekable();
         let mut links = core::array::from_fn(|index| {
             let row = chain.get(index).copied().unwrap_or_default();
             let link;
             (link, read) = Link::new(&row, read);
-            let link = Link { joint, ..link };
-            joint += u8::from(row.kind != RowKind::Fixed);
-            link
+            let joint = if row.moves() { joints.next() } else { joints.peek().copied() };
+            Link { joint: joint.unwrap_or(Joint::J14), ..link }
         });
         let nothing = Wrenched { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
         let mut contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
@@ -196,8 +234,9 @@ fn down_bounded<S: Scalar>(
     let mut links = links.iter();
     let Some(mut link) = links.next() else { return };
     loop {
-        let joint = usize::from(link.joint);
-        let (Some(row), Some(position)) = (jacobian.get_mut(joint), joints.get(joint)) else { return };
+        let (Some(row), Some(position)) = (link.joint.of_mut(jacobian), link.joint.of(joints)) else {
+            return;
+        };
         let [.., moment] = wrench.moment;
         *row = S::from_number(moment);
         let Some(next) = links.next() else { return };
@@ -292,7 +331,7 @@ impl<N: Number> Link<N> {
         ];
         let due = due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all });
         let (kind, offset) = (row.kind, row.theta_offset);
-        let link = Self { kind, joint: 0, due, twist, a: row.a, d: row.d, offset, constant };
+        let link = Self { kind, joint: Joint::J1, due, twist, a: row.a, d: row.d, offset, constant };
         (link, twisted.each(|live| before_twist(twist, live)))
     }
 
