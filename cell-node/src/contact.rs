@@ -86,48 +86,93 @@ impl<'a> Torque<'a> {
     /// most half a step, 1.3e-4 Nm.
     #[must_use]
     pub fn words(&self, format: TorqueFormat) -> [i16; MAX_JOINTS] {
+        self.words_by(&TorqueRounding::new(format, MAX_J))
+    }
+
+    /// The same, for a J that is within the rounding's bound.
+    #[must_use]
+    #[inline]
+    pub fn words_by(&self, rounding: &TorqueRounding) -> [i16; MAX_JOINTS] {
         let mut words = [0; MAX_JOINTS];
-        self.write_words(format, &mut words);
+        self.write_words(rounding, &mut words);
         words
     }
 
     /// The same; words beyond those of J stay as they are.
     #[inline]
-    pub fn write_words(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
-        let mut beyond = 0;
-        for (word, row) in words.iter_mut().zip(self.jacobian) {
-            let steps = self.steps(*row, format);
-            // Its magnitude, or one less: none of them is beyond a word where all bits together are not.
-            beyond |= steps ^ (steps >> 31);
-            let [low, high, ..] = steps.to_le_bytes();
-            *word = i16::from_le_bytes([low, high]);
+    pub fn write_words(&self, rounding: &TorqueRounding, words: &mut [i16; MAX_JOINTS]) {
+        if self.force.0 > rounding.fits {
+            return self.write_held_words(rounding.format, words);
         }
-        if beyond > i16::MAX.into() {
-            self.saturate(format, words);
+        match rounding.format {
+            TorqueFormat::Q3_12 => self.write_each(words, |row| low_word(self.steps(row, 12))),
+            TorqueFormat::Q5_10 => self.write_each(words, |row| low_word(self.steps(row, 10))),
+            TorqueFormat::Q7_8 => self.write_each(words, |row| low_word(self.steps(row, 8))),
         }
     }
 
-    /// Holds the words that do not fit.
+    /// Words, of which some may not fit.
     #[cold]
     #[inline(never)]
-    fn saturate(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
-        for (word, row) in words.iter_mut().zip(self.jacobian) {
-            let steps = self.steps(*row, format);
-            *word = i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX });
+    fn write_held_words(&self, format: TorqueFormat, words: &mut [i16; MAX_JOINTS]) {
+        self.write_each(words, |row| {
+            let steps = self.steps(row, format.fraction());
+            i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX })
+        });
+    }
+
+    /// The word of each J, from the last joint's. It stays a loop: for several at once a Cortex-M0 has too few registers.
+    #[inline(always)]
+    fn write_each(&self, words: &mut [i16; MAX_JOINTS], word_of: impl Fn(Q1_14) -> i16) {
+        for index in (0..self.jacobian.len().min(MAX_JOINTS)).rev() {
+            core::hint::black_box(());
+            if let (Some(word), Some(row)) = (words.get_mut(index), self.jacobian.get(index)) {
+                *word = word_of(*row);
+            }
         }
     }
 
-    /// One torque, rounded, in steps of a format.
+    /// One torque, rounded, in steps of so many fraction bits.
     #[inline(always)]
-    fn steps(&self, row: Q1_14, format: TorqueFormat) -> i32 {
+    fn steps(&self, row: Q1_14, fraction: u32) -> i32 {
         // Products of 16 and 32 bits in 32: (J high + (J low >> 16)) 2^16 is below J F by less than that, and so little is
         // lost in the shift too.
         let (high, low) = (self.force.0 >> 16, self.force.0 & 0xFFFF);
-        let shift = 14 - format.fraction(); // of 2^-14 Nm
+        let shift = 14 - fraction; // of 2^-14 Nm
         let half = (1 << shift) >> 1;
         let row = i32::from(row.to_bits());
         (row.wrapping_mul(high) + (row.wrapping_mul(low) >> 16) + half) >> shift
     }
+}
+
+/// No |J| is above it, in steps of 2^-14.
+pub const MAX_J: u16 = 1 << 15;
+
+/// How torques become words: worked out once per configuration.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct TorqueRounding {
+    format: TorqueFormat,
+    /// The largest force, in steps of 2^-16 N, whose torques are all within the range of a word; they are not compared
+    /// with it.
+    fits: i32,
+}
+
+impl TorqueRounding {
+    /// For torques of a J that is never beyond `bound`, in steps of 2^-14 ([`MAX_J`] where nothing better is known).
+    #[must_use]
+    pub fn new(format: TorqueFormat, bound: u16) -> Self {
+        // J F is at most a word's largest step, so no rounding takes it further.
+        let largest = i64::from(i16::MAX) << (14 + 16 - format.fraction());
+        Self { format, fits: i32::try_from(largest / i64::from(bound.max(1))).unwrap_or(i32::MAX) }
+    }
+}
+
+/// What is known to be a word.
+#[inline]
+fn low_word(steps: i32) -> i16 {
+    debug_assert!(i16::try_from(steps).is_ok(), "{steps} is no word");
+    let [low, high, ..] = steps.to_le_bytes();
+    i16::from_le_bytes([low, high])
 }
 
 #[cfg(test)]
@@ -209,6 +254,23 @@ mod tests {
         assert_eq!(less.words(TorqueFormat::Q3_12)[0], Q3_12::nearest(9.0 * arm.to_f64()).to_bits());
     }
 
+    #[test]
+    fn the_largest_force_that_surely_fits_is_not_held_and_fits() {
+        for (format, bound) in TorqueFormat::ALL
+            .into_iter()
+            .flat_map(|format| [0, 1, 3, 777, MAX_J - 1, MAX_J].map(|it| (format, it)))
+        {
+            let rounding = TorqueRounding::new(format, bound);
+            let most = Q1_14::from_bits(bound.wrapping_neg().cast_signed()); // -2 m is the longest
+            for steps in [rounding.fits, rounding.fits.saturating_add(1)] {
+                let torque = Torque { jacobian: &[most], force: Force(steps) };
+                let mut words = [0; MAX_JOINTS];
+                torque.write_words(&rounding, &mut words);
+                assert_eq!(words[0], format.round(torque.exact()[0]), "{format:?}, {bound}, {steps}");
+            }
+        }
+    }
+
     proptest! {
         #[test]
         fn the_force_is_algorithm_1_in_real_numbers(
@@ -260,7 +322,12 @@ mod tests {
                     prop_assert!((Q3_12::from_bits(word).to_f64() - held).abs() <= 0.5 / 4_096.0);
                 }
                 for format in TorqueFormat::ALL {
-                    prop_assert_eq!(torque.words(format), torque.exact().map(|exact| format.round(exact)));
+                    let rounded = torque.exact().map(|exact| format.round(exact));
+                    prop_assert_eq!(torque.words(format), rounded);
+                    let bound = jacobian.iter().map(|row| row.to_bits().unsigned_abs()).max().unwrap_or(0);
+                    let mut words = [0; MAX_JOINTS];
+                    torque.write_words(&TorqueRounding::new(format, bound), &mut words);
+                    prop_assert_eq!(words, rounded);
                 }
             }
         }

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
-use cell_node::contact::{Force, Torque};
+use cell_node::contact::{Force, MAX_J, Torque};
 use cell_node::kernel::oracle::Counted;
 use cell_node::kernel::{Kernel, Operations, PaperWord, Projection, Wrench};
 use proptest::prelude::*;
@@ -20,6 +20,20 @@ fn the_wrench_kernel_errs_less_than_its_bars_on_a_ur5() {
     let errors = Errors::of_words(|parameters, joints| Wrench::new(parameters).jacobian(joints));
     assert!(errors.mean <= 1.2e-4 && errors.max <= 1.5e-3, "{errors:?}");
     assert_eq!((errors.torques, errors.omitted), (1_048, 0));
+}
+
+#[test]
+fn the_bound_of_j_is_little_more_than_an_arms_reach_and_of_a_slide_not_known() {
+    let length = |words: &[Q1_14]| words.iter().map(|word| word.to_f64().powi(2)).sum::<f64>().sqrt();
+    for case in Case::all().into_iter().filter(|case| case.joint == 6) {
+        let mut parameters = case.parameters();
+        let links: f64 = parameters.chain().iter().map(|row| length(&[row.a, row.d])).sum();
+        let reach = links + length(&parameters.pose.position);
+        let bound = f64::from(Wrench::<Q1_14>::new(&parameters).bound()) / 16_384.0;
+        assert!(bound <= 1.02 * reach, "{bound} m for an arm of {reach} m");
+        parameters.rows[2].kind = RowKind::Prismatic;
+        assert_eq!(Wrench::<Q1_14>::new(&parameters).bound(), MAX_J);
+    }
 }
 
 #[test]
@@ -310,6 +324,16 @@ proptest! {
         // J-3
         let steps = steps_apart::<Wrench>(&parameters, &joints, exact);
         prop_assert!(steps <= steps_of_j(&parameters), "{steps} steps in {} rows", parameters.chain().len());
+    }
+
+    #[test]
+    fn no_j_is_beyond_the_bound_that_the_wrench_kernel_names(
+        parameters in prop_oneof![arm_in_reach(), any_arm(), any_chain()], joints: [i16; MAX_JOINTS],
+    ) {
+        let kernel = Wrench::<Q1_14>::new(&parameters);
+        for row in kernel.jacobian(&joints.map(Q1_14::from_bits)) {
+            prop_assert!(row.to_bits().unsigned_abs() <= kernel.bound(), "{row:?} is beyond {}", kernel.bound());
+        }
     }
 
     #[test]

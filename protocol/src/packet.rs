@@ -110,7 +110,9 @@ impl core::fmt::Display for Epoch {
 }
 
 /// A packet whose CRC was right; what its words mean is [`crate::message`]'s business.
+// Aligned, or else a Cortex-M0 copies it byte by byte.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+#[repr(align(4))]
 pub struct Packet {
     /// Kind and node.
     pub id: Id,

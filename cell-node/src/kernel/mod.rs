@@ -44,7 +44,7 @@ pub use scalar::{Number, Operations, PaperWord, Scalar, Steps, Word};
 pub use wrench::Wrench;
 
 use protocol::fixed::Q1_14;
-use protocol::parameters::{MAX_JOINTS, Parameters};
+use protocol::parameters::{MAX_JOINTS, Parameters, Row};
 
 use crate::sine::FINE;
 
@@ -68,6 +68,14 @@ pub trait Kernel<S: Scalar = Q1_14>: Sized {
         self.write_jacobian(joints, &mut jacobian);
         jacobian
     }
+}
+
+/// The rows from the base to the cell; none where they have not the joints that are to move it, as in parameters that
+/// [`Parameters::check`] refuses.
+fn chain(parameters: &Parameters) -> &[Row] {
+    let chain = parameters.chain();
+    let joints = chain.iter().filter(|row| row.moves()).count();
+    if joints == usize::from(parameters.joint) && joints <= MAX_JOINTS { chain } else { &[] }
 }
 
 /// A length of the robot's table; none where it is zero, for then it costs nothing.

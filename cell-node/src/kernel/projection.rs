@@ -20,7 +20,7 @@
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
-use super::{Kernel, Number, Scalar, Twist, length};
+use super::{Kernel, Number, Scalar, Twist, chain, length};
 
 /// The projection kernel, of one cell.
 ///
@@ -85,7 +85,7 @@ struct Step<N> {
 
 impl<S: Scalar> Kernel<S> for Projection<S> {
     fn new(parameters: &Parameters) -> Self {
-        let chain = parameters.chain();
+        let chain = chain(parameters);
         let links = core::array::from_fn(|index| {
             let row = parameters.rows.get(index).copied().unwrap_or_default();
             Link::new(&row, index == 0, index + 1 == chain.len())

@@ -23,8 +23,9 @@ use core::ops::{Add, Mul, Neg, Sub};
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
-use self::range::{Bounded, Held, Rounding, is_bounded};
-use super::{Kernel, Number, Scalar, Twist, length, settled_turn};
+use self::range::{Bounded, Held, Rounding, bound};
+use super::{Kernel, Number, Scalar, Twist, chain, length, settled_turn};
+use crate::contact::{MAX_J, TorqueRounding};
 
 /// The wrench kernel, of one cell.
 ///
@@ -39,8 +40,11 @@ pub struct Wrench<S: Scalar = Q1_14> {
     /// From joint k's row down to the base; the first `rows` are in use.
     links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
-    /// Whether no number on the way can leave the range of a word, wherever the joints are; then nothing is held.
-    is_bounded: bool,
+    /// What no |J| is beyond, in steps of 2^-14, wherever the joints are. Below [`MAX_J`] no number on the way can leave the
+    /// range of a word either; then nothing is held.
+    bound: u16,
+    /// How torques of this J become words.
+    rounding: TorqueRounding,
 }
 
 /// A force of one newton and its moment in m (that is, Nm per N); or something that is known of each of their
@@ -71,8 +75,8 @@ impl Live {
 struct Link<N> {
     /// What has to be computed: bits of [`due`].
     due: u32,
-    /// Which joint moves it, from 0; of a fixed row the one above it.
-    joint: u8,
+    /// Which joint moves it; of a fixed row the one above it.
+    joint: Joint,
     kind: RowKind,
     a: Q1_14,
     /// Without the position of a prismatic joint.
@@ -82,6 +86,45 @@ struct Link<N> {
     twist: Twist<N>,
     /// Sine and cosine of theta_offset, where the row does not turn; none of a zero.
     constant: Option<[N; 2]>,
+}
+
+/// A joint. There are no more than an array of joints has, so that no access to one is checked.
+#[repr(u8)]
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Joint {
+    J1,
+    J2,
+    J3,
+    J4,
+    J5,
+    J6,
+    J7,
+    J8,
+    J9,
+    J10,
+    J11,
+    J12,
+    J13,
+    J14,
+}
+
+impl Joint {
+    #[rustfmt::skip]
+    const ALL: [Self; MAX_JOINTS] = [
+        Self::J1, Self::J2, Self::J3, Self::J4, Self::J5, Self::J6, Self::J7,
+        Self::J8, Self::J9, Self::J10, Self::J11, Self::J12, Self::J13, Self::J14,
+    ];
+
+    /// It, of one thing for each joint.
+    #[inline(always)]
+    fn of<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
+        joints.get(self as usize)
+    }
+
+    #[inline(always)]
+    fn of_mut<T>(self, joints: &mut [T; MAX_JOINTS]) -> Option<&mut T> {
+        joints.get_mut(self as usize)
+    }
 }
 
 /// What of a row is computed, because its own row of J or a row further down reads it.
@@ -114,18 +157,31 @@ mod due {
     pub(super) const MORE: u32 = 1 << 16;
 }
 
+impl<S: Scalar> Wrench<S> {
+    /// What no |J| is beyond, in steps of 2^-14, wherever the joints are; [`MAX_J`] where that is not known.
+    #[must_use]
+    pub const fn bound(&self) -> u16 {
+        self.bound
+    }
+
+    /// How torques of J become words, in the format of the parameters.
+    #[must_use]
+    pub const fn rounding(&self) -> &TorqueRounding {
+        &self.rounding
+    }
+}
+
 impl<S: Scalar> Kernel<S> for Wrench<S> {
     fn new(parameters: &Parameters) -> Self {
-        let chain = parameters.chain();
+        let chain = chain(parameters);
         let mut read = Live::NOTHING; // by the rows further down: nothing below joint 1
-        let mut joint = 0;
+        let mut joints = Joint::ALL.into_iter().peekable();
         let mut links = core::array::from_fn(|index| {
             let row = chain.get(index).copied().unwrap_or_default();
             let link;
             (link, read) = Link::new(&row, read);
-            let link = Link { joint, ..link };
-            joint += u8::from(row.kind != RowKind::Fixed);
-            link
+            let joint = if row.moves() { joints.next() } else { joints.peek().copied() };
+            Link { joint: joint.unwrap_or(Joint::J14), ..link }
         });
         let nothing = Wrenched { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
         let mut contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
@@ -144,15 +200,18 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
             }
         }
         links.get_mut(..rows).unwrap_or_default().reverse();
-        let is_bounded = chain.iter().all(|row| row.kind != RowKind::Prismatic)
-            && is_bounded(&contact, chain.get(..rows).unwrap_or_default());
-        Self { joint: if rows == 0 { 0 } else { parameters.joint.into() }, contact, links, rows, is_bounded }
+        let slides = chain.iter().any(|row| row.kind == RowKind::Prismatic);
+        let below = chain.get(..rows.saturating_sub(1)).unwrap_or_default();
+        let bound = if slides { None } else { bound(&contact, below) }.unwrap_or(MAX_J);
+        let rounding = TorqueRounding::new(parameters.torque_format, bound);
+        let joint = if rows == 0 { 0 } else { parameters.joint.into() };
+        Self { joint, contact, links, rows, bound, rounding }
     }
 
     #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
         let links = self.links.get(..self.rows).unwrap_or_default();
-        if self.is_bounded {
+        if self.bound < MAX_J {
             down_bounded(self.contact, links, joints, jacobian);
         } else {
             let moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
@@ -175,8 +234,9 @@ fn down_bounded<S: Scalar>(
     let mut links = links.iter();
     let Some(mut link) = links.next() else { return };
     loop {
-        let joint = usize::from(link.joint);
-        let (Some(row), Some(position)) = (jacobian.get_mut(joint), joints.get(joint)) else { return };
+        let (Some(row), Some(position)) = (link.joint.of_mut(jacobian), link.joint.of(joints)) else {
+            return;
+        };
         let [.., moment] = wrench.moment;
         *row = S::from_number(moment);
         let Some(next) = links.next() else { return };
@@ -271,7 +331,7 @@ impl<N: Number> Link<N> {
         ];
         let due = due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all });
         let (kind, offset) = (row.kind, row.theta_offset);
-        let link = Self { kind, joint: 0, due, twist, a: row.a, d: row.d, offset, constant };
+        let link = Self { kind, joint: Joint::J1, due, twist, a: row.a, d: row.d, offset, constant };
         (link, twisted.each(|live| before_twist(twist, live)))
     }
 

@@ -314,16 +314,15 @@ impl Node {
     /// Answers with its own torque; one answer of zero marks the end of a contact.
     fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque<'_>>) {
         let (Some(from), Some(in_use)) = (self.identity.cell, &self.configuration.in_use) else { return };
-        let (length, format) = (in_use.length(), in_use.parameters.torque_format);
         let torque = match torque {
             Some(torque) => {
                 self.active = true;
-                torque.words(format)
+                torque.words_by(in_use.kernel.rounding())
             }
             None if core::mem::take(&mut self.active) => Default::default(),
             None => return,
         };
-        let torque = packet::Words::new(length, torque);
+        let torque = packet::Words::new(in_use.length(), torque);
         self.mark_saturated(torque.is_saturated());
         count(&mut self.heard.torques);
         self.push(Message::Torque { from, epoch, torque });

@@ -131,7 +131,9 @@ impl Lengths {
 }
 
 /// The words of a packet, as many as its length says.
+// Aligned, or else a Cortex-M0 copies them byte by byte.
 #[derive(Clone, Copy, Default, Eq, Hash, PartialEq)]
+#[repr(align(4))]
 pub struct Words {
     length: Length,
     /// Those beyond the length are zero.

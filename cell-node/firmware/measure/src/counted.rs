@@ -1,12 +1,12 @@
 //! What is counted, each under a name that stands in the program.
 
-use cell_node::contact::{Force, Torque};
+use cell_node::contact::{Force, Torque, TorqueRounding};
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
 use cell_node::kernel::{Kernel, Projection, Wrench};
 use cell_node::node::Node;
 use protocol::can::{Format, Frame};
-use protocol::fixed::{Q1_14, Q5_10, TorqueFormat};
+use protocol::fixed::{Q1_14, Q5_10};
 use protocol::id::{CellId, Node as Address};
 use protocol::message::{From, Joints, Message, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
@@ -35,7 +35,8 @@ pub(crate) extern "C" fn projection(
     kernel.write_jacobian(joints, out);
 }
 
-/// The torque's words from J, for a cell that so many joints move, and a force in steps of 2^-16 N.
+/// The torque's words from J, for a cell that so many joints move, and a force in steps of 2^-16 N; rounded as its
+/// configuration says.
 #[inline(never)]
 #[unsafe(export_name = "measure_torque_words")]
 pub(crate) extern "C" fn torque_words(
@@ -43,9 +44,10 @@ pub(crate) extern "C" fn torque_words(
     joints: u8,
     force: i32,
     out: &mut [i16; MAX_JOINTS],
+    rounding: &TorqueRounding,
 ) {
     let moved = jacobian.get(..joints.into()).unwrap_or_default();
-    Torque::new(moved, Force::from_steps(force.into())).write_words(TorqueFormat::Q3_12, out);
+    Torque::new(moved, Force::from_steps(force.into())).write_words(rounding, out);
 }
 
 /// A configured cell with its node id.

@@ -10,9 +10,10 @@ mod counted;
 mod machine;
 
 use cases::CASES;
+use cell_node::contact::{MAX_J, TorqueRounding};
 use cell_node::kernel::{Kernel, Projection, Wrench};
 use machine::Machine;
-use protocol::fixed::Q1_14;
+use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::message::Joints;
 use protocol::parameters::MAX_JOINTS;
 
@@ -31,20 +32,39 @@ fn run(machine: &mut Machine) {
 /// A line for each row: the words of J and of the torques by the wrench kernel, and by the projection kernel.
 fn words(machine: &mut Machine) {
     for case in CASES {
-        let (parameters, joints) = (case.parameters(), case.joints());
-        let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
-        let mut torque = [0; MAX_JOINTS];
-        let count = usize::from(parameters.joints);
-        counted::wrench(&Wrench::new(&parameters), &joints, &mut jacobian);
-        counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque);
-        machine.words(jacobian.iter().take(count).map(|word| word.to_bits()));
-        machine.words(torque.iter().take(count).copied());
-        counted::projection(&Projection::new(&parameters), &joints, &mut jacobian);
-        counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque);
-        machine.words(jacobian.iter().take(count).map(|word| word.to_bits()));
-        machine.words(torque.iter().take(count).copied());
+        wrench_words(machine, case);
+        projection_words(machine, case);
         machine.line();
     }
+}
+
+#[inline(never)]
+fn wrench_words(machine: &mut Machine, case: &cases::Case) {
+    let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
+    let kernel = Wrench::new(&case.parameters());
+    counted::wrench(&kernel, &case.joints(), &mut jacobian);
+    torque_words(machine, case, &jacobian, kernel.rounding());
+}
+
+#[inline(never)]
+fn projection_words(machine: &mut Machine, case: &cases::Case) {
+    let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
+    counted::projection(&Projection::new(&case.parameters()), &case.joints(), &mut jacobian);
+    torque_words(machine, case, &jacobian, &TorqueRounding::new(TorqueFormat::Q3_12, MAX_J));
+}
+
+/// The words of a J and of its torques.
+fn torque_words(
+    machine: &mut Machine,
+    case: &cases::Case,
+    jacobian: &[Q1_14; MAX_JOINTS],
+    rounding: &TorqueRounding,
+) {
+    let mut torque = [0; MAX_JOINTS];
+    let count = usize::from(case.chain().joints());
+    counted::torque_words(jacobian, case.joint, case.force, &mut torque, rounding);
+    machine.words(jacobian.iter().take(count).map(|word| word.to_bits()));
+    machine.words(torque.iter().take(count).copied());
 }
 
 /// A line for each row that is counted: chain, joint.
@@ -81,8 +101,9 @@ fn kernels(case: &cases::Case) {
     let mut jacobian = [Q1_14::ZERO; MAX_JOINTS];
     let mut torque = [0; MAX_JOINTS];
     counted::projection(&Projection::new(&parameters), &joints, &mut jacobian);
-    counted::wrench(&Wrench::new(&parameters), &joints, &mut jacobian);
-    counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque);
+    let kernel = Wrench::new(&parameters);
+    counted::wrench(&kernel, &joints, &mut jacobian);
+    counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque, kernel.rounding());
 }
 
 /// One reply of a cell on this chain.

@@ -3,31 +3,31 @@
 use protocol::parameters::Row;
 
 use super::Wrenched;
+use crate::contact::MAX_J;
 use crate::kernel::Number;
 
-/// Whether a wrench stays within the range of a word on its way down these rows, wherever the joints are.
+/// What no moment of a wrench is beyond on its way down these rows, in steps of 2^-14, wherever the joints are; none if
+/// that or a force may be more than a word can be. The wrench is turned by the joint above them first.
 ///
-/// In steps of 2^-14, with |f| and |m| at most F and M: a twist or a turn by words for sine and cosine, each at most 5e-4
-/// off, makes a vector longer by a factor of at most 1 + 2^-10, and rounding its components by less than one step; a shift
-/// adds at most |(a, d)| F to M, and its rounding less than one step.
-pub(super) fn is_bounded<N: Number>(contact: &Wrenched<N>, rows: &[Row]) -> bool {
-    let (Some(mut force), Some(mut moment)) = (N::norm(contact.force), N::norm(contact.moment)) else {
-        return false;
-    };
+/// With |f| and |m| at most F and M: a twist or a turn by words for sine and cosine, each at most 5e-4 off, makes a vector
+/// longer by a factor of at most 1 + 2^-10, and rounding its components by less than one step; a shift adds at most
+/// |(a, d)| F to M, and its rounding less than one step.
+pub(super) fn bound<N: Number>(contact: &Wrenched<N>, rows: &[Row]) -> Option<u16> {
     let turned = |norm: u32| norm + (norm >> 10) + 2;
+    let (mut force, mut moment) = (turned(N::norm(contact.force)?), turned(N::norm(contact.moment)?));
     for row in rows.iter().rev() {
-        let reach = N::norm([N::word(row.a), N::word(row.d), N::zero()]).unwrap_or(u32::MAX);
+        let reach = N::norm([N::word(row.a), N::word(row.d), N::zero()])?;
         (force, moment) = (turned(force), turned(moment));
         if force >= 1 << 15 || reach > 1 << 16 {
-            return false;
+            return None;
         }
         moment += ((reach * force) >> 14) + 3;
         (force, moment) = (turned(force), turned(moment));
         if moment >= (1 << 15) - 1 {
-            return false;
+            return None;
         }
     }
-    true
+    u16::try_from(moment).ok().filter(|bound| *bound < MAX_J - 1 && force < 1 << 15)
 }
 
 /// How sums become words.
