@@ -4,34 +4,27 @@ use model::central::Central;
 use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10, TorqueFormat};
 use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
+use rand::seq::IndexedRandom as _;
+use rand::{RngExt as _, SeedableRng as _};
+use rand_pcg::Pcg64Mcg;
 
 /// Numbers that look random, the same ones each time.
 #[derive(Clone, Debug)]
-pub(crate) struct Dice(u64);
+pub(crate) struct Dice(Pcg64Mcg);
 
 impl Dice {
-    pub(crate) const fn new(seed: u64) -> Self {
-        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
-    }
-
-    /// The next 32 bits (xorshift64*).
-    fn next(&mut self) -> u32 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        let [_, _, _, _, a, b, c, d] = self.0.wrapping_mul(0x2545_F491_4F6C_DD1D).to_le_bytes();
-        u32::from_le_bytes([a, b, c, d])
+    pub(crate) fn new(seed: u64) -> Self {
+        Self(Pcg64Mcg::seed_from_u64(seed))
     }
 
     /// Any word.
     pub(crate) fn word(&mut self) -> i16 {
-        let [a, b, ..] = self.next().to_le_bytes();
-        i16::from_le_bytes([a, b])
+        self.0.random()
     }
 
-    /// A number below a bound.
+    /// A number below a bound; 0 where that is 0.
     pub(crate) fn below(&mut self, bound: u32) -> u32 {
-        self.next() % bound.max(1)
+        self.0.random_range(0..bound.max(1))
     }
 
     /// A number in [-1, 1).
@@ -41,8 +34,7 @@ impl Dice {
 
     /// One of a few.
     pub(crate) fn one<T: Copy + Default>(&mut self, of: &[T]) -> T {
-        let place = self.below(u32::try_from(of.len()).unwrap_or(u32::MAX));
-        of.get(place as usize).copied().unwrap_or_default()
+        of.choose(&mut self.0).copied().unwrap_or_default()
     }
 }
 

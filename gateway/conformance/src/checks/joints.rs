@@ -228,7 +228,7 @@ pub(super) fn old(session: &mut Session<'_>) -> Result<(), Stop> {
             after.0.torques.wrapping_sub(before.0.torques),
         ];
         // Of a burst a cell may lose some.
-        let is_so = joints + skipped <= u16::from(BURST)
+        let is_so = joints.saturating_add(skipped) <= u16::from(BURST)
             && usize::from(torques) == answers.len()
             && joints >= torques;
         session.check("JOINTS-4", is_so, || {

@@ -1,7 +1,7 @@
 //! Frames of the bus become packets of the cell, and are looked at as far as each holds for itself.
 
 use protocol::can::Format;
-use protocol::id::{Id, Kind};
+use protocol::id::Id;
 use protocol::message::{Heartbeat, Message, State};
 use protocol::packet::{self, Lengths, Packet, PacketError, Reassembly};
 use protocol::time::Micros;
@@ -22,12 +22,7 @@ impl Session<'_> {
         }
         self.look_at_time()?;
         let Ok(id) = packet::data_id(&seen.frame) else { return Ok(Some(seen)) };
-        let is_gateways = match id.kind {
-            Kind::Command | Kind::Configure | Kind::Stimulus => true,
-            Kind::Network => id.node == 0,
-            Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => false,
-        };
-        if is_gateways && !self.clock.finishing {
+        if id.sender().is_none() && !self.clock.finishing {
             return Err(Stop::Gateway(seen.frame.to_string()));
         }
         if id.node == self.cell.get() {
