@@ -1,8 +1,11 @@
 //! Configurations to test with, and what the documents say of them: F_z, torque words, and J in floating point.
 
 use model::central::Central;
+use model::decode::Decoded;
 use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10, TorqueFormat};
-use protocol::message::SkinSensors;
+use protocol::id::CellId;
+use protocol::message::{Message, SensorPage, SkinSensors};
+use protocol::packet::Epoch;
 use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 use rand::seq::IndexedRandom as _;
 use rand::{RngExt as _, SeedableRng as _};
@@ -210,6 +213,23 @@ pub(crate) fn contact(sum: i32) -> [Q5_10; 3] {
     let second = ((sum - first) / 2).clamp(i16::MIN.into(), i16::MAX.into());
     [first, second, sum - first - second]
         .map(|word| Q5_10::from_bits(i16::try_from(word).unwrap_or_default()))
+}
+
+/// Words, one after the other.
+pub(crate) fn list(words: &[i16]) -> String {
+    words.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")
+}
+
+/// A sensors page in words.
+pub(crate) fn page(page: SensorPage) -> String {
+    let message = Message::Sensors { from: CellId::MAX, epoch: Epoch(0), page };
+    let text = Decoded::Message(message).to_string();
+    text.split_once(": ").map_or_else(String::new, |(_, values)| values.to_owned())
+}
+
+/// What is latched, in words.
+pub(crate) fn skin(skin: Option<SkinSensors>) -> String {
+    skin.map_or_else(|| "nothing".to_owned(), |skin| page(SensorPage::Skin(skin)))
 }
 
 /// A press with this sum of contact words and nothing else.

@@ -223,6 +223,10 @@ impl Bus for Virtual {
         self.now
     }
 
+    fn carries(&self, _: Format) -> bool {
+        true
+    }
+
     fn send(&mut self, frames: &[Frame]) -> Result<(), Stop> {
         for frame in frames {
             // What a real bus does, a frame at a time.

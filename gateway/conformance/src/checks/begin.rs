@@ -1,6 +1,6 @@
 //! What the cell is and which options it has.
 
-use protocol::message::{Message, NetworkPage, VERSION};
+use protocol::message::{Message, VERSION};
 use protocol::parameters::Parameter;
 use protocol::time::Span;
 
@@ -20,11 +20,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     session.known.senses = false;
     session.measure()?;
     identity(session)?;
-    session.about.ports = true;
-    let report = session.report()?;
-    session.about.ports = report.iter().any(|heard| {
-        matches!(heard.message, Message::Network { page: NetworkPage::Tree(_) | NetworkPage::Ports(_), .. })
-    });
+    session.about.ports = session.has_ports()?;
     options(session)?;
     let document = arm::document(2);
     session.about.committed = session.commit(&document)?;

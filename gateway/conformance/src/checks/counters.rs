@@ -37,9 +37,9 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
             session.say(&[protocol::message::Message::Resume])?;
         }
         let after = session.counters()?;
-        let is_so = is_counted(before.1, after.1, reason) && before.0 == after.0;
+        let is_so = is_counted(before.refused, after.refused, reason) && before.heard == after.heard;
         session.check("COUNT-1", is_so, || {
-            format!("{what} has to be counted as {reason:?} alone: {after:?}, before {before:?}")
+            format!("{what} has to be counted as {reason:?} alone: {after}; before: {before}")
         });
         before = after;
     }

@@ -17,7 +17,10 @@ mod sensing;
 mod sensing_model;
 mod stimuli;
 
+use std::collections::BTreeSet;
+
 use protocol::can::Format;
+use protocol::time::Span;
 
 use crate::bus::Stop;
 use crate::findings::Only;
@@ -92,8 +95,8 @@ const GROUPS: &[Group] = &[
     ),
 ];
 
-/// Groups of these count heartbeats themselves.
-const BEATS: &[&str] = &["BEAT-1", "CLAIM-6", "CLAIM-1", "OPT-2"];
+/// What the groups after one that is repeated take.
+const RESERVE: Span = Span::from_millis(20_000);
 
 /// What no cell can be tested for from its bus, and why.
 const BEYOND: &[(&str, &str)] = &[
@@ -134,16 +137,45 @@ fn groups(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
                 }
             }
         } else if group.about.iter().any(|id| only.has(id)) {
-            session.settle()?;
-            let before = session.tally();
-            (group.run)(session)?;
-            session.settle()?;
-            if !group.about.iter().any(|id| BEATS.contains(id)) {
-                session.check_beats(before);
-            }
+            run_group(session, group)?;
         }
     }
+    session.check_segments();
     if only.has("TIME-2") && session.about.committed { session.measure_times() } else { Ok(()) }
+}
+
+/// Runs a group; again, if something failed while this computer was late, for a cell that is a process may have waited for a
+/// processor as well. It has to meet each requirement in one of a few attempts then.
+fn run_group(session: &mut Session<'_>, group: &Group) -> Result<(), Stop> {
+    const ATTEMPTS: usize = 4;
+    const LATE: Span = Span::from_millis(4);
+    let before = session.findings.clone();
+    let mut failed: Option<BTreeSet<&'static str>> = None;
+    for attempt in 1..=ATTEMPTS {
+        session.worst_lateness();
+        let began = session.now();
+        session.regular_beat()?;
+        (group.run)(session)?;
+        session.settle()?;
+        if group.needs != Needs::Restart {
+            session.regular_beat()?;
+        }
+        let now: BTreeSet<_> = session.findings.failed_since(&before).collect();
+        let each: BTreeSet<_> =
+            failed.map_or_else(|| now.clone(), |failed| failed.intersection(&now).copied().collect());
+        for forgiven in now.difference(&each) {
+            session.findings.forgive(forgiven, &before);
+        }
+        let took = session.now().since(began);
+        let is_over = attempt == ATTEMPTS || session.left().0 < took.0 + RESERVE.0;
+        if each.is_empty() || is_over || session.worst_lateness() < LATE {
+            break;
+        }
+        session.findings = before.clone();
+        session.forget();
+        failed = Some(each);
+    }
+    Ok(())
 }
 
 /// Whether the cell has what a group needs; else whether it might, and why not.

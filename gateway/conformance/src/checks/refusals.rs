@@ -39,8 +39,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     });
     session.exchange_all(&[])?;
     let after = session.counters()?;
-    session.check("COUNT-2", before.1 == after.1, || {
-        format!("refusals were counted: {:?}, before {:?}", after.1, before.1)
+    session.check("COUNT-2", before.refused == after.refused, || {
+        format!("refusals were counted: {:?}, before {:?}", after.refused, before.refused)
     });
     Ok(())
 }

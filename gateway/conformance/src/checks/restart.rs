@@ -180,8 +180,8 @@ fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
     let done = session.commit(&next)?;
     session.check("CONF-2", done, || "after a restart the staged copy is not what is in use".to_owned());
     let counters = session.counters()?;
-    session.check("BEAT-4", counters.1 == protocol::message::Refused::default(), || {
-        format!("counters do not begin with 0 after a restart: {counters:?}")
+    session.check("BEAT-4", counters.refused == protocol::message::Refused::default(), || {
+        format!("counters do not begin with 0 after a restart: {counters}")
     });
     Ok(())
 }
@@ -239,11 +239,11 @@ fn while_claiming(session: &mut Session<'_>) -> Result<(), Stop> {
     session.known.halted = Some(true);
     session.known.hash = session.known.parameters.map(|it| it.hash());
     let counters = session.counters()?;
-    let is_so = counters.0.joints == 2 && counters.0.torques == 0;
-    session.check("CLAIM-2", is_so, || format!("a claiming cell takes joints; of 2: {:?}", counters.0));
+    let is_so = counters.heard.joints == 2 && counters.heard.torques == 0;
+    session.check("CLAIM-2", is_so, || format!("a claiming cell takes joints; of 2: {:?}", counters.heard));
     let refused = protocol::message::Refused { stimuli: u16::from(!presses), ..Default::default() };
-    session.check("CLAIM-2", counters.1 == refused, || {
-        format!("a claiming cell counted what it has to ignore: {:?}", counters.1)
+    session.check("CLAIM-2", counters.refused == refused, || {
+        format!("a claiming cell counted what it has to ignore: {:?}", counters.refused)
     });
     if presses {
         let report = session.report()?;

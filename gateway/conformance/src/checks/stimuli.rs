@@ -33,12 +33,12 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     count += late;
     count += order(session, &cell)?;
     let after = session.counters()?;
-    let counted = after.0.stimuli.wrapping_sub(before.0.stimuli);
+    let counted = after.heard.stimuli.wrapping_sub(before.heard.stimuli);
     session.check("STIM-3", counted == count, || format!("{count} stimuli were counted as {counted}"));
-    let counted = after.0.stimuli_late.wrapping_sub(before.0.stimuli_late);
+    let counted = after.heard.stimuli_late.wrapping_sub(before.heard.stimuli_late);
     session.check("STIM-5", counted == late, || format!("{late} late stimuli were counted as {counted}"));
-    let is_same = after.1 == before.1;
-    session.check("STIM-6", is_same, || format!("stimuli that had room were refused: {:?}", after.1));
+    let is_same = after.refused == before.refused;
+    session.check("STIM-6", is_same, || format!("stimuli that had room were refused: {:?}", after.refused));
     pending(session, &cell)?;
     forgotten(session, &cell)?;
     measuring(session)?;
@@ -194,8 +194,10 @@ fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
         session.say(&[Message::Stimulus { to, from: first, page }])?;
     }
     let after = session.counters()?;
-    let counted =
-        (after.0.stimuli.wrapping_sub(before.0.stimuli), after.1.stimuli.wrapping_sub(before.1.stimuli));
+    let counted = (
+        after.heard.stimuli.wrapping_sub(before.heard.stimuli),
+        after.refused.stimuli.wrapping_sub(before.refused.stimuli),
+    );
     session.check("STIM-6", counted == (8, 2), || {
         format!("of 10 stimuli {} were taken and {} refused; 8 can be pending", counted.0, counted.1)
     });
@@ -235,8 +237,8 @@ fn measuring(session: &mut Session<'_>) -> Result<(), Stop> {
     let last = session.known.last_epoch;
     session.press_at(last.wrapping_add(1), arm::press(6_666))?;
     let after = session.counters()?;
-    let counted = after.1.stimuli.wrapping_sub(before.1.stimuli);
-    session.check("STIM-1", counted == 2 && after.0.stimuli == before.0.stimuli, || {
+    let counted = after.refused.stimuli.wrapping_sub(before.refused.stimuli);
+    session.check("STIM-1", counted == 2 && after.heard.stimuli == before.heard.stimuli, || {
         format!("outside test mode 2 stimuli were counted as {counted} refused: {after:?}")
     });
     session.test_mode(true)?;
