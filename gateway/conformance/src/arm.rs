@@ -6,7 +6,7 @@ use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10, TorqueFormat};
 use protocol::id::CellId;
 use protocol::message::{Message, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
-use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
+use protocol::parameters::{Abilities, Contact, MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 use rand::seq::IndexedRandom as _;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_pcg::Pcg64Mcg;
@@ -91,6 +91,51 @@ pub(crate) fn document(joint: u8) -> Parameters {
 /// The same at 62.5 joints a second, where times matter.
 pub(crate) fn in_time(joint: u8) -> Parameters {
     Parameters { period_us: 16_000, ..document(joint) }
+}
+
+/// A configuration all of whose words are different, as large as the cell can have it: none is lost in flash unnoticed.
+pub(crate) fn distinct(abilities: Abilities) -> Parameters {
+    let mut all = document(3);
+    all.period_us = 55_500;
+    all.contact = Contact {
+        alpha_c: Q3_12::from_bits(4_101),
+        alpha_p: Q5_10::from_bits(1_031),
+        contact_threshold: Q5_10::from_bits(107),
+        proximity_threshold: Q1_14::from_bits(827),
+        force_threshold: Q5_10::from_bits(113),
+    };
+    for (row, step) in all.rows.iter_mut().zip(1..=6) {
+        row.theta_offset = Q1_14::from_bits(0x0107 * step);
+    }
+    let (joints, rows) = (abilities.joints(), abilities.rows());
+    let mut large = Parameters { torque_format: TorqueFormat::Q7_8, ..all };
+    let (mut moving, mut word) = (0, 0);
+    for (place, row) in large.rows.iter_mut().take(rows).enumerate() {
+        let rest = rows - place;
+        let is_fixed = moving == joints || place % 3 == 1 && rest > joints - moving;
+        moving += usize::from(!is_fixed);
+        let mut next = || {
+            word += 37;
+            Q1_14::from_bits(word)
+        };
+        let (a, d, alpha, theta_offset) = (next(), next(), next(), next());
+        let kind = match is_fixed {
+            true => RowKind::Fixed,
+            false if place % 4 == 2 => RowKind::Prismatic,
+            false => RowKind::Revolute,
+        };
+        *row = Row {
+            kind,
+            a: Q1_14::from_bits(a.to_bits() / 8),
+            d: Q1_14::from_bits(d.to_bits() / 8),
+            alpha,
+            theta_offset,
+        };
+    }
+    let byte = |number: usize| u8::try_from(number).unwrap_or_default();
+    (large.joints, large.table_rows, large.row) = (byte(joints), byte(rows), byte(rows));
+    large.joint = large.joints;
+    if abilities.lacks(&large).is_none() { large } else { all }
 }
 
 /// The gains and thresholds of the document's contact.

@@ -15,6 +15,8 @@ pub(crate) struct Exchange {
     pub(crate) at: Micros,
     /// What the cell sent, but for heartbeats.
     pub(crate) answers: Vec<Heard>,
+    /// How many heartbeats came.
+    pub(crate) beats: usize,
     /// The heartbeat to the sync, and its epoch byte.
     pub(crate) beat: Option<(Heartbeat, Epoch)>,
 }
@@ -71,9 +73,10 @@ impl Session<'_> {
         }
         let beat =
             self.answers().iter().rev().find_map(|heard| heard.beat().map(|(beat, epoch)| (*beat, epoch)));
+        let came = beats(self);
         let answers = self.answers().iter().filter(|heard| heard.beat().is_none()).copied().collect();
         self.consume();
-        let exchange = Exchange { at, answers, beat };
+        let exchange = Exchange { at, answers, beats: came, beat };
         self.look_at_state(&exchange);
         Ok(exchange)
     }

@@ -181,13 +181,20 @@ impl Session<'_> {
                 });
             }
         }
-        self.known.staged = Some(*parameters);
+        let mut staged = *parameters;
+        if let Some(before) = before {
+            // Rows behind the table stay.
+            let rows = staged.rows.iter_mut().zip(before.rows).skip(parameters.table().len().max(6));
+            rows.for_each(|(row, before)| *row = before);
+        }
+        self.known.staged = Some(staged);
         Ok(())
     }
 
     /// Has the cell use parameters; whether it does.
     pub(crate) fn commit(&mut self, parameters: &Parameters) -> Result<bool, Stop> {
-        if self.known.parameters == Some(*parameters) && self.known.staged == Some(*parameters) {
+        let is_so = |known: Option<Parameters>| known.is_some_and(|it| it.hash() == parameters.hash());
+        if self.known.parameters == Some(*parameters) && is_so(self.known.staged) {
             return Ok(true);
         }
         self.stage(parameters)?;
