@@ -4,6 +4,7 @@ use protocol::message::{Message, VERSION};
 use protocol::parameters::Parameter;
 use protocol::time::Span;
 
+use super::unconfigured;
 use crate::arm;
 use crate::bus::Stop;
 use crate::session::{Reply, Session};
@@ -22,6 +23,12 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     identity(session)?;
     session.about.ports = session.has_ports()?;
     options(session)?;
+    if session.known.hash == Some(0) {
+        unconfigured::run(session)?;
+    } else {
+        let why = "what a cell without a configuration does: it had one";
+        session.findings.not_tested("JOINTS-2", why);
+    }
     let document = arm::document(2);
     session.about.committed = session.commit(&document)?;
     session.known.halted = Some(false);

@@ -18,6 +18,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     if !session.ready(&arm::document(6))? {
         return Ok(());
     }
+    alone(session)?;
     halt(session)?;
     syncs(session)?;
     report(session)
@@ -38,6 +39,40 @@ fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Res
     Ok(exchange)
 }
 
+/// Nothing comes to a halt or a resume by itself, and a heartbeat to a sync of a halted cell, while no regular one is due.
+fn alone(session: &mut Session<'_>) -> Result<(), Stop> {
+    const ATTEMPTS: usize = 3;
+    let cases = [
+        ("a halt", Message::Halt, "CMD-1"),
+        ("a sync", Message::Sync, "CMD-3"),
+        ("a resume", Message::Resume, "CMD-1"),
+    ];
+    for (what, message, id) in cases {
+        let expected = usize::from(message == Message::Sync);
+        for attempt in 1..=ATTEMPTS {
+            session.quiet(Span::from_millis(120))?;
+            session.mark();
+            let at = session.say(&[message])?;
+            session.wait(at + Span::from_millis(25 + 60 * expected as u64), |heard| {
+                expected > 0 && heard.iter().any(|it| it.beat().is_some())
+            })?;
+            let came = session.answers().len();
+            session.consume();
+            if came == expected || attempt == ATTEMPTS {
+                session.check(id, came == expected, || {
+                    let halted = if expected > 0 { " of a halted cell" } else { "" };
+                    format!("{what}{halted} was answered with {came} packets, not {expected}")
+                });
+                break;
+            }
+        }
+        session.known.halted = Some(message != Message::Resume);
+        session.known.active = Some(false);
+    }
+    session.exchange_all(&[])?;
+    Ok(())
+}
+
 fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
     let unit = arm::press(arm::unit_press(protocol::fixed::TorqueFormat::Q3_12));
     let central = Central::of_cell(&arm::document(6));
@@ -55,12 +90,13 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
             session.exchange_all(&[])?;
         }
         let before = session.counters()?.heard;
-        for _ in 0..4 {
-            session.step(&HERE)?;
+        for positions in [HERE, HERE, HERE, HERE, THERE] {
+            let epoch = session.next_epoch();
+            session.step_at(epoch, &positions)?;
         }
-        session.step(&THERE)?;
         let after = session.counters()?.heard;
-        let counted = after.joints.wrapping_sub(before.joints);
+        let taken = |of: &protocol::message::Heard| of.joints.wrapping_add(of.joints_late);
+        let counted = taken(&after).wrapping_sub(taken(&before));
         session
             .check("CMD-1", counted == 5, || format!("5 joints were counted as {counted} by a halted cell"));
         session.check("CMD-1", after.torques == before.torques, || {
@@ -72,7 +108,7 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
         let off =
             step.words().iter().zip(exact).map(|(word, exact)| arm::off(*word, exact)).max().unwrap_or(0);
         session.check("CMD-2", off <= 8, || {
-            format!("the first torque after a resume is not of the new joints: {:?}", step.words())
+            format!("the first torque after a resume is not of the new joints: {}", arm::list(&step.words()))
         });
         // Released while it was halted: ACTIVE was cleared, so no zeros are due.
         command(session, Message::Halt, "CMD-1")?;
@@ -141,7 +177,10 @@ fn report(session: &mut Session<'_>) -> Result<(), Stop> {
         session
             .check("SENSE-1", sent.len() == 2, || format!("{} sensors pages came to a report", sent.len()));
         session.check("SENSE-2", sent == latched, || {
-            format!("{sent:?} was reported, and {latched:?} is latched")
+            let text = |pages: &[SensorPage]| {
+                pages.iter().map(|page| arm::page(*page)).collect::<Vec<_>>().join("; ")
+            };
+            format!("{} was reported, and {} is latched", text(&sent), text(&latched))
         });
     }
     session.pressed(&HERE, arm::press(0))?;

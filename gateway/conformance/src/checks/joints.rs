@@ -1,7 +1,6 @@
 //! Which joints are taken, and how they are counted and answered.
 
 use protocol::can::Frame;
-use protocol::message::{SensorPage, SkinSensors};
 use protocol::packet::{Epoch, Length, Packet, Words};
 use protocol::parameters::{MAX_JOINTS, Parameters};
 use protocol::time::{Micros, Span};
@@ -70,7 +69,7 @@ fn repeats(session: &mut Session<'_>) -> Result<(), Stop> {
         session.press(arm::press(2_000))?;
         let joints = session.joints(first, &POSITIONS);
         session.exchange_all(&[joints])?;
-        let skin = latched(session)?;
+        let skin = session.latched()?;
         session.check("JOINTS-1", skin == Some(arm::press(4_096)), || {
             format!("repeated joints latched a stimulus: {}", arm::skin(skin))
         });
@@ -94,12 +93,12 @@ fn counts(session: &mut Session<'_>) -> Result<(), Stop> {
         let epoch = session.next_epoch();
         // Held from the joints that follow on, whatever their epoch.
         let sum = 4_096 + i32::from(count) * 8;
-        let before_press = latched(session)?;
+        let before_press = session.latched()?;
         session.press(arm::press(sum))?;
         before = session.counters()?;
         let frames = raw(session, epoch, count, Length::Six);
         let exchange = session.exchange(&frames)?;
-        let skin = latched(session)?;
+        let skin = session.latched()?;
         session.check("JOINTS-2", skin == before_press, || {
             format!("joints with count {count} latched a stimulus: {}", arm::skin(skin))
         });
@@ -149,15 +148,6 @@ fn counts(session: &mut Session<'_>) -> Result<(), Stop> {
         });
     }
     Ok(())
-}
-
-/// What is latched, as a report says it.
-fn latched(session: &mut Session<'_>) -> Result<Option<SkinSensors>, Stop> {
-    let pages = session.report()?;
-    Ok(pages.iter().find_map(|heard| match heard.sensors() {
-        Some((_, SensorPage::Skin(skin))) => Some(*skin),
-        _ => None,
-    }))
 }
 
 /// Joints with any count.
@@ -263,7 +253,7 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
     shown.any |= skipped > 0;
     if skipped > 0 && taken == u16::from(BURST) {
         // They are the last ones taken, latch stimuli and leave ACTIVE alone, all the same.
-        let page = latched(session)?;
+        let page = session.latched()?;
         session.check("STIM-8", page == Some(arm::press(press)), || {
             format!("skipped joints did not latch a stimulus: {}", arm::skin(page))
         });

@@ -8,6 +8,7 @@ mod counters;
 mod force;
 mod joints;
 mod kinematics;
+mod leaves;
 mod options;
 mod parameters;
 mod refusals;
@@ -16,6 +17,7 @@ mod segments;
 mod sensing;
 mod sensing_model;
 mod stimuli;
+mod unconfigured;
 
 use std::collections::BTreeSet;
 
@@ -59,6 +61,7 @@ const fn group(
 const GROUPS: &[Group] = &[
     group(&["CONF-1", "CONF-2", "CONF-3", "CONF-4", "CONF-7", "CONF-12"], Needs::Nothing, parameters::run),
     group(&["CONF-11", "CONF-13", "ID-2", "OPT-1"], Needs::Nothing, parameters::others),
+    group(&["CONF-7", "CONF-9", "CMD-2", "STATE-1"], Needs::Press, leaves::run),
     group(&["CONF-5", "CONF-6", "COUNT-2"], Needs::Nothing, refusals::run),
     group(&["CONF-9", "CONF-10", "SENSE-3", "OPT-1", "LINK-1"], Needs::Nothing, options::switches),
     group(&["OPT-2"], Needs::Nothing, options::ignored),
@@ -79,7 +82,7 @@ const GROUPS: &[Group] = &[
     group(&["COUNT-1", "SEND-1"], Needs::Nothing, counters::run),
     group(&["COUNT-3"], Needs::Classic, segments::run),
     group(&["CLAIM-6", "CLAIM-7", "STATE-2"], Needs::Nothing, claims::run),
-    group(&["BEAT-1", "BEAT-2", "BEAT-3", "TIME-1"], Needs::Nothing, beats::run),
+    group(&["BEAT-1", "BEAT-2", "BEAT-3", "CMD-1", "STIM-7", "TIME-1", "TIME-3"], Needs::Nothing, beats::run),
     group(
         &["SENSE-4", "SENSE-5", "SENSE-6", "SENSE-7", "SENSE-8", "SENSE-9", "SENSE-10", "SENSE-11", "TIME-3"],
         Needs::Sensing,

@@ -1,7 +1,8 @@
 //! Joints, and what a cell has to answer them with.
 
-use protocol::message::{From, Message, SensorPage, SkinSensors, State};
-use protocol::packet::{Epoch, Length, Words};
+use protocol::id::Node;
+use protocol::message::{From, Message, Request, SensorPage, SkinSensors, State};
+use protocol::packet::{Epoch, Length, Words, words};
 use protocol::parameters::{MAX_JOINTS, Parameter};
 
 use super::{Exchange, Heard, Session};
@@ -41,14 +42,14 @@ impl Session<'_> {
     /// A stimulus that holds from the next joints on.
     pub(crate) fn press(&mut self, skin: SkinSensors) -> Result<(), Stop> {
         self.known.pending = Some(skin);
-        let to = protocol::id::Node::Cell(self.cell);
+        let to = Node::Cell(self.cell);
         self.say(&[Message::Stimulus { to, from: From::Next, page: SensorPage::Skin(skin) }])?;
         Ok(())
     }
 
     /// A stimulus that holds from these joints on.
     pub(crate) fn press_at(&mut self, first: u8, skin: SkinSensors) -> Result<(), Stop> {
-        let to = protocol::id::Node::Cell(self.cell);
+        let to = Node::Cell(self.cell);
         self.say(&[Message::Stimulus { to, from: From::Epoch(Epoch(first)), page: SensorPage::Skin(skin) }])?;
         Ok(())
     }
@@ -210,9 +211,24 @@ impl Session<'_> {
         }
     }
 
+    /// The skin page of a report.
+    pub(crate) fn latched(&mut self) -> Result<Option<SkinSensors>, Stop> {
+        let pages = self.report()?;
+        Ok(pages.iter().find_map(|heard| match heard.sensors() {
+            Some((_, SensorPage::Skin(skin))) => Some(*skin),
+            _ => None,
+        }))
+    }
+
     /// Test mode on or off, which forgets all stimuli.
     pub(crate) fn test_mode(&mut self, on: bool) -> Result<(), Stop> {
-        let reply = self.set(Parameter::Mode.number(), [i16::from(on)])?;
+        self.switch(Node::Cell(self.cell), on)
+    }
+
+    /// The same of one cell or of everyone.
+    pub(crate) fn switch(&mut self, to: Node, on: bool) -> Result<(), Stop> {
+        let (number, words) = (Parameter::Mode.number(), words([on.into()]));
+        let reply = self.request(to, Request::Write { number, words })?;
         self.known.test_mode = reply.words().map(|words| words.first() == Some(&1));
         (self.known.skin, self.known.pending) = (on.then(SkinSensors::default), None);
         Ok(())
