@@ -70,8 +70,9 @@ struct Clock {
     end: Micros,
     /// By how much the bench was late since the exchange began.
     late: Span,
-    /// The same since a group of checks began.
+    /// The same since a group of checks began, and ever.
     worst: Span,
+    longest: Span,
     /// The last torque was saturated.
     saturated: bool,
     /// Packets whose segments came too late after each other.
@@ -164,6 +165,7 @@ impl<'a> Session<'a> {
                 end: now + longest,
                 late: Span(0),
                 worst: Span(0),
+                longest: Span(0),
                 saturated: false,
                 torn: 0,
                 other_epochs: false,
@@ -350,6 +352,7 @@ impl<'a> Session<'a> {
     pub(crate) fn lateness(&mut self) -> Span {
         self.clock.late = self.clock.late.max(self.bus.lateness());
         self.clock.worst = self.clock.worst.max(self.clock.late);
+        self.clock.longest = self.clock.longest.max(self.clock.late);
         self.clock.late
     }
 

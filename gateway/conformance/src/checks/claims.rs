@@ -64,12 +64,13 @@ fn beats(session: &Session<'_>) -> Vec<(Micros, State)> {
 
 /// A claim is answered at once, with DUPLICATE, which is clear then.
 fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), Stop> {
-    session.quiet(Span::from_millis(80))?;
+    // How late the answer may be is a matter of TIME-2.
+    session.quiet(Span::from_millis(160))?;
     session.mark();
     let claim = twin(session, serial, true);
     let at = session.say(&[claim])?;
     let came =
-        session.wait(at + Span::from_millis(60), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        session.wait(at + Span::from_millis(120), |heard| heard.iter().any(|it| it.beat().is_some()))?;
     session.check("CLAIM-6", came, || format!("a claim with serial number {serial} was not answered"));
     if let Some((answered, state)) = beats(session).first().copied() {
         session.note_time("heartbeat to a claimant", at, answered);

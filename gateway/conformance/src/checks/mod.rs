@@ -140,9 +140,13 @@ fn groups(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
                 }
             }
         } else if group.about.iter().any(|id| only.has(id)) {
+            if group.needs == Needs::Restart {
+                session.check_all_beats();
+            }
             run_group(session, group)?;
         }
     }
+    session.check_all_beats();
     session.check_segments();
     if only.has("TIME-2") && session.about.committed { session.measure_times() } else { Ok(()) }
 }

@@ -315,14 +315,13 @@ fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
         return Ok(());
     };
     let Some(claimed) = claimed_before_its_first(session, higher)? else { return Ok(()) };
-    session.idle(Span::from_millis(90))?;
     let low_is_lower = if own & 0xFFFF > 0 { own.checked_add(0xFFFF) } else { None };
     for serial in [Some(higher), low_is_lower, Some(u32::MAX)].into_iter().flatten() {
         session.start();
         let claim = twin(session, serial, true);
         let at = session.say(&[claim])?;
         let came =
-            session.wait(at + Span::from_millis(60), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+            session.wait(at + Span::from_millis(100), |heard| heard.iter().any(|it| it.beat().is_some()))?;
         let answer = session.answers().iter().find_map(|it| Some((it.at, it.beat()?.0.state)));
         session.consume();
         session.check("CLAIM-3", came, || {
@@ -362,11 +361,17 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
             });
             return Ok(None);
         };
-        let mut new = session.answers().iter().filter(|it| it.at >= claimed).filter_map(Heard::beat);
-        let is_set = new.next().is_some_and(|(beat, _)| beat.state.has(State::DUPLICATE));
-        if is_set || !is_long || attempt == ATTEMPTS {
+        // An answer, and then the heartbeat that nothing asked for.
+        session.idle(Span::from_millis(80))?;
+        let new = session.answers().iter().filter(|it| it.at >= claimed).filter_map(Heard::beat);
+        let is_set = new.clone().next().is_some_and(|(beat, _)| beat.state.has(State::DUPLICATE));
+        let is_answered = new.count() > 1;
+        if is_set && is_answered || !is_long || attempt == ATTEMPTS {
             session.check("CLAIM-7", is_set || !is_long, || {
                 "DUPLICATE is not set in the first heartbeat after claims that came before it".to_owned()
+            });
+            session.check("CLAIM-3", is_answered || !is_long, || {
+                "claims that came before its first heartbeat were not answered".to_owned()
             });
             return Ok(Some(claimed));
         }

@@ -47,6 +47,8 @@ pub(super) struct Ledger {
     defended: Option<Micros>,
     /// When a regular heartbeat came, and all heartbeats until then.
     anchor: Option<(Micros, Beats)>,
+    /// Heartbeats that came too many, over all such times: at least, and at most.
+    surplus: (i64, i64),
     /// Heartbeats since then that are not waited for any more.
     given_up: u64,
 }
@@ -187,6 +189,22 @@ impl Ledger {
         let (before_at, before) = self.anchor.replace((at, self.beats))?;
         let regular = (at.since(before_at).0 + BEAT.0 / 2) / BEAT.0;
         let asked = |of: fn(&Beats) -> u64| regular + of(&self.beats) - of(&before);
-        Some((self.beats.came - before.came, asked(|it| it.asked.0), asked(|it| it.asked.1)))
+        let (came, min, max) =
+            (self.beats.came - before.came, asked(|it| it.asked.0), asked(|it| it.asked.1));
+        self.surplus.0 += came.cast_signed() - max.cast_signed();
+        self.surplus.1 += came.cast_signed() - min.cast_signed();
+        Some((came, min, max))
+    }
+
+    /// How many heartbeats came too many over all such times, if it is certain; too few are below 0.
+    pub(super) const fn surplus(&self) -> i64 {
+        let (min, max) = self.surplus;
+        if min > 0 {
+            min
+        } else if max < 0 {
+            max
+        } else {
+            0
+        }
     }
 }
