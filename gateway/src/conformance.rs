@@ -3,7 +3,7 @@
 mod show;
 
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::Args;
@@ -129,10 +129,10 @@ impl Conformance {
 }
 
 /// What an earlier test saved.
-fn read(path: &PathBuf) -> Result<Saved, Failure> {
+fn read(path: &Path) -> Result<Saved, Failure> {
     let wrong =
         |error: &dyn std::fmt::Display| Failure::usage(format!("--restore {}: {error}", path.display()));
-    let text = fs::read_to_string(path).map_err(|error| wrong(&error))?;
+    let text = protocol::document::text(path).map_err(Failure::usage)?;
     serde_json::from_str(&text).map_err(|error| wrong(&error))
 }
 

@@ -79,6 +79,24 @@ fn without_a_restart_what_shows_only_at_a_start_is_not_tested() {
     assert_eq!(untested, ["ID-3", "CLAIM-1", "CLAIM-2", "CLAIM-3", "CLAIM-4", "CLAIM-5", "CONF-8"]);
 }
 
+/// A cell that waits for a processor skips joints and is late, as it may: nothing but times is held against it.
+#[test]
+fn a_cell_that_waits_for_a_processor_is_not_blamed() {
+    let timed = |id: &&str| {
+        ["TIME-", "BEAT-", "SENSE-5", "SENSE-6", "CLAIM-"].iter().any(|start| id.starts_with(start))
+    };
+    for (seed, format) in (1..=6).zip([Format::Fd, Format::Classic].into_iter().cycle()) {
+        for is_seen in [true, false] {
+            let mut bus = Virtual::new(format, 12, Box::new(Right)).starved(seed, is_seen);
+            let (findings, failed) = test(&mut bus, format, 12, &Only::default());
+            let failed: Vec<_> = failed.into_iter().filter(|id| !timed(id)).collect();
+            assert_eq!(failed, [""; 0], "seed {seed}, {format:?}, {is_seen}\n{}", failures(&findings));
+            let passed = findings.iter().filter(|it| matches!(it.verdict, Verdict::Passed { .. })).count();
+            assert!(passed > 65, "{passed}");
+        }
+    }
+}
+
 /// Cells that are right and have less: no option, few abilities; or take their time.
 #[test]
 fn cells_with_less_pass() {
@@ -180,6 +198,16 @@ fn wrong_sensor_pages_are_found() {
 #[test]
 fn wrong_starts_are_found() {
     are_found(mutants::starts::STARTS, Format::Fd);
+}
+
+#[test]
+fn flash_that_loses_something_is_found() {
+    are_found(mutants::flash::FLASH, Format::Fd);
+}
+
+#[test]
+fn commits_that_take_something_along_are_found() {
+    are_found(mutants::flash::LEAVES, Format::Fd);
 }
 
 /// What passes for the right cell is failed by a wrong one; but for what follows from other requirements.

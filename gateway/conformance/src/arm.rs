@@ -1,37 +1,33 @@
 //! Configurations to test with, and what the documents say of them: F_z, torque words, and J in floating point.
 
 use model::central::Central;
+use model::decode::Decoded;
 use protocol::fixed::{Q, Q1_14, Q3_12, Q5_10, TorqueFormat};
-use protocol::message::SkinSensors;
-use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
+use protocol::id::CellId;
+use protocol::message::{Message, SensorPage, SkinSensors};
+use protocol::packet::Epoch;
+use protocol::parameters::{Abilities, Contact, MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
+use rand::seq::IndexedRandom as _;
+use rand::{RngExt as _, SeedableRng as _};
+use rand_pcg::Pcg64Mcg;
 
 /// Numbers that look random, the same ones each time.
 #[derive(Clone, Debug)]
-pub(crate) struct Dice(u64);
+pub(crate) struct Dice(Pcg64Mcg);
 
 impl Dice {
-    pub(crate) const fn new(seed: u64) -> Self {
-        Self(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1)
-    }
-
-    /// The next 32 bits (xorshift64*).
-    fn next(&mut self) -> u32 {
-        self.0 ^= self.0 >> 12;
-        self.0 ^= self.0 << 25;
-        self.0 ^= self.0 >> 27;
-        let [_, _, _, _, a, b, c, d] = self.0.wrapping_mul(0x2545_F491_4F6C_DD1D).to_le_bytes();
-        u32::from_le_bytes([a, b, c, d])
+    pub(crate) fn new(seed: u64) -> Self {
+        Self(Pcg64Mcg::seed_from_u64(seed))
     }
 
     /// Any word.
     pub(crate) fn word(&mut self) -> i16 {
-        let [a, b, ..] = self.next().to_le_bytes();
-        i16::from_le_bytes([a, b])
+        self.0.random()
     }
 
-    /// A number below a bound.
+    /// A number below a bound; 0 where that is 0.
     pub(crate) fn below(&mut self, bound: u32) -> u32 {
-        self.next() % bound.max(1)
+        self.0.random_range(0..bound.max(1))
     }
 
     /// A number in [-1, 1).
@@ -41,8 +37,7 @@ impl Dice {
 
     /// One of a few.
     pub(crate) fn one<T: Copy + Default>(&mut self, of: &[T]) -> T {
-        let place = self.below(u32::try_from(of.len()).unwrap_or(u32::MAX));
-        of.get(place as usize).copied().unwrap_or_default()
+        of.choose(&mut self.0).copied().unwrap_or_default()
     }
 }
 
@@ -96,6 +91,51 @@ pub(crate) fn document(joint: u8) -> Parameters {
 /// The same at 62.5 joints a second, where times matter.
 pub(crate) fn in_time(joint: u8) -> Parameters {
     Parameters { period_us: 16_000, ..document(joint) }
+}
+
+/// A configuration all of whose words are different, as large as the cell can have it: none is lost in flash unnoticed.
+pub(crate) fn distinct(abilities: Abilities) -> Parameters {
+    let mut all = document(3);
+    all.period_us = 55_500;
+    all.contact = Contact {
+        alpha_c: Q3_12::from_bits(4_101),
+        alpha_p: Q5_10::from_bits(1_031),
+        contact_threshold: Q5_10::from_bits(107),
+        proximity_threshold: Q1_14::from_bits(827),
+        force_threshold: Q5_10::from_bits(113),
+    };
+    for (row, step) in all.rows.iter_mut().zip(1..=6) {
+        row.theta_offset = Q1_14::from_bits(0x0107 * step);
+    }
+    let (joints, rows) = (abilities.joints(), abilities.rows());
+    let mut large = Parameters { torque_format: TorqueFormat::Q7_8, ..all };
+    let (mut moving, mut word) = (0, 0);
+    for (place, row) in large.rows.iter_mut().take(rows).enumerate() {
+        let rest = rows - place;
+        let is_fixed = moving == joints || place % 3 == 1 && rest > joints - moving;
+        moving += usize::from(!is_fixed);
+        let mut next = || {
+            word += 37;
+            Q1_14::from_bits(word)
+        };
+        let (a, d, alpha, theta_offset) = (next(), next(), next(), next());
+        let kind = match is_fixed {
+            true => RowKind::Fixed,
+            false if place % 4 == 2 => RowKind::Prismatic,
+            false => RowKind::Revolute,
+        };
+        *row = Row {
+            kind,
+            a: Q1_14::from_bits(a.to_bits() / 8),
+            d: Q1_14::from_bits(d.to_bits() / 8),
+            alpha,
+            theta_offset,
+        };
+    }
+    let byte = |number: usize| u8::try_from(number).unwrap_or_default();
+    (large.joints, large.table_rows, large.row) = (byte(joints), byte(rows), byte(rows));
+    large.joint = large.joints;
+    if abilities.lacks(&large).is_none() { large } else { all }
 }
 
 /// The gains and thresholds of the document's contact.
@@ -218,6 +258,23 @@ pub(crate) fn contact(sum: i32) -> [Q5_10; 3] {
     let second = ((sum - first) / 2).clamp(i16::MIN.into(), i16::MAX.into());
     [first, second, sum - first - second]
         .map(|word| Q5_10::from_bits(i16::try_from(word).unwrap_or_default()))
+}
+
+/// Words, one after the other.
+pub(crate) fn list(words: &[i16]) -> String {
+    words.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")
+}
+
+/// A sensors page in words.
+pub(crate) fn page(page: SensorPage) -> String {
+    let message = Message::Sensors { from: CellId::MAX, epoch: Epoch(0), page };
+    let text = Decoded::Message(message).to_string();
+    text.split_once(": ").map_or_else(String::new, |(_, values)| values.to_owned())
+}
+
+/// What is latched, in words.
+pub(crate) fn skin(skin: Option<SkinSensors>) -> String {
+    skin.map_or_else(|| "nothing".to_owned(), |skin| page(SensorPage::Skin(skin)))
 }
 
 /// A press with this sum of contact words and nothing else.

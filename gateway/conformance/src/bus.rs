@@ -1,6 +1,6 @@
 //! The bus that the cell is on, as the checks see it: in virtual time or real.
 
-use protocol::can::Frame;
+use protocol::can::{Format, Frame};
 use protocol::time::{Micros, Span};
 use thiserror::Error;
 
@@ -19,6 +19,9 @@ pub struct Seen {
 pub trait Bus {
     /// The time.
     fn now(&self) -> Micros;
+
+    /// Whether frames of this format can be sent, whatever format the cell's are.
+    fn carries(&self, format: Format) -> bool;
 
     /// Sends frames, in order. Each comes back by [`Bus::receive`], marked as own, when it was on the bus.
     ///

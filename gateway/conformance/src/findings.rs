@@ -109,6 +109,19 @@ impl Findings {
         self.0.iter().filter(|(_, tally)| tally.failed > 0).map(|(id, _)| *id).collect()
     }
 
+    /// The ids that have failed more often than there.
+    pub(crate) fn failed_since(&self, before: &Self) -> impl Iterator<Item = &'static str> {
+        let failed = |of: &Self, id| of.0.get(id).map_or(0, |tally| tally.failed);
+        self.0.keys().copied().filter(move |id| failed(self, *id) > failed(before, *id))
+    }
+
+    /// What failed of a requirement since then does not count.
+    pub(crate) fn forgive(&mut self, id: &'static str, before: &Self) {
+        let Tally { failed, failure, .. } = before.0.get(id).cloned().unwrap_or_default();
+        let tally = self.tally(id);
+        (tally.failed, tally.failure) = (failed, failure);
+    }
+
     /// What came of a requirement; `why` it was not tested if nothing says so.
     fn verdict(&self, id: &str, why: &str) -> Verdict {
         let tally = self.0.get(id).cloned().unwrap_or_default();

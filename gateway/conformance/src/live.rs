@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use bench::listen;
 use protocol::bus::{Bus as Socket, BusError, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
-use protocol::can::Frame;
+use protocol::can::{Format, Frame};
 use protocol::time::{Micros, Span};
 
 use crate::bus::{Bus, Seen, Stop};
@@ -67,6 +67,11 @@ fn lost(error: impl ToString) -> Stop {
 impl Bus for Live {
     fn now(&self) -> Micros {
         listen::now()
+    }
+
+    fn carries(&self, format: Format) -> bool {
+        // A real classic bus would be disturbed.
+        format == Format::Classic || self.socket.carries_fd() && self.probe.is_some()
     }
 
     fn send(&mut self, frames: &[Frame]) -> Result<(), Stop> {

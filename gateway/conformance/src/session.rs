@@ -1,14 +1,17 @@
 //! A conversation with the cell: sends, collects what the cell sends, and checks what holds of every packet.
 
+mod beats;
+mod exchange;
 mod joints;
 mod known;
+mod ledger;
 mod receive;
 mod request;
 
 use protocol::can::{Format, Frame};
 use protocol::candump::{Record, Timestamp};
 use protocol::id::CellId;
-use protocol::message::{Heartbeat, Joints, Message, NetworkPage, SensorPage, State};
+use protocol::message::{Heartbeat, Joints, Message, NetworkPage, SensorPage};
 use protocol::packet::{Epoch, Segment, Words};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
@@ -17,13 +20,17 @@ use crate::bus::{Bus, Seen, Stop};
 use crate::findings::Findings;
 use crate::timing::Timings;
 
+pub(crate) use exchange::Exchange;
 pub(crate) use known::{About, Known};
+use ledger::Ledger;
 pub(crate) use request::Reply;
 
 /// Longer than any answer takes that comes at all.
 pub(crate) const PATIENT: Span = Span::from_millis(300);
 /// After a sync's heartbeat nothing is awaited longer than this.
 pub(crate) const LINGER: Span = Span::from_millis(5);
+/// What was sent is on the bus by then, whatever else this computer does.
+const ON_BUS: Span = Span::from_millis(1_200);
 /// A cell that sends nothing for so long has fallen silent.
 const SILENT: Span = Span::from_millis(1_500);
 
@@ -54,28 +61,6 @@ impl Heard {
     }
 }
 
-/// What came of some packets with a sync after them.
-#[derive(Clone, Debug)]
-pub(crate) struct Exchange {
-    /// When the first of our packets was on the bus as a whole.
-    pub(crate) at: Micros,
-    /// What the cell sent, but for heartbeats.
-    pub(crate) answers: Vec<Heard>,
-    /// The heartbeat to the sync, and its epoch byte.
-    pub(crate) beat: Option<(Heartbeat, Epoch)>,
-}
-
-impl Exchange {
-    /// Whether the cell answered nothing but the sync.
-    pub(crate) fn is_silent(&self) -> bool {
-        self.answers.is_empty()
-    }
-
-    pub(crate) fn state(&self) -> State {
-        self.beat.map(|(beat, _)| beat.state).unwrap_or_default()
-    }
-}
-
 /// Times of the conversation.
 #[derive(Clone, Copy, Debug)]
 struct Clock {
@@ -85,14 +70,21 @@ struct Clock {
     end: Micros,
     /// By how much the bench was late since the exchange began.
     late: Span,
+    /// The same since a group of checks began, and ever.
+    worst: Span,
+    longest: Span,
+    /// The last torque was saturated.
+    saturated: bool,
+    /// Packets whose segments came too late after each other.
+    torn: usize,
+    /// Heartbeats do not have the epoch of the last joints.
+    other_epochs: bool,
     /// The cell is put back, whoever else is there.
     finishing: bool,
     /// A regular heartbeat that nothing asked for.
     regular: Option<Micros>,
     /// The last joints were too old when the cell came to them.
     skipped: bool,
-    /// Syncs that were sent.
-    syncs: usize,
     /// What an answer takes, with the way there and back.
     round_trip: Span,
 }
@@ -115,8 +107,12 @@ pub struct Session<'a> {
     pub(crate) from: usize,
     /// Up to where they were expected.
     consumed: usize,
-    /// Segments that wait for the others, by kind.
-    segments: [Segment; 8],
+    /// Segments that wait for the others, by kind, and when the last one came.
+    segments: [(Segment, Micros); 8],
+    /// Joints whose answers came so late that the cell may have skipped them.
+    pub(crate) skips: u16,
+    /// What was counted of the bus.
+    ledger: Ledger,
     /// What was found.
     pub findings: Findings,
     pub(crate) known: Known,
@@ -154,7 +150,9 @@ impl<'a> Session<'a> {
             heard: Vec::new(),
             from: 0,
             consumed: 0,
-            segments: [Segment::NONE; 8],
+            segments: [const { (Segment::NONE, Micros(0)) }; 8],
+            skips: 0,
+            ledger: Ledger::default(),
             findings: Findings::default(),
             known: Known::default(),
             about: About::default(),
@@ -166,10 +164,14 @@ impl<'a> Session<'a> {
                 last: now,
                 end: now + longest,
                 late: Span(0),
+                worst: Span(0),
+                longest: Span(0),
+                saturated: false,
+                torn: 0,
+                other_epochs: false,
                 finishing: false,
                 regular: None,
                 skipped: false,
-                syncs: 0,
                 round_trip: Span(0),
             },
         }
@@ -199,6 +201,10 @@ impl<'a> Session<'a> {
     /// The cell was allowed to be silent until now.
     pub(crate) fn extend_life(&mut self) {
         self.clock.last = self.bus.now();
+    }
+
+    pub(crate) fn carries(&self, format: Format) -> bool {
+        self.bus.carries(format)
     }
 
     pub(crate) fn can_restart(&self) -> bool {
@@ -234,7 +240,7 @@ impl<'a> Session<'a> {
     pub(crate) fn start(&mut self) {
         self.clock.skipped = false;
         (self.since, self.from, self.consumed) = (self.ended, self.heard.len(), self.heard.len());
-        self.bus.lateness();
+        self.lateness();
         self.clock.late = Span(0);
     }
 
@@ -257,7 +263,18 @@ impl<'a> Session<'a> {
     /// The cell has been switched off: its counts begin again.
     pub(crate) fn forget_counts(&mut self) {
         self.sent = None;
-        self.segments = [Segment::NONE; 8];
+        self.segments = [const { (Segment::NONE, Micros(0)) }; 8];
+        self.ledger = Ledger::default();
+    }
+
+    /// Nothing that was written is taken for granted any more.
+    pub(crate) fn forget(&mut self) {
+        self.known = Known {
+            last_epoch: self.known.last_epoch,
+            joints: self.known.joints,
+            hash: None,
+            ..Known::default()
+        };
     }
 
     /// Sends frames, and waits until the last one was on the bus: when that was.
@@ -271,7 +288,7 @@ impl<'a> Session<'a> {
         let Some(last) = frames.last() else { return Ok(Vec::new()) };
         let before = self.log.len();
         self.bus.send(frames)?;
-        let give_up = self.bus.now() + PATIENT;
+        let give_up = self.bus.now() + ON_BUS;
         loop {
             let own = self.log.get(before..).unwrap_or_default().iter().filter(|seen| seen.own);
             let own: Vec<_> = own.map(|seen| seen.at).collect();
@@ -296,7 +313,6 @@ impl<'a> Session<'a> {
         for message in messages {
             let frames = self.frames(message);
             let on_bus = self.send(&frames)?;
-            self.clock.syncs += usize::from(*message == Message::Sync);
             at.get_or_insert(on_bus);
         }
         Ok(at.unwrap_or_else(|| self.now()))
@@ -325,53 +341,6 @@ impl<'a> Session<'a> {
         self.wait(until, |_| false).map(|_| ())
     }
 
-    /// Sends frames and then a sync, and collects what comes until the sync is answered.
-    pub(crate) fn exchange(&mut self, frames: &[Frame]) -> Result<Exchange, Stop> {
-        self.mark();
-        let at = self.send(frames)?;
-        self.finish(at)
-    }
-
-    /// The same with packets.
-    pub(crate) fn exchange_all(&mut self, messages: &[Message]) -> Result<Exchange, Stop> {
-        self.mark();
-        let at = self.say(messages)?;
-        self.finish(at)
-    }
-
-    /// A sync, and what came since the exchange began.
-    fn finish(&mut self, at: Micros) -> Result<Exchange, Stop> {
-        let sync = self.say(&[Message::Sync])?;
-        let is_answer = |heard: &Heard| heard.beat().is_some() && heard.at >= sync;
-        let answered = self.wait(sync + PATIENT, |heard| heard.iter().any(is_answer))?;
-        self.check("CMD-3", answered, || "no heartbeat after a sync".to_owned());
-        let beats = |it: &Self| it.answers().iter().filter(|heard| heard.beat().is_some()).count();
-        if self.answers().len() == beats(self) || self.known.senses {
-            // A regular heartbeat may have come between, and a cell that is wrong may answer later.
-            self.idle(LINGER)?;
-        }
-        let first = self.answers().iter().find(|heard| is_answer(heard)).copied();
-        if let (Some(first), 1) = (first, beats(self)) {
-            self.note_time("heartbeat to sync", sync, first.at);
-        }
-        let torque = self.answers().iter().rposition(|heard| heard.torque().is_some());
-        if let Some(torque) = torque {
-            let after = |it: &Self| it.answers().iter().skip(torque).any(|heard| heard.beat().is_some());
-            if !after(self) {
-                self.idle(Span::from_millis(20))?;
-            }
-            let is_after = after(self);
-            self.check("CMD-3", is_after, || "the heartbeat to a sync came before the torque".to_owned());
-        }
-        let beat =
-            self.answers().iter().rev().find_map(|heard| heard.beat().map(|(beat, epoch)| (*beat, epoch)));
-        let answers = self.answers().iter().filter(|heard| heard.beat().is_none()).copied().collect();
-        self.consume();
-        let exchange = Exchange { at, answers, beat };
-        self.look_at_state(&exchange);
-        Ok(exchange)
-    }
-
     /// What the cell sends late comes now.
     pub(crate) fn settle(&mut self) -> Result<(), Stop> {
         self.idle(Span::from_millis(15))?;
@@ -379,30 +348,29 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
-    /// The time, and how many heartbeats came and syncs were sent until now.
-    pub(crate) fn tally(&self) -> (Micros, usize, usize) {
-        let beats = self.heard.iter().filter(|it| it.beat().is_some()).count();
-        (self.now(), beats, self.clock.syncs)
-    }
-
-    /// A heartbeat for each sync since then, four a second, and no more.
-    pub(crate) fn check_beats(&mut self, (began, beats, syncs): (Micros, usize, usize)) {
-        const EDGE: u64 = 2;
-        let (now, all_beats, all_syncs) = self.tally();
-        let regular = now.since(began).0 / 250_000;
-        let came = (all_beats - beats) as u64;
-        let asked = (all_syncs - syncs) as u64;
-        let range = (asked + regular).saturating_sub(EDGE)..=asked + regular + EDGE;
-        self.check("BEAT-1", range.contains(&came), || {
-            let ms = now.since(began).0 / 1_000;
-            format!("{came} heartbeats in {ms} ms with {asked} syncs; {} are right", asked + regular)
-        });
-    }
-
     /// By how much the bench was late since the exchange began.
     pub(crate) fn lateness(&mut self) -> Span {
         self.clock.late = self.clock.late.max(self.bus.lateness());
+        self.clock.worst = self.clock.worst.max(self.clock.late);
+        self.clock.longest = self.clock.longest.max(self.clock.late);
         self.clock.late
+    }
+
+    /// By how much the bench was late since this was called last, in whatever exchange.
+    pub(crate) fn worst_lateness(&mut self) -> Span {
+        self.lateness();
+        core::mem::take(&mut self.clock.worst)
+    }
+
+    /// Whether segments followed each other: those of a few packets may wait for a processor.
+    pub(crate) fn check_segments(&mut self) {
+        const FEW: usize = 3;
+        if self.format == Format::Classic {
+            let torn = self.clock.torn;
+            self.check("SEND-1", torn <= FEW, || {
+                format!("of {torn} packets a segment came too late after the one before")
+            });
+        }
     }
 
     /// Measures what an answer takes.
@@ -426,31 +394,10 @@ impl<'a> Session<'a> {
         if self.is_slow() { many.div_ceil(4) } else { many }
     }
 
-    /// No regular heartbeat comes for so long, less than 200 ms.
-    pub(crate) fn quiet(&mut self, span: Span) -> Result<(), Stop> {
-        const BEAT: Span = Span::from_millis(250);
-        const EDGE: Span = Span::from_millis(25);
-        let now = self.now();
-        let is_free = self.clock.regular.is_some_and(|at| {
-            let since = now.since(at);
-            since > EDGE && since.0 + span.0 + EDGE.0 < BEAT.0
-        });
-        if !is_free {
-            // Answers to what was asked before have come.
-            self.settle()?;
-            let until = self.now() + BEAT + EDGE + EDGE;
-            self.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
-            self.clock.regular = self.answers().iter().rev().find(|it| it.beat().is_some()).map(|it| it.at);
-            self.idle(EDGE)?;
-            self.consume();
-        }
-        Ok(())
-    }
-
     /// How long an answer took; not if the bench itself was late.
     pub(crate) fn note_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
-        self.clock.late = self.clock.late.max(self.bus.lateness());
-        self.timings.note(what, answered.since(asked), self.clock.late);
+        let late = self.lateness();
+        self.timings.note(what, answered.since(asked), late);
     }
 
     pub(crate) fn begin_restart(&mut self) -> Result<(), Stop> {

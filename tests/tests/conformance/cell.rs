@@ -10,6 +10,8 @@ use protocol::can::{Format, Frame};
 use protocol::id::CellId;
 use protocol::packet::Packet;
 use protocol::time::{Micros, Span};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
 
 /// From one frame on the bus to the next.
 const FRAME: Span = Span(20);
@@ -66,6 +68,16 @@ pub(crate) struct Right;
 
 impl Mutant for Right {}
 
+/// A cell that is kept from its processor now and then.
+struct Starved {
+    dice: Pcg64Mcg,
+    /// When it is next.
+    at: Micros,
+    /// Whether the bench notices, and by how much it was late.
+    is_seen: bool,
+    late: Span,
+}
+
 /// The bus.
 pub(crate) struct Virtual {
     now: Micros,
@@ -87,6 +99,7 @@ pub(crate) struct Virtual {
     later: Vec<(Micros, Frame)>,
     restart: Option<Micros>,
     restarts: bool,
+    starved: Option<Starved>,
 }
 
 impl Virtual {
@@ -108,6 +121,7 @@ impl Virtual {
             later: Vec::new(),
             restart: None,
             restarts: true,
+            starved: None,
         };
         bus.start();
         bus
@@ -118,6 +132,22 @@ impl Virtual {
         self.test_mode = false;
         self.start();
         self
+    }
+
+    /// Once in a second or so the cell gets no processor for up to 90 ms; the bench notices that on its own computer only.
+    pub(crate) fn starved(mut self, seed: u64, is_seen: bool) -> Self {
+        let dice = Pcg64Mcg::seed_from_u64(seed);
+        self.starved = Some(Starved { dice, at: self.now, is_seen, late: Span(0) });
+        self
+    }
+
+    /// Its processor is taken from the cell, if it is time for that.
+    fn starve(&mut self) {
+        let Some(starved) = self.starved.as_mut().filter(|starved| starved.at <= self.now) else { return };
+        let span = Span(starved.dice.random_range(5_000..90_000));
+        starved.late = starved.late.max(span);
+        starved.at = self.now + Span(starved.dice.random_range(200_000..1_800_000));
+        self.busy = self.busy.max(self.now + span);
     }
 
     pub(crate) fn without_restart(mut self) -> Self {
@@ -223,6 +253,10 @@ impl Bus for Virtual {
         self.now
     }
 
+    fn carries(&self, _: Format) -> bool {
+        true
+    }
+
     fn send(&mut self, frames: &[Frame]) -> Result<(), Stop> {
         for frame in frames {
             // What a real bus does, a frame at a time.
@@ -233,6 +267,7 @@ impl Bus for Virtual {
 
     fn receive(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
         loop {
+            self.starve();
             let seen = self.wire.front().map(|seen| seen.at);
             let limit = seen.map_or(until, |at| at.min(until));
             if let Some((at, event)) = self.next(limit) {
@@ -251,7 +286,8 @@ impl Bus for Virtual {
     }
 
     fn lateness(&mut self) -> Span {
-        Span(0)
+        let seen = self.starved.as_mut().filter(|starved| starved.is_seen);
+        seen.map_or(Span(0), |starved| core::mem::take(&mut starved.late))
     }
 
     fn finish(&mut self) {}

@@ -1,13 +1,14 @@
 //! When heartbeats come.
 
-use protocol::message::Message;
+use protocol::message::{Message, State};
+use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 
 use super::claims::twin;
 use crate::arm;
 use crate::bus::Stop;
-use crate::session::Session;
+use crate::session::{Heard, Session};
 
 const BEAT: u64 = 250_000;
 /// How late a heartbeat may be.
@@ -18,14 +19,14 @@ const SLACK: u64 = 3_000;
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     session.ready(&arm::in_time(2))?;
     session.settle()?;
-    let first = regular(session)?;
+    let first = regular(session, 1_300)?;
     shifted(session)?;
     if session.about.test_mode && session.about.committed {
         early(session)?;
     } else {
         session.findings.not_tested("BEAT-2", "without test mode nothing presses the cell");
     }
-    let last = regular(session)?;
+    let last = held(session)?;
     if let (Some(first), Some(last)) = (first, last) {
         clock(session, first, last);
     }
@@ -41,26 +42,57 @@ struct Grid {
     each: u64,
 }
 
+/// Times in us, as ms.
+pub(super) fn in_ms(times: impl Iterator<Item = u64>) -> String {
+    times.map(|us| (us / 1_000).to_string()).collect::<Vec<_>>().join(", ")
+}
+
 /// Times of heartbeats since the exchange began.
 fn times(session: &Session<'_>) -> Vec<u64> {
     session.answers().iter().filter(|it| it.beat().is_some()).map(|it| it.at.0).collect()
 }
 
-/// Nothing is asked for 1.3 s: a heartbeat every 250 ms, at most 20 ms late.
-fn regular(session: &mut Session<'_>) -> Result<Option<Grid>, Stop> {
+/// A halt, and what is latched, hold for longer than 2 s, and heartbeats come meanwhile.
+fn held(session: &mut Session<'_>) -> Result<Option<Grid>, Stop> {
+    let presses = session.about.test_mode && session.about.committed;
+    if presses {
+        session.pressed(&[0; MAX_JOINTS], arm::press(4_096))?;
+    }
+    session.say(&[Message::Halt])?;
+    (session.known.halted, session.known.active) = (Some(true), Some(false));
+    let first = session.heard.len();
+    let grid = regular(session, 2_300)?;
+    let beats = session.heard.get(first..).unwrap_or_default().iter().filter_map(Heard::beat);
+    let is_halted = beats.clone().all(|(beat, _)| beat.state.has(State::HALTED));
+    session.check("CMD-1", is_halted, || "HALTED is not set any more, without a resume".to_owned());
+    session.step(&[0; MAX_JOINTS])?;
+    session.say(&[Message::Resume])?;
+    session.known.halted = Some(false);
+    if presses {
+        let step = session.step(&[0; MAX_JOINTS])?;
+        let is_there = step.torque.is_some();
+        session.check("STIM-7", is_there, || "a stimulus does not hold for more than 2 s".to_owned());
+        session.pressed(&[0; MAX_JOINTS], arm::press(0))?;
+    }
+    Ok(grid)
+}
+
+/// Nothing is asked for so long: a heartbeat every 250 ms, at most 20 ms late.
+fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, Stop> {
+    let due = usize::try_from(ms * 1_000 / BEAT).unwrap_or_default();
     for attempt in 0..3 {
         session.mark();
-        session.idle(Span::from_millis(1_300))?;
+        session.idle(Span::from_millis(ms))?;
         let late = session.lateness();
         let times = times(session);
         session.consume();
         let apart: Vec<_> = times.windows(2).filter_map(|pair| Some(pair.get(1)? - pair.first()?)).collect();
         let (from, to) = (BEAT - LATE - SLACK, BEAT + LATE + SLACK);
-        let is_so = (5..=6).contains(&times.len()) && apart.iter().all(|span| (from..=to).contains(span));
+        let is_so =
+            (due..=due + 1).contains(&times.len()) && apart.iter().all(|span| (from..=to).contains(span));
         if is_so || attempt == 2 || late.0 < 1_000 {
             session.check("BEAT-1", is_so, || {
-                let apart: Vec<_> = apart.iter().map(|span| span / 1_000).collect();
-                format!("{} heartbeats in 1.3 s, {apart:?} ms apart", times.len())
+                format!("{} heartbeats in {ms} ms, {} ms apart", times.len(), in_ms(apart.iter().copied()))
             });
             let due = times.iter().zip(0..).map(|(at, place)| at.saturating_sub(place * BEAT)).min();
             let each = apart.iter().sum::<u64>().checked_div(apart.len() as u64);
@@ -97,9 +129,9 @@ fn shifted(session: &mut Session<'_>) -> Result<(), Stop> {
             };
             if is_so || attempt == 2 || late.0 < 1_000 {
                 session.check("BEAT-3", is_so, || {
-                    let times: Vec<_> = times.iter().map(|at| (at - grid.0) / 1_000).collect();
+                    let times = in_ms(times.iter().map(|at| at - grid.0));
                     format!(
-                        "{what} {offset} ms after a regular heartbeat: heartbeats came {times:?} ms after it, and \
+                        "{what} {offset} ms after a regular heartbeat: heartbeats came {times} ms after it, and \
                          {offset}, 250 and 500 are right"
                     )
                 });
@@ -140,6 +172,9 @@ fn early(session: &mut Session<'_>) -> Result<(), Stop> {
             session.idle(Span::from_millis(40))?;
             let late = session.lateness();
             let times = times(session);
+            if press > 0 {
+                look_at_order(session);
+            }
             session.consume();
             session.known.pending = None;
             session.known.skin = Some(arm::press(press));
@@ -158,9 +193,9 @@ fn early(session: &mut Session<'_>) -> Result<(), Stop> {
             let is_so = (4..=5).contains(&slots.len()) && (1..).zip(&slots).all(is_early);
             if is_so || attempt == 2 || late.0 < 1_000 {
                 session.check("BEAT-2", is_so, || {
-                    let times: Vec<_> = times.iter().map(|at| at.saturating_sub(grid.0) / 1_000).collect();
+                    let times = in_ms(times.iter().map(|at| at.saturating_sub(grid.0)));
                     format!(
-                        "with joints every 16 ms heartbeats came {times:?} ms after a regular one; 250, 500, 750 and \
+                        "with joints every 16 ms heartbeats came {times} ms after a regular one; 250, 500, 750 and \
                          1000 are right, and up to a period before"
                     )
                 });
@@ -170,6 +205,21 @@ fn early(session: &mut Session<'_>) -> Result<(), Stop> {
     }
     session.step(&[0; MAX_JOINTS])?;
     Ok(())
+}
+
+/// A heartbeat that is early, or due at that moment, follows the torque of its epoch. A cell may come to a single one between
+/// taking joints and answering them.
+fn look_at_order(session: &mut Session<'_>) {
+    let before = |place: usize, of: Epoch| {
+        let later = session.answers().get(place..).unwrap_or_default();
+        later.iter().any(|it| it.torque().is_some_and(|(epoch, _)| epoch == of))
+    };
+    let answers = session.answers().iter().enumerate();
+    let first =
+        answers.filter(|(place, it)| it.beat().is_some_and(|(_, epoch)| before(*place, epoch))).count();
+    session.check("TIME-3", first <= 1, || {
+        format!("{first} regular heartbeats came before the torque of their epoch")
+    });
 }
 
 /// The cell's clock by its heartbeats, over some seconds.

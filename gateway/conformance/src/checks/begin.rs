@@ -1,9 +1,10 @@
 //! What the cell is and which options it has.
 
-use protocol::message::{Message, NetworkPage, VERSION};
+use protocol::message::{Message, VERSION};
 use protocol::parameters::Parameter;
 use protocol::time::Span;
 
+use super::unconfigured;
 use crate::arm;
 use crate::bus::Stop;
 use crate::session::{Reply, Session};
@@ -20,12 +21,14 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     session.known.senses = false;
     session.measure()?;
     identity(session)?;
-    session.about.ports = true;
-    let report = session.report()?;
-    session.about.ports = report.iter().any(|heard| {
-        matches!(heard.message, Message::Network { page: NetworkPage::Tree(_) | NetworkPage::Ports(_), .. })
-    });
+    session.about.ports = session.has_ports()?;
     options(session)?;
+    if session.known.hash == Some(0) {
+        unconfigured::run(session)?;
+    } else {
+        let why = "what a cell without a configuration does: it had one";
+        session.findings.not_tested("JOINTS-2", why);
+    }
     let document = arm::document(2);
     session.about.committed = session.commit(&document)?;
     session.known.halted = Some(false);

@@ -3,6 +3,7 @@
 use protocol::id::Node;
 use protocol::message::{Heard as HeardPage, Heartbeat, Message, NetworkPage, Ports, Refused, State, Tree};
 use protocol::packet::Epoch;
+use protocol::parameters::Parameter;
 use protocol::time::{Micros, Span};
 
 use crate::arm;
@@ -31,9 +32,13 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
         defended(session, serial)?;
     }
     twice(session, own)?;
+    // What are serial number and CLAIMING of a heartbeat means other things there.
+    let state = State::CLAIMING.0 | 1 << 12;
     let pages = [
         NetworkPage::Heard(HeardPage::default()),
         NetworkPage::Refused(Refused::default()),
+        NetworkPage::Heard(HeardPage { joints: 1, torques: state, ..HeardPage::default() }),
+        NetworkPage::Refused(Refused { length: 1, stimuli: state, ..Refused::default() }),
         NetworkPage::Tree(Tree::default()),
         NetworkPage::Ports(Ports::default()),
     ];
@@ -43,6 +48,11 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     for other in others {
         not_answered(session, &other)?;
     }
+    // A claim is answered whatever came before it.
+    session.quiet(Span::from_millis(120))?;
+    let other = page(session, NetworkPage::Heard(HeardPage::default()));
+    session.say(&[other])?;
+    defended(session, own.wrapping_sub(1))?;
     session.exchange_all(&[])?;
     Ok(())
 }
@@ -54,12 +64,13 @@ fn beats(session: &Session<'_>) -> Vec<(Micros, State)> {
 
 /// A claim is answered at once, with DUPLICATE, which is clear then.
 fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), Stop> {
-    session.quiet(Span::from_millis(80))?;
+    // How late the answer may be is a matter of TIME-2.
+    session.quiet(Span::from_millis(160))?;
     session.mark();
     let claim = twin(session, serial, true);
     let at = session.say(&[claim])?;
     let came =
-        session.wait(at + Span::from_millis(60), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        session.wait(at + Span::from_millis(120), |heard| heard.iter().any(|it| it.beat().is_some()))?;
     session.check("CLAIM-6", came, || format!("a claim with serial number {serial} was not answered"));
     if let Some((answered, state)) = beats(session).first().copied() {
         session.note_time("heartbeat to a claimant", at, answered);
@@ -124,6 +135,15 @@ fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), Stop> 
     session.idle(Span::from_millis(25))?;
     let count = beats(session).len();
     session.check("CLAIM-6", count == 0, || "a 4nn that is no claim was answered".to_owned());
+    session.consume();
+    // A read of the identity shows it, and clears nothing.
+    let reply = session.read(Parameter::Identity.number())?;
+    let shown = reply.words().map(|[.., state, _]| State(state.cast_unsigned())).unwrap_or_default();
+    let is_set = shown.has(State::DUPLICATE);
+    session.check("CONF-1", is_set, || {
+        format!("DUPLICATE is not set in the identity after a 4nn of another cell: {:04X}", shown.0)
+    });
+    session.mark();
     let at = session.say(&[Message::Sync])?;
     session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
     let state = beats(session).last().map(|(_, state)| *state).unwrap_or_default();

@@ -62,8 +62,13 @@ fn press(
     let step = session.pressed(&known.positions, skin)?;
     let force = arm::force(&parameters.contact, &skin);
     let is_there = step.torque.is_some_and(|words| !words.is_zero() || force > 0);
-    let sensed =
-        || format!("contact {:?}, proximity {}", skin.contact.map(Q5_10::to_bits), skin.proximity.to_bits());
+    let sensed = || {
+        format!(
+            "contact {}, proximity {}",
+            arm::list(&skin.contact.map(Q5_10::to_bits)),
+            skin.proximity.to_bits()
+        )
+    };
     session.check(id, is_there == (force > 0), || {
         let came = if is_there { "a torque came" } else { "no torque came" };
         format!("{}: F_z is {force} steps of 2^-16 N, and {came}", sensed())

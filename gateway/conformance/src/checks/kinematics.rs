@@ -2,7 +2,7 @@
 
 use model::central::Central;
 use protocol::fixed::{Q1_14, TorqueFormat};
-use protocol::parameters::{Abilities, MAX_JOINTS, Parameters, Pose, Row};
+use protocol::parameters::{Abilities, MAX_JOINTS, Parameters, Pose, Row, RowKind};
 
 use crate::arm::{self, Dice, Shape};
 use crate::bus::Stop;
@@ -10,11 +10,16 @@ use crate::session::Session;
 
 /// Joint positions of one arm.
 const POSES: usize = 20;
+/// Of one that is like others but for its number of joints.
+const FEW: usize = 4;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     let mut dice = Dice::new(1);
     for parameters in arms(&mut dice, session.about.abilities) {
-        one(session, &mut dice, &parameters)?;
+        one(session, &mut dice, &parameters, POSES)?;
+    }
+    for parameters in lengths(&mut dice, session.about.abilities) {
+        one(session, &mut dice, &parameters, FEW)?;
     }
     out_of_reach(session)
 }
@@ -22,6 +27,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
 /// Arms that the cell can compute: a UR5, six revolute joints of any shape, and what else its identity says.
 fn arms(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
     let mut arms: Vec<_> = [2, 6, 1].map(arm::document).into();
+    arms.extend(half_turns());
     let six = |prismatic, rows| Shape { joints: 6, rows, prismatic };
     arms.extend((0..4).map(|_| arm::random(dice, six(false, 6))));
     let (joints, rows) = (abilities.joints(), abilities.rows());
@@ -51,15 +57,46 @@ fn arms(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
     arms
 }
 
+/// A UR5 with half turns, whose word is the lowest one: of two twists, and of two joints.
+fn half_turns() -> [Parameters; 2] {
+    let half = |places: [usize; 2], turn: fn(&mut Row)| {
+        let mut parameters = arm::document(6);
+        for place in places {
+            parameters.rows.iter_mut().skip(place).take(1).for_each(turn);
+        }
+        parameters
+    };
+    [half([1, 4], |row| row.alpha = Q1_14::MIN), half([0, 3], |row| row.theta_offset = Q1_14::MIN)]
+}
+
+/// Arms of each number of joints above six, with a row for each and the cell at their end.
+fn lengths(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
+    let most = abilities.joints().min(abilities.rows());
+    let of = |joints| {
+        let arm = arm::random(dice, Shape { joints, rows: joints, prismatic: false });
+        Parameters { joint: arm.joints, ..arm }
+    };
+    (7..=most).map(of).collect()
+}
+
 /// One arm at many joint positions.
-fn one(session: &mut Session<'_>, dice: &mut Dice, parameters: &Parameters) -> Result<(), Stop> {
+fn one(
+    session: &mut Session<'_>,
+    dice: &mut Dice,
+    parameters: &Parameters,
+    poses: usize,
+) -> Result<(), Stop> {
     if !session.ready(parameters)? {
         return Ok(());
     }
     let central = Central::of_cell(parameters);
     let format = parameters.torque_format;
-    for _ in 0..session.attempts(POSES) {
-        let positions = arm::positions(dice, parameters);
+    let mut positions = [0; MAX_JOINTS];
+    for pose in 0..session.attempts(poses) {
+        let next = arm::positions(dice, parameters);
+        // Every third time only joints beyond the sixth have moved.
+        let stays = if pose % 3 == 2 && parameters.joints > 6 { 6 } else { 0 };
+        positions.iter_mut().zip(next).skip(stays).for_each(|(position, next)| *position = next);
         let j = session.pressed(&positions, arm::press(arm::unit_press(format)))?.words();
         look_at_j(session, parameters, &central, &positions, &j);
         // The same joints again, with any force: J is known now.
@@ -84,9 +121,9 @@ fn look_at_j(
     session.check("J-3", off <= most, || {
         let nearest = exact.map(|x| Q1_14::nearest(x).to_bits());
         format!(
-            "J is {:?}, {off} steps off {:?}; {most} are allowed",
-            j.get(..joints).unwrap_or_default(),
-            nearest.get(..joints).unwrap_or_default()
+            "J is {}, {off} steps off {}; {most} are allowed",
+            arm::list(j.get(..joints).unwrap_or_default()),
+            arm::list(nearest.get(..joints).unwrap_or_default())
         )
     });
 }
@@ -104,31 +141,52 @@ pub(super) fn look_at_words(
     let joints = usize::from(parameters.joints);
     session.check(id, expected == *words, || {
         format!(
-            "the torque of {force} steps of 2^-16 N is {:?}, not {:?}; J is {:?}",
-            words.get(..joints).unwrap_or_default(),
-            expected.get(..joints).unwrap_or_default(),
-            j.get(..joints).unwrap_or_default()
+            "the torque of {force} steps of 2^-16 N is {}, not {}; J is {}",
+            arm::list(words.get(..joints).unwrap_or_default()),
+            arm::list(expected.get(..joints).unwrap_or_default()),
+            arm::list(j.get(..joints).unwrap_or_default())
         )
     });
 }
 
-/// A lever of 3.8 m.
+/// Levers of 3.8 m: of a link, and of a joint that slides beyond the range of a word.
 fn out_of_reach(session: &mut Session<'_>) -> Result<(), Stop> {
     let far = Q1_14::from_bits(31_000);
+    let mut long = Parameters { joint: 1, joints: 1, ..arm::document(1) };
+    long.rows = [Row { a: far, ..Row::default() }; protocol::parameters::MAX_ROWS];
+    long.pose.position = [far, Q1_14::ZERO, Q1_14::ZERO];
+    held(session, &long, &[0x2345; MAX_JOINTS], [0, 0x4000, 0])?;
+    // The second joint slides along y of the first; the force is along x.
+    let mut slides = Parameters { joint: 2, joints: 2, row: 2, table_rows: 2, ..arm::document(2) };
+    slides.rows = [Row::default(); protocol::parameters::MAX_ROWS];
+    if let [first, second, ..] = slides.rows.as_mut_slice() {
+        first.alpha = Q1_14::from_bits(-0x4000);
+        (second.kind, second.d) = (RowKind::Prismatic, far);
+    }
+    slides.pose.position = [Q1_14::ZERO; 3];
+    if session.about.abilities.lacks(&slides).is_none() {
+        let mut positions = [0; MAX_JOINTS];
+        positions.iter_mut().skip(1).take(1).for_each(|slide| *slide = far.to_bits());
+        held(session, &slides, &positions, [-0x4000, 0, 0])?;
+    }
+    Ok(())
+}
+
+/// With this normal J of the first joint is held at its lowest word, and with the other one at its highest.
+fn held(
+    session: &mut Session<'_>,
+    arm: &Parameters,
+    positions: &[i16; MAX_JOINTS],
+    normal: [i16; 3],
+) -> Result<(), Stop> {
     for sign in [1, -1] {
-        let mut parameters = Parameters { joint: 1, joints: 1, ..arm::document(1) };
-        parameters.rows = [Row::default(); protocol::parameters::MAX_ROWS];
-        if let Some(row) = parameters.rows.first_mut() {
-            row.a = far;
-        }
-        let normal = [0, 0x4000 * sign, 0].map(Q1_14::from_bits);
-        parameters.pose = Pose { position: [far, Q1_14::ZERO, Q1_14::ZERO], normal };
+        let pose = Pose { normal: normal.map(|word| Q1_14::from_bits(word * sign)), ..arm.pose };
+        let parameters = Parameters { pose, ..*arm };
         if !session.ready(&parameters)? {
             return Ok(());
         }
         let press = arm::press(arm::unit_press(parameters.torque_format));
-        let [first, ..] = session.pressed(&[0x2345; MAX_JOINTS], press)?.words();
-        // The force is against the normal.
+        let [first, ..] = session.pressed(positions, press)?.words();
         let is_held = if sign > 0 { first <= i16::MIN + 8 } else { first >= i16::MAX - 8 };
         session.check("J-2", is_held, || {
             let word = if sign > 0 { "8000" } else { "7FFF" };

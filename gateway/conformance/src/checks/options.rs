@@ -258,7 +258,11 @@ fn words_beyond(session: &mut Session<'_>) -> Result<(), Stop> {
     let exchange = session.exchange(&frames)?;
     let got = exchange.answers.iter().find_map(|heard| heard.torque()).map(|(_, words)| words.padded());
     session.check("OPT-2", got == Some(expected), || {
-        format!("words behind the joints of the chain changed the torque from {expected:?} to {got:?}")
+        let got = got.map_or_else(|| "nothing".to_owned(), |got| arm::list(&got));
+        format!(
+            "words behind the joints of the chain changed the torque from {} to {got}",
+            arm::list(&expected)
+        )
     });
     // Page 1 has three words.
     let id = Id::new(Kind::Stimulus, Node::Cell(session.cell));

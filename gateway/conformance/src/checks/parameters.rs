@@ -32,6 +32,16 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     reads(session, &one, "CONF-2")?;
     session.exchange_all(&[])?;
     computes(session, &one, &other, "CONF-2")?;
+    if session.about.test_mode {
+        // The joints of the chain are those in use too.
+        session.stage(&Parameters { joints: 3, joint: 3, ..other })?;
+        let step = session.pressed(&[0x0222; MAX_JOINTS], arm::press(4_096))?;
+        session.check("JOINTS-2", step.torque.is_some(), || {
+            "joints of the chain in use were not answered while a shorter one was staged".to_owned()
+        });
+        session.pressed(&[0x0222; MAX_JOINTS], arm::press(0))?;
+        session.stage(&other)?;
+    }
     for wrong in [0x0001, 0x0080, 0x0100, 0x8000, 0xFFFF, one.hash() ^ other.hash(), other.hash()] {
         let hash = other.hash() ^ wrong;
         let reply = session.set(Parameter::Commit.number(), [hash.cast_signed()])?;
@@ -86,7 +96,9 @@ fn computes(
         step.words().iter().zip(exact).all(|(got, x)| (i32::from(*got) - word(x)).abs() <= 24)
     };
     debug_assert!(!near(expected) || !near(not), "they are apart");
-    session.check(id, near(expected), || format!("the torque {:?} is not of what is in use", step.words()));
+    session.check(id, near(expected), || {
+        format!("the torque {} is not of what is in use", arm::list(&step.words()))
+    });
     session.pressed(&positions, arm::press(0))?;
     Ok(())
 }
@@ -134,16 +146,32 @@ fn unused(session: &mut Session<'_>) -> Result<(), Stop> {
 
 fn tags(session: &mut Session<'_>) -> Result<(), Stop> {
     let own = Node::Cell(session.cell);
+    let (number, on) = (Parameter::Mode.number(), i16::from(session.about.test_mode));
     for tag in [0, 1, 0x7E, 0x7F, 0x80, 0xFE, 0xFF, 0xFF, 0] {
         session.request_with(own, tag, Request::Read { number: 2 })?;
-        let number = Parameter::Mode.number();
-        session.request_with(
-            own,
-            tag,
-            Request::Write { number, words: words([session.about.test_mode.into()]) },
-        )?;
+        session.request_with(own, tag, Request::Write { number, words: words([on]) })?;
         session.request_with(own, tag, Request::Read { number: 99 })?;
     }
+    // The very same request is answered each time.
+    let pose = arm::document(3).words(Parameter::Pose);
+    let hash = session.known.hash.unwrap_or_default().cast_signed();
+    session.write(Parameter::Pose.number(), pose)?;
+    let staged = session.known.staged.take();
+    let requests = [
+        (Request::Read { number: 2 }, "CONF-1"),
+        (Request::Write { number: 2, words: pose }, "CONF-4"),
+        (Request::Write { number, words: words([on]) }, "CONF-4"),
+        (Request::Write { number: 0, words: [1; 6] }, "CONF-6"),
+        (Request::Write { number: Parameter::Commit.number(), words: words([!hash]) }, "CONF-6"),
+    ];
+    for (request, id) in requests {
+        let replies = [session.request_with(own, 0x2A, request)?, session.request_with(own, 0x2A, request)?];
+        let [first, second] = replies;
+        session.check(id, first == second, || {
+            format!("the same request again was answered with {second}, and with {first} before")
+        });
+    }
+    session.known.staged = staged.map(|staged| Parameters { pose: arm::document(3).pose, ..staged });
     session.known.skin = session.about.test_mode.then(Default::default);
     session.known.pending = None;
     Ok(())
@@ -158,9 +186,9 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
         format!("a read of everyone was answered with {reply}")
     });
     let number = Parameter::Pose.number();
-    let words = other().words(Parameter::Pose);
-    let reply = session.request(Node::Everyone, Request::Write { number, words })?;
-    session.check("CONF-11", reply == Reply::Value(words), || {
+    let pose = other().words(Parameter::Pose);
+    let reply = session.request(Node::Everyone, Request::Write { number, words: pose })?;
+    session.check("CONF-11", reply == Reply::Value(pose), || {
         format!("a write to everyone was answered with {reply}")
     });
     let on = [i16::from(session.about.test_mode), 0, 0, 0, 0, 0];
@@ -171,6 +199,18 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
     });
     let staged = Parameters { pose: other().pose, ..arm::document(2) };
     session.known.staged = Some(staged);
+    // A commit of everyone is one of this cell.
+    let hash = words([staged.hash().cast_signed()]);
+    let commit = Request::Write { number: Parameter::Commit.number(), words: hash };
+    let reply = session.request(Node::Everyone, commit)?;
+    session.check("CONF-11", reply == Reply::Value(hash), || {
+        format!("a commit of everyone was answered with {reply}")
+    });
+    session.known.active = None;
+    let done = reply == Reply::Value(hash);
+    (session.known.parameters, session.known.hash) =
+        if done { (Some(staged), Some(staged.hash())) } else { (None, None) };
+    session.exchange_all(&[])?;
     session.commit(&staged)?;
     unknown(session)?;
     not_its_own(session)
@@ -210,8 +250,8 @@ fn not_its_own(session: &mut Session<'_>) -> Result<(), Stop> {
         session.step(&[0; MAX_JOINTS])?;
     }
     let after = session.counters()?;
-    session.check("COUNT-1", before.1 == after.1, || {
-        format!("packets for other cells were counted: {:?}, before {:?}", after.1, before.1)
+    session.check("COUNT-1", before.refused == after.refused, || {
+        format!("packets for other cells were counted: {after}; before: {before}")
     });
     Ok(())
 }

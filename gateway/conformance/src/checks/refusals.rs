@@ -2,7 +2,7 @@
 
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 
-use protocol::parameters::{Parameter, Parameters};
+use protocol::parameters::{MAX_ROWS, Parameter, Parameters, Row, RowKind};
 
 use crate::arm;
 use crate::bus::Stop;
@@ -39,8 +39,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     });
     session.exchange_all(&[])?;
     let after = session.counters()?;
-    session.check("COUNT-2", before.1 == after.1, || {
-        format!("refusals were counted: {:?}, before {:?}", after.1, before.1)
+    session.check("COUNT-2", before.refused == after.refused, || {
+        format!("refusals were counted: {after}; before: {before}")
     });
     Ok(())
 }
@@ -80,8 +80,9 @@ fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), Stop> {
         let reply = session.set(parameter.number(), words)?;
         session.check("CONF-6", reply == Reply::Refused(reason), || {
             format!(
-                "parameter {} with {words:?} has to be refused with {reason}: {reply}",
-                parameter.number()
+                "parameter {} with {} has to be refused with {reason}: {reply}",
+                parameter.number(),
+                arm::list(&words)
             )
         });
         if reply.words().is_some() {
@@ -131,6 +132,10 @@ const ROWS: &[Flaw] = &[
     (8, |it| (it.table_rows, it.row) = (6, 3)),
     (8, |it| (it.table_rows, it.row) = (6, 7)),
     (8, |it| (it.table_rows, it.row) = (0, 2)),
+    // Joint 6 is the last of all rows, but there is no row 7.
+    (8, |it| (it.table_rows, it.row, it.joint) = (6, 7, 6)),
+    (7, |it| it.rows.iter_mut().skip(5).take(1).for_each(|row| row.kind = RowKind::Prismatic)),
+    (7, |it| it.rows.iter_mut().take(1).for_each(|row| row.kind = RowKind::Fixed)),
     (16, |it| (it.table_rows, it.row) = (6, 2)),
 ];
 
@@ -139,6 +144,9 @@ fn commits(session: &mut Session<'_>) -> Result<(), Stop> {
     let can_rows = session.about.abilities.word() != 0;
     let is_apt = |flaw: &&Flaw| can_rows || !matches!(flaw.0, 7 | 8);
     let base = arm::document(2);
+    if session.about.abilities.rows() == MAX_ROWS {
+        one_row_more(session, &base)?;
+    }
     let all = FLAWS.iter().chain(MORE).chain(if can_rows { ROWS } else { &[] }).filter(is_apt);
     for (reason, flaw) in all {
         let mut parameters = base;
@@ -157,6 +165,26 @@ fn commits(session: &mut Session<'_>) -> Result<(), Stop> {
     let mut all = base;
     apt.iter().for_each(|(_, flaw)| flaw(&mut all));
     refused(session, &all, 2)
+}
+
+/// 33 rows, whatever the joints are.
+fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), Stop> {
+    let mut full = Parameters { table_rows: 32, row: 6, joint: 6, ..*base };
+    for (place, row) in full.rows.iter_mut().enumerate().skip(6) {
+        let a = Q1_14::from_bits(i16::try_from(place).unwrap_or_default());
+        *row = Row { kind: RowKind::Fixed, a, ..Row::default() };
+    }
+    refused(session, &full, 16)?;
+    for joints in [6, 7] {
+        let over = Parameters { table_rows: 33, joints, ..full };
+        session.write(Parameter::Mount.number(), over.words(Parameter::Mount))?;
+        let reply = session.set(Parameter::Commit.number(), [1])?;
+        session.check("CONF-6", reply == Reply::Refused(7), || {
+            format!("a commit of 33 rows with {joints} joints has to be refused with 7: {reply}")
+        });
+    }
+    session.known.staged = None;
+    Ok(())
 }
 
 fn refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16) -> Result<(), Stop> {

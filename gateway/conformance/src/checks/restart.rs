@@ -2,7 +2,7 @@
 
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, Request, SensorPage, State};
-use protocol::packet::{WORDS, words};
+use protocol::packet::{WORDS, Words, words};
 use protocol::parameters::{Events, MAX_JOINTS, Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
@@ -16,18 +16,29 @@ const BOOT: Span = Span::from_millis(8_000);
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     session.ready(&arm::document(2))?;
-    survives(session)?;
-    while_claiming(session)?;
+    let after_test_mode = survives(session)?;
+    while_claiming(session, after_test_mode)?;
     stays(session)?;
     invalid(session)?;
     let own = session.about.serial.unwrap_or_default();
+    // CLAIMING and a higher serial number stand there in a heartbeat only.
+    let state = State::CLAIMING.0 | 1 << 12;
+    let other =
+        protocol::message::Refused { length: 0xFFFF, crc: 0xFFFF, stimuli: state, ..Default::default() };
+    let lower = own.wrapping_sub(0x1_0000).wrapping_add(1);
     let others = [
         ("a claim with a lower serial number", twin(session, own.wrapping_sub(1), true)),
+        ("a claim with a lower serial number, whose low word is higher", twin(session, lower, true)),
+        ("network page 2", page(session, NetworkPage::Refused(other))),
         ("a claim with its own serial number", twin(session, own, true)),
         ("a heartbeat without CLAIMING", twin(session, own.wrapping_add(1), false)),
         ("network page 1", page(session, NetworkPage::Heard(protocol::message::Heard::default()))),
     ];
-    for (what, other) in others.into_iter().filter(|(what, _)| own > 0 || !what.contains("lower")) {
+    let has_lower = |what: &str| match what.contains("low word") {
+        true => own >= 0x1_0000 && own & 0xFFFF != 0xFFFF,
+        false => own > 0 || !what.contains("lower"),
+    };
+    for (what, other) in others.into_iter().filter(|(what, _)| has_lower(what)) {
         gives_way(session, what, &other)?;
     }
     in_the_middle(session)
@@ -109,9 +120,12 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
 }
 
 /// A plain restart: what is kept, what is lost, what is counted.
-fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
-    let kept = Parameters { period_us: 55_500, ..arm::document(3) };
+fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
+    let kept = arm::distinct(session.about.abilities);
     session.ready(&kept)?;
+    let before = touched(session)?;
+    session.press(arm::press(0))?;
+    session.step(&[0; MAX_JOINTS])?;
     let staged = Parameters { period_us: 44_000, ..arm::document(4) };
     session.stage(&staged)?;
     if session.about.sensing {
@@ -160,7 +174,7 @@ fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
     session.known.hash = Some(kept.hash());
     (session.known.halted, session.known.epoch) = (Some(false), Some(0));
     session.exchange_all(&[])?;
-    for parameter in Parameter::stored(6) {
+    for parameter in Parameter::stored(kept.table().len()) {
         let reply = session.read(parameter.number())?;
         session.check("CONF-8", reply == Reply::Value(kept.words(parameter)), || {
             format!("after a restart parameter {} is {reply}", parameter.number())
@@ -178,12 +192,22 @@ fn survives(session: &mut Session<'_>) -> Result<(), Stop> {
     let next = Parameters { period_us: 45_250, ..kept };
     session.known.active = None;
     let done = session.commit(&next)?;
+    session.test_mode(session.about.test_mode)?;
     session.check("CONF-2", done, || "after a restart the staged copy is not what is in use".to_owned());
-    let counters = session.counters()?;
-    session.check("BEAT-4", counters.1 == protocol::message::Refused::default(), || {
-        format!("counters do not begin with 0 after a restart: {counters:?}")
+    let after = if session.known.test_mode == Some(true) { touched(session)? } else { None };
+    session.check("CONF-8", after.is_none() || before.is_none() || before == after, || {
+        let words = |words: Option<Words>| words.map_or_else(String::new, |it| arm::list(it.as_slice()));
+        format!(
+            "the same press gave a torque of {} before a restart, and {} after it",
+            words(before),
+            words(after)
+        )
     });
-    Ok(())
+    let counters = session.counters()?;
+    session.check("BEAT-4", counters.refused == protocol::message::Refused::default(), || {
+        format!("counters do not begin with 0 after a restart: {counters}")
+    });
+    Ok(first.0.state.has(State::TEST_MODE))
 }
 
 /// Volatile parameters are as at a start.
@@ -201,12 +225,30 @@ fn volatile(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
+/// The torque of a press at some joints.
+fn touched(session: &mut Session<'_>) -> Result<Option<Words>, Stop> {
+    if !session.about.test_mode {
+        return Ok(None);
+    }
+    session.known.active = None;
+    let positions =
+        core::array::from_fn(|place| [0x0777, -0x0555, 0x0333].get(place % 3).copied().unwrap_or(0));
+    Ok(session.pressed(&positions, arm::press(9_000))?.torque)
+}
+
 /// What a claiming cell takes, and what it ignores.
-fn while_claiming(session: &mut Session<'_>) -> Result<(), Stop> {
+fn while_claiming(session: &mut Session<'_>, after_test_mode: bool) -> Result<(), Stop> {
+    // Test mode is as at any start, whether it was on or off before.
+    if session.about.test_mode {
+        session.test_mode(false)?;
+    }
     let claimed = restart(session)?;
     let state =
         session.answers().last().and_then(Heard::beat).map(|(beat, _)| beat.state).unwrap_or_default();
     let presses = state.has(State::TEST_MODE);
+    session.check("CONF-9", presses == after_test_mode || !session.about.test_mode, || {
+        "test mode after a restart is as it was before".to_owned()
+    });
     session.start();
     session.press(arm::press(4_096))?;
     let first = session.next_epoch();
@@ -221,6 +263,9 @@ fn while_claiming(session: &mut Session<'_>) -> Result<(), Stop> {
         request(1, Request::Read { number: 0 }),
         request(2, write),
         request(3, Request::Read { number: 77 }),
+        request(4, Request::Write { number: Parameter::Mode.number(), words: words([(!presses).into()]) }),
+        request(5, Request::Write { number: Parameter::Sensing.number(), words: words([2]) }),
+        request(6, Request::Write { number: Parameter::Mode.number(), words: words([(!presses).into()]) }),
         session.joints(second, &[0; MAX_JOINTS]),
         Message::Halt,
     ];
@@ -230,7 +275,8 @@ fn while_claiming(session: &mut Session<'_>) -> Result<(), Stop> {
     }
     session.idle(Span::from_millis(20))?;
     let came: Vec<_> = session.answers().iter().map(|it| it.message.id().kind.name()).collect();
-    session.check("CLAIM-2", came.is_empty(), || format!("a claiming cell answered with {came:?}"));
+    session
+        .check("CLAIM-2", came.is_empty(), || format!("a claiming cell answered with {}", came.join(", ")));
     let at = settled(session, claimed)?;
     if at.is_none() {
         return Ok(());
@@ -238,12 +284,14 @@ fn while_claiming(session: &mut Session<'_>) -> Result<(), Stop> {
     session.known.epoch = Some(second);
     session.known.halted = Some(true);
     session.known.hash = session.known.parameters.map(|it| it.hash());
+    let is_on = session.exchange_all(&[])?.state().has(State::TEST_MODE);
+    session.check("CLAIM-2", is_on == presses, || "a claiming cell obeyed a write of parameter 5".to_owned());
     let counters = session.counters()?;
-    let is_so = counters.0.joints == 2 && counters.0.torques == 0;
-    session.check("CLAIM-2", is_so, || format!("a claiming cell takes joints; of 2: {:?}", counters.0));
+    let is_so = counters.heard.joints == 2 && counters.heard.torques == 0;
+    session.check("CLAIM-2", is_so, || format!("a claiming cell takes joints; of 2: {counters}"));
     let refused = protocol::message::Refused { stimuli: u16::from(!presses), ..Default::default() };
-    session.check("CLAIM-2", counters.1 == refused, || {
-        format!("a claiming cell counted what it has to ignore: {:?}", counters.1)
+    session.check("CLAIM-2", counters.refused == refused, || {
+        format!("a claiming cell counted what it has to ignore: {counters}")
     });
     if presses {
         let report = session.report()?;
@@ -252,7 +300,7 @@ fn while_claiming(session: &mut Session<'_>) -> Result<(), Stop> {
             _ => None,
         });
         session.check("STIM-8", skin == Some(arm::press(4_096)), || {
-            format!("a claiming cell did not latch a stimulus: {skin:?}")
+            format!("a claiming cell did not latch a stimulus: {}", arm::skin(skin))
         });
     }
     session.ready(&arm::document(2))?;
@@ -266,22 +314,14 @@ fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
         session.findings.not_tested("CLAIM-3", "no serial number is higher than its own");
         return Ok(());
     };
-    let rest = twin(session, higher, true);
-    // Not too often: each is answered only if the last answer was 10 ms ago.
-    let longest = Span::from_millis(3_000);
-    let Some(claimed) = restart_with(session, longest, |session| session.say(&[rest]).map(|_| ()))? else {
-        session.check("CLAIM-3", false, || {
-            format!("no heartbeat came while claims with the higher serial number {higher} did: it gave way to them")
-        });
-        return Ok(());
-    };
-    session.idle(Span::from_millis(90))?;
-    for serial in [higher, u32::MAX] {
+    let Some(claimed) = claimed_before_its_first(session, higher)? else { return Ok(()) };
+    let low_is_lower = if own & 0xFFFF > 0 { own.checked_add(0xFFFF) } else { None };
+    for serial in [Some(higher), low_is_lower, Some(u32::MAX)].into_iter().flatten() {
         session.start();
         let claim = twin(session, serial, true);
         let at = session.say(&[claim])?;
         let came =
-            session.wait(at + Span::from_millis(60), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+            session.wait(at + Span::from_millis(100), |heard| heard.iter().any(|it| it.beat().is_some()))?;
         let answer = session.answers().iter().find_map(|it| Some((it.at, it.beat()?.0.state)));
         session.consume();
         session.check("CLAIM-3", came, || {
@@ -301,6 +341,43 @@ fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
     session.known.hash = None;
     session.ready(&arm::document(2))?;
     Ok(())
+}
+
+/// Claims with a higher serial number come all the time while it starts: when its first heartbeat came. That has DUPLICATE if
+/// one of them came before it, at some (serial mod 64) ms; a computer that is late may delay them.
+fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Option<Micros>, Stop> {
+    const ATTEMPTS: usize = 3;
+    let rest = twin(session, higher, true);
+    let is_long = session.about.serial.unwrap_or_default() % 64 >= 30;
+    let longest = Span::from_millis(3_000);
+    for attempt in 1..=ATTEMPTS {
+        // Not too often: each is answered only if the last answer was 10 ms ago.
+        let claimed = restart_with(session, longest, |session| session.say(&[rest]).map(|_| ()))?;
+        let Some(claimed) = claimed else {
+            session.check("CLAIM-3", false, || {
+                format!(
+                    "no heartbeat came while claims with the higher serial number {higher} did: it gave way to them"
+                )
+            });
+            return Ok(None);
+        };
+        // An answer, and then the heartbeat that nothing asked for.
+        session.idle(Span::from_millis(80))?;
+        let new = session.answers().iter().filter(|it| it.at >= claimed).filter_map(Heard::beat);
+        let is_set = new.clone().next().is_some_and(|(beat, _)| beat.state.has(State::DUPLICATE));
+        let is_answered = new.count() > 1;
+        if is_set && is_answered || !is_long || attempt == ATTEMPTS {
+            session.check("CLAIM-7", is_set || !is_long, || {
+                "DUPLICATE is not set in the first heartbeat after claims that came before it".to_owned()
+            });
+            session.check("CLAIM-3", is_answered || !is_long, || {
+                "claims that came before its first heartbeat were not answered".to_owned()
+            });
+            return Ok(Some(claimed));
+        }
+        settled(session, claimed)?;
+    }
+    Ok(None)
 }
 
 /// What is no valid 4nn changes nothing.

@@ -64,7 +64,12 @@ impl Model {
 
     /// The states before a latch, for a message.
     pub(super) fn turned(&self) -> String {
-        format!("contact {:?}, proximity {:?}", self.contact, self.proximity)
+        let name = |touch| match touch {
+            Touch::Free => "free",
+            Touch::Touched => "touched",
+            Touch::Fading => "fading",
+        };
+        format!("contact {}, proximity {}", name(self.contact), name(self.proximity))
     }
 
     /// A page was sent.

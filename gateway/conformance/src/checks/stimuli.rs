@@ -33,12 +33,12 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     count += late;
     count += order(session, &cell)?;
     let after = session.counters()?;
-    let counted = after.0.stimuli.wrapping_sub(before.0.stimuli);
+    let counted = after.heard.stimuli.wrapping_sub(before.heard.stimuli);
     session.check("STIM-3", counted == count, || format!("{count} stimuli were counted as {counted}"));
-    let counted = after.0.stimuli_late.wrapping_sub(before.0.stimuli_late);
+    let counted = after.heard.stimuli_late.wrapping_sub(before.heard.stimuli_late);
     session.check("STIM-5", counted == late, || format!("{late} late stimuli were counted as {counted}"));
-    let is_same = after.1 == before.1;
-    session.check("STIM-6", is_same, || format!("stimuli that had room were refused: {:?}", after.1));
+    let is_same = after.refused == before.refused;
+    session.check("STIM-6", is_same, || format!("stimuli that had room were refused: {after}"));
     pending(session, &cell)?;
     forgotten(session, &cell)?;
     measuring(session)?;
@@ -61,9 +61,9 @@ fn latched(
     let is_there = step.torque.is_some_and(|words| !words.is_zero());
     session.check(id, is_there == (sum > 0), || {
         format!(
-            "at joints {epoch} {} N are latched, and the torque is {:?}",
+            "at joints {epoch} {} N are latched, and the torque is {}",
             f64::from(sum) / 1024.0,
-            step.words()
+            arm::list(&step.words())
         )
     });
     if is_there && sum > 0 {
@@ -108,7 +108,7 @@ fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     session.press(arm::press(held))?;
     let epoch = session.next_epoch();
     latched(session, cell, epoch, held, "STIM-3")?;
-    for (last, ahead) in [(10, 3), (250, 8), (100, 1), (20, 127), (200, 100)] {
+    for (last, ahead) in [(10, 3), (250, 8), (250, 6), (100, 1), (20, 127), (200, 100)] {
         latched(session, cell, last, held, "STIM-3")?;
         let (first, sum) = (u8::wrapping_add(last, ahead), held + 111);
         session.press_at(first, arm::press(sum))?;
@@ -133,7 +133,12 @@ fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     latched(session, cell, last.wrapping_sub(20), held, "STIM-3")?;
     latched(session, cell, last.wrapping_add(2), held + 300, "STIM-3")?;
     latched(session, cell, last.wrapping_add(3), held + 600, "STIM-3")?;
-    Ok(count)
+    // The first epoch just 128 ahead of the joints.
+    let first = session.known.last_epoch.wrapping_add(100);
+    session.press_at(first, arm::press(held + 900))?;
+    latched(session, cell, first.wrapping_sub(128), held + 600, "STIM-3")?;
+    latched(session, cell, first, held + 900, "STIM-3")?;
+    Ok(count + 1)
 }
 
 /// For joints that have been; how many stimuli that took.
@@ -146,7 +151,11 @@ fn too_late(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
         count += 1;
         latched(session, cell, last.wrapping_add(jump), sum, "STIM-5")?;
     }
-    Ok(count)
+    // Late for the joints of epoch 0.
+    session.step_at(0, &POSITIONS)?;
+    session.press_at(0, arm::press(5_777))?;
+    latched(session, cell, 1, 5_777, "STIM-5")?;
+    Ok(count + 1)
 }
 
 /// Several for the same joints; how many stimuli that took.
@@ -194,8 +203,10 @@ fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
         session.say(&[Message::Stimulus { to, from: first, page }])?;
     }
     let after = session.counters()?;
-    let counted =
-        (after.0.stimuli.wrapping_sub(before.0.stimuli), after.1.stimuli.wrapping_sub(before.1.stimuli));
+    let counted = (
+        after.heard.stimuli.wrapping_sub(before.heard.stimuli),
+        after.refused.stimuli.wrapping_sub(before.refused.stimuli),
+    );
     session.check("STIM-6", counted == (8, 2), || {
         format!("of 10 stimuli {} were taken and {} refused; 8 can be pending", counted.0, counted.1)
     });
@@ -235,9 +246,9 @@ fn measuring(session: &mut Session<'_>) -> Result<(), Stop> {
     let last = session.known.last_epoch;
     session.press_at(last.wrapping_add(1), arm::press(6_666))?;
     let after = session.counters()?;
-    let counted = after.1.stimuli.wrapping_sub(before.1.stimuli);
-    session.check("STIM-1", counted == 2 && after.0.stimuli == before.0.stimuli, || {
-        format!("outside test mode 2 stimuli were counted as {counted} refused: {after:?}")
+    let counted = after.refused.stimuli.wrapping_sub(before.refused.stimuli);
+    session.check("STIM-1", counted == 2 && after.heard.stimuli == before.heard.stimuli, || {
+        format!("outside test mode 2 stimuli were counted as {counted} refused: {after}")
     });
     session.test_mode(true)?;
     session.known.active = None;
@@ -258,6 +269,10 @@ fn halted(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
     session.step_at(epoch, &POSITIONS)?;
     session.known.skin = Some(arm::press(2_222));
     session.step_at(epoch.wrapping_add(1), &POSITIONS)?;
+    let skin = session.latched()?;
+    session.check("STIM-8", skin == Some(arm::press(2_222)), || {
+        format!("a halted cell did not latch a stimulus: {}", arm::skin(skin))
+    });
     session.say(&[Message::Resume])?;
     session.known.halted = Some(false);
     latched(session, cell, epoch.wrapping_add(2), 2_222, "STIM-8")?;

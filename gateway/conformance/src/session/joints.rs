@@ -1,7 +1,8 @@
 //! Joints, and what a cell has to answer them with.
 
-use protocol::message::{From, Message, SensorPage, SkinSensors, State};
-use protocol::packet::{Epoch, Length, Words};
+use protocol::id::Node;
+use protocol::message::{From, Message, Request, SensorPage, SkinSensors, State};
+use protocol::packet::{Epoch, Length, Words, words};
 use protocol::parameters::{MAX_JOINTS, Parameter};
 
 use super::{Exchange, Heard, Session};
@@ -41,22 +42,30 @@ impl Session<'_> {
     /// A stimulus that holds from the next joints on.
     pub(crate) fn press(&mut self, skin: SkinSensors) -> Result<(), Stop> {
         self.known.pending = Some(skin);
-        let to = protocol::id::Node::Cell(self.cell);
+        let to = Node::Cell(self.cell);
         self.say(&[Message::Stimulus { to, from: From::Next, page: SensorPage::Skin(skin) }])?;
         Ok(())
     }
 
     /// A stimulus that holds from these joints on.
     pub(crate) fn press_at(&mut self, first: u8, skin: SkinSensors) -> Result<(), Stop> {
-        let to = protocol::id::Node::Cell(self.cell);
+        let to = Node::Cell(self.cell);
         self.say(&[Message::Stimulus { to, from: From::Epoch(Epoch(first)), page: SensorPage::Skin(skin) }])?;
         Ok(())
     }
 
-    /// Joints of the next epoch.
+    /// Joints of the next epoch; again, if the cell came to them too late.
     pub(crate) fn step(&mut self, positions: &[i16; MAX_JOINTS]) -> Result<Step, Stop> {
-        let epoch = self.next_epoch();
-        self.step_at(epoch, positions)
+        const ATTEMPTS: usize = 6;
+        let mut attempt = 1;
+        loop {
+            let epoch = self.next_epoch();
+            let step = self.step_at(epoch, positions)?;
+            if !self.clock.skipped || attempt == ATTEMPTS {
+                return Ok(step);
+            }
+            attempt += 1;
+        }
     }
 
     /// A press from the next joints on, and these.
@@ -73,11 +82,10 @@ impl Session<'_> {
         }
         let due = self.due();
         (self.known.epoch, self.known.last_epoch) = (Some(epoch), epoch);
+        // After joints without a force it is not active, whatever it was.
         self.known.active = match due {
             Some(due) => Some(due == Due::Torque),
-            // Halted, or not known.
-            None if self.known.halted == Some(true) => Some(false),
-            None => None,
+            None => self.force().map(|force| force > 0),
         };
         let active = self.known.active.take();
         let exchange = self.exchange_all(&[joints])?;
@@ -97,13 +105,17 @@ impl Session<'_> {
         if known.halted == Some(true) {
             return Some(Due::Nothing);
         }
-        let force = arm::force(&known.parameters?.contact, &known.skin?);
-        match (force > 0, known.active) {
+        match (self.force()? > 0, known.active) {
             (true, _) => Some(Due::Torque),
             (false, Some(true)) => Some(Due::Zeros),
             (false, Some(false)) => Some(Due::Nothing),
             (false, None) => None,
         }
+    }
+
+    /// F_z of what is latched, as far as it is known.
+    fn force(&self) -> Option<i64> {
+        Some(arm::force(&self.known.parameters?.contact, &self.known.skin?))
     }
 
     /// Looks at what came to joints.
@@ -120,6 +132,7 @@ impl Session<'_> {
         }
         let first = torques.first().and_then(|heard| Some((heard.at, heard.torque()?.0, *heard.torque()?.1)));
         self.clock.skipped = first.is_none() && self.came_late(&exchange);
+        self.skips = self.skips.wrapping_add(u16::from(self.clock.skipped));
         let expected = match due {
             Some(Due::Torque) => Some(true),
             Some(Due::Zeros) => Some(true),
@@ -172,7 +185,7 @@ impl Session<'_> {
         });
         let beyond = words.padded().iter().skip(parameters.joint.into()).all(|word| *word == 0);
         self.check("J-1", beyond, || {
-            format!("a word beyond joint {} is not 0: {:04X?}", parameters.joint, words.as_slice())
+            format!("a word beyond joint {} is not 0: {}", parameters.joint, arm::list(words.as_slice()))
         });
     }
 
@@ -186,23 +199,36 @@ impl Session<'_> {
         };
         let beats = after(self.answers());
         if let [first, rest @ ..] = beats.as_slice() {
-            self.check("TORQUE-2", *first == expected, || {
-                format!(
-                    "SATURATED is {}set after {:04X?}",
-                    if *first { "" } else { "not " },
-                    words.as_slice()
-                )
+            // What was in the heartbeat before and stays is no matter of this torque.
+            let stays = *first && !expected && self.clock.saturated;
+            self.check(if stays { "STATE-2" } else { "TORQUE-2" }, *first == expected, || {
+                let (set, words) = (if *first { "" } else { "not " }, arm::list(words.as_slice()));
+                format!("SATURATED is {set}set after a torque of {words}")
             });
-            if expected {
-                let again = rest.contains(&true);
-                self.check("STATE-2", !again, || "SATURATED is set in two heartbeats".to_owned());
-            }
+            let again = expected && rest.contains(&true);
+            self.check("STATE-2", !again, || "SATURATED is set in two heartbeats".to_owned());
+            self.clock.saturated = expected;
         }
+    }
+
+    /// The skin page of a report.
+    pub(crate) fn latched(&mut self) -> Result<Option<SkinSensors>, Stop> {
+        let pages = self.report()?;
+        Ok(pages.iter().find_map(|heard| match heard.sensors() {
+            Some((_, SensorPage::Skin(skin))) => Some(*skin),
+            _ => None,
+        }))
     }
 
     /// Test mode on or off, which forgets all stimuli.
     pub(crate) fn test_mode(&mut self, on: bool) -> Result<(), Stop> {
-        let reply = self.set(Parameter::Mode.number(), [i16::from(on)])?;
+        self.switch(Node::Cell(self.cell), on)
+    }
+
+    /// The same of one cell or of everyone.
+    pub(crate) fn switch(&mut self, to: Node, on: bool) -> Result<(), Stop> {
+        let (number, words) = (Parameter::Mode.number(), words([on.into()]));
+        let reply = self.request(to, Request::Write { number, words })?;
         self.known.test_mode = reply.words().map(|words| words.first() == Some(&1));
         (self.known.skin, self.known.pending) = (on.then(SkinSensors::default), None);
         Ok(())

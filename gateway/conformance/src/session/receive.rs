@@ -1,9 +1,9 @@
 //! Frames of the bus become packets of the cell, and are looked at as far as each holds for itself.
 
-use protocol::can::Format;
-use protocol::id::{Id, Kind};
+use protocol::can::{BIT_RATE_SWITCH, Format};
+use protocol::id::Id;
 use protocol::message::{Heartbeat, Message, State};
-use protocol::packet::{self, Lengths, Packet, PacketError, Reassembly};
+use protocol::packet::{self, Lengths, Packet, PacketError, Reassembly, Segment};
 use protocol::time::Micros;
 
 use super::{Heard, SILENT, Session};
@@ -18,16 +18,13 @@ impl Session<'_> {
         };
         if seen.own {
             self.log.push(seen);
+            let joints = (self.known.hash != Some(0)).then_some(self.known.joints);
+            self.ledger.own(&seen, self.cell, self.format, joints);
             return Ok(Some(seen));
         }
         self.look_at_time()?;
         let Ok(id) = packet::data_id(&seen.frame) else { return Ok(Some(seen)) };
-        let is_gateways = match id.kind {
-            Kind::Command | Kind::Configure | Kind::Stimulus => true,
-            Kind::Network => id.node == 0,
-            Kind::Sum | Kind::Torque | Kind::Sensors | Kind::Configured => false,
-        };
-        if is_gateways && !self.clock.finishing {
+        if id.sender().is_none() && !self.clock.finishing {
             return Err(Stop::Gateway(seen.frame.to_string()));
         }
         if id.node == self.cell.get() {
@@ -55,10 +52,18 @@ impl Session<'_> {
             return;
         }
         let packet = match self.format {
-            Format::Fd => Packet::from_fd(frame),
+            Format::Fd => {
+                let switches = frame.flags() & BIT_RATE_SWITCH != 0;
+                self.check("SEND-1", switches, || format!("{frame} is without bit-rate switch"));
+                Packet::from_fd(frame)
+            }
             Format::Classic => {
-                let Some(segments) = self.segments.get_mut(id.kind as usize) else { return };
-                match segments.push(seen.at, id, Lengths::of(id), frame.data()) {
+                let Some((segments, last)) = self.segments.get_mut(id.kind as usize) else { return };
+                let apart = seen.at.since(*last);
+                self.clock.torn += usize::from(segments.is_waiting() && apart > Segment::within(id));
+                *last = seen.at;
+                // Those that come late are counted, and belong together all the same.
+                match segments.push(Micros(0), id, Lengths::of(id), frame.data()) {
                     Ok(Reassembly::Waiting) => return,
                     Ok(Reassembly::Complete(packet)) => Ok(packet),
                     Ok(Reassembly::Incomplete) => Err(PacketError::Incomplete),
@@ -87,6 +92,7 @@ impl Session<'_> {
 
     /// What holds of every packet: heartbeats know how many there were.
     fn look_at(&mut self, heard: &Heard) {
+        self.ledger.heard(&heard.message);
         if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.beat() {
             // It has been switched off and on.
             let begins = state.has(State::CLAIMING) && !self.claiming;

@@ -1,8 +1,9 @@
 //! Parameters over the bus: every answer is looked at as the documents have it.
 
+use model::decode::Decoded;
 use protocol::id::Node;
-use protocol::message::{Answer, Heard as HeardPage, Message, NetworkPage, Refused, Request};
-use protocol::packet::{WORDS, words};
+use protocol::message::{Answer, Heard as HeardPage, Message, NetworkPage, Refused, Request, SensorPage};
+use protocol::packet::{Epoch, WORDS, words};
 use protocol::parameters::{Parameter, Parameters};
 use protocol::time::{Micros, Span};
 
@@ -27,6 +28,43 @@ pub(crate) enum Reply {
 impl Reply {
     pub(crate) const fn words(self) -> Option<[i16; WORDS]> {
         if let Self::Value(words) = self { Some(words) } else { None }
+    }
+}
+
+/// What a cell has counted.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub(crate) struct Counters {
+    pub(crate) heard: HeardPage,
+    pub(crate) refused: Refused,
+}
+
+impl core::fmt::Display for Counters {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let (from, epoch) = (Node::Gateway, Epoch(0));
+        let text = |page| Decoded::Message(Message::Network { from, epoch, page }).to_string();
+        let [heard, refused] = [NetworkPage::Heard(self.heard), NetworkPage::Refused(self.refused)].map(text);
+        let fields =
+            |text: &str| text.split_once(": ").map_or_else(String::new, |(_, fields)| fields.to_owned());
+        write!(f, "{}; refused: {}", fields(&heard), fields(&refused))
+    }
+}
+
+/// The pages that a report is answered with, by their names.
+const REPORT_OF: [&str; 6] = ["network 1", "network 2", "sensors 0", "sensors 1", "network 3", "network 4"];
+
+fn page_name(message: &Message) -> &'static str {
+    if let Message::Network { page, .. } = message {
+        match page {
+            NetworkPage::Heartbeat(_) => "heartbeat",
+            NetworkPage::Heard(_) => "network 1",
+            NetworkPage::Refused(_) => "network 2",
+            NetworkPage::Tree(_) => "network 3",
+            NetworkPage::Ports(_) => "network 4",
+        }
+    } else if let Message::Sensors { page, .. } = message {
+        if matches!(page, SensorPage::Skin(_)) { "sensors 0" } else { "sensors 1" }
+    } else {
+        message.id().kind.name()
     }
 }
 
@@ -143,13 +181,20 @@ impl Session<'_> {
                 });
             }
         }
-        self.known.staged = Some(*parameters);
+        let mut staged = *parameters;
+        if let Some(before) = before {
+            // Rows behind the table stay.
+            let rows = staged.rows.iter_mut().zip(before.rows).skip(parameters.table().len().max(6));
+            rows.for_each(|(row, before)| *row = before);
+        }
+        self.known.staged = Some(staged);
         Ok(())
     }
 
     /// Has the cell use parameters; whether it does.
     pub(crate) fn commit(&mut self, parameters: &Parameters) -> Result<bool, Stop> {
-        if self.known.parameters == Some(*parameters) && self.known.staged == Some(*parameters) {
+        let is_so = |known: Option<Parameters>| known.is_some_and(|it| it.hash() == parameters.hash());
+        if self.known.parameters == Some(*parameters) && is_so(self.known.staged) {
             return Ok(true);
         }
         self.stage(parameters)?;
@@ -173,18 +218,40 @@ impl Session<'_> {
         self.pages(asked)
     }
 
-    /// The pages that come to a report of then.
-    pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<Heard>, Stop> {
-        let expected = if self.about.ports { 6 } else { 4 };
+    /// Whether it sends the pages of a cell with ports.
+    pub(crate) fn has_ports(&mut self) -> Result<bool, Stop> {
+        self.mark();
+        let asked = self.say(&[Message::Report])?;
+        let pages = self.collect(asked, REPORT_OF.len())?;
+        let is_of_ports = |page: &NetworkPage| matches!(page, NetworkPage::Tree(_) | NetworkPage::Ports(_));
+        Ok(pages.iter().any(|it| matches!(&it.message, Message::Network { page, .. } if is_of_ports(page))))
+    }
+
+    /// So many pages, or as many as come.
+    fn collect(&mut self, asked: Micros, expected: usize) -> Result<Vec<Heard>, Stop> {
         let pages = |heard: &[Heard]| heard.iter().filter(|it| it.beat().is_none()).count();
         self.wait(asked + REPORT, |heard| pages(heard) >= expected)?;
-        let pages: Vec<_> = self.answers().iter().filter(|it| it.beat().is_none()).copied().collect();
+        let pages = self.answers().iter().filter(|it| it.beat().is_none()).copied().collect();
         self.consume();
         Ok(pages)
     }
 
-    /// Asks for the counters.
-    pub(crate) fn counters(&mut self) -> Result<(HeardPage, Refused), Stop> {
+    /// The pages that come to a report of then.
+    pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<Heard>, Stop> {
+        let expected = if self.about.ports { 6 } else { 4 };
+        let pages = self.collect(asked, expected)?;
+        if !self.known.senses {
+            let names: Vec<_> = pages.iter().map(|it| page_name(&it.message)).collect();
+            let order = REPORT_OF.get(..expected).unwrap_or_default();
+            self.check("CMD-4", names == order, || {
+                format!("a report was answered with {}, not {}", names.join(", "), order.join(", "))
+            });
+        }
+        Ok(pages)
+    }
+
+    /// Asks for the counters, which have to add up to what was sent and what came.
+    pub(crate) fn counters(&mut self) -> Result<Counters, Stop> {
         let report = self.report()?;
         let (mut heard, mut refused) = (None, None);
         for answer in &report {
@@ -196,11 +263,15 @@ impl Session<'_> {
                 }
             }
         }
-        let is_whole = heard.is_some() && refused.is_some();
-        self.check("CMD-4", is_whole, || "network pages 1 and 2 did not come to a report".to_owned());
-        let (heard, refused) = (heard.unwrap_or_default(), refused.unwrap_or_default());
+        let whole = heard.zip(refused);
+        self.check("CMD-4", whole.is_some(), || "network pages 1 and 2 did not come to a report".to_owned());
+        if let Some((heard, refused)) = whole {
+            for (id, what) in self.ledger.compare(heard, refused) {
+                self.check(id, false, || what);
+            }
+        }
         let sync = self.exchange_all(&[])?;
-        if let (Some((beat, _)), true) = (sync.beat, is_whole) {
+        if let (Some((beat, _)), Some((_, refused))) = (sync.beat, refused.and(whole)) {
             let Refused { length, crc, foreign, meaning, incomplete, stimuli } = refused;
             let sum =
                 [length, crc, foreign, meaning, incomplete, stimuli].into_iter().fold(0, u16::wrapping_add);
@@ -208,6 +279,12 @@ impl Session<'_> {
                 format!("refused is {} in a heartbeat, and page 2 adds up to {sum}", beat.rejected)
             });
         }
-        Ok((heard, refused))
+        let (heard, refused) = whole.unwrap_or_default();
+        Ok(Counters { heard, refused })
+    }
+
+    /// The cell may have lost some of a burst, which its counters show.
+    pub(crate) const fn forget_counters(&mut self) {
+        self.ledger.forget_counters();
     }
 }

@@ -4,6 +4,7 @@ pub(crate) mod arithmetic;
 pub(crate) mod beats;
 pub(crate) mod commands;
 pub(crate) mod counters;
+pub(crate) mod flash;
 pub(crate) mod joints;
 pub(crate) mod parameters;
 pub(crate) mod segments;
@@ -35,6 +36,8 @@ pub(crate) const ALL: &[(&[Spoilt], Format)] = &[
     (segments::SEGMENTS, Format::Classic),
     (sensing::SENSING, Format::Fd),
     (starts::STARTS, Format::Fd),
+    (flash::FLASH, Format::Fd),
+    (flash::LEAVES, Format::Fd),
 ];
 
 pub(crate) fn decoded(frame: &Frame) -> Option<Message> {

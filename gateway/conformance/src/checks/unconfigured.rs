@@ -1,0 +1,109 @@
+//! A cell without a configuration, as it is from the factory. It cannot be made to have none again.
+
+use protocol::message::Message;
+use protocol::packet::{Epoch, Length, Packet, WORDS, Words};
+use protocol::parameters::{MAX_JOINTS, Parameter};
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::{Reply, Session};
+
+const POSITIONS: [i16; MAX_JOINTS] = [0x0111; MAX_JOINTS];
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.mark();
+    session.known.halted = Some(false);
+    staged(session)?;
+    let skin = arm::press(4_096);
+    if session.about.test_mode {
+        session.press(skin)?;
+        session.known.pending = None;
+    }
+    joints(session)?;
+    if session.about.test_mode {
+        let latched = session.latched()?;
+        session.check("JOINTS-3", latched == Some(skin), || {
+            format!(
+                "a cell without a configuration latched {}, not {}",
+                arm::skin(latched),
+                arm::skin(Some(skin))
+            )
+        });
+        session.test_mode(true)?;
+    }
+    session.known.epoch = None;
+    Ok(())
+}
+
+/// What is staged is read where nothing is in use.
+fn staged(session: &mut Session<'_>) -> Result<(), Stop> {
+    let pose = arm::document(2).words(Parameter::Pose);
+    let number = Parameter::Pose.number();
+    let before = session.read(number)?;
+    session.write(number, pose)?;
+    let reply = session.read(number)?;
+    session.check("CONF-1", reply == Reply::Value(pose), || {
+        format!(
+            "without a configuration parameter {number} was written with {}, and is read as {reply}",
+            Reply::Value(pose)
+        )
+    });
+    session.write(number, before.words().unwrap_or([0; WORDS]))?;
+    let reply = session.set(Parameter::Commit.number(), [0])?;
+    let is_refused = matches!(reply, Reply::Refused(_));
+    session.check("CONF-7", is_refused, || format!("a commit of nothing was answered with {reply}"));
+    Ok(())
+}
+
+/// It takes joints of any chain, whose count suits their length, and answers none.
+fn joints(session: &mut Session<'_>) -> Result<(), Stop> {
+    let before = session.counters()?;
+    // More than it can compute it need not take.
+    let most = u8::try_from(session.about.abilities.joints()).unwrap_or(u8::MAX);
+    for count in 1..=most {
+        let epoch = session.next_epoch();
+        let joints = session.joints_of(epoch, &POSITIONS, count);
+        session.known.epoch = Some(epoch);
+        let exchange = session.exchange_all(&[joints])?;
+        session.check("JOINTS-5", exchange.is_silent(), || {
+            format!("joints of a chain of {count} were answered by a cell without a configuration")
+        });
+        session.exchange_all(&[joints])?;
+    }
+    let after = session.counters()?;
+    let skipped = after.heard.joints_late.wrapping_sub(before.heard.joints_late);
+    session.check("JOINTS-4", skipped == 0, || format!("a cell without a period skipped {skipped} joints"));
+    let counted = after.heard.joints.wrapping_sub(before.heard.joints);
+    session.check("JOINTS-2", counted == u16::from(most), || {
+        format!("of joints of {most} chains a cell without a configuration took {counted}")
+    });
+    let repeated = after.heard.joints_repeated.wrapping_sub(before.heard.joints_repeated);
+    session.check("JOINTS-3", repeated == u16::from(most), || {
+        format!("{most} joints came twice to a cell without a configuration, and {repeated} were counted as repeated")
+    });
+    let wrong = [
+        (7, Length::Six),
+        (6, Length::Eight),
+        (8, Length::Ten),
+        (10, Length::Fourteen),
+        (15, Length::Fourteen),
+    ];
+    let can = wrong.iter().filter(|(_, length)| length.words() <= usize::from(most));
+    for &(count, length) in can.clone() {
+        let epoch = session.next_epoch();
+        let id = session.joints_of(epoch, &POSITIONS, 1).id();
+        let packet = Packet { id, words: Words::new(length, POSITIONS), epoch: Epoch(epoch), count };
+        let frames: Vec<_> = packet.frames(session.format).collect();
+        session.exchange(&frames)?;
+    }
+    let last = session.counters()?;
+    let counted = last.refused.meaning.wrapping_sub(after.refused.meaning);
+    let expected = can.count();
+    session.check("COUNT-1", usize::from(counted) == expected, || {
+        format!(
+            "{expected} joints whose count does not suit their length were counted {counted} times as meaning"
+        )
+    });
+    session.exchange_all(&[Message::Resume])?;
+    Ok(())
+}

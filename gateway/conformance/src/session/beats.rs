@@ -1,0 +1,55 @@
+//! Regular heartbeats: none is left out, and none is too many.
+
+use protocol::time::Span;
+
+use super::Session;
+use super::ledger::BEAT;
+use crate::bus::Stop;
+
+/// Around a regular heartbeat nothing is asked for so long.
+const EDGE: Span = Span::from_millis(25);
+
+impl Session<'_> {
+    /// Waits for a heartbeat that nothing asked for. Since the last such one every 250 ms one had to come, and one to each sync
+    /// and claim.
+    pub(crate) fn regular_beat(&mut self) -> Result<(), Stop> {
+        // Answers to what was asked before have come.
+        self.settle()?;
+        let until = self.now() + BEAT + EDGE + EDGE;
+        let came = self.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        let at = self.answers().iter().find(|it| it.beat().is_some()).map(|it| it.at);
+        self.check("BEAT-1", came, || "no heartbeat came for 300 ms".to_owned());
+        self.clock.regular = at;
+        if let Some((came, min, max)) = at.and_then(|at| self.ledger.regular(at)) {
+            self.check("BEAT-1", (min..=max).contains(&came), || {
+                let due = if min == max { min.to_string() } else { format!("{min} to {max}") };
+                format!("{came} heartbeats came; {due} were due, every 250 ms and to each sync and claim")
+            });
+        }
+        self.idle(EDGE)?;
+        self.consume();
+        Ok(())
+    }
+
+    /// All heartbeats of the test together: a cell that is late leaves none out, unless it was for a whole 250 ms.
+    pub(crate) fn check_all_beats(&mut self) {
+        let surplus = self.ledger.surplus();
+        if self.clock.longest < BEAT {
+            self.start();
+            self.check("BEAT-1", surplus == 0, || {
+                let many = if surplus > 0 { "too many" } else { "too few" };
+                format!("{} heartbeats {many} came over the whole test", surplus.abs())
+            });
+        }
+    }
+
+    /// No regular heartbeat comes for so long, less than 200 ms.
+    pub(crate) fn quiet(&mut self, span: Span) -> Result<(), Stop> {
+        let now = self.now();
+        let is_free = self.clock.regular.is_some_and(|at| {
+            let since = now.since(at);
+            since > EDGE && since.0 + span.0 + EDGE.0 < BEAT.0
+        });
+        if is_free { Ok(()) } else { self.regular_beat() }
+    }
+}

@@ -1,0 +1,210 @@
+//! What was on the bus, counted: the cell's own counts have to add up to it, and so do its heartbeats.
+
+use protocol::can::{Format, Frame};
+use protocol::id::{CellId, Id};
+use protocol::message::{Heard as HeardPage, Message, NetworkPage, Refused, State};
+use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Segment, data_id};
+use protocol::time::{Micros, Span};
+
+use crate::bus::Seen;
+
+/// From one regular heartbeat to the next.
+pub(crate) const BEAT: Span = Span::from_millis(250);
+/// A claim that comes sooner after one that was answered may be answered or not.
+const DEFENDED: Span = Span::from_millis(40);
+
+/// Packets that a cell counts, modulo 2^16.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub(super) struct Counts {
+    /// Joints that it has to take.
+    taken: u16,
+    /// Joints of the epoch of the last ones.
+    repeated: u16,
+    stimuli: u16,
+    /// Torques that it sent.
+    torques: u16,
+}
+
+/// Heartbeats until some time.
+#[derive(Clone, Copy, Debug, Default)]
+struct Beats {
+    came: u64,
+    /// Those that something asked for: at least, and at most.
+    asked: (u64, u64),
+}
+
+/// All of that.
+#[derive(Debug, Default)]
+pub(super) struct Ledger {
+    /// Of the test's own packets.
+    segments: Vec<(Id, Segment)>,
+    /// The last joints taken.
+    last: Option<Epoch>,
+    counts: Counts,
+    /// Counters of the cell, and what was counted when they came.
+    compared: Option<(HeardPage, Refused, Counts)>,
+    beats: Beats,
+    defended: Option<Micros>,
+    /// When a regular heartbeat came, and all heartbeats until then.
+    anchor: Option<(Micros, Beats)>,
+    /// Heartbeats that came too many, over all such times: at least, and at most.
+    surplus: (i64, i64),
+    /// Heartbeats since then that are not waited for any more.
+    given_up: u64,
+}
+
+/// Something that does not add up: the requirement, and what is wrong.
+pub(super) type Difference = (&'static str, String);
+
+impl Ledger {
+    /// A frame of the test was on the bus; the joints of the chain, if the cell has one.
+    pub(super) fn own(&mut self, seen: &Seen, cell: CellId, format: Format, joints: Option<u8>) {
+        let Some(message) = self.message(seen, format) else { return };
+        if let Message::Joints { epoch, joints: came } = message {
+            if self.last == Some(epoch) {
+                self.counts.repeated = self.counts.repeated.wrapping_add(1);
+            } else if joints.is_none_or(|joints| joints == came.in_use) {
+                self.last = Some(epoch);
+                self.counts.taken = self.counts.taken.wrapping_add(1);
+            }
+        } else if matches!(message, Message::Stimulus { to, .. } if to.names(cell)) {
+            self.counts.stimuli = self.counts.stimuli.wrapping_add(1);
+        } else if message == Message::Sync {
+            self.beats.asked.0 += 1;
+            self.beats.asked.1 += 1;
+        } else if let Message::Network { from, page: NetworkPage::Heartbeat(beat), .. } = message
+            && from.names(cell)
+            && beat.state.has(State::CLAIMING)
+        {
+            let is_again = self.defended.is_some_and(|at| seen.at.since(at) < DEFENDED);
+            self.beats.asked.0 += u64::from(!is_again);
+            self.beats.asked.1 += 1;
+            self.defended = Some(seen.at);
+        }
+    }
+
+    /// The message that ends with a frame of the test, as a cell takes it.
+    fn message(&mut self, seen: &Seen, format: Format) -> Option<Message> {
+        let Seen { at, frame, .. } = seen;
+        let id = data_id(frame).ok().filter(|_| frame.format() == format)?;
+        let packet = match format {
+            Format::Fd => Packet::from_fd(frame).ok()?,
+            Format::Classic => self.segment(*at, id, frame)?,
+        };
+        Message::decode(&packet).ok()
+    }
+
+    fn segment(&mut self, at: Micros, id: Id, frame: &Frame) -> Option<Packet> {
+        let place = self.segments.iter().position(|(of, _)| *of == id).unwrap_or_else(|| {
+            self.segments.push((id, Segment::NONE));
+            self.segments.len() - 1
+        });
+        let (_, waiting) = self.segments.get_mut(place)?;
+        match waiting.push(at, id, Lengths::of(id), frame.data()) {
+            Ok(Reassembly::Complete(packet)) => Some(packet),
+            _ => None,
+        }
+    }
+
+    /// A packet of the cell came.
+    pub(super) fn heard(&mut self, message: &Message) {
+        if matches!(message, Message::Network { page: NetworkPage::Heartbeat(_), .. }) {
+            self.beats.came += 1;
+        } else if matches!(message, Message::Torque { .. }) {
+            self.counts.torques = self.counts.torques.wrapping_add(1);
+        }
+    }
+
+    /// The cell may have lost what came, and counts from here on.
+    pub(super) const fn forget_counters(&mut self) {
+        self.compared = None;
+    }
+
+    /// Counters of the cell: what does not add up since the last ones.
+    pub(super) fn compare(&mut self, heard: HeardPage, refused: Refused) -> Vec<Difference> {
+        let now = self.counts;
+        let Some((heard_before, refused_before, before)) = self.compared.replace((heard, refused, now))
+        else {
+            return Vec::new();
+        };
+        let since = |of: fn(&HeardPage) -> u16| of(&heard).wrapping_sub(of(&heard_before));
+        let (joints, skipped) = (since(|it| it.joints), since(|it| it.joints_late));
+        let (taken, repeated) =
+            (since(|it| it.stimuli), refused.stimuli.wrapping_sub(refused_before.stimuli));
+        let all = [
+            (
+                "JOINTS-5",
+                "joints and joints_skipped",
+                "joints",
+                joints.wrapping_add(skipped),
+                now.taken,
+                before.taken,
+            ),
+            (
+                "JOINTS-1",
+                "joints_repeated",
+                "joints of the epoch of the last ones",
+                since(|it| it.joints_repeated),
+                now.repeated,
+                before.repeated,
+            ),
+            (
+                "STIM-6",
+                "stimuli, taken and refused,",
+                "stimuli",
+                taken.wrapping_add(repeated),
+                now.stimuli,
+                before.stimuli,
+            ),
+            ("JOINTS-6", "torques", "torques that came", since(|it| it.torques), now.torques, before.torques),
+        ];
+        let differs = |(id, name, what, counted, now, before): (_, _, _, u16, u16, u16)| {
+            let expected = now.wrapping_sub(before);
+            let text = || format!("{name} went up by {counted} with {expected} {what}");
+            (counted != expected).then(|| (id, text()))
+        };
+        all.into_iter().filter_map(differs).collect()
+    }
+
+    /// Whether more heartbeats were due by then than came, by those that were asked for and the regular ones.
+    pub(super) fn is_one_missing(&self, now: Micros) -> bool {
+        self.missing(now) > self.given_up
+    }
+
+    fn missing(&self, now: Micros) -> u64 {
+        let Some((at, before)) = self.anchor else { return 0 };
+        let regular = now.since(at).0 / BEAT.0;
+        let asked = self.beats.asked.0 - before.asked.0;
+        (regular + asked).saturating_sub(self.beats.came - before.came)
+    }
+
+    /// What is missing is not waited for any more.
+    pub(super) fn give_up(&mut self, now: Micros) {
+        self.given_up = self.missing(now);
+    }
+
+    /// A regular heartbeat came then: how many came since the last such one, and how many at least and at most had to.
+    pub(super) fn regular(&mut self, at: Micros) -> Option<(u64, u64, u64)> {
+        self.given_up = 0;
+        let (before_at, before) = self.anchor.replace((at, self.beats))?;
+        let regular = (at.since(before_at).0 + BEAT.0 / 2) / BEAT.0;
+        let asked = |of: fn(&Beats) -> u64| regular + of(&self.beats) - of(&before);
+        let (came, min, max) =
+            (self.beats.came - before.came, asked(|it| it.asked.0), asked(|it| it.asked.1));
+        self.surplus.0 += came.cast_signed() - max.cast_signed();
+        self.surplus.1 += came.cast_signed() - min.cast_signed();
+        Some((came, min, max))
+    }
+
+    /// How many heartbeats came too many over all such times, if it is certain; too few are below 0.
+    pub(super) const fn surplus(&self) -> i64 {
+        let (min, max) = self.surplus;
+        if min > 0 {
+            min
+        } else if max < 0 {
+            max
+        } else {
+            0
+        }
+    }
+}
