@@ -269,7 +269,7 @@ fn live(
                     if show.has_enough() {
                         return Ok(());
                     }
-                    let time = Timestamp { nanos: received.at_nanos, nine_digits: false };
+                    let time = Timestamp::six_digits(received.at_nanos);
                     let interface = receive_end.bus().name();
                     show.frame(&Record { time, interface, frame: received.frame, direction: None })
                 })
