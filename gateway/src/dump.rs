@@ -238,9 +238,8 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> R
     // They have been named, each where it is.
     missing.frames = 0;
     missing.tell(reader, "not shown");
-    let lines = reader.lines();
-    if frames == 0 && lines > 0 && !stop::flag().load(Ordering::Relaxed) {
-        return Err(Failure::run(no_frame(&name, lines)));
+    if frames == 0 && !stop::flag().load(Ordering::Relaxed) {
+        return Err(no_frame(reader));
     }
     Ok(())
 }
