@@ -176,7 +176,7 @@ fn size(frames: &[Seen]) -> Result<(), Box<dyn Error>> {
             flushes += 1;
         }
         let direction = Some(if own { Direction::Sent } else { Direction::Received });
-        let time = Timestamp { nanos: at_nanos, nine_digits: true };
+        let time = Timestamp::nine_digits(at_nanos);
         let message = Record { time, interface: "vcan0", frame, direction };
         writer.write(&mut channel, at_nanos, &message)?;
     }

@@ -38,7 +38,7 @@ fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) ->
         let packet = Packet { id, words: [word; WORDS].into(), epoch, count };
         for frame in packet.frames(Format::Fd) {
             let nanos = (1_700_000_000_000_000 + number * PERIOD + micros) * 1_000;
-            let time = Timestamp { nanos, nine_digits: false };
+            let time = Timestamp::six_digits(nanos);
             line.clear();
             write_record(line, &Record { time, interface: "vcan0", frame, direction: None }).unwrap();
             line.push('\n');

@@ -16,13 +16,12 @@ use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;
 use trace::capture::convert::{ConvertError, Converted, Output, convert};
 use trace::capture::log::{Digits, Style};
-use trace::capture::{Format, ORIGIN, Reader};
+use trace::capture::{Format, Reader};
 use trace::files::WholeFile;
 
 use super::arguments::{Word, one_of};
-use super::input::{captures, no_frame, place, skin_for};
+use super::input::{captures, no_frame, others, place, skin_for};
 use super::output::{Force, apart, note, refused};
-use super::print::list;
 
 /// Lines that cannot be read and are reported; further ones are counted.
 const NAMED: u64 = 100;
@@ -131,7 +130,7 @@ impl Convert {
             Err(error) => return Err(Failure::run(error)),
         };
         if done.frames == 0 {
-            return Err(Failure::run(nothing(&name, &reader)));
+            return Err(no_frame(&reader));
         }
         if stopped.load(Ordering::Relaxed) && !live {
             let frames = done.frames;
@@ -261,32 +260,9 @@ fn bar(size: Option<u64>) -> ProgressBar {
     bar.with_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-/// Why there is nothing to convert.
-fn nothing(name: &str, reader: &Reader) -> String {
-    match (reader.format(), reader.lines()) {
-        (Format::Candump, 0) => format!("{name} is empty: there is nothing to convert"),
-        (Format::Candump, lines) => no_frame(name, lines),
-        (Format::Mcap, _) => match others(reader) {
-            others if others.is_empty() => format!("{name}: there is no frame in it"),
-            others => format!("{name}: there is no frame in it, only {others}"),
-        },
-    }
-}
-
-/// What is in a recording beside frames and notes.
-fn others(reader: &Reader) -> String {
-    let extras = reader.extras();
-    let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
-    let topics = topics.map(|topic| format!("{} ({} messages)", topic.name, topic.messages));
-    let attached = extras.attachments.iter().map(|(name, _)| format!("attachment {name}"));
-    let facts = extras.metadata.iter().filter(|(name, _)| name != ORIGIN);
-    let facts = facts.map(|(name, _)| format!("metadata {name}"));
-    list(topics.chain(attached).chain(facts))
-}
-
 /// Notes on a conversion, a line each.
 fn remarks(reader: &Reader, done: &Converted, style: &Style) -> Vec<String> {
-    let mut lines = Vec::new();
+    let mut lines: Vec<_> = reader.remarks().iter().map(ToString::to_string).collect();
     if let Some((times, first)) = done.backwards {
         lines.push(format!("times run backwards {times} times, first at frame {first}; the order is kept"));
     }

@@ -240,9 +240,8 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> R
     // They have been named, each where it is.
     missing.frames = 0;
     missing.tell(reader, "not shown");
-    let lines = reader.lines();
-    if frames == 0 && lines > 0 && !stop::flag().load(Ordering::Relaxed) {
-        return Err(Failure::run(no_frame(&name, lines)));
+    if frames == 0 && !stop::flag().load(Ordering::Relaxed) {
+        return Err(no_frame(reader));
     }
     Ok(())
 }
@@ -271,7 +270,7 @@ fn live(
                     if show.has_enough() {
                         return Ok(());
                     }
-                    let time = Timestamp { nanos: received.at_nanos, nine_digits: false };
+                    let time = Timestamp::six_digits(received.at_nanos);
                     let interface = receive_end.bus().name();
                     show.frame(&Record { time, interface, frame: received.frame, direction: None })
                 })

@@ -17,9 +17,10 @@ use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use trace::capture::{Format, Note, NoteKind, Reader};
+use trace::capture::{Format, Note, NoteKind, ORIGIN, Reader};
 
 use super::output;
+use super::print::{count, list};
 
 /// How long a signal to end may wait, when nothing comes.
 pub(crate) const LOOK: Duration = Duration::from_millis(200);
@@ -146,12 +147,33 @@ pub(crate) fn place(name: &str, line: u64) -> String {
     if line > 0 { format!("{name}:{line}") } else { name.to_owned() }
 }
 
-/// The error for a log without frames.
-pub(crate) fn no_frame(name: &str, lines: u64) -> String {
-    format!(
-        "{name}: there is no frame in {lines} lines; a candump log is read: its lines are like \
-         `(1700000000.123456) vcan0 123#00`"
-    )
+/// The error for a capture without frames.
+pub(crate) fn no_frame(reader: &Reader) -> Failure {
+    let name = reader.name();
+    let what = match (reader.format(), reader.lines()) {
+        (Format::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
+        (Format::Candump, lines) => format!(
+            "there is no frame in {}; what candump prints or logs is read: lines like \
+             `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
+            count(lines, "line")
+        ),
+        (Format::Mcap, _) => match others(reader) {
+            others if others.is_empty() => "there is no frame in it".to_owned(),
+            others => format!("there is no frame in it, only {others}"),
+        },
+    };
+    Failure::run(format!("{name}: {what}"))
+}
+
+/// What is in a recording beside frames and notes.
+pub(crate) fn others(reader: &Reader) -> String {
+    let extras = reader.extras();
+    let topics = extras.topics.iter().filter(|topic| topic.messages > 0);
+    let topics = topics.map(|topic| format!("{} ({} messages)", topic.name, topic.messages));
+    let attached = extras.attachments.iter().map(|(name, _)| format!("attachment {name}"));
+    let facts = extras.metadata.iter().filter(|(name, _)| name != ORIGIN);
+    let facts = facts.map(|(name, _)| format!("metadata {name}"));
+    list(topics.chain(attached).chain(facts))
 }
 
 /// What a capture lacks.
@@ -187,6 +209,9 @@ impl Missing {
         let said = said.iter().filter(|(count, _)| *count > 0).map(|(_, said)| said);
         for line in said.chain(&reader.extras().unfinished) {
             output::note(format_args!("{name}: {line}"));
+        }
+        for remark in reader.remarks() {
+            output::note(format_args!("{name}: {remark}"));
         }
     }
 }

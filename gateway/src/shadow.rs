@@ -15,12 +15,12 @@ use protocol::skin::Skin;
 use protocol::stop::{self, Stoppable};
 use protocol::usage::{Failure, print, written};
 use protocol::wire_time::{BitRates, bit_rate};
-use trace::capture::{Entry, Format, NoteKind, Reader};
+use trace::capture::{Entry, NoteKind, Reader};
 
 use self::show::write_frames;
 use super::arguments::{BusKind, nanos};
 use super::input::{
-    self, LOOK, Missing, ReceiveEnd, captures, is_file, place, remark_another, skin_beside, stopped,
+    self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame, place, remark_another, skin_beside, stopped,
 };
 use super::output;
 use super::print::list;
@@ -278,12 +278,7 @@ fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Re
     if stop::flag().load(Ordering::Relaxed) {
         output::note(format_args!("{name}: stopped after {frames} frames"));
     } else if frames == 0 && ended.is_ok() {
-        let like = "a candump log has lines like `(1700000000.123456) vcan0 123#00`";
-        ended = Err(Failure::run(match (reader.format(), reader.lines()) {
-            (Format::Candump, 0) => format!("{name} is empty: there is no frame to look at"),
-            (Format::Candump, lines) => format!("{name}: there is no frame in {lines} lines; {like}"),
-            (Format::Mcap, _) => format!("{name}: there is no CAN frame in this recording"),
-        }));
+        ended = Err(no_frame(&reader));
     }
     Ok(Taken { what, missing: missing.frames, ended })
 }

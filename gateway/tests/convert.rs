@@ -81,6 +81,53 @@ fn a_log_becomes_a_recording_and_a_log_again() {
 }
 
 #[test]
+fn what_candump_prints_becomes_a_log_and_a_recording_and_what_is_not_in_it_is_said() {
+    let console = "\
+$ candump -td -a can0 vcan1
+ (000.000000)   can0  123   [2]  DE AD                     '..'
+ (000.010034)  vcan1  123  [02]  DE AD
+ (000.010016)   can0  20000004   [8]  00 08 00 00 00 00 00 00   ERRORFRAME
+ (000.000100)   can0  1F334455   [4]  remote request
+ (000.000001)  vcan1  123  [02]  DE AF
+";
+    let folder = Folder::new(&[("forum.txt", console.as_bytes())]);
+    let differences = "its times are differences (candump -t d): they are added up from 0";
+    let flags = "its lines do not say whether FD frames switch the bit rate (candump without -x): they are read as \
+                 if none did";
+    for to in ["forum.log", "forum.mcap"] {
+        let said = folder.says(&format!("convert forum.txt {to}"), 0);
+        let expected =
+            format!("forum.txt: {differences}\nforum.txt: {flags}\nforum.txt -> {to}: 5 frames, 1 notes\n");
+        assert_eq!(said, expected);
+    }
+    let log = "\
+$ candump -td -a can0 vcan1
+(0.000000) can0 123#DEAD
+(0.010034) vcan1 123##4DEAD
+(0.020050) can0 20000004#0008000000000000
+(0.020150) can0 1F334455#R4
+(0.020151) vcan1 123##4DEAF
+";
+    assert_eq!(folder.text("forum.log"), log);
+    folder.says("convert forum.mcap back.log", 0);
+    assert_eq!(folder.text("back.log"), log);
+}
+
+#[test]
+fn padded_seconds_and_can_xl_come_back_and_indented_lines_are_read() {
+    let log = "(0000000012.345678) can0 123#11\n(000.000001) can0 123#\n(12.000000) can0 123#\n\
+               (1700000000.000001) can0 00123#80:01:00000000#11223344\n";
+    let indented = log.replace('\n', "\n    ");
+    let folder = Folder::new(&[("run.log", log.as_bytes()), ("in.log", indented.as_bytes())]);
+    folder.says("convert run.log run.mcap", 0);
+    let said = folder.says("convert run.mcap back.log", 0);
+    assert!(said.contains("1 are CAN XL frames"), "{said}");
+    assert_eq!(folder.text("back.log"), log);
+    let said = folder.says("convert in.log in.mcap", 0);
+    assert!(said.ends_with("in.log -> in.mcap: 3 frames, 2 notes\n"), "{said}");
+}
+
+#[test]
 fn standard_input_and_output_are_text_or_a_recording_that_comes_in() {
     let folder = Folder::new(&[("run.log", LOG.as_bytes())]);
     folder.says("convert run.log run.mcap", 0);
@@ -106,12 +153,12 @@ fn what_is_no_capture_is_refused_by_its_name() {
     );
     assert_eq!(
         folder.refuses("convert empty.log run.mcap", 1),
-        "gateway: empty.log is empty: there is nothing to convert"
+        "gateway: empty.log: it is empty: there is no frame in it"
     );
     assert_eq!(
         folder.refuses("convert words.txt run.mcap", 1),
-        "gateway: words.txt: there is no frame in 3 lines; a candump log is read: its lines are like \
-         `(1700000000.123456) vcan0 123#00`"
+        "gateway: words.txt: there is no frame in 3 lines; what candump prints or logs is read: \
+         lines like `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`"
     );
     assert!(folder.refuses("convert run.pcapng run.mcap", 2).contains("is a packet capture"));
     assert_eq!(

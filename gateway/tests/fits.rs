@@ -39,7 +39,7 @@ impl Files {
         let mut log = String::new();
         for (nanos, message) in run() {
             for frame in message.encode().frames(Format::Fd) {
-                let time = Timestamp { nanos, nine_digits: true };
+                let time = Timestamp::nine_digits(nanos);
                 let direction = Some(Direction::Received);
                 let record = Record { time, interface: "vcan0", frame, direction };
                 mcap.write(&mut topic, nanos, &record).unwrap();

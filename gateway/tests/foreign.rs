@@ -37,7 +37,7 @@ fn settled(frames: &[(u64, Frame)]) -> Vec<((u64, Frame), Decoded)> {
 }
 
 fn record(nanos: u64, frame: Frame) -> Record<'static> {
-    let time = Timestamp { nanos, nine_digits: true };
+    let time = Timestamp::nine_digits(nanos);
     Record { time, interface: "can0", frame, direction: None }
 }
 

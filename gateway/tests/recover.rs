@@ -26,7 +26,7 @@ fn recording() -> Vec<u8> {
     for number in 0..50_u8 {
         let nanos = u64::from(number) * 1_000;
         let frame = Frame::classic(0x123, &[number; 8]).unwrap();
-        let time = Timestamp { nanos, nine_digits: true };
+        let time = Timestamp::nine_digits(nanos);
         let record = Record { time, interface: "vcan0", frame, direction: None };
         writer.write(&mut can, nanos, &record).unwrap();
         let q = [f64::from(number)];

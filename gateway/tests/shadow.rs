@@ -107,8 +107,8 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
     }
     fs::write(folder.path().join("run.log"), log()).unwrap();
     for (arguments, code, begin) in [
-        ("shadow empty.log", 1, "gateway: empty.log is empty: there is no frame"),
-        ("shadow notes.txt", 1, "gateway: notes.txt: there is no frame in 1 lines; a candump log"),
+        ("shadow empty.log", 1, "gateway: empty.log: it is empty: there is no frame in it"),
+        ("shadow notes.txt", 1, "gateway: notes.txt: there is no frame in 1 line; what candump prints"),
         ("shadow x.zip", 2, "gateway: x.zip is "),
         ("shadow .", 2, "gateway: . is a directory"),
         ("shadow nowhere", 2, "gateway: there is no file nowhere, and as a bus: "),

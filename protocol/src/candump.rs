@@ -7,9 +7,9 @@
 //!   (1700000000.123456) vcan0 20000004#0001...   error frame: 8 digits with 0x20000000 set
 //! ```
 //!
-//! Also read: several spaces, 9 digits of a second (`-N`), a direction `T` or `R` at the end (`-x`),
+//! Also read: lines that are indented or quoted by `>` or `|`, several spaces, 9 digits of a second (`-N`), a direction `T` or `R` at the end (`-x`),
 //! dots between bytes, a raw DLC (`_9` to `_F`). Lines that do not begin with a parenthesis are other
-//! text, as can-utils has it; CAN XL frames (5 digits, `###`) are named but not read.
+//! text, as can-utils has it; CAN XL frames (`00242#81:00:12345678#...`) are named but not read.
 
 mod portable;
 mod read;
@@ -30,6 +30,22 @@ pub struct Timestamp {
     pub nanos: u64,
     /// Whether it was given, or is to be written, with 9 digits instead of 6.
     pub nine_digits: bool,
+    /// How many digits the seconds have at least, with zeros in front: candump pads them to 10.
+    pub min_digits: u8,
+}
+
+impl Timestamp {
+    /// A time with 6 digits of a second.
+    #[must_use]
+    pub const fn six_digits(nanos: u64) -> Self {
+        Self { nanos, nine_digits: false, min_digits: 1 }
+    }
+
+    /// A time with 9 digits of a second.
+    #[must_use]
+    pub const fn nine_digits(nanos: u64) -> Self {
+        Self { nine_digits: true, ..Self::six_digits(nanos) }
+    }
 }
 
 /// Whether the frame was sent or received by the node that took the capture.
@@ -83,7 +99,7 @@ pub struct LineError {
 /// Reads one line, with or without its end. Never panics.
 ///
 /// # Errors
-/// When it begins with a parenthesis and is no frame.
+/// When it begins with a parenthesis, behind blanks and quotation marks or not, and is no frame.
 pub fn parse(line: &str) -> Result<Line<'_>, LineError> {
     parse_bytes(line.as_bytes())
 }
@@ -91,7 +107,7 @@ pub fn parse(line: &str) -> Result<Line<'_>, LineError> {
 /// As [`parse`], of bytes that need not be text: only the interface's name has to be. Never panics.
 ///
 /// # Errors
-/// When it begins with a parenthesis and is no frame.
+/// When it begins with a parenthesis, behind blanks and quotation marks or not, and is no frame.
 #[inline]
 pub fn parse_bytes(line: &[u8]) -> Result<Line<'_>, LineError> {
     portable::record(line).map_or_else(|| parse_widely(line), |record| Ok(Line::Frame(record)))
@@ -100,10 +116,17 @@ pub fn parse_bytes(line: &[u8]) -> Result<Line<'_>, LineError> {
 /// Reads all that can be read.
 fn parse_widely(line: &[u8]) -> Result<Line<'_>, LineError> {
     let text = trim_end(line);
-    if !text.starts_with(b"(") {
+    // In mails and issues.
+    let indent = text.iter().take_while(|byte| matches!(byte, b' ' | b'\t' | b'>' | b'|')).count();
+    let is_frame = match text.get(indent..).unwrap_or_default() {
+        [b'(', next, ..] if indent > 0 => next.is_ascii_digit(),
+        [b'(', ..] => true,
+        _ => false,
+    };
+    if !is_frame {
         return Ok(other(text));
     }
-    let mut cursor = Cursor::new(text, 1);
+    let mut cursor = Cursor::new(text, indent + 1);
     let time = cursor.time()?;
     cursor.expect(b')', "`)` after the time")?;
     cursor.spaces()?;
@@ -174,7 +197,7 @@ mod tests {
     fn a_line_is_read_in_every_dress() {
         let plain = parse("(1700000000.123456) vcan0 22C##1AABBCC").unwrap();
         let Line::Frame(record) = plain else { panic!("{plain:?}") };
-        assert_eq!(record.time, Timestamp { nanos: 1_700_000_000_123_456_000, nine_digits: false });
+        assert_eq!(record.time, Timestamp::six_digits(1_700_000_000_123_456_000));
         assert_eq!((record.interface, record.direction), ("vcan0", None));
         assert_eq!(record.frame.data(), [0xAA, 0xBB, 0xCC]);
         assert_eq!(record.frame.flags(), BIT_RATE_SWITCH);
@@ -182,7 +205,7 @@ mod tests {
         let dressed = parse("(1700000000.123456789)   vcan0  22C##1AA.BB.cc   T\r\n").unwrap();
         let Line::Frame(other) = dressed else { panic!("{dressed:?}") };
         assert_eq!(other.frame, record.frame);
-        assert_eq!(other.time, Timestamp { nanos: 1_700_000_000_123_456_789, nine_digits: true });
+        assert_eq!(other.time, Timestamp::nine_digits(1_700_000_000_123_456_789));
         assert_eq!(other.direction, Some(Direction::Sent));
     }
 
@@ -195,7 +218,9 @@ mod tests {
         assert!(frame_of("(0.000000) can0 00000123#").is_extended());
         assert_eq!(frame_of("(0.000000) can0 123#1122334455667788_E").raw_dlc(), 14);
         assert_eq!(frame_of("(0.000000) can0 123##5AABBCCDDEEFF0011223344").len(), 11, "no padding");
-        assert_eq!(parse("(0.000000) can0 00242###81000000000011."), Ok(Line::CanXl));
+        for xl in ["00242###81000000000011.", "00242#81:00:12345678#", "12345678#80:01:00000000#112233"] {
+            assert_eq!(parse(&format!("(0.000000) can0 {xl}")), Ok(Line::CanXl));
+        }
     }
 
     #[test]
@@ -234,7 +259,7 @@ mod tests {
     proptest! {
         #[test]
         fn every_frame_comes_back(
-            nanos in 0_u64..4_000_000_000_000_000_000, nine: bool, kind in 0..5, id: u32, flags in 0_u8..8,
+            nanos in 0_u64..4_000_000_000_000_000_000, nine: bool, pad in 0..3_usize, kind in 0..5, id: u32, flags in 0_u8..8,
             data in proptest::collection::vec(any::<u8>(), 0..=64),
         ) {
             let short = &data[..data.len().min(8)];
@@ -246,7 +271,10 @@ mod tests {
                 _ => Frame::with_data(id & STANDARD_MASK, Format::Fd, flags, &data),
             }.unwrap();
             let nanos = if nine { nanos } else { nanos / 1_000 * 1_000 };
-            let record = Record { time: Timestamp { nanos, nine_digits: nine }, interface: "vcan0", frame, direction: None };
+            // Zeros in front are told by one.
+            let is_padded = |&digits: &u8| nanos / 1_000_000_000 < 10_u64.pow(u32::from(digits) - 1);
+            let min_digits = [1, 3, 10].into_iter().nth(pad).filter(is_padded).unwrap_or(1);
+            let record = Record { time: Timestamp { nine_digits: nine, min_digits, ..Timestamp::six_digits(nanos) }, interface: "vcan0", frame, direction: None };
             let line = record.to_string();
             prop_assert_eq!(parse(&line), Ok(Line::Frame(record)));
             prop_assert_eq!(parse_frame(&frame.to_string()), Ok(frame));

@@ -137,7 +137,7 @@ fn latched(latched_frames: &Latched) -> Vec<capture::Latched> {
 
 fn record(seen: &Seen) -> Record<'static> {
     let direction = Some(if seen.own { Direction::Sent } else { Direction::Received });
-    let time = Timestamp { nanos: seen.at_nanos, nine_digits: true };
+    let time = Timestamp::nine_digits(seen.at_nanos);
     Record { time, interface: BUS, frame: seen.frame, direction }
 }
 

@@ -104,8 +104,8 @@ fn invalid_input_is_refused_in_one_line() {
     let zip = place.path("some.zip");
     fs::write(&zip, b"PK\x03\x04..............").unwrap();
     for (words, code, said) in [
-        ("empty.log", 2, "gateway: empty.log"),
-        ("none.log", 2, "gateway: none.log: there is no frame in it"),
+        ("empty.log", 1, "gateway: empty.log: there is no frame in it"),
+        ("none.log", 1, "gateway: none.log: there is no frame in it"),
         ("nothing.log", 2, "gateway: nothing.log: No such file"),
         ("some.zip", 2, "gateway: some.zip is a zip"),
         ("-", 2, "gateway: a capture is read twice, which standard input cannot be"),

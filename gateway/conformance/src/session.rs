@@ -424,7 +424,7 @@ impl<'a> Session<'a> {
 
 /// A frame as candump writes it, with T for what the bench sent.
 fn line(name: &str, seen: &Seen) -> String {
-    let time = Timestamp { nanos: seen.at.0 * 1_000, nine_digits: false };
+    let time = Timestamp::six_digits(seen.at.0 * 1_000);
     let record = Record { time, interface: name, frame: seen.frame, direction: None };
     format!("{record} {}", if seen.own { 'T' } else { 'R' })
 }

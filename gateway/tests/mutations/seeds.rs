@@ -90,7 +90,7 @@ impl File {
 
     fn packet(&mut self, topic: &str, nanos: u64, packet: &Packet) {
         for frame in packet.encode().frames(Format::Fd) {
-            let time = Timestamp { nanos, nine_digits: true };
+            let time = Timestamp::nine_digits(nanos);
             let record = Record { time, interface: "vcan0", frame, direction: None };
             self.message(topic, nanos, &record);
         }

@@ -41,7 +41,8 @@ pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
         }
         _ => return None,
     };
-    let time = Timestamp { nanos, nine_digits: false };
+    let min_digits = if time.get(1) == Some(&b'0') { 10 } else { 1 };
+    let time = Timestamp { min_digits, ..Timestamp::six_digits(nanos) };
     Some(Record { time, interface, frame, direction: None })
 }
 

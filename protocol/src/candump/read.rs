@@ -1,5 +1,6 @@
 //! A place in a line, and what is read from there on.
 
+use super::write::MAX_PAD;
 use super::{Direction, LineError, Timestamp};
 use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, STANDARD_MASK};
 
@@ -70,6 +71,19 @@ pub(super) fn eight_digits(text: [u8; 8]) -> (u64, usize) {
     (digits.wrapping_mul(10_000).wrapping_add(digits >> 32) & 0xFFFF_FFFF, (bits >> 3) as usize)
 }
 
+/// Whether a frame goes on as CAN XL behind so many digits: as can-utils write it, `#81:00:12345678#`, or as they did
+/// in drafts, `###`.
+fn is_can_xl(digits: usize, rest: &[u8]) -> bool {
+    let is_header = |text: &[u8]| {
+        text.iter().zip(b"#00:00:00000000#").all(|(byte, like)| match like {
+            b'0' => byte.is_ascii_hexdigit(),
+            _ => byte == like,
+        })
+    };
+    let header = rest.get(..16).filter(|_| matches!(digits, 3 | 5 | 8));
+    header.is_some_and(is_header) || digits == 5 && rest.starts_with(b"###")
+}
+
 pub(super) struct Cursor<'a> {
     text: &'a [u8],
     at: usize,
@@ -137,7 +151,8 @@ impl<'a> Cursor<'a> {
     }
 
     pub(super) fn time(&mut self) -> Result<Timestamp, LineError> {
-        let (seconds, _) = self.digits("seconds since 1970")?;
+        let padded = self.peek() == Some(b'0');
+        let (seconds, whole_digits) = self.digits("seconds since 1970")?;
         self.expect(b'.', "`.` and the fraction of a second")?;
         let (fraction, digits) = self.digits("6 or 9 digits of a second")?;
         let nanos = match digits {
@@ -147,7 +162,8 @@ impl<'a> Cursor<'a> {
         };
         let whole = seconds.checked_mul(1_000_000_000).and_then(|whole| whole.checked_add(nanos));
         let nanos = whole.ok_or_else(|| self.error("a time before the year 2554"))?;
-        Ok(Timestamp { nanos, nine_digits: digits == 9 })
+        let min_digits = if padded { u8::try_from(whole_digits).unwrap_or(MAX_PAD).min(MAX_PAD) } else { 1 };
+        Ok(Timestamp { nanos, nine_digits: digits == 9, min_digits })
     }
 
     /// A frame, or `None` for CAN XL, whose text is skipped.
@@ -160,7 +176,7 @@ impl<'a> Cursor<'a> {
             self.at += 1;
         }
         let digits = self.at - start;
-        if digits == 5 && self.rest().starts_with(b"###") {
+        if is_can_xl(digits, self.rest()) {
             self.at = self.text.len();
             return Ok(None);
         }

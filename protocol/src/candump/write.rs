@@ -20,8 +20,10 @@ const HEX: [[u8; 2]; 256] = {
 
 /// 8 digits of an identifier, `##`, flags, 64 bytes, a raw DLC.
 const FRAME: usize = 8 + 2 + 1 + 128 + 2;
-/// Two parentheses, 11 digits of seconds before the year 2554, a point, 9 digits, a space.
-const TIME: usize = 2 + 11 + 1 + 9 + 1;
+/// The most digits that seconds are padded to.
+pub(super) const MAX_PAD: u8 = 20;
+/// Two parentheses, digits of seconds, a point, 9 digits, a space.
+const TIME: usize = 2 + MAX_PAD as usize + 1 + 9 + 1;
 
 /// Writes one line without its end: single spaces, upper case, no direction.
 ///
@@ -31,7 +33,7 @@ pub fn write_record(out: &mut impl Write, record: &Record<'_>) -> fmt::Result {
     let mut time = Text::<TIME>::new();
     let (seconds, nanos) = (record.time.nanos / 1_000_000_000, record.time.nanos % 1_000_000_000);
     time.push(b'(');
-    time.decimal(seconds, 1);
+    time.decimal(seconds, usize::from(record.time.min_digits.clamp(1, MAX_PAD)));
     time.push(b'.');
     if record.time.nine_digits {
         time.decimal(nanos, 9);

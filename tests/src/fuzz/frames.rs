@@ -144,7 +144,7 @@ pub(super) fn decoder(data: &[u8]) {
             came += 1;
             let mut text = String::new();
             write!(text, "{decoded}").unwrap();
-            let time = Timestamp { nanos, nine_digits: true };
+            let time = Timestamp::nine_digits(nanos);
             let record = Record { time, interface: bus, frame, direction: None };
             let mut line = Vec::new();
             json::write(&mut line, &record, &decoded, Units::default()).unwrap();

@@ -22,7 +22,7 @@ impl Tape {
         settler.push(Micros(nanos / 1_000), bus, &frame, (nanos, bus.to_owned(), frame));
         settler.finish();
         while let Some(((nanos, bus, frame), decoded)) = settler.pop() {
-            let time = Timestamp { nanos, nine_digits: false };
+            let time = Timestamp::six_digits(nanos);
             self.stats.take(&Record { time, interface: &bus, frame, direction: None }, &decoded);
         }
     }

@@ -59,7 +59,7 @@ impl Text {
             self.lost += 1;
             return Ok(());
         }
-        let time = Timestamp { nanos: seen.at_nanos, nine_digits: false };
+        let time = Timestamp::six_digits(seen.at_nanos);
         let record = Record { time, interface, frame: seen.frame, direction: None };
         // A string takes everything.
         let _ = write_record(&mut self.lines, &record);

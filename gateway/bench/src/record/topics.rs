@@ -186,7 +186,7 @@ impl Topics {
 }
 
 fn message<'a>(interface: &'a str, seen: &Seen) -> Record<'a> {
-    let time = Timestamp { nanos: seen.at_nanos, nine_digits: true };
+    let time = Timestamp::nine_digits(seen.at_nanos);
     let direction = Some(if seen.own { Direction::Sent } else { Direction::Received });
     Record { time, interface, frame: seen.frame, direction }
 }

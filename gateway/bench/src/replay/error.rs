@@ -146,7 +146,6 @@ impl ReplayError {
             | Self::Pipe(_)
             | Self::Open(_)
             | Self::Buses(_)
-            | Self::Empty(_)
             | Self::NothingLeft { .. }
             | Self::NoBus { .. }
             | Self::MapTwice(_)
@@ -155,6 +154,7 @@ impl ReplayError {
             | Self::NotOfSkin { .. } => 2,
             Self::Read(_)
             | Self::Line(_)
+            | Self::Empty(_)
             | Self::CellsThere { .. }
             | Self::Ended { .. }
             | Self::OtherGateway(_)

@@ -397,7 +397,7 @@ mod tests {
         assert_eq!((&wrong["crc"], &wrong["crc_expected"]), (&json!("E74B"), &json!("9C2A")));
         assert_eq!(wrong["error"], json!("no packet: CRC E74B, not 9C2A"));
         let frame = candump::parse_frame("20C##10011").unwrap();
-        let time = candump::Timestamp { nanos: 0, nine_digits: false };
+        let time = candump::Timestamp::six_digits(0);
         let record = Record { time, interface: "can0", frame, direction: None };
         let id = protocol::packet::data_id(&frame).unwrap();
         let mut line = Vec::new();

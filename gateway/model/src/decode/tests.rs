@@ -427,12 +427,8 @@ fn joints_and_torques_are_in_the_units_of_their_bus() {
         let epoch = protocol::packet::Epoch(7);
         let packet = Packet { id, words: words.into(), epoch, count };
         let frame = packet.frames(Format::Fd).next().unwrap();
-        let record = candump::Record {
-            time: Timestamp { nanos: 0, nine_digits: false },
-            interface: "vcan0",
-            frame,
-            direction: None,
-        };
+        let record =
+            candump::Record { time: Timestamp::six_digits(0), interface: "vcan0", frame, direction: None };
         let decoded = Decoder::new(None).decode(Micros(0), "vcan0", &frame);
         let mut line = Vec::new();
         json::write(&mut line, &record, &decoded, units).unwrap();

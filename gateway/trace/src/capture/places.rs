@@ -11,13 +11,12 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use ::mcap::records::op;
-use protocol::candump::{Line, parse_bytes};
 use protocol::input;
 
-use super::log::LONGEST as LONGEST_LINE;
+use super::log::{Clock, LONGEST as LONGEST_LINE, LogReader, known_time};
 use super::mcap::{Fault, State};
 use super::reader::is_mcap;
-use super::{CaptureError, Reader};
+use super::{CaptureError, Entry, Reader};
 use crate::container::{LONGEST_DESCRIPTION, MAGIC, find};
 use crate::order::WINDOW_NS;
 
@@ -39,6 +38,8 @@ pub struct Place {
     pub(super) line: u64,
     /// Entries of the record before it.
     pub(super) skip: u32,
+    /// The times of a log up to there.
+    pub(super) clock: Clock,
 }
 
 /// Some places of a capture, by time.
@@ -118,12 +119,14 @@ impl Places {
 
     /// A place in the last part, if the one before it is far enough away; everything before the next one is at `latest`
     /// or earlier.
-    fn mark(&mut self, offset: u64, latest: u64) {
-        let part = self.parts.len() - 1;
+    fn mark(&mut self, place: Place, latest: u64) {
+        let place = Place { part: self.parts.len() - 1, ..place };
         let latest = latest.max(self.latest());
         match self.marks.last_mut() {
-            Some((of, place)) if place.part == part && offset - place.offset < self.piece => *of = latest,
-            _ => self.marks.push((latest, Place { part, offset, ..Place::default() })),
+            Some((of, last)) if last.part == place.part && place.offset - last.offset < self.piece => {
+                *of = latest
+            }
+            _ => self.marks.push((latest, place)),
         }
     }
 
@@ -152,8 +155,8 @@ impl Places {
                 bytes.map_or(0, u64::from_le_bytes)
             };
             match opcode {
-                op::CHUNK => self.mark(at, time(8)),
-                op::MESSAGE => self.mark(at, time(6)),
+                op::CHUNK => self.mark(Place { offset: at, ..Place::default() }, time(8)),
+                op::MESSAGE => self.mark(Place { offset: at, ..Place::default() }, time(6)),
                 _ => {
                     described += head.len();
                     if let Some(part) = self.parts.last_mut().filter(|_| described <= DESCRIPTIONS) {
@@ -168,27 +171,49 @@ impl Places {
     /// A line of every piece. Its neighbours of other buses may be older and newer by the window of the order.
     fn add_log(&mut self, mut file: File) -> io::Result<()> {
         let length = file.metadata()?.len();
-        let mut last = 0;
+        let mut last = Place::default();
         let mut at = 0;
         while at < length {
-            let found = line_at(&mut file, at)?;
-            if let Some((offset, nanos)) = found.filter(|_| at > 0) {
-                self.mark(last, nanos.saturating_add(WINDOW_NS));
-                last = offset;
+            match line_at(&mut file, at)? {
+                Some((_, None)) => return self.add_by_reading(file),
+                Some((offset, Some(nanos))) if at > 0 => {
+                    self.mark(last, nanos.saturating_add(WINDOW_NS));
+                    last = Place { offset, ..Place::default() };
+                }
+                Some(_) | None => {}
             }
             at += self.piece;
         }
         let mut end = Vec::new();
         file.seek(SeekFrom::Start(length.saturating_sub(END)))?;
         (&mut file).take(END).read_to_end(&mut end)?;
-        let latest = end.split(|&byte| byte == b'\n').filter_map(time_of).max();
+        let latest = end.split(|&byte| byte == b'\n').filter_map(|line| known_time(line)?).max();
         self.mark(last, latest.unwrap_or(0));
         Ok(())
     }
+
+    /// The same of a log whose times depend on all lines before them.
+    fn add_by_reading(&mut self, mut file: File) -> io::Result<()> {
+        file.rewind()?;
+        let part = self.parts.len() - 1;
+        self.marks.retain(|(_, place)| place.part != part);
+        let mut log = LogReader::new(&[], Box::new(file));
+        loop {
+            let (offset, line, clock) = (log.offset(), log.lines(), log.clock());
+            match log.next()? {
+                Some(Entry::Frame(record)) => {
+                    let place = Place { offset, line, clock, ..Place::default() };
+                    self.mark(place, record.time.nanos);
+                }
+                Some(Entry::Note(_)) => {}
+                None => return Ok(()),
+            }
+        }
+    }
 }
 
-/// The first frame of a log at this place or behind it: where its line begins, and its time.
-fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, u64)>> {
+/// The first frame of a log at this place or behind it: where its line begins, and its time if it says that itself.
+fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, Option<u64>)>> {
     file.seek(SeekFrom::Start(at))?;
     let mut piece = Vec::new();
     file.take(2 * LONGEST_LINE as u64).read_to_end(&mut piece)?;
@@ -196,19 +221,12 @@ fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, u64)>> {
     // Within a line, unless it is the first one.
     for (number, line) in piece.split_inclusive(|&byte| byte == b'\n').enumerate() {
         let text = line.trim_ascii_end();
-        if let Some(nanos) = time_of(text).filter(|_| number > 0 || at == 0) {
+        if let Some(nanos) = known_time(text).filter(|_| number > 0 || at == 0) {
             return Ok(Some((from, nanos)));
         }
         from += line.len() as u64;
     }
     Ok(None)
-}
-
-fn time_of(line: &[u8]) -> Option<u64> {
-    match parse_bytes(line.trim_ascii_end()) {
-        Ok(Line::Frame(record)) => Some(record.time.nanos),
-        Ok(_) | Err(_) => None,
-    }
 }
 
 #[cfg(test)]

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use protocol::input;
 use thiserror::Error;
 
-use super::log::LogReader;
+use super::log::{Clock, LogReader, Remark};
 use super::magic::{self, Kind};
 use super::mcap::{Fault, McapReader, ORIGIN, SOURCE, State};
 use super::parts::{self, Part, PartsError};
@@ -235,14 +235,14 @@ impl Reader {
     /// Where its next entry is. Of an input that cannot be gone back in it is of no use.
     #[must_use]
     pub const fn place(&self) -> Place {
-        let (offset, line, skip) = match &self.source {
-            Source::Log(log) => (log.offset(), log.lines(), 0),
-            Source::Mcap(mcap) => {
-                let (offset, skip) = mcap.anchor();
-                (offset, 0, skip)
+        let (offset, skip) = match &self.source {
+            Source::Log(log) => {
+                let (offset, line, clock) = (log.offset(), log.lines(), log.clock());
+                return Place { part: self.part, offset, line, skip: 0, clock };
             }
+            Source::Mcap(mcap) => mcap.anchor(),
         };
-        Place { part: self.part, offset, line, skip }
+        Place { part: self.part, offset, line: 0, skip, clock: Clock::NEW }
     }
 
     /// Goes to a place of the same capture; what comes next is the entry there.
@@ -265,7 +265,7 @@ impl Reader {
             let input = (self.through)(file);
             let empty = Source::Log(LogReader::new(&[], Box::new(io::empty())));
             self.source = match std::mem::replace(&mut self.source, empty) {
-                Source::Log(_) => Source::Log(LogReader::at((place.offset, place.line), input)),
+                Source::Log(_) => Source::Log(LogReader::at((place.offset, place.line, place.clock), input)),
                 Source::Mcap(mcap) => {
                     let mut state = mcap.into_state();
                     places.describe(place.part, &mut state).map_err(|fault| fault.of(&name, self.entries))?;
@@ -337,6 +337,15 @@ impl Reader {
         match &self.source {
             Source::Log(log) => log.lines(),
             Source::Mcap(_) => 0,
+        }
+    }
+
+    /// What is to be known of the times and flags of the frames so far.
+    #[must_use]
+    pub fn remarks(&self) -> &[Remark] {
+        match &self.source {
+            Source::Log(log) => log.remarks(),
+            Source::Mcap(_) => &[],
         }
     }
 

@@ -150,7 +150,7 @@ mod tests {
     #[test]
     fn a_frame_stands_byte_for_byte_where_the_definition_says() {
         let frame = Frame::fd(0x22C, 1, &[0xAA, 0xBB]).unwrap();
-        let time = Timestamp { nanos: 5 * NANOS + 7, nine_digits: true };
+        let time = Timestamp::nine_digits(5 * NANOS + 7);
         let record = Record { time, interface: "vcan0", frame, direction: Some(Direction::Sent) };
         let mut buffer = Vec::new();
         record.encode_into(&mut buffer);
@@ -168,7 +168,7 @@ mod tests {
 
     #[test]
     fn a_message_that_is_no_frame_is_refused() {
-        let time = Timestamp { nanos: 0, nine_digits: true };
+        let time = Timestamp::nine_digits(0);
         let record = Record { time, interface: "", frame: Frame::EMPTY, direction: None };
         let mut buffer = Vec::new();
         record.encode_into(&mut buffer);
@@ -221,14 +221,14 @@ mod tests {
             }.unwrap();
             let frame = if kind < 4 && frame.len() == 8 { frame.with_raw_dlc(dlc) } else { frame };
             let direction = [None, Some(Direction::Sent), Some(Direction::Received)][way];
-            let time = Timestamp { nanos, nine_digits };
+            let time = Timestamp { nine_digits, ..Timestamp::six_digits(nanos) };
             let record = Record { time, interface: &interface, frame, direction };
             prop_assert_eq!(back_and_forth(record), Ok(record));
         }
 
         #[test]
         fn no_bytes_panic(bytes in proptest::collection::vec(0_u8..4, 0..80)) {
-            let _ = frame(&bytes, Timestamp { nanos: 0, nine_digits: true });
+            let _ = frame(&bytes, Timestamp::nine_digits(0));
             let _ = super::note(&bytes, 0);
         }
     }

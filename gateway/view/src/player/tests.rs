@@ -32,7 +32,7 @@ fn log(skin: &Skin) -> Vec<u8> {
     let mut out = Vec::new();
     let mut say = |ms: u64, micros: u64, message: &Message| {
         for frame in message.encode().frames(Format::Fd) {
-            let time = Timestamp { nanos: BEGAN + ms * MS + micros * 1_000, nine_digits: false };
+            let time = Timestamp::six_digits(BEGAN + ms * MS + micros * 1_000);
             let record = Record { time, interface: "vcan0", frame, direction: None };
             writeln!(out, "{record}").unwrap();
         }
@@ -232,7 +232,7 @@ proptest! {
     fn frames_of_any_time_are_played_to_the_end(times in times(), seeks in proptest::collection::vec(0.0..2e10, 3)) {
         let mut log = Vec::new();
         for nanos in times {
-            let time = Timestamp { nanos, nine_digits: true };
+            let time = Timestamp::nine_digits(nanos);
             for frame in Message::Halt.encode().frames(Format::Fd) {
                 writeln!(log, "{}", Record { time, interface: "vcan0", frame, direction: None }).unwrap();
             }

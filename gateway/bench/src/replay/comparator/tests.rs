@@ -54,7 +54,7 @@ fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Compa
     let mut comparator = Comparator::new([("vcan0".to_owned(), BTreeMap::new())], 0, Some(tolerance));
     let times = (1_u64..).map(|at| at * MS);
     for (nanos, message) in times.clone().zip(recording) {
-        let time = Timestamp { nanos, nine_digits: false };
+        let time = Timestamp::six_digits(nanos);
         for frame in message.encode().frames(Format::Fd) {
             survey.take(&Record { time, interface: "vcan0", frame, direction: None });
         }

@@ -62,7 +62,7 @@ fn share_of(
 ) -> (Vec<Due>, PlanSummary) {
     let mut survey = Survey::new(part);
     let record = |(nanos, interface, frame): &(u64, &'static str, Frame)| Record {
-        time: Timestamp { nanos: *nanos, nine_digits: true },
+        time: Timestamp::nine_digits(*nanos),
         interface,
         frame: *frame,
         direction: None,

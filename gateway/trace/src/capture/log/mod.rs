@@ -1,8 +1,15 @@
 //! Captures as candump text.
 
+mod clock;
+mod console;
 mod read;
 mod write;
 
+pub(super) use clock::Clock;
+pub use clock::Remark;
 pub use read::LONGEST;
-pub(super) use read::LogReader;
+pub(super) use read::{LogReader, known_time};
+#[cfg(test)]
+mod tests;
+
 pub use write::{Digits, LogWriter, Style, Wrote};

@@ -3,8 +3,10 @@
 use std::io::{self, Read};
 use std::ops::Range;
 
-use protocol::candump::{self, Line};
+use protocol::candump::{self, Line, Record};
 
+use super::clock::{Clock, Evidence, Remark};
+use super::console::{self, Console, Seen, Stamp};
 use crate::capture::{Entry, Note, NoteKind};
 use crate::container::read_some;
 
@@ -26,8 +28,9 @@ pub(crate) struct LogReader {
     taken: u64,
     /// Lines so far.
     lines: u64,
-    /// The time of the last frame.
-    nanos: u64,
+    clock: Clock,
+    /// Each once.
+    remarks: Vec<Remark>,
 }
 
 impl LogReader {
@@ -39,12 +42,13 @@ impl LogReader {
         for (to, from) in buffer.iter_mut().zip(head) {
             *to = *from;
         }
-        Self { input, buffer, rest: 0..head.len(), at_end: false, taken, lines: 0, nanos: 0 }
+        let (clock, remarks) = (Clock::default(), Vec::new());
+        Self { input, buffer, rest: 0..head.len(), at_end: false, taken, lines: 0, clock, remarks }
     }
 
     /// Goes on behind so many bytes and lines, which have been passed over.
-    pub(crate) fn at((bytes, lines): (u64, u64), input: Box<dyn Read + Send>) -> Self {
-        Self { taken: bytes, lines, ..Self::new(&[], input) }
+    pub(crate) fn at((bytes, lines, clock): (u64, u64, Clock), input: Box<dyn Read + Send>) -> Self {
+        Self { taken: bytes, lines, clock, ..Self::new(&[], input) }
     }
 
     /// Bytes of the input that are used up.
@@ -56,6 +60,15 @@ impl LogReader {
         self.lines
     }
 
+    pub(crate) const fn clock(&self) -> Clock {
+        self.clock
+    }
+
+    /// What is to be said of the frames so far.
+    pub(crate) fn remarks(&self) -> &[Remark] {
+        &self.remarks
+    }
+
     pub(crate) const fn is_drained(&self) -> bool {
         self.rest.start >= self.rest.end
     }
@@ -64,13 +77,63 @@ impl LogReader {
     #[inline]
     pub(crate) fn next(&mut self) -> io::Result<Option<Entry<'_>>> {
         let Some((line, long)) = self.next_line()? else { return Ok(None) };
+        if self.clock.is_open() && relative(self.buffer.get(line.clone()).unwrap_or_default()).is_some() {
+            self.rest.start = line.start;
+            self.look_ahead()?;
+            return self.next();
+        }
         self.lines += 1;
         let text = self.buffer.get(line).unwrap_or_default();
-        if !long && let Ok(Line::Frame(record)) = candump::parse_bytes(text) {
-            self.nanos = record.time.nanos;
+        if long {
+            return Ok(Some(Entry::Note(note(text, long, self.clock.last(), self.lines))));
+        }
+        if let Ok(Line::Frame(record)) = candump::parse_bytes(text) {
+            self.clock.at(record.time.nanos);
             return Ok(Some(Entry::Frame(record)));
         }
-        Ok(Some(Entry::Note(note(text, long, self.nanos, self.lines))))
+        let mut note = note(text, long, self.clock.last(), self.lines);
+        match console::parse(text) {
+            None => {}
+            Some(Ok(Console::CanXl)) => note.kind = NoteKind::CanXl,
+            Some(Ok(Console::Frame(Seen { stamp, interface, frame, direction, has_flags }))) => {
+                let (time, remark) = self.clock.time(stamp);
+                let no_flags = (!has_flags).then_some(Remark::NoFlags);
+                for remark in remark.into_iter().chain(no_flags) {
+                    if !self.remarks.contains(&remark) {
+                        self.remarks.push(remark);
+                    }
+                }
+                return Ok(Some(Entry::Frame(Record { time, interface, frame, direction })));
+            }
+            Some(Err(error)) => note.kind = NoteKind::Unreadable(error.to_string()),
+        }
+        Ok(Some(Entry::Note(note)))
+    }
+
+    /// Finds out what relative times are relative to, by the lines from here on, as many as are needed and have room.
+    #[cold]
+    fn look_ahead(&mut self) -> io::Result<()> {
+        let mut evidence = Evidence::default();
+        let mut seen = 0;
+        while !evidence.is_enough() {
+            let fresh = self.buffer.get(self.rest.start + seen..self.rest.end).unwrap_or_default();
+            let end = memchr::memchr(b'\n', fresh);
+            let line = fresh.get(..end.unwrap_or(fresh.len())).unwrap_or_default();
+            if end.is_some() || self.at_end {
+                if let Some((interface, nanos)) = relative(line) {
+                    evidence.take(interface, nanos);
+                }
+                seen += line.len() + 1;
+            }
+            if end.is_none() && (self.at_end || self.rest.len() == self.buffer.len()) {
+                break;
+            }
+            if end.is_none() {
+                self.fill()?;
+            }
+        }
+        self.clock.decide(evidence.verdict());
+        Ok(())
     }
 
     /// Where the next line stands in the buffer, without its end, and whether it was longer than is read.
@@ -153,6 +216,36 @@ impl LogReader {
         self.taken += got as u64;
         self.at_end = got == 0;
         Ok(got)
+    }
+}
+
+/// The bus and the time of a frame whose time is relative.
+#[inline]
+fn relative(line: &[u8]) -> Option<(&str, u64)> {
+    // Lines of a log have ten digits before the point.
+    if line.first() == Some(&b'(') && line.get(11) == Some(&b'.') {
+        return None;
+    }
+    match console::parse(line) {
+        Some(Ok(Console::Frame(Seen { stamp: Stamp::Relative(time), interface, .. }))) => {
+            Some((interface, time.nanos))
+        }
+        _ => None,
+    }
+}
+
+/// The time in a line that is a frame, in ns since 1970; `Some(None)` of one whose time depends on the lines before it.
+pub(crate) fn known_time(line: &[u8]) -> Option<Option<u64>> {
+    let line = line.trim_ascii_end();
+    if let Ok(Line::Frame(record)) = candump::parse_bytes(line) {
+        return Some(Some(record.time.nanos));
+    }
+    match console::parse(line)?.ok()? {
+        Console::Frame(Seen { stamp: Stamp::Absolute(time) | Stamp::Local(time), .. }) => {
+            Some(Some(time.nanos))
+        }
+        Console::Frame(_) => Some(None),
+        Console::CanXl => None,
     }
 }
 

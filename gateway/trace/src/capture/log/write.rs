@@ -74,14 +74,15 @@ impl<W: Write> LogWriter<W> {
     }
 
     fn frame(&mut self, record: &Record<'_>) -> io::Result<Wrote> {
-        let Record { time: Timestamp { nanos, nine_digits: own }, interface, frame, direction } = *record;
+        let Record { time, interface, frame, direction } = *record;
+        let Timestamp { nanos, nine_digits: own, .. } = time;
         let nine_digits = match self.style.digits {
             Digits::Own => own,
             Digits::Six => false,
             Digits::Nine => true,
         };
         let mut less = !nine_digits && nanos % 1_000 != 0;
-        let mut written = Record { time: Timestamp { nanos, nine_digits }, interface, frame, direction };
+        let mut written = Record { time: Timestamp { nine_digits, ..time }, interface, frame, direction };
         let mut way = match direction {
             None => "",
             Some(Direction::Sent) => " T",

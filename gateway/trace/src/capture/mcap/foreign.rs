@@ -66,7 +66,7 @@ impl Foreign {
                 Frame::with_data(id, Format::Fd, FD_FORMAT, data)
             }
         };
-        let time = Timestamp { nanos: if stamp == 0 { log_time } else { stamp }, nine_digits: true };
+        let time = Timestamp::nine_digits(if stamp == 0 { log_time } else { stamp });
         let interface = if name.is_empty() { topic } else { name };
         Ok(Record { time, interface, frame: frame.map_err(|_| wrong)?, direction: None })
     }

@@ -9,6 +9,7 @@ use protocol::candump::{Direction, Record, Timestamp};
 
 use super::Fault;
 use super::foreign::Foreign;
+use super::write::{SECONDS_DIGITS, TIME_DIGITS};
 use crate::capture::log::LONGEST as LONGEST_LINE;
 use crate::capture::{Entry, Extras, Item, Latched, Note, NoteKind, Other, Topic};
 use crate::container::{Damage, Facts, MAGIC, Names, Record as Raw, find, parse};
@@ -62,9 +63,8 @@ struct Channel {
 
 #[derive(Clone, Copy)]
 enum What {
-    Frames {
-        nine_digits: bool,
-    },
+    /// Their times are written in this form.
+    Frames(Timestamp),
     /// Earlier frames that are latched when the recording begins.
     Latched,
     Notes,
@@ -190,7 +190,7 @@ impl State {
                 });
                 Ok(false)
             }
-            What::Frames { .. } | What::Notes | What::Foreign(_) => Ok(true),
+            What::Frames(_) | What::Notes | What::Foreign(_) => Ok(true),
         }
     }
 
@@ -229,13 +229,12 @@ impl State {
         let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
         // Each of them may be kept twice.
         self.names.add(2 * (topic.len() + schema.len()))?;
-        let nine_digits = facts.get("time_digits").is_none_or(|digits| digits != "6");
         let what = if encoding != "cdr" {
             None
         } else if schema == Record::TYPE && topic.starts_with(TOPIC_OF_STATE) {
             Some(What::Latched)
         } else if schema == Record::TYPE {
-            Some(What::Frames { nine_digits })
+            Some(What::Frames(form(facts)))
         } else if schema == Note::TYPE {
             Some(What::Notes)
         } else {
@@ -266,8 +265,8 @@ impl State {
             }
             // They are never requested.
             What::Latched => latched(message).map(Entry::Frame),
-            What::Frames { nine_digits } => {
-                let time = Timestamp { nanos: log_time, nine_digits };
+            What::Frames(form) => {
+                let time = Timestamp { nanos: log_time, ..form };
                 decode(message, LONGEST_FRAME, |message| messages::frame(message, time)).map(Entry::Frame)
             }
             What::Foreign(foreign) => {
@@ -291,6 +290,13 @@ impl State {
     }
 }
 
+/// How the metadata of a channel says that times are written.
+fn form(facts: &Facts<'_>) -> Timestamp {
+    let nine_digits = facts.get(TIME_DIGITS).is_none_or(|digits| digits != "6");
+    let min_digits = facts.get(SECONDS_DIGITS).and_then(|digits| digits.parse().ok()).unwrap_or(1);
+    Timestamp { nanos: 0, nine_digits, min_digits }
+}
+
 /// Decodes a message, unless it is too long.
 fn decode<'a, T>(
     message: &'a [u8],
@@ -304,7 +310,7 @@ fn decode<'a, T>(
 /// A latched frame, with its own time.
 fn latched(message: &[u8]) -> Result<Record<'_>, MessageError> {
     decode(message, LONGEST_FRAME, |message| {
-        messages::frame(message, Timestamp { nanos: messages::stamp(message)?, nine_digits: true })
+        messages::frame(message, Timestamp::nine_digits(messages::stamp(message)?))
     })
 }
 

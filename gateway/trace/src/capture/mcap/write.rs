@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use protocol::candump::Record;
+use protocol::candump::{Record, Timestamp};
 
 use crate::capture::{Entry, Note, NoteKind};
 use crate::recording::file::{Channel, FileWriter};
@@ -16,6 +16,10 @@ const FURTHER: &str = "/further";
 pub const ORIGIN: &str = "capture";
 /// Its content.
 pub(crate) const SOURCE: (&str, &str) = ("from", "candump log");
+/// The metadata of a channel: digits of a second, 6 or 9.
+pub(super) const TIME_DIGITS: &str = "time_digits";
+/// The same: digits that seconds are padded to; missing where they are not.
+pub(super) const SECONDS_DIGITS: &str = "seconds_digits";
 /// Bytes of notes that wait for the first frame.
 const WAITING: usize = 1 << 20;
 
@@ -33,11 +37,11 @@ pub(crate) struct McapWriter<W: Write> {
     bytes: usize,
 }
 
-/// The channel of a bus' frames with times of so many digits.
+/// The channel of a bus' frames with times in one form.
 #[derive(Debug)]
 struct BusChannel {
     interface: String,
-    nine_digits: bool,
+    form: Timestamp,
     channel: Channel,
 }
 
@@ -103,8 +107,8 @@ impl<W: Write> McapWriter<W> {
 
     /// The place of a frame's channel, which is created for its first frame.
     fn channel(&mut self, record: &Record<'_>) -> io::Result<usize> {
-        let nine_digits = record.time.nine_digits;
-        let is = |name: &str, bus: &BusChannel| bus.nine_digits == nine_digits && bus.interface == name;
+        let form = Timestamp { nanos: 0, ..record.time };
+        let is = |name: &str, bus: &BusChannel| bus.form == form && bus.interface == name;
         if self.channels.get(self.last).is_some_and(|bus| is(record.interface, bus)) {
             return Ok(self.last);
         }
@@ -119,9 +123,12 @@ impl<W: Write> McapWriter<W> {
             place
         } else {
             let topic = format!("{TOPIC_OF_BUS}{}", name.trim_start_matches('/'));
-            let digits = if nine_digits { "9" } else { "6" };
-            let channel = self.file.channel::<Record<'_>>(&topic, &[("time_digits", digits)])?;
-            self.channels.push(BusChannel { interface: name.to_owned(), nine_digits, channel });
+            let padded = form.min_digits.to_string();
+            let facts =
+                [(TIME_DIGITS, if form.nine_digits { "9" } else { "6" }), (SECONDS_DIGITS, padded.as_str())];
+            let facts = facts.get(..if form.min_digits > 1 { 2 } else { 1 }).unwrap_or_default();
+            let channel = self.file.channel::<Record<'_>>(&topic, facts)?;
+            self.channels.push(BusChannel { interface: name.to_owned(), form, channel });
             self.channels.len() - 1
         };
         Ok(self.last)

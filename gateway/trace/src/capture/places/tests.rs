@@ -19,7 +19,7 @@ fn capture(path: &Path, format: Format) {
             second => ("can1", burst * 300 * MS + u64::from(second - 150) * 2 * MS + MS),
         };
         let frame = Frame::classic(0x123, &number.to_be_bytes()).unwrap();
-        let time = Timestamp { nanos: 1_700_000_000_000_000_000 + nanos, nine_digits: true };
+        let time = Timestamp::nine_digits(1_700_000_000_000_000_000 + nanos);
         out.write(&Entry::Frame(Record { time, interface, frame, direction: None })).unwrap();
     }
     out.finish().unwrap();
@@ -70,6 +70,37 @@ fn a_reader_goes_on_where_it_was_and_no_moment_is_before_its_place() {
             let earliest = all.iter().position(|(_, time)| *time >= nanos).unwrap();
             assert!(first as usize <= earliest, "{format:?}: {first} {earliest}");
             assert!(earliest - (first as usize) < 6_000, "{format:?}: {first} {earliest}");
+        }
+    }
+}
+
+#[test]
+fn in_console_text_whose_times_depend_on_other_lines_a_reader_goes_on_too() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("console.txt");
+    for stamp in ["none", "difference"] {
+        let line = |number: u32| {
+            let [.., a, b] = number.to_be_bytes();
+            let time = format!("(000.{:06})", if number.is_multiple_of(2) { 2_000 } else { 1_000 });
+            let time = if stamp == "none" { "" } else { &time };
+            format!("  {time}  can0  123   [4]  00 00 {a:02X} {b:02X}\n")
+        };
+        std::fs::write(&path, (0..9_000).map(line).collect::<String>()).unwrap();
+        let paths = [path.clone()];
+        let places = Places::of(&paths).unwrap();
+        assert!(places.marks.len() > 3, "{}", places.marks.len());
+        let mut reader = Reader::open_all(&paths).unwrap();
+        let all = next(&mut reader, 9_000);
+        let (_, end) = all[8_999];
+        assert_eq!(end, if stamp == "none" { 8_999_000 } else { 13_500 * MS }, "{stamp}");
+        assert_eq!(places.latest(), end);
+        for from in (0..all.len()).step_by(997) {
+            reader.go_to(&places, places.before(all[from].1)).unwrap();
+            let (first, _) = next(&mut reader, 1)[0];
+            assert!(first as usize <= from && from < first as usize + 3_000, "{stamp}: {first} {from}");
+            let count = (from - first as usize).min(all.len() - 1);
+            let next = next(&mut reader, count + 1);
+            assert_eq!(next, all[first as usize + 1..][..next.len()], "{stamp} {from}");
         }
     }
 }

@@ -1,0 +1,148 @@
+//! The times of frames whose lines do not say when they were.
+//!
+//! `candump -t d` prints the time since the line before, `-t z` since the first one, and nothing says which of them it was:
+//! times that run backwards on one bus do. Without `-t` there are no times.
+
+use std::fmt;
+
+use protocol::candump::Timestamp;
+
+use super::console::Stamp;
+
+/// From one frame to the next where there are no times.
+const STEP_NS: u64 = 1_000;
+/// Buses whose times are compared.
+const BUSES: usize = 16;
+/// Comparisons that are enough.
+const ENOUGH: u32 = 20;
+
+/// What is to be known of the times and flags of a capture.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+#[non_exhaustive]
+pub enum Remark {
+    /// There are no times.
+    NoTimes,
+    /// They are dates of an unknown time zone.
+    LocalTimes,
+    /// They count from the first frame.
+    SinceFirst,
+    /// They are differences.
+    Differences,
+    /// FD frames have no flags.
+    NoFlags,
+}
+
+impl fmt::Display for Remark {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::NoTimes => {
+                "its lines have no time (candump without -t): frames are numbered in their order, 1 us apart; rates, \
+                 gaps and loads mean nothing"
+            }
+            Self::LocalTimes => "its times are dates (candump -t A) of an unknown time zone: they are read as UTC",
+            Self::SinceFirst => "its times count from the first frame (candump -t z), which is at 0",
+            Self::Differences => "its times are differences (candump -t d): they are added up from 0",
+            Self::NoFlags => {
+                "its lines do not say whether FD frames switch the bit rate (candump without -x): they are read as if \
+                 none did"
+            }
+        })
+    }
+}
+
+/// What relative times are relative to.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Relative {
+    First,
+    Before,
+}
+
+/// Gives frames their times, one after the other.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub(crate) struct Clock {
+    /// What relative times are relative to, once that is known.
+    relative: Option<Relative>,
+    /// When the last frame was, in ns.
+    last: Option<u64>,
+}
+
+impl Clock {
+    /// Before the first frame.
+    pub(crate) const NEW: Self = Self { relative: None, last: None };
+
+    /// When the last frame was, in ns; 0 before the first one.
+    pub(super) fn last(self) -> u64 {
+        self.last.unwrap_or(0)
+    }
+
+    /// Whether it is not known yet what relative times are relative to.
+    pub(super) const fn is_open(self) -> bool {
+        self.relative.is_none()
+    }
+
+    pub(super) const fn decide(&mut self, relative: Relative) {
+        self.relative = Some(relative);
+    }
+
+    /// The next frame was at this time.
+    pub(super) const fn at(&mut self, nanos: u64) {
+        self.last = Some(nanos);
+    }
+
+    /// The time of the next frame, and what is to be said of it.
+    pub(super) fn time(&mut self, stamp: Stamp) -> (Timestamp, Option<Remark>) {
+        let (time, remark) = match stamp {
+            Stamp::None => {
+                let nanos = self.last.map_or(0, |last| last.saturating_add(STEP_NS));
+                (Timestamp::six_digits(nanos), Some(Remark::NoTimes))
+            }
+            Stamp::Absolute(time) => (time, None),
+            Stamp::Local(time) => (time, Some(Remark::LocalTimes)),
+            Stamp::Relative(time) if self.relative == Some(Relative::Before) => {
+                let nanos = self.last().saturating_add(time.nanos);
+                (Timestamp { nanos, ..time }, Some(Remark::Differences))
+            }
+            Stamp::Relative(time) => (time, Some(Remark::SinceFirst)),
+        };
+        self.at(time.nanos);
+        (time, remark)
+    }
+}
+
+/// What times of several lines say of what they are relative to.
+#[derive(Debug, Default)]
+pub(super) struct Evidence {
+    /// The last time of each bus.
+    last: Vec<(String, u64)>,
+    compared: u32,
+    smaller: u32,
+    same: u32,
+}
+
+impl Evidence {
+    pub(super) fn take(&mut self, interface: &str, nanos: u64) {
+        let Some((_, last)) = self.last.iter_mut().find(|(name, _)| name == interface) else {
+            if self.last.len() < BUSES {
+                self.last.push((interface.to_owned(), nanos));
+            }
+            return;
+        };
+        self.compared += 1;
+        self.smaller += u32::from(nanos < *last);
+        self.same += u32::from(nanos == *last && nanos > 0);
+        *last = nanos;
+    }
+
+    pub(super) const fn is_enough(&self) -> bool {
+        self.compared >= ENOUGH
+    }
+
+    /// Times since the first frame grow on each bus; a few may not where the clock was set.
+    pub(super) const fn verdict(&self) -> Relative {
+        if self.smaller * 8 > self.compared || self.same * 2 > self.compared {
+            Relative::Before
+        } else {
+            Relative::First
+        }
+    }
+}

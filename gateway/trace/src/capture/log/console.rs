@@ -1,0 +1,328 @@
+//! One line of what candump prints on a terminal.
+//!
+//! ```text
+//!    can0  123   [8]  11 22 33 44 55 66 77 88   '."3DUfw.'        -a: the same as characters
+//!    (1700000000.123456)  can0  1F334455   [2]  11 22             -t a; z and d (000.001234), A a date
+//!    can0  TX B -  123  [12]  11 22 33 44 55 66 77 88 99 AA BB CC -x: direction, flags; two digits: FD
+//!    can0  123   [3]  33`22`11                                    -S: the last byte first
+//!    can0  123   [2]  00010001 00100010                           -i
+//!    can0  123   {C}  11 22 33 44 55 66 77 88                     -8: the DLC
+//!    can0  5A1   [4]  remote request
+//!    can0  20000004   [8]  00 08 00 00 00 00 00 00   ERRORFRAME
+//!    can0  123 [0003] (00|81:03:DEADBEEF) 11 22 33                CAN XL
+//! ```
+//!
+//! Colours (`-c`) may stand between words, anything before it, as a prompt, and anything behind the data but a further byte.
+
+use protocol::can::{BIT_RATE_SWITCH, ERROR, ERROR_STATE, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};
+use protocol::candump::{Direction, LineError, Timestamp};
+
+/// A line that is a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Seen<'a> {
+    pub(super) stamp: Stamp,
+    pub(super) interface: &'a str,
+    pub(super) frame: Frame,
+    pub(super) direction: Option<Direction>,
+    /// Whether it says the flags of an FD frame, or needs none.
+    pub(super) has_flags: bool,
+}
+
+/// What a line says of its time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Stamp {
+    /// Nothing.
+    None,
+    /// Since 1970.
+    Absolute(Timestamp),
+    /// A date and a time of day somewhere, read as UTC.
+    Local(Timestamp),
+    /// Since the first frame, or the one before it.
+    Relative(Timestamp),
+}
+
+/// What a line of console text is.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Console<'a> {
+    Frame(Seen<'a>),
+    CanXl,
+}
+
+/// Reads one line without its end; `None` when it is no console text: a name, an identifier and a length. Never panics.
+///
+/// # Errors
+/// When it begins so, and what follows the length is no frame.
+pub(super) fn parse(line: &[u8]) -> Option<Result<Console<'_>, LineError>> {
+    let text = line.trim_ascii_end();
+    memchr::memchr2(b'[', b'{', text)?;
+    let mut cursor = Cursor { text, at: 0 };
+    cursor.quotes();
+    if matches!(cursor.rest().first(), Some(b'#' | b';' | b'/')) {
+        return None;
+    }
+    let first = cursor.line();
+    if first.is_some() || cursor.rest().starts_with(b"(") {
+        return first;
+    }
+    // A frame behind a prompt; what is like one there may be anything.
+    while !cursor.word().is_empty() {
+        cursor.blanks();
+        if let Some(Ok(frame)) = cursor.line() {
+            return Some(Ok(frame));
+        }
+    }
+    None
+}
+
+/// What stands in brackets.
+#[derive(Clone, Copy)]
+enum Length {
+    Classic(u8),
+    /// The DLC of a classic frame.
+    Dlc(u8),
+    Fd(u8),
+    CanXl,
+}
+
+fn identifier(digits: &[u8]) -> Option<u32> {
+    let id = u32::from_str_radix(core::str::from_utf8(digits).ok()?, 16).ok()?;
+    match digits.len() {
+        3 => Some(id).filter(|&id| id <= STANDARD_MASK),
+        _ if id & !EXTENDED_MASK == ERROR => Some(id),
+        _ => Some(id | EXTENDED).filter(|_| id <= EXTENDED_MASK),
+    }
+}
+
+#[derive(Clone, Copy)]
+struct Cursor<'a> {
+    text: &'a [u8],
+    at: usize,
+}
+
+impl<'a> Cursor<'a> {
+    /// What a line is from here on, behind blanks.
+    fn line(mut self) -> Option<Result<Console<'a>, LineError>> {
+        let stamp = if self.take(b'(') { self.stamp()? } else { Stamp::None };
+        self.blanks();
+        let interface = core::str::from_utf8(self.word()).ok().filter(|name| !name.is_empty())?;
+        self.blanks();
+        let marks = self.marks();
+        self.blanks();
+        let id_at = self.at;
+        let id = self.word();
+        if !matches!(id.len(), 3 | 8) || !id.iter().all(u8::is_ascii_hexdigit) || !self.blanks() {
+            return None;
+        }
+        let length = self.length()?;
+        if let Length::CanXl = length {
+            return Some(Ok(Console::CanXl));
+        }
+        let (direction, flags) = marks.map_or((None, None), |(direction, flags)| (Some(direction), flags));
+        let has_flags = flags.is_some() || !matches!(length, Length::Fd(_));
+        let expected = "an identifier, at most 7FF in 3 digits or 3FFFFFFF in 8";
+        let frame = identifier(id).ok_or(LineError { column: id_at + 1, expected });
+        let frame = frame.and_then(|id| self.frame(id, length, flags.unwrap_or(0)));
+        Some(frame.map(|frame| Console::Frame(Seen { stamp, interface, frame, direction, has_flags })))
+    }
+
+    fn rest(&self) -> &'a [u8] {
+        self.text.get(self.at..).unwrap_or_default()
+    }
+
+    fn take(&mut self, byte: u8) -> bool {
+        let there = self.rest().first() == Some(&byte);
+        self.at += usize::from(there);
+        there
+    }
+
+    const fn error(&self, expected: &'static str) -> LineError {
+        LineError { column: self.at + 1, expected }
+    }
+
+    /// Passes over blanks and colours; whether there are any.
+    fn blanks(&mut self) -> bool {
+        let from = self.at;
+        loop {
+            match self.rest() {
+                [b' ' | b'\t', ..] => self.at += 1,
+                [0x1B, b'[', rest @ ..] => {
+                    let parameters = rest.iter().take_while(|byte| matches!(byte, 0x20..=0x3F)).count();
+                    self.at += 3 + parameters;
+                }
+                _ => return self.at > from,
+            }
+        }
+    }
+
+    /// Passes over blanks, colours, and the marks of a quotation in mails and issues.
+    fn quotes(&mut self) {
+        while self.blanks() || self.take(b'>') || self.take(b'|') {}
+    }
+
+    /// What stands up to the next blank or colour.
+    fn word(&mut self) -> &'a [u8] {
+        self.run(|byte| !matches!(byte, b' ' | b'\t' | 0x1B))
+    }
+
+    /// The bytes from here on that are of a kind.
+    fn run(&mut self, is: impl Fn(u8) -> bool) -> &'a [u8] {
+        let rest = self.rest();
+        let len = rest.iter().take_while(|&&byte| is(byte)).count();
+        self.at += len;
+        rest.get(..len).unwrap_or_default()
+    }
+
+    /// A number, and in how many decimal digits.
+    fn number(&mut self) -> Option<(u64, usize)> {
+        let digits = self.run(|byte| byte.is_ascii_digit());
+        Some((core::str::from_utf8(digits).ok()?.parse().ok()?, digits.len()))
+    }
+
+    /// What stands in the parentheses before the name, and the one that closes them.
+    fn stamp(&mut self) -> Option<Stamp> {
+        let is_padded = self.rest().first() == Some(&b'0');
+        let (number, digits) = self.number()?;
+        let is_date = self.take(b'-');
+        let seconds = if is_date { self.date(number)? } else { number };
+        let (fraction, fraction_digits) = self.take(b'.').then(|| self.number())??;
+        let nanos = match fraction_digits {
+            6 => fraction * 1_000,
+            9 => fraction,
+            _ => return None,
+        };
+        let nanos = seconds.checked_mul(1_000_000_000)?.checked_add(nanos)?;
+        let time = Timestamp { nine_digits: fraction_digits == 9, ..Timestamp::six_digits(nanos) };
+        self.take(b')').then_some(())?;
+        Some(match digits {
+            _ if is_date => Stamp::Local(time),
+            10.. => Stamp::Absolute(Timestamp { min_digits: if is_padded { 10 } else { 1 }, ..time }),
+            _ => Stamp::Relative(time),
+        })
+    }
+
+    /// The rest of `2026-11-24 03:55:42` behind the year, in seconds since 1970.
+    fn date(&mut self, year: u64) -> Option<u64> {
+        let mut two_digits = |end: Option<u8>| {
+            let (number, digits) = self.number()?;
+            (digits == 2 && end.is_none_or(|end| self.take(end))).then_some(number)
+        };
+        let (month, day) = (two_digits(Some(b'-'))?, two_digits(Some(b' '))?);
+        let (hour, minute, second) = (two_digits(Some(b':'))?, two_digits(Some(b':'))?, two_digits(None)?);
+        let is_date = (1970..2554).contains(&year) && (1..=12).contains(&month) && (1..=31).contains(&day);
+        (is_date && hour < 24 && minute < 60 && second <= 60)
+            .then(|| ((days(year, month, day) * 24 + hour) * 60 + minute) * 60 + second)
+    }
+
+    /// What `-x` says: a direction, and two flags unless somebody left them out.
+    fn marks(&mut self) -> Option<(Direction, Option<u8>)> {
+        let mut cursor = *self;
+        let direction = match cursor.word() {
+            b"TX" => Direction::Sent,
+            b"RX" => Direction::Received,
+            _ => return None,
+        };
+        self.at = cursor.at;
+        let mut flags = 0;
+        for (letters, flag) in [(b"BS", BIT_RATE_SWITCH), (b"ER", ERROR_STATE)] {
+            cursor.blanks();
+            match cursor.word() {
+                b"-" => {}
+                [letter] if letters.contains(letter) => flags |= flag,
+                _ => return Some((direction, None)),
+            }
+        }
+        self.at = cursor.at;
+        Some((direction, Some(flags)))
+    }
+
+    fn length(&mut self) -> Option<Length> {
+        let is_dlc = self.take(b'{');
+        if is_dlc {
+            let digit = self.run(|byte| byte.is_ascii_hexdigit());
+            let [digit] = digit else { return None };
+            let dlc = char::from(*digit).to_digit(16).and_then(|dlc| u8::try_from(dlc).ok())?;
+            return self.take(b'}').then_some(Length::Dlc(dlc));
+        }
+        let (number, digits) = self.take(b'[').then(|| self.number())??;
+        self.take(b']').then_some(())?;
+        let len = u8::try_from(number).unwrap_or(u8::MAX);
+        match digits {
+            1 => Some(Length::Classic(len)),
+            2 => Some(Length::Fd(len)),
+            4 => Some(Length::CanXl),
+            _ => None,
+        }
+    }
+
+    fn frame(&mut self, id: u32, length: Length, flags: u8) -> Result<Frame, LineError> {
+        let wrong = self.error("a length of at most 8 bytes, or 64 in two digits");
+        let len = match length {
+            Length::Dlc(dlc) => dlc.min(8),
+            Length::Classic(len) | Length::Fd(len) => len,
+            Length::CanXl => 0,
+        };
+        self.blanks();
+        let made = if self.rest().starts_with(b"remote request") {
+            Frame::remote(id, len)
+        } else {
+            let data = self.data(usize::from(len), wrong)?;
+            let data = data.get(..usize::from(len)).unwrap_or_default();
+            match length {
+                Length::Fd(_) => Frame::fd(id, flags, data),
+                Length::Classic(_) | Length::Dlc(_) | Length::CanXl => Frame::classic(id, data),
+            }
+        };
+        let frame = made.map_err(|_| wrong)?;
+        Ok(match length {
+            Length::Dlc(dlc @ 9..) => frame.with_raw_dlc(dlc),
+            Length::Dlc(_) | Length::Classic(_) | Length::Fd(_) | Length::CanXl => frame,
+        })
+    }
+
+    /// So many bytes, in hexadecimal or binary digits, and no more; `too_long` when there is no room for them.
+    fn data(&mut self, len: usize, too_long: LineError) -> Result<[u8; 64], LineError> {
+        let mut data = [0; 64];
+        let mut is_swapped = false;
+        for place in data.get_mut(..len).ok_or(too_long)? {
+            let swap = self.take(b'`');
+            is_swapped |= swap;
+            if !swap {
+                self.blanks();
+            }
+            let missing = self.error("a data byte: there are fewer than the length says");
+            let digits = self.run(|byte| byte.is_ascii_hexdigit());
+            *place = byte(digits).ok_or(missing)?;
+        }
+        if is_swapped && let Some(data) = data.get_mut(..len) {
+            data.reverse();
+        }
+        let from = self.at;
+        self.blanks();
+        let further = LineError {
+            column: self.at + 1,
+            expected: "the end: there are more data bytes than the length says",
+        };
+        let is_near = self.at <= from + 1;
+        if is_near && byte(self.word()).is_some() { Err(further) } else { Ok(data) }
+    }
+}
+
+/// A byte in two hexadecimal digits or eight binary ones.
+fn byte(digits: &[u8]) -> Option<u8> {
+    let base = match digits.len() {
+        2 => 16,
+        8 => 2,
+        _ => return None,
+    };
+    let digits = core::str::from_utf8(digits).ok().filter(|digits| !digits.starts_with('+'))?;
+    u8::from_str_radix(digits, base).ok()
+}
+
+/// Days from 1970-01-01 to a day of the Gregorian calendar, of a year from 1970 on.
+const fn days(year: u64, month: u64, day: u64) -> u64 {
+    // Years begin in March, so that a leap day is the last one.
+    let (year, month) = if month > 2 { (year, month - 3) } else { (year - 1, month + 9) };
+    let of_years = year * 365 + year / 4 - year / 100 + year / 400;
+    // Up to 1970-03-01 less January and February, in the same count.
+    of_years + (153 * month + 2) / 5 + day - 1 - 719_468
+}
