@@ -57,16 +57,11 @@ impl Recorded {
             let stamp = &value["header"]["stamp"];
             let stamp = stamp["sec"].as_u64().unwrap() * 1_000_000_000 + stamp["nanosec"].as_u64().unwrap();
             let topic = message.channel.topic.clone();
-            assert_eq!(message.publish_time, message.log_time);
-            // What is latched when a file begins is older.
-            let of_the_past = topic.starts_with("/state/");
-            assert!(
-                if of_the_past { stamp < message.log_time } else { stamp == message.log_time },
-                "{topic}"
-            );
+            assert_eq!(stamp, message.publish_time, "{topic}");
             Message { topic, nanos: stamp, log_nanos: message.log_time, value }
         });
         let messages: Vec<_> = messages.collect();
+        assert!(messages.is_sorted_by_key(|message| message.log_nanos), "{name}: in order of log_time");
         let counted: u64 = summary.stats.as_ref().unwrap().message_count;
         assert_eq!(messages.len() as u64, counted, "{name}");
         let attachments = summary.attachment_indexes.iter().map(|index| {

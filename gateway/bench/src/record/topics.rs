@@ -15,6 +15,7 @@ use trace::capture::Note;
 use trace::recording::file::Channel;
 use trace::recording::layout::{Layout, Patch};
 use trace::recording::series::Writer;
+use trace::recording::window::Window;
 use trace::recording::{NOTES, TOPIC_OF_BUS, TOPIC_OF_STATE};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
@@ -41,7 +42,7 @@ impl Topics {
     /// All of them, so that a reader knows all topics from the beginning.
     ///
     /// # Errors
-    /// When the file cannot be written, as of everything below.
+    /// When the file cannot be written.
     pub fn new(writer: &mut Writer, layout: &Layout) -> io::Result<Self> {
         let digits = [("time_digits", "9")];
         let mut of_buses = |before: &str| -> io::Result<Vec<Channel>> {
@@ -69,49 +70,29 @@ impl Topics {
     }
 
     /// A frame of a bus.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn frame(&mut self, writer: &mut Writer, bus: usize, name: &str, seen: &Seen) -> io::Result<()> {
-        let Some(channel) = self.can.get_mut(bus) else { return Ok(()) };
-        writer.write(channel, seen.at_nanos, &message(name, seen))
+    pub fn frame(&mut self, window: &mut Window, bus: usize, name: &str, seen: &Seen) {
+        if let Some(channel) = self.can.get_mut(bus) {
+            window.write(channel, seen.at_nanos, &message(name, seen));
+        }
     }
 
     /// A frame that is latched when the file begins, at `nanos`: its own time may be long before, and viewers would
     /// begin there.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn latched(
-        &mut self,
-        writer: &mut Writer,
-        nanos: u64,
-        (bus, name): (usize, &str),
-        seen: &Seen,
-    ) -> io::Result<()> {
-        let Some(channel) = self.state.get_mut(bus) else { return Ok(()) };
-        writer.write(channel, nanos, &message(name, seen))
+    pub fn latched(&mut self, window: &mut Window, nanos: u64, (bus, name): (usize, &str), seen: &Seen) {
+        if let Some(channel) = self.state.get_mut(bus) {
+            window.write_at(channel, nanos, seen.at_nanos, &message(name, seen));
+        }
     }
 
-    /// Something between frames.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn note(&mut self, writer: &mut Writer, note: &Note<'_>) -> io::Result<()> {
-        writer.write(&mut self.notes, note.nanos, note)
+    /// Something between frames; of a bus, behind those that it has heard.
+    pub fn note(&mut self, window: &mut Window, bus: Option<usize>, note: &Note<'_>) {
+        let channel = bus.and_then(|bus| self.can.get(bus));
+        let heard = channel.map(|channel| window.latest(channel)).filter(|heard| *heard > 0);
+        window.write_at(&mut self.notes, heard.unwrap_or(note.nanos), note.nanos, note);
     }
 
     /// A tick of the loop that should have begun at a time.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn tick(
-        &mut self,
-        writer: &mut Writer,
-        layout: &Layout,
-        nanos: u64,
-        timed: &Timed,
-    ) -> io::Result<()> {
+    pub fn tick(&mut self, window: &mut Window, layout: &Layout, nanos: u64, timed: &Timed) {
         let names = &layout.joints;
         fn of(joints: usize, values: &[f64; MAX_ROBOT_JOINTS]) -> &[f64] {
             values.get(..joints).unwrap_or_default()
@@ -119,39 +100,33 @@ impl Topics {
         let record = &timed.record;
         let [position, velocity, effort, command] =
             [&record.q, &record.qdot, &record.torque, &record.command].map(|values| of(names.len(), values));
-        writer.write(
-            &mut self.joint_states,
-            nanos,
-            &JointState { nanos, names, position, velocity, effort },
-        )?;
+        let state = JointState { nanos, names, position, velocity, effort };
+        window.write(&mut self.joint_states, nanos, &state);
         let command = JointState { nanos, names, position: &[], velocity: command, effort: &[] };
-        writer.write(&mut self.joint_commands, nanos, &command)?;
+        window.write(&mut self.joint_commands, nanos, &command);
         let (central, active) = match &timed.central {
             Some((_, reference)) => (of(names.len(), &reference.torque), reference.active),
             None => (&[][..], 0),
         };
-        writer.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active })?;
-        writer.write(&mut self.timing, nanos, &timing(nanos, timed))
+        window.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active });
+        window.write(&mut self.timing, nanos, &timing(nanos, timed));
     }
 
     /// The contact states of a patch's cells; with points if the joints' positions are given.
-    ///
-    /// # Errors
-    /// See above.
     pub fn patch(
         &mut self,
-        writer: &mut Writer,
+        window: &mut Window,
         layout: &Layout,
         place: usize,
         touched: &Touched,
         q: Option<&[f64; MAX_ROBOT_JOINTS]>,
         scratch: &mut (Vec<ContactState>, Vec<Point>),
-    ) -> io::Result<()> {
+    ) {
         let (Some(patch), Some([state, points])) = (layout.patches.get(place), self.patches.get_mut(place))
         else {
-            return Ok(());
+            return;
         };
-        let Some(central) = layout.central.get(patch.bus) else { return Ok(()) };
+        let Some(central) = layout.central.get(patch.bus) else { return };
         let (cells, cloud) = scratch;
         cells.clear();
         cells.extend(patch.cells.iter().map(|&(cell, node)| {
@@ -164,8 +139,8 @@ impl Topics {
         }));
         let nanos = touched.at_nanos;
         let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells };
-        writer.write(state, nanos, &message)?;
-        let Some(q) = q else { return Ok(()) };
+        window.write(state, nanos, &message);
+        let Some(q) = q else { return };
         let frames = central.frames_at(&layout.chain_positions(patch.bus, q));
         cloud.clear();
         cloud.extend(cells.iter().zip(&patch.cells).map(|(state, &(cell, _))| {
@@ -173,15 +148,12 @@ impl Topics {
             let position = central.position(cell, &frames).map(|metres| metres as f32);
             Point { position, force: state.force }
         }));
-        writer.write(points, nanos, &PointCloud { nanos, frame_id: BASE, points: cloud })
+        window.write(points, nanos, &PointCloud { nanos, frame_id: BASE, points: cloud });
     }
 
     /// The state of everything.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn diagnostics(&mut self, writer: &mut Writer, nanos: u64, parts: &[Diagnosis]) -> io::Result<()> {
-        writer.write(&mut self.diagnostics, nanos, &Diagnostics { nanos, parts })
+    pub fn diagnostics(&mut self, window: &mut Window, nanos: u64, parts: &[Diagnosis]) {
+        window.write(&mut self.diagnostics, nanos, &Diagnostics { nanos, parts });
     }
 }
 

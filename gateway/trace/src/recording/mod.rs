@@ -8,6 +8,7 @@ pub mod recover;
 pub mod repair;
 pub mod series;
 pub mod sink;
+pub mod window;
 
 /// What topics of frames begin with; the bus' name follows.
 pub const TOPIC_OF_BUS: &str = "/can/";
