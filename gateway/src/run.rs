@@ -7,7 +7,6 @@ use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use analysis::dbc;
 use bench::emulate::Emulated;
 use bench::record::{self, Candump};
 use bench::remote::Lines;
@@ -106,7 +105,7 @@ fn limit(text: &str) -> Result<Limit, String> {
 
 impl Recording {
     /// What is recorded where; the files go with it as they are.
-    fn options(&self, candump: Option<Candump>, skin: &Skin, files: Files) -> record::Options {
+    fn options(&self, candump: Option<Candump>, files: Files) -> record::Options {
         let mut split = Split::default();
         for &limit in &self.record_split {
             match limit {
@@ -123,14 +122,6 @@ impl Recording {
             let mut attachments = vec![file("skin.toml", "application/toml", files.skin)];
             attachments.extend(files.scenario.map(|text| file("scenario.toml", "application/toml", text)));
             attachments.extend(files.urdf.map(|text| file("robot.urdf", "application/xml", text)));
-            attachments.extend(skin.buses.iter().enumerate().map(|(index, bus)| Attached {
-                name: match skin.buses.as_slice() {
-                    [_] => "skin.dbc".to_owned(),
-                    _ => format!("skin-{}.dbc", bus.name),
-                },
-                media_type: "text/plain",
-                bytes: dbc::dbc(skin, index).into_bytes(),
-            }));
             let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
             record::Mcap { path, split, attachments, command_line }
         });
@@ -225,7 +216,7 @@ impl Demo {
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
         let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), urdf: None };
-        options.record = recording.options(candump, &options.skin, files);
+        options.record = recording.options(candump, files);
         let page = view.map(|listen| Page::of(&options, listen)).transpose()?;
         bench(&options, summary.as_deref(), recording.force, &[], page)
     }
@@ -262,7 +253,7 @@ impl Run {
         options.kinds = self.kinds.of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
         let files = Files { skin: skin_text, scenario: scenario_text, urdf: urdf_text };
-        options.record = recording.options(candump, &options.skin, files);
+        options.record = recording.options(candump, files);
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.emulated = emulated(self.firmware, &self.emulate, &options.skin)?;
