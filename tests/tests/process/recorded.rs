@@ -54,9 +54,14 @@ impl Recorded {
             assert_eq!(message.channel.message_encoding, "cdr");
             assert!(message.channel.metadata.contains_key("offered_qos_profiles"));
             let value = types[&schema.name].decode(&message.data);
-            let stamp = &value["header"]["stamp"];
-            let stamp = stamp["sec"].as_u64().unwrap() * 1_000_000_000 + stamp["nanosec"].as_u64().unwrap();
             let topic = message.channel.topic.clone();
+            let header =
+                if topic.starts_with("/tf") { &value["transforms"][0]["header"] } else { &value["header"] };
+            let stamp = |stamp: &Value| {
+                stamp["sec"].as_u64().unwrap() * 1_000_000_000 + stamp["nanosec"].as_u64().unwrap()
+            };
+            // A text has no header.
+            let stamp = header.get("stamp").map_or(message.publish_time, stamp);
             assert_eq!(stamp, message.publish_time, "{topic}");
             Message { topic, nanos: stamp, log_nanos: message.log_time, value }
         });

@@ -16,7 +16,7 @@ use super::facts::realtime_minus_monotonic;
 use super::feed::{BusFeed, Captured, FRAMES, Feed};
 use super::force::Latched;
 use super::text::Text;
-use super::topics::Topics;
+use super::topics::{OF_ROBOT, Topics};
 use super::{Outputs, Stop};
 use crate::run::realtime::wall;
 use trace::capture::{Note, NoteKind};
@@ -126,7 +126,9 @@ impl Work {
     /// Records until it is stopped, and what has come until then.
     pub(super) fn run(mut self, head: Head, stop: &Stop) -> Recording {
         if let Some(series) = &mut self.files.series {
+            let nanos = head.nanos;
             series.begin(head, |writer| Topics::new(writer, &self.layout));
+            robot(series, &self.layout, nanos);
         }
         let (mut flush, mut request, mut diagnose) =
             (Every::new(FLUSH), Every::new(REQUEST), Every::new(DIAGNOSE));
@@ -217,7 +219,9 @@ impl Work {
             self.max_late_ns = self.max_late_ns.max(timed.late_ns);
             let nanos = timed.due_ns.saturating_add_signed(offset);
             let layout = &self.layout;
-            self.files.put(Count::others(4), |window, topics| topics.tick(window, layout, nanos, &timed));
+            let messages = 4 + u64::from(layout.poses_at(timed.record.tick.number));
+            self.files
+                .put(Count::others(messages), |window, topics| topics.tick(window, layout, nanos, &timed));
         }
     }
 
@@ -295,6 +299,7 @@ impl Work {
         }
         // So that this file can be understood without the one before. They come first: what waited is in that one.
         let began = now.saturating_sub(WINDOW_NS);
+        robot(series, &self.layout, began);
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.latched.frames() {
                 series.put(Count::others(1), |window, topics| {
@@ -410,6 +415,13 @@ impl Files {
         let interface = interface.unwrap_or_default();
         let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
         self.put(Count::others(1), |window, topics| topics.note(window, bus, &note));
+    }
+}
+
+/// What each file says of the robot.
+fn robot(series: &mut Series<Topics>, layout: &Layout, nanos: u64) {
+    if layout.robot.is_some() {
+        series.put(Count::others(OF_ROBOT), |window, topics| topics.robot(window, layout, nanos));
     }
 }
 

@@ -17,11 +17,20 @@ use trace::recording::layout::{Layout, Patch};
 use trace::recording::series::Writer;
 use trace::recording::window::Window;
 use trace::recording::{NOTES, TOPIC_OF_BUS, TOPIC_OF_STATE};
+use trace::ros2::robot::{Text, Transforms};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
 
-/// What positions of points are relative to.
-const BASE: &str = "base";
+/// How messages are kept for readers that come later, as bag tools write it: the last one, for ever.
+const LATCHED: (&str, &str) = (
+    "offered_qos_profiles",
+    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    \
+     nsec: 854775807\n  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: 1\n  \
+     liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n  \
+     avoid_ros_namespace_conventions: false\n",
+);
+/// Messages of [`Topics::robot`].
+pub const OF_ROBOT: u64 = 2;
 
 /// The channels of one file.
 #[derive(Debug)]
@@ -34,6 +43,8 @@ pub struct Topics {
     torques: Channel,
     timing: Channel,
     diagnostics: Channel,
+    /// Where links are, those that do not move, the description.
+    robot: Option<[Channel; 3]>,
     /// By patch: its state, its points.
     patches: Vec<[Channel; 2]>,
 }
@@ -56,6 +67,11 @@ impl Topics {
         });
         let patches = patches.collect::<io::Result<_>>()?;
         let arm = &layout.arm;
+        let robot = layout.robot.is_some().then(|| {
+            let moving = writer.channel::<Transforms<'_>>("/tf", &[])?;
+            let still = writer.channel::<Transforms<'_>>("/tf_static", &[LATCHED])?;
+            Ok::<_, io::Error>([moving, still, writer.channel::<Text<'_>>("/robot_description", &[LATCHED])?])
+        });
         Ok(Self {
             can,
             state,
@@ -65,8 +81,16 @@ impl Topics {
             torques: writer.channel::<Torques<'_>>(&format!("/{arm}/torques"), &[])?,
             timing: writer.channel::<LoopTiming>("/gateway/timing", &[])?,
             diagnostics: writer.channel::<Diagnostics<'_>>("/diagnostics", &[])?,
+            robot: robot.transpose()?,
             patches,
         })
+    }
+
+    /// What a file says once of the robot, if it is known.
+    pub fn robot(&mut self, window: &mut Window, layout: &Layout, nanos: u64) {
+        let (Some(robot), Some([_, still, description])) = (&layout.robot, &mut self.robot) else { return };
+        window.write(still, nanos, &Transforms { nanos, transforms: &robot.still() });
+        window.write(description, nanos, &Text(&robot.description));
     }
 
     /// A frame of a bus.
@@ -102,7 +126,7 @@ impl Topics {
             [&record.q, &record.qdot, &record.torque, &record.command].map(|values| of(names.len(), values));
         let state = JointState { nanos, names, position, velocity, effort };
         window.write(&mut self.joint_states, nanos, &state);
-        let command = JointState { nanos, names, position: &[], velocity: command, effort: &[] };
+        let command = JointState { nanos, names, position, velocity: command, effort };
         window.write(&mut self.joint_commands, nanos, &command);
         let (central, active) = match &timed.central {
             Some((_, reference)) => (of(names.len(), &reference.torque), reference.active),
@@ -110,6 +134,11 @@ impl Topics {
         };
         window.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active });
         window.write(&mut self.timing, nanos, &timing(nanos, timed));
+        if layout.poses_at(record.tick.number)
+            && let (Some(robot), Some([moving, ..])) = (&layout.robot, &mut self.robot)
+        {
+            window.write(moving, nanos, &Transforms { nanos, transforms: &robot.moving(position) });
+        }
     }
 
     /// The contact states of a patch's cells; with points if the joints' positions are given.
@@ -148,7 +177,7 @@ impl Topics {
             let position = central.position(cell, &frames).map(|metres| metres as f32);
             Point { position, force: state.force }
         }));
-        window.write(points, nanos, &PointCloud { nanos, frame_id: BASE, points: cloud });
+        window.write(points, nanos, &PointCloud { nanos, frame_id: layout.base(), points: cloud });
     }
 
     /// The state of everything.

@@ -182,7 +182,7 @@ impl<W: Write> FileWriter<W> {
     pub fn channel<M: Message>(&mut self, topic: &str, facts: &[(&str, &str)]) -> io::Result<Channel> {
         // Bag tools want to find it, and take it empty.
         let qos = ("offered_qos_profiles", "");
-        let facts = facts.iter().chain([&qos]).map(|&(key, value)| (key.to_owned(), value.to_owned()));
+        let facts = [&qos].into_iter().chain(facts).map(|&(key, value)| (key.to_owned(), value.to_owned()));
         let schema =
             self.writer.add_schema(M::TYPE, "ros2msg", M::DEFINITION.as_bytes()).map_err(io_error)?;
         let id = self.writer.add_channel(schema, topic, "cdr", &facts.collect()).map_err(io_error)?;

@@ -6,6 +6,7 @@ pub mod layout;
 pub mod names;
 pub mod recover;
 pub mod repair;
+pub mod robot;
 pub mod series;
 pub mod sink;
 pub mod window;
