@@ -110,7 +110,8 @@ fn of_log(text: &str) -> Result<Vec<Seen>, Box<dyn Error>> {
 fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), Box<dyn Error>> {
     let path = folder.join("recorder_speed.mcap");
     let split = Split { bytes: u64::MAX / 2, age: Duration::MAX };
-    let mcap = Mcap { path: path.clone(), split, attachments: Vec::new(), command_line: Vec::new() };
+    let mcap =
+        Mcap { path: path.clone(), split, attachments: Vec::new(), robot: None, command_line: Vec::new() };
     let options = Options { mcap: Some(mcap), force: true, ..Options::default() };
     let outputs = Outputs::claim(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
     let (mut outlet, bus_feed) = feed::bus_feed(true, Arc::default(), Arc::default());

@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use analysis::dbc::dbc;
 use clap::Args;
 use protocol::can::Format;
-use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
 
 use super::arguments::bus_names;
+use super::input::skin_in;
 use super::output::{Force, apart};
 use super::print::list;
 
@@ -16,15 +16,16 @@ use super::print::list;
 ///
 /// Every identifier of the bus is a message: the commands, and what each cell of the skin sends and is sent. Every
 /// field is a signal with its scale, unit and range; byte 13 multiplexes pages and parameters. Identifiers repeat
-/// from bus to bus, so there is one file for each.
+/// from bus to bus, so there is one file for each. Of a recording, that is the bus that it was recorded on.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway dbc gateway/examples/ur5-253.toml -o skin.dbc
   gateway dbc skin.toml --bus can1 > can1.dbc
+  gateway dbc run.mcap -o run.dbc
   candump -L vcan0 | python3 -m cantools decode -s skin.dbc")]
 pub(crate) struct Dbc {
-    /// The skin's description
-    #[arg(value_name = "SKIN")]
+    /// The skin's description, or a recording of a run, which has it in it
+    #[arg(value_name = "SKIN|MCAP")]
     file: PathBuf,
     /// Which bus, when the skin has several
     #[arg(long, value_name = "NAME")]
@@ -43,7 +44,7 @@ impl Dbc {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let file = self.file.display();
         apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
-        let skin = Skin::read(&self.file).map_err(Failure::usage)?;
+        let skin = skin_in(&self.file)?;
         let names = || list(bus_names(&skin));
         let bus = match (&self.bus, skin.buses.as_slice()) {
             (Some(name), _) => skin.bus_named(name).ok_or_else(|| {

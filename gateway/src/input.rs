@@ -101,6 +101,16 @@ fn difference(one: &Skin, other: &Skin) -> Option<(String, String, String)> {
     ))
 }
 
+/// The skin in a file, which is its own or a recording that has it with it.
+pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
+    // What is no capture either says so as a skin.
+    let is_recording = file.is_file() && Reader::open(file).is_ok_and(|it| it.format() == Format::Mcap);
+    if !is_recording {
+        return Skin::read(file).map_err(Failure::usage);
+    }
+    attached(&[file.to_owned()], "name the skin's own file")
+}
+
 /// The skin that a recording has with it.
 pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
     if files.iter().any(|file| file.as_os_str() == "-") {
@@ -114,6 +124,10 @@ pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
             pipe.display()
         )));
     }
+    attached(files, "name one with --skin")
+}
+
+fn attached(files: &[PathBuf], hint: &str) -> Result<Skin, Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
     // It may stand behind the frames.
     while reader.format() == Format::Mcap
@@ -123,7 +137,7 @@ pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
     let name = reader.name();
     match reader.extras().skin() {
         Some(skin) => skin.map_err(|error| Failure::usage(format!("{name}, {error}"))),
-        None => Err(Failure::usage(format!("{name} has no skin in it: name one with --skin"))),
+        None => Err(Failure::usage(format!("{name} has no skin in it: {hint}"))),
     }
 }
 

@@ -1,8 +1,46 @@
-//! The URDF that a skin names.
+//! The URDF that a skin names, or that is written for its rows.
 
+use std::fmt::Display;
 use std::path::{Component, Path, PathBuf};
 
+use protocol::document;
+use protocol::skin::Skin;
+use protocol::usage::Failure;
+use robots::Urdf;
 use trace::files::folder_of;
+use trace::recording::robot::Robot;
+
+use super::output::note;
+
+/// A skin's robot: what recordings show of it, and the text of the URDF that the skin names.
+#[derive(Default)]
+pub(crate) struct RobotOfSkin {
+    pub(crate) robot: Option<Robot>,
+    pub(crate) urdf: Option<String>,
+}
+
+impl RobotOfSkin {
+    /// By the URDF in a file, if the skin names one, else by the skin's rows. A URDF of another robot is noted.
+    ///
+    /// # Errors
+    /// When the file cannot be read, or is no URDF.
+    pub(crate) fn read(skin: &Skin, file: Option<&Path>) -> Result<Self, Failure> {
+        let of_rows = || {
+            Robot::of_rows(skin).map_err(|error| note(format_args!("the robot is not shown: {error}"))).ok()
+        };
+        let Some(path) = file else { return Ok(Self { robot: of_rows(), urdf: None }) };
+        let hint = "correct the skin's path, or take the key out";
+        let wrong = |error: &dyn Display| Failure::usage(format!("robot.urdf: {error}; {hint}"));
+        let text = document::text(path).map_err(|error| wrong(&error))?;
+        let urdf = Urdf::parse(&path.display().to_string(), &text).map_err(|error| wrong(&error))?;
+        let robot = Robot::of_urdf(skin, urdf, text.clone());
+        let robot = robot.or_else(|error| {
+            note(format_args!("robot.urdf: {error}; the robot is shown by the skin's rows"));
+            of_rows().ok_or(())
+        });
+        Ok(Self { robot: robot.ok(), urdf: Some(text) })
+    }
+}
 
 /// Where the URDF of a skin's file is.
 pub(crate) fn urdf_of(skin: &Path, urdf: &str) -> PathBuf {

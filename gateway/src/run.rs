@@ -7,7 +7,6 @@ use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use analysis::dbc;
 use bench::emulate::Emulated;
 use bench::record::{self, Candump};
 use bench::remote::Lines;
@@ -27,7 +26,7 @@ use super::arguments::{BusKinds, Named, Programs, bus_names, cell, seconds, time
 use super::buses;
 use super::output::{self, Force, apart, note};
 use super::print::json;
-use super::robot_file::urdf_of;
+use super::robot_file::{RobotOfSkin, urdf_of};
 use super::view::Page;
 
 /// The skin and the scenario of the demonstration.
@@ -66,7 +65,7 @@ struct Common {
 struct Files {
     skin: String,
     scenario: Option<String>,
-    urdf: Option<String>,
+    robot: RobotOfSkin,
 }
 
 /// What is recorded beside frames as text.
@@ -106,7 +105,7 @@ fn limit(text: &str) -> Result<Limit, String> {
 
 impl Recording {
     /// What is recorded where; the files go with it as they are.
-    fn options(&self, candump: Option<Candump>, skin: &Skin, files: Files) -> record::Options {
+    fn options(&self, candump: Option<Candump>, files: Files) -> record::Options {
         let mut split = Split::default();
         for &limit in &self.record_split {
             match limit {
@@ -122,17 +121,9 @@ impl Recording {
             };
             let mut attachments = vec![file("skin.toml", "application/toml", files.skin)];
             attachments.extend(files.scenario.map(|text| file("scenario.toml", "application/toml", text)));
-            attachments.extend(files.urdf.map(|text| file("robot.urdf", "application/xml", text)));
-            attachments.extend(skin.buses.iter().enumerate().map(|(index, bus)| Attached {
-                name: match skin.buses.as_slice() {
-                    [_] => "skin.dbc".to_owned(),
-                    _ => format!("skin-{}.dbc", bus.name),
-                },
-                media_type: "text/plain",
-                bytes: dbc::dbc(skin, index).into_bytes(),
-            }));
+            attachments.extend(files.robot.urdf.map(|text| file("robot.urdf", "application/xml", text)));
             let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
-            record::Mcap { path, split, attachments, command_line }
+            record::Mcap { path, split, attachments, robot: files.robot.robot, command_line }
         });
         record::Options { candump, mcap, force: self.force.force }
     }
@@ -224,8 +215,12 @@ impl Demo {
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
-        let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), urdf: None };
-        options.record = recording.options(candump, &options.skin, files);
+        let robot = match recording.record {
+            Some(_) => RobotOfSkin::read(&options.skin, None)?,
+            None => RobotOfSkin::default(),
+        };
+        let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), robot };
+        options.record = recording.options(candump, files);
         let page = view.map(|listen| Page::of(&options, listen)).transpose()?;
         bench(&options, summary.as_deref(), recording.force, &[], page)
     }
@@ -244,7 +239,10 @@ impl Run {
         };
         let urdf = self.common.recording.record.as_ref().and(skin.robot.urdf.as_deref());
         let urdf = urdf.map(|urdf| urdf_of(&self.skin, urdf));
-        let urdf_text = urdf.as_deref().map(urdf_text).transpose()?;
+        let robot = match self.common.recording.record {
+            Some(_) => RobotOfSkin::read(&skin, urdf.as_deref())?,
+            None => RobotOfSkin::default(),
+        };
         let read = [Some(self.skin.clone()), self.scenario.clone(), urdf];
         let read: Vec<_> = read.into_iter().flatten().collect();
         // What can be read once only is read by the cells from memory.
@@ -261,8 +259,8 @@ impl Run {
         let Common { recording, summary, view, .. } = self.common;
         options.kinds = self.kinds.of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
-        let files = Files { skin: skin_text, scenario: scenario_text, urdf: urdf_text };
-        options.record = recording.options(candump, &options.skin, files);
+        let files = Files { skin: skin_text, scenario: scenario_text, robot };
+        options.record = recording.options(candump, files);
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.emulated = emulated(self.firmware, &self.emulate, &options.skin)?;
@@ -284,13 +282,6 @@ fn emulated(firmware: Option<PathBuf>, named: &[Named], skin: &Skin) -> Result<O
         cells.push(cell);
     }
     Ok(Some(Emulated { firmware, cells }))
-}
-
-/// The URDF that goes into a recording.
-fn urdf_text(path: &Path) -> Result<String, Failure> {
-    document::text(path).map_err(|error| {
-        Failure::usage(format!("robot.urdf: {error}; correct the skin's path, or take the key out"))
-    })
 }
 
 impl Common {

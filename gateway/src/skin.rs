@@ -1,8 +1,9 @@
-//! `gateway skin generate`, `gateway skin import`, `gateway skin check` and `gateway skin show`.
+//! `gateway skin generate`, `gateway skin import`, `gateway skin check`, `gateway skin show` and `gateway skin urdf`.
 
 mod covering;
 mod import;
 mod show;
+mod urdf;
 
 use std::collections::hash_map::Entry;
 use std::collections::{BTreeMap, HashMap};
@@ -37,6 +38,7 @@ enum Command {
     Import(import::Import),
     Check(Check),
     Show(show::Show),
+    Urdf(urdf::Urdf),
 }
 
 /// Describe a skin of hexagonal cells on a robot's arm
@@ -98,6 +100,7 @@ impl Skin {
             Command::Import(command) => command.run(),
             Command::Check(command) => command.run(),
             Command::Show(command) => command.run(),
+            Command::Urdf(command) => command.run(),
         }
     }
 }

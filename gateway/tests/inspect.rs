@@ -60,6 +60,15 @@ fn a_dbc_goes_to_standard_output_or_into_a_file_that_is_not_there_yet() {
 }
 
 #[test]
+fn a_recording_without_a_skin_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("run.log"), "(1.000000) vcan0 123#00\n").unwrap();
+    assert!(gateway(folder.path(), "convert run.log run.mcap").status.success());
+    let said = refusal(folder.path(), "dbc run.mcap", 2);
+    assert_eq!(said, "gateway: run.mcap has no skin in it: name the skin's own file");
+}
+
+#[test]
 fn of_several_buses_one_is_chosen() {
     let folder = skins();
     let folder = folder.path();

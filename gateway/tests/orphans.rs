@@ -37,6 +37,7 @@ fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
         path: folder.join(name),
         split: trace::recording::series::Split::default(),
         attachments: Vec::new(),
+        robot: None,
         command_line: Vec::new(),
     };
     let options = Options { mcap: Some(mcap), ..Options::default() };

@@ -16,7 +16,7 @@ use std::fs;
 
 use process::{Ended, Place, example};
 use protocol::skin::Skin;
-use recorded::Recorded;
+use recorded::{Message, Recorded};
 use serde_json::Value;
 
 /// Two joints, a tube, a box, and a plate that is a mesh of a package.
@@ -130,7 +130,27 @@ fn links_are_covered_and_the_skin_runs() {
     for part in ["run.mcap", "run-1.mcap"] {
         let recorded = Recorded::read(&place.path(part));
         assert_eq!(recorded.attachments["robot.urdf"], ARM.as_bytes(), "{part}");
+        let said = |topic: &str| recorded.on(topic).next().unwrap().value.clone();
+        assert_eq!(said("/robot_description")["data"], ARM, "{part}");
+        let frames = ["/tf", "/tf_static"].map(|topic| said(topic)["transforms"].as_array().unwrap().clone());
+        let frames: BTreeSet<_> =
+            frames.iter().flatten().map(|it| it["child_frame_id"].as_str().unwrap()).collect();
+        let patches: Vec<_> = recorded.messages.iter().filter(|it| it.topic.starts_with("/skin/")).collect();
+        let named = |it: &Message| it.value["header"]["frame_id"].as_str().unwrap().to_owned();
+        assert!(!patches.is_empty());
+        for patch in patches {
+            let base = named(patch) == "base" && patch.topic.ends_with("/points");
+            assert!(base || frames.contains(named(patch).as_str()), "{}", named(patch));
+        }
+        assert!(frames.contains("upper") && frames.contains("vcan0/1"), "{frames:?}");
     }
+    // What is no URDF goes into no recording.
+    place.write("arm.urdf", "root:x:0:0:root:/root:/bin/bash\n");
+    refused(
+        &place,
+        "run skin.toml --bus-kind embedded --record no.mcap",
+        "robot.urdf: arm.urdf: not XML: unknown token at 1:1; correct the skin's path, or take the key out",
+    );
     fs::remove_file(place.path("arm.urdf")).unwrap();
     refused(
         &place,

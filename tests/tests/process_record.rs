@@ -56,10 +56,9 @@ fn everything_that_a_run_knows_is_in_its_recording() {
 
     let text = place.read("skin.toml");
     let skin = Skin::parse("skin.toml", &text).unwrap();
-    let attached: BTreeMap<_, _> =
-        [("skin.toml", text), ("scenario.toml", PRESSED.to_owned()), ("skin.dbc", dbc::dbc(&skin, 0))]
-            .map(|(name, text)| (name.to_owned(), text.into_bytes()))
-            .into();
+    let attached: BTreeMap<_, _> = [("skin.toml", text), ("scenario.toml", PRESSED.to_owned())]
+        .map(|(name, text)| (name.to_owned(), text.into_bytes()))
+        .into();
     assert_eq!(recorded.attachments, attached);
     let names: Vec<_> = recorded.metadata.keys().map(String::as_str).collect();
     assert_eq!(names, ["configuration", "configuration_hashes", "machine", "part", "program", "recorder"]);
@@ -133,6 +132,11 @@ fn two_hundred_and_fifty_three_cells_are_recorded_without_a_gap() {
     let (summary, recorded) = (place.summary(), Recorded::read(&place.path("run.mcap")));
     frames_are_whole(&recorded.lines("/can/vcan0"), &place, &summary, 1);
     assert!(recorded.on("/can/notes").next().is_none());
+    // What stands before the first message is small: of little more than that, there are messages.
+    let file = fs::read(place.path("run.mcap")).unwrap();
+    fs::write(place.path("cut.mcap"), &file[..300_000]).unwrap();
+    place.start("gateway", "recover cut.mcap").end().well();
+    assert!(Recorded::read(&place.path("cut-recovered.mcap")).messages.len() > 1_000);
 }
 
 #[test]
@@ -149,7 +153,11 @@ fn two_buses_of_classic_frames_have_a_topic_each() {
         let log: Vec<_> = log.lines().filter(|line| line.split(' ').nth(1) == Some(bus)).collect();
         assert!(!log.is_empty() && log == lines, "{bus}");
     }
-    assert!(recorded.attachments.contains_key("skin-vcan1.dbc"));
+    let described = place.start("gateway", "dbc run.mcap --bus vcan1 --joined").end().well();
+    assert_eq!(
+        described.stdout,
+        dbc::dbc(&Skin::parse("skin.toml", &skin_of(8, 2, Format::Classic)).unwrap(), 1)
+    );
 }
 
 /// The files of a recording in their order.
@@ -284,7 +292,7 @@ fn a_limit_on_the_size_of_files_ends_the_recording_and_not_the_run() {
     place.pressed();
     // In blocks of 512 bytes; a pipe has no size.
     let run = format!("{RUN} --record run.mcap --candump /dev/stderr");
-    let ended = in_shell(&place, "ulimit -f 700", &run, "true");
+    let ended = in_shell(&place, "ulimit -f 270", &run, "true");
     let is_frame = |line: &&str| line.starts_with('(');
     let log: String = ended.stderr.lines().filter(is_frame).flat_map(|line| [line, "\n"]).collect();
     place.write("run.log", &log);
@@ -301,7 +309,7 @@ fn a_full_disk_ends_the_recording_and_not_the_run() {
     fs::create_dir(place.path("disk")).unwrap();
     fs::create_dir(place.path("saved")).unwrap();
     // A small disk that only this run sees.
-    let enter = "cd disk && mount -t tmpfs -o size=850k none . && cd ../disk && ln -s ../skin.toml ../scenario.toml .";
+    let enter = "cd disk && mount -t tmpfs -o size=640k none . && cd ../disk && ln -s ../skin.toml ../scenario.toml .";
     let run = format!("{RUN} --record run.mcap --candump ../run.log");
     let save = "cp run.json run.mcap ../; ls > ../left";
     let script = format!(

@@ -74,3 +74,43 @@ fn the_mcap_library_and_rosbags_read_every_value_on_every_topic() {
     theirs.sort();
     first(&ours, &theirs);
 }
+
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn the_robot_and_its_cells_are_where_forward_kinematics_says() {
+    let place = Place::new();
+    let tests = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let python = tests.join("../target/tools/bin/python");
+    let script = tests.join("tools/recording.py");
+    let examples = tests.join("../gateway/examples");
+    place.start("gateway", "skin generate --cells 12 -o rows.toml").end().well();
+    for (skin, file, tips) in [
+        ("urdf.toml", "panda.urdf", "--tip hand"),
+        ("two.toml", "two-arms.urdf", "--tip left_palm --tip right_palm"),
+    ] {
+        let import = format!("skin import {}/{file} {tips} -o {skin}", examples.display());
+        place.start("gateway", &import).end().well();
+    }
+    // The same arms by what is written of their rows.
+    let two = place.read("two.toml");
+    let rows: String =
+        two.lines().filter(|line| !line.starts_with("urdf = ")).flat_map(|line| [line, "\n"]).collect();
+    place.write("two-rows.toml", &rows);
+    let panda = vec![0.0, -0.5, 0.1, -2.0, 0.2, 1.6, 0.8];
+    for (skin, start) in
+        [("rows", vec![0.4; 6]), ("urdf", panda), ("two", vec![0.04; 12]), ("two-rows", vec![0.04; 12])]
+    {
+        let swing = format!(
+            "[motion]\nkind = \"sine\"\nstart = {start:?}\namplitude = {:?}\nperiod_s = 2.0\n",
+            vec![0.05; start.len()]
+        );
+        place.write("moving.toml", &swing);
+        let run = format!(
+            "run {skin}.toml --scenario moving.toml --bus-kind embedded --duration 1 --quiet --record {skin}.mcap"
+        );
+        place.start("gateway", &run).end().well();
+        let words = format!("{} tf {skin}.mcap", script.display());
+        let compared = process::Running::start(place.command_of(&python, &words)).end().well();
+        println!("{skin}: {}", compared.stdout.trim());
+    }
+}

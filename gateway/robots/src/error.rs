@@ -118,6 +118,24 @@ pub enum Problem {
         /// Names like it.
         nearest: String,
     },
+    /// A joint is asked for that does not exist, or does not move by itself.
+    #[error("no joint {joint:?} moves; the nearest are {nearest}")]
+    NoSuchJoint {
+        /// What was asked for.
+        joint: String,
+        /// Names like it.
+        nearest: String,
+    },
+    /// A chain of a skin is another one than that of the file.
+    #[error(
+        "behind joint {joint:?} it is not where chain {chain:?} of the skin has it: import the skin from this file again, or          correct the rows"
+    )]
+    OtherRows {
+        /// The joint.
+        joint: String,
+        /// The chain.
+        chain: String,
+    },
     /// The chain's end is not below its start.
     #[error("link {tip:?} is not below {root:?}; the path to it is {path}: choose a root on it")]
     NotBelow {

@@ -23,22 +23,28 @@
 //! |---|---|
 //! | `urdf` | the file: links, joints, shapes, and its own kinematics |
 //! | `describe` | the text of a skin for chains and cells |
+//! | `links` | each link on its parent, for the positions of joints |
+//! | `written` | the text of a URDF for the chains of a skin |
 //! | `chain` | the joints between two links, with rows and the frame of each link |
 //! | `rows` | rows, and how one axis leads to the next |
 
 mod chain;
 mod describe;
 mod error;
+mod links;
 mod nearest;
 mod residual;
 mod rows;
 mod urdf;
+mod written;
 
 pub use chain::{Chain, Joint, LinkFrame, MAX_LENGTH_M, MAX_RESIDUAL};
 pub use describe::{CELLS_OF_A_BUS, CellOnLink, Import, ImportError};
 pub use error::{Problem, RobotError};
+pub use links::LinkPose;
 pub use nalgebra::Isometry3;
 pub use protocol::parameters::RowKind;
 pub use protocol::skin::JointKind;
 pub use rows::{Row, frames, pose_of};
 pub use urdf::{Geometry, Shape, Urdf};
+pub use written::{Written, word, written};

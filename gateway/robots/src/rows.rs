@@ -35,6 +35,13 @@ pub struct Row {
     pub theta_offset: f64,
 }
 
+impl From<&ChainRow> for Row {
+    fn from(row: &ChainRow) -> Self {
+        let DenavitHartenberg { a, alpha, d, theta_offset } = row.table;
+        Self { kind: row.kind, a, alpha, d, theta_offset }
+    }
+}
+
 impl Row {
     /// From frame l - 1 to frame l, with the joint at this position in rad or m; a fixed row ignores it.
     #[must_use]

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use cover::drawing::{Drawing, DrawnCell, page};
 use protocol::parameters::RowKind;
-use protocol::skin::{Cell, Chain, ChainRow, Skin};
+use protocol::skin::{Cell, Chain, Skin};
 use protocol::usage::{Failure, print};
 use robots::{Isometry3, Row, frames, pose_of};
 use view::Scene;
@@ -100,7 +100,7 @@ impl Robot {
 
     /// The frames of a chain, 0 to the last row's.
     fn frames(&self, index: usize, chain: &Chain) -> Vec<Isometry3<f64>> {
-        let rows: Vec<_> = chain.rows.iter().map(row).collect();
+        let rows: Vec<_> = chain.rows.iter().map(Row::from).collect();
         let position = |joint: &usize| self.positions.get(*joint).copied().unwrap_or_default();
         let positions: Vec<_> = chain.joints.iter().map(position).collect();
         let base = self.bases.get(index).copied().unwrap_or_else(Isometry3::identity);
@@ -136,11 +136,6 @@ impl Robot {
             triangles: self.triangles,
         }
     }
-}
-
-fn row(row: &ChainRow) -> Row {
-    let ChainRow { kind, table, .. } = *row;
-    Row { kind, a: table.a, alpha: table.alpha, d: table.d, theta_offset: table.theta_offset }
 }
 
 fn drawn(skin: &Skin, cell: &Cell, frames: &[Vec<Isometry3<f64>>]) -> DrawnCell {

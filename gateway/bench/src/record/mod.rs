@@ -30,6 +30,7 @@ use topics::Topics;
 use trace::recording::account::Recording;
 use trace::recording::layout::Layout;
 use trace::recording::repair;
+use trace::recording::robot::Robot;
 use trace::recording::series::{Attached, Head, Series, Split};
 
 use crate::run::RunError;
@@ -66,6 +67,8 @@ pub struct Mcap {
     pub split: Split,
     /// Files in each file.
     pub attachments: Vec<Attached>,
+    /// What is known of the robot's links.
+    pub robot: Option<Robot>,
     /// How the program was called.
     pub command_line: Vec<String>,
 }

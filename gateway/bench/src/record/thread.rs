@@ -16,14 +16,15 @@ use super::facts::realtime_minus_monotonic;
 use super::feed::{BusFeed, Captured, FRAMES, Feed};
 use super::force::Latched;
 use super::text::Text;
-use super::topics::Topics;
+use super::topics::{OF_ROBOT, Topics};
 use super::{Outputs, Stop};
 use crate::run::realtime::wall;
 use trace::capture::{Note, NoteKind};
 use trace::files::sync;
 use trace::recording::account::{Recording, Written};
 use trace::recording::layout::Layout;
-use trace::recording::series::{Count, Head, Said, Series, Writer};
+use trace::recording::series::{Count, Head, Said, Series};
+use trace::recording::window::{WINDOW_NS, Window};
 use trace::ros2::skin::ContactState;
 use trace::ros2::standard::{Diagnosis, Level, Point};
 
@@ -125,7 +126,9 @@ impl Work {
     /// Records until it is stopped, and what has come until then.
     pub(super) fn run(mut self, head: Head, stop: &Stop) -> Recording {
         if let Some(series) = &mut self.files.series {
+            let nanos = head.nanos;
             series.begin(head, |writer| Topics::new(writer, &self.layout));
+            robot(series, &self.layout, nanos);
         }
         let (mut flush, mut request, mut diagnose) =
             (Every::new(FLUSH), Every::new(REQUEST), Every::new(DIAGNOSE));
@@ -158,6 +161,9 @@ impl Work {
     /// Writes everything that waits; the most that waited in one queue.
     fn take(&mut self) -> usize {
         let offset = realtime_minus_monotonic();
+        if let Some(series) = &mut self.files.series {
+            series.look(wall());
+        }
         let mut most = 0;
         self.take_ticks(offset);
         for bus in 0..self.feed.bus_feeds.len() {
@@ -165,7 +171,7 @@ impl Work {
             self.take_touched(bus);
         }
         for (nanos, text) in self.noted.try_iter() {
-            self.files.note(nanos, "", NoteKind::Text, &text);
+            self.files.note(nanos, None, NoteKind::Text, &text);
         }
         most
     }
@@ -187,17 +193,17 @@ impl Work {
                     seen.latched.take(frame);
                     seen.missing += u64::from(self.files.is_between());
                     self.files.text(|text| text.frame(name, &frame));
-                    self.files.put(Count::FRAME, |writer, topics| topics.frame(writer, bus, name, &frame));
+                    self.files.put(Count::FRAME, |window, topics| topics.frame(window, bus, name, &frame));
                 }
                 Captured::Dropped { at_nanos, frames } => {
                     seen.dropped += frames;
                     let place = format!("CAN frames on '{name}' socket");
-                    self.files.dropped(at_nanos, name, frames, &place, seen.dropped);
+                    self.files.dropped(at_nanos, Some((bus, name)), frames, &place, seen.dropped);
                 }
                 Captured::Unrecorded { at_nanos, frames } => {
                     seen.unrecorded += frames;
                     let place = format!("CAN frames on '{name}' in the queue to the recorder");
-                    self.files.dropped(at_nanos, name, frames, &place, seen.unrecorded);
+                    self.files.dropped(at_nanos, Some((bus, name)), frames, &place, seen.unrecorded);
                 }
             }
         }
@@ -213,7 +219,9 @@ impl Work {
             self.max_late_ns = self.max_late_ns.max(timed.late_ns);
             let nanos = timed.due_ns.saturating_add_signed(offset);
             let layout = &self.layout;
-            self.files.put(Count::others(4), |writer, topics| topics.tick(writer, layout, nanos, &timed));
+            let messages = 4 + u64::from(layout.poses_at(timed.record.tick.number));
+            self.files
+                .put(Count::others(messages), |window, topics| topics.tick(window, layout, nanos, &timed));
         }
     }
 
@@ -229,8 +237,8 @@ impl Work {
             let patches = self.layout.patches.iter().enumerate().filter(|(_, patch)| patch.bus == bus);
             for (place, _) in patches {
                 let messages = if q.is_some() { 2 } else { 1 };
-                self.files.put(Count::others(messages), |writer, topics| {
-                    topics.patch(writer, &self.layout, place, &touched, q, &mut self.scratch)
+                self.files.put(Count::others(messages), |window, topics| {
+                    topics.patch(window, &self.layout, place, &touched, q, &mut self.scratch)
                 });
             }
         }
@@ -243,7 +251,7 @@ impl Work {
         self.backlog = Some(total);
         if frames > 0 {
             let place = "packets of any network in the kernel's backlog";
-            self.files.dropped(wall(), "", frames, place, total);
+            self.files.dropped(wall(), None, frames, place, total);
         }
     }
 
@@ -273,10 +281,11 @@ impl Work {
                 ("frames_not_written", lost.frames.to_string()),
                 ("others_not_written", lost.others.to_string()),
                 ("frames_queue_full", unrecorded.to_string()),
+                ("messages_late", series.late().to_string()),
             ],
         });
         let now = wall();
-        series.put(Count::others(1), |writer, topics| topics.diagnostics(writer, now, &parts));
+        series.put(Count::others(1), |window, topics| topics.diagnostics(window, now, &parts));
     }
 
     fn flush(&mut self) {
@@ -288,19 +297,24 @@ impl Work {
         if !series.flush(holds) || !series.next(|writer| Topics::new(writer, &self.layout)) {
             return;
         }
-        // So that this file can be understood without the one before.
+        // So that this file can be understood without the one before. They come first: what waited is in that one.
+        let began = now.saturating_sub(WINDOW_NS);
+        robot(series, &self.layout, began);
         for (bus, (name, seen)) in self.layout.buses.iter().zip(&self.buses).enumerate() {
             for frame in seen.latched.frames() {
-                series
-                    .put(Count::others(1), |writer, topics| topics.latched(writer, now, (bus, name), &frame));
+                series.put(Count::others(1), |window, topics| {
+                    topics.latched(window, began, (bus, name), &frame);
+                });
             }
         }
-        for (name, seen) in self.layout.buses.iter().zip(&mut self.buses) {
+        series.settle();
+        for (bus, (name, seen)) in self.layout.buses.iter().zip(&mut self.buses).enumerate() {
             let frames = mem::take(&mut seen.missing);
             if frames > 0 {
                 let place = format!("CAN frames on '{name}' while nothing could be written");
                 // The log has them.
-                self.files.note(wall(), name, NoteKind::Dropped(frames), &dropped(frames, &place, frames));
+                let line = dropped(frames, &place, frames);
+                self.files.note(wall(), Some((bus, name)), NoteKind::Dropped(frames), &line);
             }
         }
     }
@@ -337,6 +351,7 @@ impl Work {
                 }
             }
             recording.files = files;
+            recording.messages_late = series.late();
             lost = unwritten.frames;
             if unwritten.others > 0 {
                 recording.messages_lost.insert("unwritten", unwritten.others);
@@ -381,23 +396,32 @@ impl Files {
     }
 
     /// Writes to the recording, if there is one.
-    fn put(&mut self, count: Count, write: impl FnOnce(&mut Writer, &mut Topics) -> io::Result<()>) {
+    fn put(&mut self, count: Count, write: impl FnOnce(&mut Window, &mut Topics)) {
         if let Some(series) = &mut self.series {
             series.put(count, write);
         }
     }
 
     /// Notes in every format that frames of a bus, if it is known, are missing from here on: which, and where.
-    fn dropped(&mut self, nanos: u64, interface: &str, frames: u64, place: &str, total: u64) {
+    fn dropped(&mut self, nanos: u64, bus: Option<(usize, &str)>, frames: u64, place: &str, total: u64) {
         let line = dropped(frames, place, total);
         self.text(|text| text.note(&line));
-        self.note(nanos, interface, NoteKind::Dropped(frames), &line);
+        self.note(nanos, bus, NoteKind::Dropped(frames), &line);
     }
 
     /// Notes it in the recording alone.
-    fn note(&mut self, nanos: u64, interface: &str, kind: NoteKind, line: &str) {
+    fn note(&mut self, nanos: u64, bus: Option<(usize, &str)>, kind: NoteKind, line: &str) {
+        let (bus, interface) = bus.unzip();
+        let interface = interface.unwrap_or_default();
         let note = Note { kind, nanos, interface, line: 0, text: line.as_bytes() };
-        self.put(Count::others(1), |writer, topics| topics.note(writer, &note));
+        self.put(Count::others(1), |window, topics| topics.note(window, bus, &note));
+    }
+}
+
+/// What each file says of the robot.
+fn robot(series: &mut Series<Topics>, layout: &Layout, nanos: u64) {
+    if layout.robot.is_some() {
+        series.put(Count::others(OF_ROBOT), |window, topics| topics.robot(window, layout, nanos));
     }
 }
 

@@ -15,12 +15,22 @@ use trace::capture::Note;
 use trace::recording::file::Channel;
 use trace::recording::layout::{Layout, Patch};
 use trace::recording::series::Writer;
+use trace::recording::window::Window;
 use trace::recording::{NOTES, TOPIC_OF_BUS, TOPIC_OF_STATE};
+use trace::ros2::robot::{Text, Transforms};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
 
-/// What positions of points are relative to.
-const BASE: &str = "base";
+/// How messages are kept for readers that come later, as bag tools write it: the last one, for ever.
+const LATCHED: (&str, &str) = (
+    "offered_qos_profiles",
+    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  deadline:\n    sec: 9223372036\n    \
+     nsec: 854775807\n  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n  liveliness: 1\n  \
+     liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n  \
+     avoid_ros_namespace_conventions: false\n",
+);
+/// Messages of [`Topics::robot`].
+pub const OF_ROBOT: u64 = 2;
 
 /// The channels of one file.
 #[derive(Debug)]
@@ -33,6 +43,8 @@ pub struct Topics {
     torques: Channel,
     timing: Channel,
     diagnostics: Channel,
+    /// Where links are, those that do not move, the description.
+    robot: Option<[Channel; 3]>,
     /// By patch: its state, its points.
     patches: Vec<[Channel; 2]>,
 }
@@ -41,7 +53,7 @@ impl Topics {
     /// All of them, so that a reader knows all topics from the beginning.
     ///
     /// # Errors
-    /// When the file cannot be written, as of everything below.
+    /// When the file cannot be written.
     pub fn new(writer: &mut Writer, layout: &Layout) -> io::Result<Self> {
         let digits = [("time_digits", "9")];
         let mut of_buses = |before: &str| -> io::Result<Vec<Channel>> {
@@ -55,6 +67,11 @@ impl Topics {
         });
         let patches = patches.collect::<io::Result<_>>()?;
         let arm = &layout.arm;
+        let robot = layout.robot.is_some().then(|| {
+            let moving = writer.channel::<Transforms<'_>>("/tf", &[])?;
+            let still = writer.channel::<Transforms<'_>>("/tf_static", &[LATCHED])?;
+            Ok::<_, io::Error>([moving, still, writer.channel::<Text<'_>>("/robot_description", &[LATCHED])?])
+        });
         Ok(Self {
             can,
             state,
@@ -64,54 +81,42 @@ impl Topics {
             torques: writer.channel::<Torques<'_>>(&format!("/{arm}/torques"), &[])?,
             timing: writer.channel::<LoopTiming>("/gateway/timing", &[])?,
             diagnostics: writer.channel::<Diagnostics<'_>>("/diagnostics", &[])?,
+            robot: robot.transpose()?,
             patches,
         })
     }
 
+    /// What a file says once of the robot, if it is known.
+    pub fn robot(&mut self, window: &mut Window, layout: &Layout, nanos: u64) {
+        let (Some(robot), Some([_, still, description])) = (&layout.robot, &mut self.robot) else { return };
+        window.write(still, nanos, &Transforms { nanos, transforms: &robot.still() });
+        window.write(description, nanos, &Text(&robot.description));
+    }
+
     /// A frame of a bus.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn frame(&mut self, writer: &mut Writer, bus: usize, name: &str, seen: &Seen) -> io::Result<()> {
-        let Some(channel) = self.can.get_mut(bus) else { return Ok(()) };
-        writer.write(channel, seen.at_nanos, &message(name, seen))
+    pub fn frame(&mut self, window: &mut Window, bus: usize, name: &str, seen: &Seen) {
+        if let Some(channel) = self.can.get_mut(bus) {
+            window.write(channel, seen.at_nanos, &message(name, seen));
+        }
     }
 
     /// A frame that is latched when the file begins, at `nanos`: its own time may be long before, and viewers would
     /// begin there.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn latched(
-        &mut self,
-        writer: &mut Writer,
-        nanos: u64,
-        (bus, name): (usize, &str),
-        seen: &Seen,
-    ) -> io::Result<()> {
-        let Some(channel) = self.state.get_mut(bus) else { return Ok(()) };
-        writer.write(channel, nanos, &message(name, seen))
+    pub fn latched(&mut self, window: &mut Window, nanos: u64, (bus, name): (usize, &str), seen: &Seen) {
+        if let Some(channel) = self.state.get_mut(bus) {
+            window.write_at(channel, nanos, seen.at_nanos, &message(name, seen));
+        }
     }
 
-    /// Something between frames.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn note(&mut self, writer: &mut Writer, note: &Note<'_>) -> io::Result<()> {
-        writer.write(&mut self.notes, note.nanos, note)
+    /// Something between frames; of a bus, behind those that it has heard.
+    pub fn note(&mut self, window: &mut Window, bus: Option<usize>, note: &Note<'_>) {
+        let channel = bus.and_then(|bus| self.can.get(bus));
+        let heard = channel.map(|channel| window.latest(channel)).filter(|heard| *heard > 0);
+        window.write_at(&mut self.notes, heard.unwrap_or(note.nanos), note.nanos, note);
     }
 
     /// A tick of the loop that should have begun at a time.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn tick(
-        &mut self,
-        writer: &mut Writer,
-        layout: &Layout,
-        nanos: u64,
-        timed: &Timed,
-    ) -> io::Result<()> {
+    pub fn tick(&mut self, window: &mut Window, layout: &Layout, nanos: u64, timed: &Timed) {
         let names = &layout.joints;
         fn of(joints: usize, values: &[f64; MAX_ROBOT_JOINTS]) -> &[f64] {
             values.get(..joints).unwrap_or_default()
@@ -119,39 +124,38 @@ impl Topics {
         let record = &timed.record;
         let [position, velocity, effort, command] =
             [&record.q, &record.qdot, &record.torque, &record.command].map(|values| of(names.len(), values));
-        writer.write(
-            &mut self.joint_states,
-            nanos,
-            &JointState { nanos, names, position, velocity, effort },
-        )?;
-        let command = JointState { nanos, names, position: &[], velocity: command, effort: &[] };
-        writer.write(&mut self.joint_commands, nanos, &command)?;
+        let state = JointState { nanos, names, position, velocity, effort };
+        window.write(&mut self.joint_states, nanos, &state);
+        let command = JointState { nanos, names, position, velocity: command, effort };
+        window.write(&mut self.joint_commands, nanos, &command);
         let (central, active) = match &timed.central {
             Some((_, reference)) => (of(names.len(), &reference.torque), reference.active),
             None => (&[][..], 0),
         };
-        writer.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active })?;
-        writer.write(&mut self.timing, nanos, &timing(nanos, timed))
+        window.write(&mut self.torques, nanos, &Torques { nanos, distributed: effort, central, active });
+        window.write(&mut self.timing, nanos, &timing(nanos, timed));
+        if layout.poses_at(record.tick.number)
+            && let (Some(robot), Some([moving, ..])) = (&layout.robot, &mut self.robot)
+        {
+            window.write(moving, nanos, &Transforms { nanos, transforms: &robot.moving(position) });
+        }
     }
 
     /// The contact states of a patch's cells; with points if the joints' positions are given.
-    ///
-    /// # Errors
-    /// See above.
     pub fn patch(
         &mut self,
-        writer: &mut Writer,
+        window: &mut Window,
         layout: &Layout,
         place: usize,
         touched: &Touched,
         q: Option<&[f64; MAX_ROBOT_JOINTS]>,
         scratch: &mut (Vec<ContactState>, Vec<Point>),
-    ) -> io::Result<()> {
+    ) {
         let (Some(patch), Some([state, points])) = (layout.patches.get(place), self.patches.get_mut(place))
         else {
-            return Ok(());
+            return;
         };
-        let Some(central) = layout.central.get(patch.bus) else { return Ok(()) };
+        let Some(central) = layout.central.get(patch.bus) else { return };
         let (cells, cloud) = scratch;
         cells.clear();
         cells.extend(patch.cells.iter().map(|&(cell, node)| {
@@ -164,8 +168,8 @@ impl Topics {
         }));
         let nanos = touched.at_nanos;
         let message = PatchState { nanos, frame_id: &patch.link, epoch: touched.epoch, cells };
-        writer.write(state, nanos, &message)?;
-        let Some(q) = q else { return Ok(()) };
+        window.write(state, nanos, &message);
+        let Some(q) = q else { return };
         let frames = central.frames_at(&layout.chain_positions(patch.bus, q));
         cloud.clear();
         cloud.extend(cells.iter().zip(&patch.cells).map(|(state, &(cell, _))| {
@@ -173,15 +177,12 @@ impl Topics {
             let position = central.position(cell, &frames).map(|metres| metres as f32);
             Point { position, force: state.force }
         }));
-        writer.write(points, nanos, &PointCloud { nanos, frame_id: BASE, points: cloud })
+        window.write(points, nanos, &PointCloud { nanos, frame_id: layout.base(), points: cloud });
     }
 
     /// The state of everything.
-    ///
-    /// # Errors
-    /// See above.
-    pub fn diagnostics(&mut self, writer: &mut Writer, nanos: u64, parts: &[Diagnosis]) -> io::Result<()> {
-        writer.write(&mut self.diagnostics, nanos, &Diagnostics { nanos, parts })
+    pub fn diagnostics(&mut self, window: &mut Window, nanos: u64, parts: &[Diagnosis]) {
+        window.write(&mut self.diagnostics, nanos, &Diagnostics { nanos, parts });
     }
 }
 

@@ -196,7 +196,11 @@ fn record(
     let head =
         options.record.mcap.as_ref().map(|mcap| head(options, mcap, bus_links, idle)).unwrap_or_default();
     let feed = Feed { bus_feeds, ticks };
-    Ok((Some(outputs.start(feed, Layout::new(&options.skin), head)?), recorded))
+    let mut layout = Layout::new(&options.skin);
+    if let Some(robot) = options.record.mcap.as_ref().and_then(|mcap| mcap.robot.clone()) {
+        layout = layout.with_robot(robot);
+    }
+    Ok((Some(outputs.start(feed, layout, head)?), recorded))
 }
 
 /// What each file of a recording begins with.

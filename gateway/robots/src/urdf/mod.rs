@@ -180,6 +180,11 @@ impl Urdf {
         })
     }
 
+    /// The joints, in the file's order.
+    pub(crate) fn joints(&self) -> &[UrdfJoint] {
+        &self.joints
+    }
+
     /// A link's index.
     pub(crate) fn index(&self, link: &str) -> Result<usize, RobotError> {
         Ok(self.link(link)?.0)

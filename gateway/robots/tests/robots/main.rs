@@ -10,3 +10,4 @@ mod reading;
 mod refusals;
 mod rows;
 mod written;
+mod written_urdf;

@@ -34,6 +34,8 @@ pub struct Recording {
     pub lost_write: u64,
     /// Other messages that are missing, by topic's kind: ticks and epochs, and those that could not be written.
     pub messages_lost: BTreeMap<&'static str, u64>,
+    /// Messages that came too late for their place in the order of times, and stand behind it.
+    pub messages_late: u64,
     /// Processor time of the recorder's thread, in s.
     pub processor_s: f64,
     /// What went wrong, in words, each once.

@@ -11,7 +11,9 @@ use std::time::UNIX_EPOCH;
 use mcap::records::{MessageHeader, op};
 use mcap::write::{Metadata, NoSeek};
 use mcap::{Attachment, McapError, WriteOptions, Writer};
+use protocol::candump::Record as Frame;
 
+use super::TOPIC_OF_BUS;
 use crate::container::{Framed, Record, Source, parse};
 use crate::ros2::Message;
 
@@ -91,6 +93,27 @@ pub fn io_error(error: McapError) -> io::Error {
 pub struct Channel {
     id: u16,
     sequence: u32,
+    is_frames: bool,
+}
+
+impl Channel {
+    /// Its number in the file.
+    pub(super) const fn id(&self) -> u16 {
+        self.id
+    }
+
+    /// Its number, that of its next message, and whether that is a frame of a bus.
+    pub(super) const fn next(&mut self) -> (u16, u32, bool) {
+        let sequence = self.sequence;
+        self.sequence = sequence.wrapping_add(1);
+        (self.id, sequence, self.is_frames)
+    }
+}
+
+/// Whether a topic of messages of a type is frames of a bus.
+#[must_use]
+pub(super) fn is_frames(topic: &str, schema: &str) -> bool {
+    schema == Frame::TYPE && topic.starts_with(TOPIC_OF_BUS)
 }
 
 /// A file that is being written. After an error it takes nothing more.
@@ -159,11 +182,11 @@ impl<W: Write> FileWriter<W> {
     pub fn channel<M: Message>(&mut self, topic: &str, facts: &[(&str, &str)]) -> io::Result<Channel> {
         // Bag tools want to find it, and take it empty.
         let qos = ("offered_qos_profiles", "");
-        let facts = facts.iter().chain([&qos]).map(|&(key, value)| (key.to_owned(), value.to_owned()));
+        let facts = [&qos].into_iter().chain(facts).map(|&(key, value)| (key.to_owned(), value.to_owned()));
         let schema =
             self.writer.add_schema(M::TYPE, "ros2msg", M::DEFINITION.as_bytes()).map_err(io_error)?;
         let id = self.writer.add_channel(schema, topic, "cdr", &facts.collect()).map_err(io_error)?;
-        Ok(Channel { id, sequence: 0 })
+        Ok(Channel { id, sequence: 0, is_frames: is_frames(topic, M::TYPE) })
     }
 
     /// A message. Nothing is allocated for it but the chunk's growth.
@@ -171,16 +194,24 @@ impl<W: Write> FileWriter<W> {
     /// # Errors
     /// See above.
     pub fn write<M: Message>(&mut self, channel: &mut Channel, nanos: u64, message: &M) -> io::Result<()> {
-        message.encode_into(&mut self.buffer);
-        let header = MessageHeader {
-            channel_id: channel.id,
-            sequence: channel.sequence,
-            log_time: nanos,
-            publish_time: nanos,
-        };
-        self.writer.write_to_known_channel(&header, &self.buffer).map_err(io_error)?;
-        channel.sequence = channel.sequence.wrapping_add(1);
-        self.raw += HEAD + self.buffer.len() as u64;
+        let mut buffer = std::mem::take(&mut self.buffer);
+        message.encode_into(&mut buffer);
+        let (id, sequence, _) = channel.next();
+        let put = self.put((id, sequence), (nanos, nanos), &buffer);
+        self.buffer = buffer;
+        put
+    }
+
+    /// The bytes of a channel's message: its numbers, when it is logged and when it was published.
+    pub(super) fn put(
+        &mut self,
+        (channel_id, sequence): (u16, u32),
+        (log_time, publish_time): (u64, u64),
+        data: &[u8],
+    ) -> io::Result<()> {
+        let header = MessageHeader { channel_id, sequence, log_time, publish_time };
+        self.writer.write_to_known_channel(&header, data).map_err(io_error)?;
+        self.raw += HEAD + data.len() as u64;
         Ok(())
     }
 

@@ -4,7 +4,12 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
 use model::central::Central;
+use robots::word;
 
+use super::robot::Robot;
+
+/// What positions are relative to, where no robot says it.
+const BASE: &str = "base";
 /// The points of a patch are recorded at most so often.
 const POINTS_HZ: f64 = 30.0;
 
@@ -13,10 +18,12 @@ const POINTS_HZ: f64 = 30.0;
 pub struct Patch {
     /// Its topic.
     pub topic: String,
-    /// The link.
+    /// The link: a frame of the robot.
     pub link: String,
     /// The bus, by its place in the skin.
     pub bus: usize,
+    /// The chain that it is on, and the joint of that which moves it, from 1.
+    pub joint: (usize, usize),
     /// The cells: place among the bus' cells, and number there.
     pub cells: Vec<(usize, u16)>,
 }
@@ -38,6 +45,10 @@ pub struct Layout {
     pub central: Vec<Central>,
     /// From one of a patch's clouds of points to the next, in epochs.
     pub epochs_per_cloud: u64,
+    /// From one of the poses of links to the next, in ticks.
+    pub ticks_per_poses: u64,
+    /// What is known of the robot's links.
+    pub robot: Option<Robot>,
 }
 
 impl Layout {
@@ -63,7 +74,7 @@ impl Layout {
                 patches.extend(parts.into_iter().map(|(bus, cells)| {
                     let name = buses.get(bus).filter(|_| several).map(|bus| format!("_{}", word(bus)));
                     let topic = format!("/skin/{link}{}", name.unwrap_or_default());
-                    Patch { topic, link: link.clone(), bus, cells }
+                    Patch { topic, link: link.clone(), bus, joint: (index, joint), cells }
                 }));
             }
         }
@@ -76,12 +87,37 @@ impl Layout {
         Self {
             central: (0..buses.len()).map(|bus| Central::new(&skin.part_on(bus))).collect(),
             buses,
-            arm: word(&skin.robot.name),
+            arm: if skin.robot.name.is_empty() { "robot".to_owned() } else { word(&skin.robot.name) },
             joints: skin.robot.joints.iter().map(|joint| joint.name.clone()).collect(),
             chains: (0..skin.buses.len()).map(|bus| skin.chain(bus).joints.clone()).collect(),
             patches,
             epochs_per_cloud,
+            ticks_per_poses: skin.timing.ticks_per_broadcast.into(),
+            robot: None,
         }
+    }
+
+    /// With the robot's links.
+    #[must_use]
+    pub fn with_robot(mut self, robot: Robot) -> Self {
+        for patch in &mut self.patches {
+            if let Some(link) = robot.link(patch.joint) {
+                link.clone_into(&mut patch.link);
+            }
+        }
+        Self { robot: Some(robot), ..self }
+    }
+
+    /// Whether the poses of links are recorded at a tick.
+    #[must_use]
+    pub const fn poses_at(&self, tick: u64) -> bool {
+        self.robot.is_some() && tick.is_multiple_of(self.ticks_per_poses)
+    }
+
+    /// The frame that positions of cells are in: the robot's base.
+    #[must_use]
+    pub fn base(&self) -> &str {
+        self.robot.as_ref().map_or(BASE, Robot::base)
     }
 
     /// Of positions of the robot those of a bus' chain.
@@ -93,13 +129,6 @@ impl Layout {
         }
         positions
     }
-}
-
-/// A name as a topic may have it.
-fn word(name: &str) -> String {
-    let word = |letter: char| if letter.is_ascii_alphanumeric() { letter } else { '_' };
-    let word: String = name.chars().map(word).collect();
-    if word.is_empty() { "robot".to_owned() } else { word }
 }
 
 #[cfg(test)]

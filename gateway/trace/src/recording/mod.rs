@@ -6,8 +6,10 @@ pub mod layout;
 pub mod names;
 pub mod recover;
 pub mod repair;
+pub mod robot;
 pub mod series;
 pub mod sink;
+pub mod window;
 
 /// What topics of frames begin with; the bus' name follows.
 pub const TOPIC_OF_BUS: &str = "/can/";

@@ -19,6 +19,7 @@ use super::names::{self, Part};
 use super::recover::RecoverError;
 use super::repair::{self, Repaired};
 use super::sink::{Gauge, Sink};
+use super::window::Window;
 use crate::files::folder_of;
 
 /// Bytes that go to the file together; a chunk is larger and goes by itself.
@@ -120,6 +121,7 @@ impl core::fmt::Display for Said {
 #[derive(Debug)]
 struct Open<T> {
     writer: Writer,
+    window: Window,
     topics: T,
     part: Part,
     gauge: Arc<Gauge>,
@@ -131,7 +133,16 @@ struct Open<T> {
     /// In the file, flushed.
     kept: Count,
     /// Written since.
-    pending: Count,
+    written: Count,
+}
+
+impl<T> Open<T> {
+    /// Writes what has waited long enough, or all that waits.
+    fn release(&mut self, all: bool) -> io::Result<()> {
+        let Self { writer, window, written, .. } = self;
+        written.add(if all { window.release_all(writer) } else { window.release(writer) }?);
+        Ok(())
+    }
 }
 
 /// A file that broke off, held until it is repaired.
@@ -161,7 +172,7 @@ impl Count {
         Self { frames: 0, others }
     }
 
-    fn add(&mut self, other: Self) {
+    pub(super) fn add(&mut self, other: Self) {
         self.frames += other.frames;
         self.others += other.others;
     }
@@ -180,6 +191,8 @@ pub struct Series<T> {
     force: bool,
     split: Split,
     head: Head,
+    /// The recorder's time.
+    now: u64,
     /// The number of the file that is open, or was last.
     number: u32,
     /// Claimed, and not begun.
@@ -192,6 +205,8 @@ pub struct Series<T> {
     broken: Vec<Broken>,
     written: Vec<Written>,
     lost: Count,
+    /// Messages of files that have ended which came when the file was past their time.
+    late: u64,
     /// What people should know.
     said: Vec<Said>,
 }
@@ -214,19 +229,21 @@ impl<T> Series<T> {
             force,
             split,
             head: Head::default(),
+            now: 0,
             number: 0,
             open: None,
             failed: None,
             broken: Vec::new(),
             written: Vec::new(),
             lost: Count::default(),
+            late: 0,
             said: Vec::new(),
         })
     }
 
     /// Begins the first file.
     pub fn begin(&mut self, head: Head, topics: impl FnOnce(&mut Writer) -> io::Result<T>) {
-        self.head = head;
+        (self.now, self.head) = (head.nanos, head);
         let Some((part, file)) = self.claimed.take() else { return };
         match self.start(part, file, topics) {
             Ok(open) => self.open = Some(open),
@@ -254,31 +271,53 @@ impl<T> Series<T> {
         };
         // There is nothing in it.
         let (writer, topics, gauge) = begin().inspect_err(|_: &io::Error| part.remove())?;
-        let (kept, pending, head) = (Count::default(), Count::default(), gauge.bytes());
-        Ok(Open { writer, topics, part, gauge, head, began: Instant::now(), enough: None, kept, pending })
+        let (window, head, began) = (Window::new(self.now), gauge.bytes(), Instant::now());
+        let (kept, written) = (Count::default(), Count::default());
+        Ok(Open { writer, window, topics, part, gauge, head, began, enough: None, kept, written })
     }
 
-    /// Writes something into the file that is open; without one it is counted.
-    pub fn put(&mut self, count: Count, write: impl FnOnce(&mut Writer, &mut T) -> io::Result<()>) {
+    /// Tells the recorder's time, in ns since 1970, by which messages are put in order.
+    pub fn look(&mut self, now: u64) {
+        self.now = now;
+        let Some(Open { window, writer, written, .. }) = &mut self.open else { return };
+        match window.look(now, writer) {
+            Ok(count) => written.add(count),
+            Err(error) => self.break_off(&error),
+        }
+    }
+
+    /// Takes messages for the file that is open; without one they are counted.
+    pub fn put(&mut self, count: Count, write: impl FnOnce(&mut Window, &mut T)) {
         let Some(open) = &mut self.open else { return self.lost.add(count) };
-        open.pending.add(count);
-        if let Err(error) = write(&mut open.writer, &mut open.topics) {
+        write(&mut open.window, &mut open.topics);
+        if open.window.is_full() {
+            self.release(false);
+        }
+    }
+
+    /// Writes what waits in the file that is open: what comes then stands behind it.
+    pub fn settle(&mut self) {
+        self.release(true);
+    }
+
+    fn release(&mut self, all: bool) {
+        if let Some(Err(error)) = self.open.as_mut().map(|open| open.release(all)) {
             self.break_off(&error);
         }
     }
 
-    /// Hands on what was written; ends a file that is large or old enough, as soon as nothing `holds` it, or whose
-    /// disk is full. Whether another file should be begun with [`Series::next`].
+    /// Hands on what has waited long enough; ends a file that is large or old enough, as soon as nothing `holds` it, or
+    /// whose disk is full. Whether another file should be begun with [`Series::next`].
     pub fn flush(&mut self, holds: bool) -> bool {
         let Some(open) = &mut self.open else {
             let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY);
             return due && has_room(&self.path);
         };
-        if let Err(error) = open.writer.flush() {
+        if let Err(error) = open.release(false).and_then(|()| open.writer.flush()) {
             self.break_off(&error);
             return false;
         }
-        open.kept.add(std::mem::take(&mut open.pending));
+        open.kept.add(std::mem::take(&mut open.written));
         open.gauge.reserve_for(open.writer.chunks());
         if open.gauge.is_full() {
             self.end();
@@ -330,6 +369,12 @@ impl<T> Series<T> {
         self.lost
     }
 
+    /// Messages that came when their file was past their time.
+    #[must_use]
+    pub fn late(&self) -> u64 {
+        self.late + self.open.as_ref().map_or(0, |open| open.window.late())
+    }
+
     /// Bytes of the file that is open.
     #[must_use]
     pub fn bytes(&self) -> u64 {
@@ -344,11 +389,12 @@ impl<T> Series<T> {
     /// Ends the file and gives it its name.
     fn end(&mut self) {
         let Some(mut open) = self.open.take() else { return };
-        if let Err(error) = open.writer.finish() {
+        if let Err(error) = open.release(true).and_then(|()| open.writer.finish()) {
             self.open = Some(open);
             return self.break_off(&error);
         }
-        open.kept.add(open.pending);
+        open.kept.add(open.written);
+        self.late += open.window.late();
         let (kept, gauge, part) = (open.kept, open.gauge, open.part);
         let path = match part.finish(self.force) {
             Ok(()) => part.goal,
@@ -364,7 +410,9 @@ impl<T> Series<T> {
     /// The file takes nothing more.
     fn break_off(&mut self, error: &io::Error) {
         let Some(open) = self.open.take() else { return };
-        self.lost.add(open.pending);
+        self.lost.add(open.written);
+        self.lost.add(open.window.count());
+        self.late += open.window.late();
         // What is buffered is a part of something; the file stays held until it is repaired.
         let (sink, _) = open.writer.into_inner().into_parts();
         self.broken.push(Broken { part: open.part, file: sink.into_file(), kept: open.kept });

@@ -6,6 +6,7 @@
 pub mod cdr;
 pub mod messages;
 pub mod read;
+pub mod robot;
 pub mod skin;
 pub mod standard;
 

@@ -81,11 +81,11 @@ impl McapReader {
             Some(first) => Some(first?),
             None => self.advance()?,
         };
-        let Some(Target { channel, log_time, in_chunk }) = target else { return Ok(None) };
+        let Some(Target { channel, times, in_chunk }) = target else { return Ok(None) };
         self.anchor.1 += 1;
         let body = if in_chunk { self.chunk.body() } else { self.source.body() };
         let Ok(Record::Message { data, .. }) = parse(op::MESSAGE, body) else { return Ok(None) };
-        Ok(Some(self.state.item(channel, log_time, data)))
+        Ok(Some(self.state.item(channel, times, data)))
     }
 
     /// Reads up to the next requested message.

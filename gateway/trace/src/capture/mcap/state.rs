@@ -51,8 +51,17 @@ pub(crate) struct State {
 #[derive(Clone, Copy)]
 pub(crate) struct Target {
     pub(super) channel: u16,
-    pub(super) log_time: u64,
+    pub(super) times: Times,
     pub(super) in_chunk: bool,
+}
+
+/// The times of a message, in ns since 1970.
+#[derive(Clone, Copy)]
+pub(crate) struct Times {
+    /// Where it stands in the order of the file.
+    pub(super) logged: u64,
+    /// Its own.
+    pub(super) published: u64,
 }
 
 /// A channel: its topic, and what is done with its messages.
@@ -153,9 +162,10 @@ impl State {
             Raw::Channel { id, schema, topic, encoding, facts } => {
                 self.channel(id, schema, topic, encoding, &facts)?;
             }
-            Raw::Message { channel, log_time, data, .. } => {
+            Raw::Message { channel, log_time, publish_time, data, .. } => {
                 let target = self.is_requested(channel, data)?;
-                return Ok(target.then_some(Target { channel, log_time, in_chunk }));
+                let times = Times { logged: log_time, published: publish_time };
+                return Ok(target.then_some(Target { channel, times, in_chunk }));
             }
             Raw::Attachment { name, data, .. } if !self.knows_files => self.attachment(name, data),
             Raw::Metadata { name, facts } if !self.knows_files => self.metadata(name, &facts),
@@ -253,7 +263,9 @@ impl State {
         Ok(())
     }
 
-    pub(super) fn item<'a>(&'a mut self, channel: u16, log_time: u64, message: &'a [u8]) -> Item<'a> {
+    pub(super) fn item<'a>(&'a mut self, channel: u16, times: Times, message: &'a [u8]) -> Item<'a> {
+        // Other programs' messages may have been published by another clock.
+        let Times { logged: log_time, published } = times;
         let Some(Channel { topic, what }) = self.channels.get(&channel) else {
             return Item::Entry(unreadable("", log_time, message, &"no channel"));
         };
@@ -261,12 +273,12 @@ impl State {
             What::Counted(place) => {
                 let topic = self.extras.topics.get(place);
                 let (topic, schema) = topic.map_or(("", ""), |topic| (&topic.name, &topic.schema));
-                return Item::Other(Other { topic, schema, nanos: log_time, message });
+                return Item::Other(Other { topic, schema, nanos: published, message });
             }
             // They are never requested.
             What::Latched => latched(message).map(Entry::Frame),
             What::Frames(form) => {
-                let time = Timestamp { nanos: log_time, ..form };
+                let time = Timestamp { nanos: published, ..form };
                 decode(message, LONGEST_FRAME, |message| messages::frame(message, time)).map(Entry::Frame)
             }
             What::Foreign(foreign) => {
@@ -275,7 +287,7 @@ impl State {
                     .map(Entry::Frame)
             }
             What::Notes => {
-                let note = decode(message, LONGEST_NOTE, |message| messages::note(message, log_time));
+                let note = decode(message, LONGEST_NOTE, |message| messages::note(message, published));
                 note.map(|mut note| {
                     if note.line > 0 && !self.any_frame {
                         note.nanos = 0;

@@ -1,0 +1,103 @@
+//! A robot's links on their parents, for the positions of some of its joints.
+
+use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
+
+use crate::error::{Problem, RobotError};
+use crate::nearest::nearest;
+use crate::urdf::{Kind, Urdf, UrdfJoint};
+
+/// A link on its parent.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LinkPose {
+    /// The link that it is on.
+    pub parent: String,
+    /// The link.
+    pub child: String,
+    /// From the parent to the child, with the joint at zero.
+    origin: Isometry3<f64>,
+    motion: Option<Motion>,
+}
+
+/// How a link moves on its parent.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Motion {
+    /// Which of the joints moves it.
+    joint: usize,
+    slides: bool,
+    axis: Unit<Vector3<f64>>,
+    multiplier: f64,
+    offset: f64,
+}
+
+impl LinkPose {
+    /// Whether one of the joints moves it.
+    #[must_use]
+    pub const fn moves(&self) -> bool {
+        self.motion.is_some()
+    }
+
+    /// From the parent to the child, with the joints at these positions in rad or m.
+    #[must_use]
+    pub fn at(&self, positions: &[f64]) -> Isometry3<f64> {
+        let Some(Motion { joint, slides, axis, multiplier, offset }) = self.motion else {
+            return self.origin;
+        };
+        let position = multiplier * positions.get(joint).copied().unwrap_or_default() + offset;
+        if slides {
+            self.origin * Translation3::from(axis.into_inner() * position)
+        } else {
+            self.origin * UnitQuaternion::from_axis_angle(&axis, position)
+        }
+    }
+}
+
+impl Urdf {
+    /// All links but the root, each on its parent. These joints move, and those that mimic them; all others are at rest.
+    ///
+    /// # Errors
+    /// When one of the joints does not exist, or does not move by itself.
+    pub fn link_poses(&self, joints: &[&str]) -> Result<Vec<LinkPose>, RobotError> {
+        for name in joints {
+            self.moving(name)?;
+        }
+        let place = |name: &str| joints.iter().position(|it| *it == name);
+        let pose = |joint: &UrdfJoint| {
+            let (of, multiplier, offset) = match &joint.mimic {
+                Some(mimic) => (mimic.joint.as_str(), mimic.multiplier, mimic.offset),
+                None => (joint.name.as_str(), 1.0, 0.0),
+            };
+            let slides = joint.kind == Kind::Prismatic;
+            let moves = matches!(joint.kind, Kind::Revolute | Kind::Continuous | Kind::Prismatic);
+            let motion = place(of).filter(|_| moves);
+            let motion = motion.map(|of| Motion { joint: of, slides, axis: joint.axis, multiplier, offset });
+            let origin = match motion {
+                Some(_) => joint.origin,
+                None => joint.transform(multiplier * self.rest(of) + offset),
+            };
+            let name = |link| self.link_name(link).to_owned();
+            LinkPose { parent: name(joint.parent), child: name(joint.child), origin, motion }
+        };
+        Ok(self.joints().iter().map(pose).collect())
+    }
+
+    /// The link that a joint moves.
+    ///
+    /// # Errors
+    /// When there is no such joint, or it does not move by itself.
+    pub fn link_of(&self, joint: &str) -> Result<&str, RobotError> {
+        Ok(self.link_name(self.moving(joint)?.child))
+    }
+
+    fn moving(&self, name: &str) -> Result<&UrdfJoint, RobotError> {
+        let moves = |joint: &&UrdfJoint| {
+            let kind = matches!(joint.kind, Kind::Revolute | Kind::Continuous | Kind::Prismatic);
+            kind && joint.mimic.is_none()
+        };
+        let found = self.joints().iter().filter(moves).find(|joint| joint.name == name);
+        found.ok_or_else(|| {
+            let names = self.joints().iter().filter(moves).map(|joint| joint.name.as_str());
+            let nearest = nearest(name, names);
+            self.error(Problem::NoSuchJoint { joint: name.to_owned(), nearest })
+        })
+    }
+}

@@ -1,0 +1,200 @@
+//! A URDF for the chains of a skin, of which no other is known.
+//!
+//! Each row is one joint: its origin is what does not move of the row before it, `Rz(theta_offset) Tz(d) Tx(a) Rx(alpha)`, and its
+//! axis is z. Behind the last row there is a link `tip`. Chains that begin with the same joints and rows share their links; a
+//! joint that is on two chains in different places is one of the second that mimics it.
+
+use core::fmt::Write;
+
+use nalgebra::{UnitQuaternion, Vector3};
+use protocol::parameters::RowKind;
+use protocol::skin::{JointKind, Skin};
+
+use crate::rows::{Row, pose_of};
+
+/// The link that all chains are on.
+const BASE: &str = "base";
+/// The radius of what is drawn of a link, in m.
+const RADIUS_M: f64 = 0.04;
+/// What is shorter is not drawn, in m.
+const SHORTEST_M: f64 = 1e-3;
+/// The effort that URDF requires a limit for, in Nm or N: none is known.
+const EFFORT: f64 = 1000.0;
+
+/// A URDF and what its links are called.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Written {
+    /// Its text.
+    pub xml: String,
+    /// By chain, the link that each of its joints moves.
+    pub links: Vec<Vec<String>>,
+}
+
+/// From a link to a joint on it, as URDF has it: lengths in m; roll, pitch and yaw in rad.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Origin {
+    xyz: [f64; 3],
+    rpy: [f64; 3],
+}
+
+impl Origin {
+    /// What does not move of a row.
+    fn of_row(row: &Row) -> Self {
+        let (sine, cosine) = row.theta_offset.sin_cos();
+        Self { xyz: [row.a * cosine, row.a * sine, row.d], rpy: [row.alpha, 0.0, row.theta_offset] }
+    }
+
+    fn of_base(base: &protocol::skin::Base) -> Self {
+        let pose = pose_of(base);
+        Self { xyz: pose.translation.vector.into(), rpy: pose.rotation.euler_angles().into() }
+    }
+
+    fn xml(&self) -> String {
+        format!("<origin xyz=\"{}\" rpy=\"{}\"/>", three(self.xyz), three(self.rpy))
+    }
+}
+
+fn three(numbers: [f64; 3]) -> String {
+    // Adding zero takes the sign from a negative zero.
+    numbers.map(|number| format!("{}", number + 0.0)).join(" ")
+}
+
+/// A joint and the link that it carries.
+struct Joint {
+    parent: String,
+    origin: Origin,
+    /// Which joint of the robot it is, unless it is fixed.
+    moved: Option<usize>,
+    link: String,
+    /// Its element, without its origin and links.
+    name: String,
+    kind: &'static str,
+    inner: String,
+}
+
+/// Describes the chains of a skin.
+#[must_use]
+pub fn written(skin: &Skin) -> Written {
+    let robot = &skin.robot;
+    let several = robot.chains.len() > 1;
+    let mut joints: Vec<Joint> = Vec::new();
+    let mut links = Vec::new();
+    for chain in &robot.chains {
+        let prefix = if several { format!("{}_", word(&chain.name)) } else { String::new() };
+        let (mut parent, mut origin) = (BASE.to_owned(), Origin::of_base(&chain.base));
+        let (mut of_chain, mut moving) = (Vec::new(), chain.joints.iter());
+        for (index, row) in chain.rows.iter().enumerate() {
+            let moved = if row.kind == RowKind::Fixed { None } else { moving.next().copied() };
+            let number = of_chain.len() + usize::from(moved.is_some());
+            let shared =
+                joints.iter().find(|it| (&it.parent, it.origin, it.moved) == (&parent, origin, moved));
+            let link = if let Some(shared) = shared {
+                shared.link.clone()
+            } else {
+                let fixed = moved.is_none().then(|| format!("_row{}", index + 1));
+                let link = format!("{prefix}link{number}{}", fixed.unwrap_or_default());
+                let joint = joint(skin, &joints, (parent, origin, moved), link.clone());
+                joints.push(joint);
+                link
+            };
+            if moved.is_some() {
+                of_chain.push(link.clone());
+            }
+            (parent, origin) = (link, Origin::of_row(&Row::from(row)));
+        }
+        joints.push(joint(skin, &joints, (parent, origin, None), format!("{prefix}tip")));
+        links.push(of_chain);
+    }
+    Written { xml: xml(&robot.name, &joints), links }
+}
+
+/// A joint between a link and a new one.
+fn joint(
+    skin: &Skin,
+    before: &[Joint],
+    (parent, origin, moved): (String, Origin, Option<usize>),
+    link: String,
+) -> Joint {
+    let robot = &skin.robot;
+    let known = moved.and_then(|index| Some((index, robot.joints.get(index)?)));
+    let Some((index, joint)) = known else {
+        let names = || robot.joints.iter().map(|joint| &joint.name);
+        let mut name = format!("{link}_fixed");
+        while names().any(|it| *it == name) {
+            name.push('_');
+        }
+        return Joint { parent, origin, moved, link, name, kind: "fixed", inner: String::new() };
+    };
+    let [lower, upper] = joint.limits;
+    let speed = skin.controller.max_speed.get(index).copied().unwrap_or(1.0);
+    let mut inner = format!(
+        "    <axis xyz=\"0 0 1\"/>\n    <limit lower=\"{lower}\" upper=\"{upper}\" velocity=\"{speed}\" effort=\"{EFFORT}\"/>\n"
+    );
+    let mut name = joint.name.clone();
+    if before.iter().any(|it| it.moved == moved) {
+        let _ = writeln!(inner, "    <mimic joint=\"{}\"/>", escaped(&name));
+        name = format!("{name}_of_{link}");
+    }
+    let kind = match joint.kind {
+        JointKind::Revolute => "revolute",
+        JointKind::Prismatic => "prismatic",
+    };
+    Joint { parent, origin, moved, link, name, kind, inner }
+}
+
+fn xml(name: &str, joints: &[Joint]) -> String {
+    let name = escaped(if name.is_empty() { "robot" } else { name });
+    let mut out = format!(
+        "<?xml version=\"1.0\"?>\n<robot name=\"{name}\">\n  <material name=\"grey\"><color rgba=\"0.6 0.6 0.6 1\"/></material>\n"
+    );
+    for link in core::iter::once(BASE).chain(joints.iter().map(|joint| joint.link.as_str())) {
+        let _ = writeln!(out, "  <link name=\"{link}\">");
+        shape(&mut out, [0.0; 3], [0.0; 3], &format!("<sphere radius=\"{RADIUS_M}\"/>"));
+        for joint in joints.iter().filter(|joint| joint.parent == link) {
+            segment(&mut out, joint.origin.xyz);
+        }
+        out.push_str("  </link>\n");
+    }
+    for Joint { parent, origin, link, name, kind, inner, .. } in joints {
+        let name = escaped(name);
+        let _ = write!(
+            out,
+            "  <joint name=\"{name}\" type=\"{kind}\">\n    <parent link=\"{parent}\"/>\n    <child link=\"{link}\"/>\n    \
+             {}\n{inner}  </joint>\n",
+            origin.xml()
+        );
+    }
+    out.push_str("</robot>\n");
+    out
+}
+
+/// What is drawn between a link's origin and the next joint.
+fn segment(out: &mut String, to: [f64; 3]) {
+    let way = Vector3::from(to);
+    let length = way.norm();
+    if length < SHORTEST_M {
+        return;
+    }
+    let turn = UnitQuaternion::rotation_between(&Vector3::z(), &way)
+        .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), core::f64::consts::PI));
+    let cylinder = format!("<cylinder radius=\"{RADIUS_M}\" length=\"{length}\"/>");
+    shape(out, (way / 2.0).into(), turn.euler_angles().into(), &cylinder);
+}
+
+fn shape(out: &mut String, xyz: [f64; 3], rpy: [f64; 3], geometry: &str) {
+    let origin = Origin { xyz, rpy }.xml();
+    let _ = writeln!(
+        out,
+        "    <visual>{origin}<geometry>{geometry}</geometry><material name=\"grey\"/></visual>"
+    );
+}
+
+/// A name as a frame or a topic may have it.
+#[must_use]
+pub fn word(name: &str) -> String {
+    name.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '_' }).collect()
+}
+
+fn escaped(name: &str) -> String {
+    name.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}

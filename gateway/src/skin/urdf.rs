@@ -1,0 +1,40 @@
+//! `gateway skin urdf`.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use protocol::skin::Skin;
+use protocol::usage::{Failure, print};
+use robots::written;
+
+use super::super::output::{Force, apart};
+
+/// Describe a skin's robot as a URDF: its chains, row by row
+///
+/// It is what recordings carry on /robot_description for a skin without robot.urdf. Each row is a joint with its origin and its
+/// axis, with the limits of the skin; fixed rows are fixed joints, and a link `tip` is behind the last row. A link is drawn as a
+/// cylinder. Two chains that begin with the same rows share links; the controller's max_speed is the joints' velocity.
+#[derive(Args, Debug)]
+#[command(after_help = "Example:\n  gateway skin urdf skin.toml -o robot.urdf")]
+pub(super) struct Urdf {
+    /// The skin's description
+    #[arg(value_name = "SKIN")]
+    file: PathBuf,
+    /// The file to write, whole or not at all; else standard output
+    #[arg(long, short, value_name = "FILE.urdf")]
+    output: Option<PathBuf>,
+    #[command(flatten)]
+    force: Force,
+}
+
+impl Urdf {
+    pub(super) fn run(self) -> Result<(), Failure> {
+        let skin = Skin::read(&self.file).map_err(Failure::usage)?;
+        apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
+        let text = written(&skin).xml;
+        match &self.output {
+            Some(path) => self.force.write("-o", path, &text),
+            None => print(&text),
+        }
+    }
+}

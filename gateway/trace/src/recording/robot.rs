@@ -1,0 +1,159 @@
+//! What a recording says of the robot: its description, where its links are, and where cells are on them.
+
+use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
+use protocol::skin::{Cell, Chain, Skin};
+use robots::{LinkPose, Problem, RobotError, Row, Urdf, frames, pose_of, written};
+
+use crate::ros2::robot::Transform;
+
+/// How much the rows of a skin and the links of a description may differ, in m.
+const TOLERANCE_M: f64 = 1e-6;
+/// How far joints are moved to compare them, in rad or m.
+const STEP: f64 = 0.3;
+
+/// A robot.
+#[derive(Clone, Debug)]
+pub struct Robot {
+    /// Its URDF.
+    pub description: String,
+    base: String,
+    poses: Vec<LinkPose>,
+    /// By chain, the link that each of its joints moves.
+    links: Vec<Vec<String>>,
+    /// Each cell on its link: the link, its own frame, where it is.
+    cells: Vec<(String, String, Isometry3<f64>)>,
+}
+
+/// A URDF and the names of its links.
+struct Described {
+    urdf: Urdf,
+    poses: Vec<LinkPose>,
+    links: Vec<Vec<String>>,
+}
+
+impl Robot {
+    /// The robot of a skin by its rows.
+    ///
+    /// # Errors
+    /// When rows cannot be described, as when chains share a joint that is in different places.
+    pub fn of_rows(skin: &Skin) -> Result<Self, RobotError> {
+        let written = written(skin);
+        let urdf = Urdf::parse("the skin's robot", &written.xml)?;
+        Self::new(skin, urdf, written.xml, written.links)
+    }
+
+    /// The robot of a skin by its URDF.
+    ///
+    /// # Errors
+    /// When that is of another robot than the skin's rows.
+    pub fn of_urdf(skin: &Skin, urdf: Urdf, text: String) -> Result<Self, RobotError> {
+        let link = |joint: &usize| {
+            let name = skin.robot.joints.get(*joint).map_or("", |joint| &joint.name);
+            urdf.link_of(name).map(str::to_owned)
+        };
+        let links = skin.robot.chains.iter().map(|chain| chain.joints.iter().map(link).collect());
+        let links = links.collect::<Result<Vec<_>, _>>()?;
+        Self::new(skin, urdf, text, links)
+    }
+
+    fn new(
+        skin: &Skin,
+        urdf: Urdf,
+        description: String,
+        links: Vec<Vec<String>>,
+    ) -> Result<Self, RobotError> {
+        let names: Vec<_> = skin.robot.joints.iter().map(|joint| joint.name.as_str()).collect();
+        let poses = urdf.link_poses(&names)?;
+        let base = urdf.root().to_owned();
+        let described = Described { urdf, poses, links };
+        let cells = skin.cells.iter().map(|cell| described.cell(skin, cell)).collect::<Result<_, _>>()?;
+        let Described { poses, links, .. } = described;
+        Ok(Self { description, base, poses, links, cells })
+    }
+
+    /// The link that all others are on.
+    #[must_use]
+    pub fn base(&self) -> &str {
+        &self.base
+    }
+
+    /// The link that a joint of a chain, from 1, moves.
+    #[must_use]
+    pub fn link(&self, (chain, joint): (usize, usize)) -> Option<&str> {
+        self.links.get(chain)?.get(joint.checked_sub(1)?).map(String::as_str)
+    }
+
+    /// Links that move, with the joints at these positions in rad or m.
+    #[must_use]
+    pub fn moving(&self, q: &[f64]) -> Vec<Transform<'_>> {
+        let moving = self.poses.iter().filter(|pose| pose.moves());
+        moving.map(|pose| transform(&pose.parent, &pose.child, &pose.at(q))).collect()
+    }
+
+    /// Links that do not move, and cells.
+    #[must_use]
+    pub fn still(&self) -> Vec<Transform<'_>> {
+        let links = self.poses.iter().filter(|pose| !pose.moves());
+        let links = links.map(|pose| transform(&pose.parent, &pose.child, &pose.at(&[])));
+        links.chain(self.cells.iter().map(|(link, cell, pose)| transform(link, cell, pose))).collect()
+    }
+}
+
+impl Described {
+    /// A cell on the link that its joint moves.
+    fn cell(&self, skin: &Skin, cell: &Cell) -> Result<(String, String, Isometry3<f64>), RobotError> {
+        let bus = skin.buses.get(cell.bus);
+        let index = bus.map_or(0, |bus| bus.chain);
+        let chain = skin.chain(cell.bus);
+        let of_chain = usize::from(cell.joint).saturating_sub(1);
+        let link = self.links.get(index).and_then(|links| links.get(of_chain)).map_or("", String::as_str);
+        let near = |step: f64| -> Vec<f64> {
+            let joints = skin.robot.joints.iter();
+            joints.map(|joint| step.clamp(joint.limits[0], joint.limits[1])).collect()
+        };
+        let row = usize::from(cell.row);
+        let [one, other] = [0.0, STEP].map(|step| self.row_on(link, chain, row, &near(step)));
+        let apart = (one.translation.vector - other.translation.vector).norm()
+            + one.rotation.angle_to(&other.rotation);
+        if apart.is_nan() || apart > TOLERANCE_M {
+            let joint = chain.joints.get(of_chain).and_then(|joint| skin.robot.joints.get(*joint));
+            let joint = joint.map_or_else(String::new, |joint| joint.name.clone());
+            let problem = Box::new(Problem::OtherRows { joint, chain: chain.name.clone() });
+            return Err(RobotError { file: self.urdf.file.clone(), line: None, problem });
+        }
+        let normal = Vector3::from(cell.normal);
+        // Where it is turned about its normal nobody knows.
+        let turn = UnitQuaternion::rotation_between(&Vector3::z(), &normal)
+            .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), core::f64::consts::PI));
+        let place = Isometry3::from_parts(Point3::from(cell.position).into(), turn);
+        let name = format!("{}/{}", bus.map_or("", |bus| &bus.name), cell.node);
+        Ok((link.to_owned(), name, one * place))
+    }
+
+    /// From a link to the frame of a row.
+    fn row_on(&self, link: &str, chain: &Chain, row: usize, q: &[f64]) -> Isometry3<f64> {
+        let of_chain: Vec<_> =
+            chain.joints.iter().map(|joint| q.get(*joint).copied().unwrap_or_default()).collect();
+        let rows: Vec<_> = chain.rows.iter().map(Row::from).collect();
+        let frames = frames(&pose_of(&chain.base), &rows, &of_chain);
+        let frame = frames.get(row).copied().unwrap_or_else(Isometry3::identity);
+        let (mut pose, mut at) = (Isometry3::identity(), link);
+        while let Some(above) = self.poses.iter().find(|pose| pose.child == at) {
+            pose = above.at(q) * pose;
+            at = &above.parent;
+        }
+        pose.inverse() * frame
+    }
+}
+
+fn transform<'a>(parent: &'a str, child: &'a str, pose: &Isometry3<f64>) -> Transform<'a> {
+    Transform {
+        parent,
+        child,
+        translation: pose.translation.vector.into(),
+        rotation: pose.rotation.coords.into(),
+    }
+}
+
+#[cfg(test)]
+mod tests;

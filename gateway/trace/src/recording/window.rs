@@ -1,0 +1,183 @@
+//! Messages in the order of their times: each waits a little before it is written.
+//!
+//! ```text
+//!   topics ──> write ──> [ waiting ] ──> release ──> file, in order of log_time
+//! ```
+//!
+//! Receivers and the loop hand over in turn, so only messages of one topic come in order. A message's `log_time` is its own
+//! time; it is later where the file is past that already, so that the file's order is always that of `log_time`. The
+//! message's own time is its `publish_time`. The order of one topic is never changed.
+
+use std::io::{self, Write};
+
+use super::file::{Channel, FileWriter};
+use super::series::Count;
+use crate::ros2::Message;
+
+/// How long a message waits for others that are older, in ns.
+pub const WINDOW_NS: u64 = 40_000_000;
+/// Messages that wait at most: more than a second of three full buses.
+const MESSAGES: usize = 65_536;
+/// Their bytes at most.
+const BYTES: usize = 16 << 20;
+
+/// A message that waits.
+#[derive(Clone, Copy, Debug)]
+struct Waiting {
+    /// Where it belongs in the file, in ns since 1970.
+    at: u64,
+    /// Its own time.
+    nanos: u64,
+    /// Where its bytes are.
+    begin: usize,
+    end: usize,
+    channel: u16,
+    sequence: u32,
+    is_frame: bool,
+}
+
+/// The messages of a file that wait to be written.
+#[derive(Debug, Default)]
+pub struct Window {
+    waiting: Vec<Waiting>,
+    bytes: Vec<u8>,
+    /// The latest place of each channel.
+    latest: Vec<u64>,
+    /// The recorder's time.
+    now: u64,
+    /// The place of the last message that was written.
+    released: u64,
+    /// Messages that came when the file was past their time.
+    late: u64,
+    buffers: (Vec<u8>, Vec<u8>),
+}
+
+impl Window {
+    /// One that begins at a time, in ns since 1970.
+    #[must_use]
+    pub fn new(now: u64) -> Self {
+        Self { now, ..Self::default() }
+    }
+
+    /// Takes a message with its own time, in ns since 1970.
+    pub fn write<M: Message>(&mut self, channel: &mut Channel, nanos: u64, message: &M) {
+        self.write_at(channel, nanos, nanos, message);
+    }
+
+    /// Takes a message that belongs elsewhere in the file than its own time says.
+    pub fn write_at<M: Message>(&mut self, channel: &mut Channel, at: u64, nanos: u64, message: &M) {
+        let id = usize::from(channel.id());
+        if self.latest.len() <= id {
+            self.latest.resize(id + 1, 0);
+        }
+        // A time in the future would have everything else wait for it.
+        let mut at = at.min(self.now.saturating_add(WINDOW_NS));
+        if let Some(latest) = self.latest.get_mut(id) {
+            at = at.max(*latest);
+            *latest = at;
+        }
+        message.encode_into(&mut self.buffers.0);
+        let begin = self.bytes.len();
+        self.bytes.extend_from_slice(&self.buffers.0);
+        let end = self.bytes.len();
+        let (channel, sequence, is_frame) = channel.next();
+        self.waiting.push(Waiting { at, nanos, begin, end, channel, sequence, is_frame });
+    }
+
+    /// The latest place of a channel's messages; 0 when there was none.
+    #[must_use]
+    pub fn latest(&self, channel: &Channel) -> u64 {
+        self.latest.get(usize::from(channel.id())).copied().unwrap_or_default()
+    }
+
+    /// Messages that wait.
+    #[must_use]
+    pub fn count(&self) -> Count {
+        count(&self.waiting)
+    }
+
+    /// Messages that came when the file was past their time.
+    #[must_use]
+    pub const fn late(&self) -> u64 {
+        self.late
+    }
+
+    /// Tells the time. When the clock was set back, everything that waits is written first, and what comes then begins a new order.
+    ///
+    /// # Errors
+    /// When the file cannot be written, as of everything below.
+    pub fn look<W: Write>(&mut self, now: u64, file: &mut FileWriter<W>) -> io::Result<Count> {
+        let written = if now < self.now {
+            let written = self.release_all(file)?;
+            self.latest.clear();
+            self.released = 0;
+            written
+        } else {
+            Count::default()
+        };
+        self.now = now;
+        Ok(written)
+    }
+
+    /// Writes what has waited long enough, and the older half of what waits if that is too much; how many.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn release<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<Count> {
+        self.sort();
+        let until = self.now.saturating_sub(WINDOW_NS);
+        let due = self.waiting.partition_point(|it| it.at <= until);
+        let due = if self.is_full() { due.max(self.waiting.len() / 2) } else { due };
+        self.write_out(due, file)
+    }
+
+    /// Whether more waits than may.
+    #[must_use]
+    pub const fn is_full(&self) -> bool {
+        self.waiting.len() >= MESSAGES || self.bytes.len() >= BYTES
+    }
+
+    /// Writes everything that waits; how many.
+    ///
+    /// # Errors
+    /// See above.
+    pub fn release_all<W: Write>(&mut self, file: &mut FileWriter<W>) -> io::Result<Count> {
+        self.sort();
+        self.write_out(self.waiting.len(), file)
+    }
+
+    /// Messages of the same place stay in the order in which they came.
+    fn sort(&mut self) {
+        self.waiting.sort_by_key(|it| it.at);
+    }
+
+    /// Writes the first ones.
+    fn write_out<W: Write>(&mut self, due: usize, file: &mut FileWriter<W>) -> io::Result<Count> {
+        let Self { waiting, bytes, released, late, buffers: (_, kept), .. } = self;
+        let written = waiting.get(..due).unwrap_or_default();
+        for it in written {
+            *late += u64::from(it.at < *released);
+            *released = it.at.max(*released);
+            let data = bytes.get(it.begin..it.end).unwrap_or_default();
+            file.put((it.channel, it.sequence), (*released, it.nanos), data)?;
+        }
+        let written = count(written);
+        waiting.drain(..due);
+        kept.clear();
+        for it in waiting {
+            let begin = kept.len();
+            kept.extend_from_slice(bytes.get(it.begin..it.end).unwrap_or_default());
+            (it.begin, it.end) = (begin, kept.len());
+        }
+        std::mem::swap(bytes, kept);
+        Ok(written)
+    }
+}
+
+fn count(messages: &[Waiting]) -> Count {
+    let frames = messages.iter().filter(|it| it.is_frame).count() as u64;
+    Count { frames, others: messages.len() as u64 - frames }
+}
+
+#[cfg(test)]
+mod tests;

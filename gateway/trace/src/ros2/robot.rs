@@ -1,0 +1,72 @@
+//! Types of ROS 2 that show a robot: where its links are, and its description.
+
+use super::cdr::{Encode, Writer};
+use super::{Header, Message, definition};
+
+/// Where a frame is, seen from its parent.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Transform<'a> {
+    /// The parent.
+    pub parent: &'a str,
+    /// The frame.
+    pub child: &'a str,
+    /// In m.
+    pub translation: [f64; 3],
+    /// A unit quaternion: x, y, z, w.
+    pub rotation: [f64; 4],
+}
+
+/// `tf2_msgs/TFMessage`: where frames are.
+#[derive(Clone, Copy, Debug)]
+pub struct Transforms<'a> {
+    /// When, in ns since 1970.
+    pub nanos: u64,
+    /// Each frame.
+    pub transforms: &'a [Transform<'a>],
+}
+
+impl Message for Transforms<'_> {
+    const TYPE: &'static str = "tf2_msgs/msg/TFMessage";
+    const DEFINITION: &'static str = definition!(
+        "tf2_msgs/TFMessage",
+        "geometry_msgs/TransformStamped",
+        "std_msgs/Header",
+        "builtin_interfaces/Time",
+        "geometry_msgs/Transform",
+        "geometry_msgs/Vector3",
+        "geometry_msgs/Quaternion"
+    );
+}
+
+impl Encode for Transforms<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.sequence(self.transforms.iter().map(|transform| Stamped(self.nanos, transform)));
+    }
+}
+
+/// `geometry_msgs/TransformStamped`.
+struct Stamped<'a>(u64, &'a Transform<'a>);
+
+impl Encode for Stamped<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
+        let Self(nanos, Transform { parent, child, translation, rotation }) = self;
+        out.put(Header { nanos: *nanos, frame_id: parent });
+        out.put(*child);
+        translation.iter().chain(rotation).for_each(|number| out.put(number));
+    }
+}
+
+/// `std_msgs/String`.
+#[derive(Clone, Copy, Debug)]
+pub struct Text<'a>(pub &'a str);
+
+impl Message for Text<'_> {
+    const TYPE: &'static str = "std_msgs/msg/String";
+    const DEFINITION: &'static str = definition!("std_msgs/String");
+}
+
+impl Encode for Text<'_> {
+    fn encode(&self, out: &mut Writer<'_>) {
+        out.put(self.0);
+    }
+}
