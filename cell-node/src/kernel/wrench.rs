@@ -16,13 +16,15 @@
 //! that carries the cell are constant, but for a slide, as are fixed rows right below it: they are folded into the six
 //! stored words. What nobody reads further down the chain is not computed: [`Live`] says what is, worked out once.
 
+mod fold;
+mod joint;
 mod range;
 
-use core::ops::{Add, Mul, Neg, Sub};
-
 use protocol::fixed::Q1_14;
-use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
+use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
+use self::fold::fold;
+use self::joint::Joint;
 use self::range::{Bounded, Held, Rounding, bound};
 use super::{Kernel, Number, Scalar, Twist, chain, length, settled_turn};
 use crate::contact::{MAX_J, TorqueRounding};
@@ -86,45 +88,6 @@ struct Link<N> {
     twist: Twist<N>,
     /// Sine and cosine of theta_offset, where the row does not turn; none of a zero.
     constant: Option<[N; 2]>,
-}
-
-/// A joint. There are no more than an array of joints has, so that no access to one is checked.
-#[repr(u8)]
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Joint {
-    J1,
-    J2,
-    J3,
-    J4,
-    J5,
-    J6,
-    J7,
-    J8,
-    J9,
-    J10,
-    J11,
-    J12,
-    J13,
-    J14,
-}
-
-impl Joint {
-    #[rustfmt::skip]
-    const ALL: [Self; MAX_JOINTS] = [
-        Self::J1, Self::J2, Self::J3, Self::J4, Self::J5, Self::J6, Self::J7,
-        Self::J8, Self::J9, Self::J10, Self::J11, Self::J12, Self::J13, Self::J14,
-    ];
-
-    /// It, of one thing for each joint.
-    #[inline(always)]
-    fn of<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
-        joints.get(self as usize)
-    }
-
-    #[inline(always)]
-    fn of_mut<T>(self, joints: &mut [T; MAX_JOINTS]) -> Option<&mut T> {
-        joints.get_mut(self as usize)
-    }
 }
 
 /// What of a row is computed, because its own row of J or a row further down reads it.
@@ -507,31 +470,4 @@ fn before_twist<N>(twist: Twist<N>, [x, y, z]: [bool; 3]) -> [bool; 3] {
 /// What must be there before a turn about z, for these to be there after it.
 fn before_turn([x, y, z]: [bool; 3]) -> [bool; 3] {
     [x || y, x || y, z]
-}
-
-/// The contact's wrench, twisted and shifted by joint k's row, rounded once.
-fn fold<N: Number>(pose: &Pose, row: &Row) -> Wrenched<N> {
-    let (force, moment) = folded(
-        pose.normal.map(N::fine),
-        pose.position.map(N::fine),
-        N::fine_turn(row.alpha),
-        (N::fine(row.a), N::fine(row.d)),
-    );
-    // 14 bits of a word and 28 of the twist; and for the moment 14 more of a length.
-    Wrenched { force: force.map(N::settle::<42>), moment: moment.map(N::settle::<56>) }
-}
-
-/// The same before rounding. Words of 16 bits give no number above 2^61.
-fn folded<N: Copy + Add<Output = N> + Sub<Output = N> + Mul<Output = N> + Neg<Output = N>>(
-    [nx, ny, nz]: [N; 3],
-    [tx, ty, tz]: [N; 3],
-    [sine, cosine, one]: [N; 3],
-    (a, d): (N, N),
-) -> ([N; 3], [N; 3]) {
-    let twist = |[x, y, z]: [N; 3]| [one * x, cosine * y - sine * z, sine * y + cosine * z];
-    // The force pushes against the normal.
-    let [fx, fy, fz] = twist([-nx, -ny, -nz]);
-    // t x f = n x t.
-    let [mx, my, mz] = twist([ny * tz - nz * ty, nz * tx - nx * tz, nx * ty - ny * tx]);
-    ([fx, fy, fz], [mx - d * fy, my + d * fx - a * fz, mz + a * fy])
 }

@@ -1,0 +1,34 @@
+//! What does not change with the joints, computed once.
+
+use core::ops::{Add, Mul, Neg, Sub};
+
+use protocol::parameters::{Pose, Row};
+
+use super::{Number, Wrenched};
+
+/// The contact's wrench, twisted and shifted by joint k's row, rounded once.
+pub(super) fn fold<N: Number>(pose: &Pose, row: &Row) -> Wrenched<N> {
+    let (force, moment) = folded(
+        pose.normal.map(N::fine),
+        pose.position.map(N::fine),
+        N::fine_turn(row.alpha),
+        (N::fine(row.a), N::fine(row.d)),
+    );
+    // 14 bits of a word and 28 of the twist; and for the moment 14 more of a length.
+    Wrenched { force: force.map(N::settle::<42>), moment: moment.map(N::settle::<56>) }
+}
+
+/// The same before rounding. Words of 16 bits give no number above 2^61.
+fn folded<N: Copy + Add<Output = N> + Sub<Output = N> + Mul<Output = N> + Neg<Output = N>>(
+    [nx, ny, nz]: [N; 3],
+    [tx, ty, tz]: [N; 3],
+    [sine, cosine, one]: [N; 3],
+    (a, d): (N, N),
+) -> ([N; 3], [N; 3]) {
+    let twist = |[x, y, z]: [N; 3]| [one * x, cosine * y - sine * z, sine * y + cosine * z];
+    // The force pushes against the normal.
+    let [fx, fy, fz] = twist([-nx, -ny, -nz]);
+    // t x f = n x t.
+    let [mx, my, mz] = twist([ny * tz - nz * ty, nz * tx - nx * tz, nx * ty - ny * tx]);
+    ([fx, fy, fz], [mx - d * fy, my + d * fx - a * fz, mz + a * fy])
+}

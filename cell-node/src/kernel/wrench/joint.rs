@@ -1,0 +1,42 @@
+//! Which joint moves a row.
+
+use protocol::parameters::MAX_JOINTS;
+
+/// A joint. There are no more than an array of joints has, so that no access to one is checked.
+#[repr(u8)]
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Joint {
+    J1,
+    J2,
+    J3,
+    J4,
+    J5,
+    J6,
+    J7,
+    J8,
+    J9,
+    J10,
+    J11,
+    J12,
+    J13,
+    J14,
+}
+
+impl Joint {
+    #[rustfmt::skip]
+    pub(super) const ALL: [Self; MAX_JOINTS] = [
+        Self::J1, Self::J2, Self::J3, Self::J4, Self::J5, Self::J6, Self::J7,
+        Self::J8, Self::J9, Self::J10, Self::J11, Self::J12, Self::J13, Self::J14,
+    ];
+
+    /// It, of one thing for each joint.
+    #[inline(always)]
+    pub(super) fn of<T>(self, joints: &[T; MAX_JOINTS]) -> Option<&T> {
+        joints.get(self as usize)
+    }
+
+    #[inline(always)]
+    pub(super) fn of_mut<T>(self, joints: &mut [T; MAX_JOINTS]) -> Option<&mut T> {
+        joints.get_mut(self as usize)
+    }
+}
