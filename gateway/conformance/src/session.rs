@@ -1,10 +1,10 @@
 //! A conversation with the cell: sends, collects what the cell sends, and checks what holds of every packet.
 
+mod accounts;
 mod beats;
 mod exchange;
 mod joints;
 mod known;
-mod ledger;
 mod receive;
 mod request;
 
@@ -20,9 +20,9 @@ use crate::bus::{Bus, Seen, Stop};
 use crate::findings::Findings;
 use crate::timing::Timings;
 
+use accounts::Accounts;
 pub(crate) use exchange::Exchange;
 pub(crate) use known::{About, Known};
-use ledger::Ledger;
 pub(crate) use request::Reply;
 
 /// Longer than any answer takes that comes at all.
@@ -89,18 +89,30 @@ struct Clock {
     round_trip: Span,
 }
 
+/// Frames of the cell and of the bench.
+#[derive(Debug, Default)]
+struct Log {
+    frames: Vec<Seen>,
+    /// Where the present exchange begins: what was sent for it may come before it.
+    since: usize,
+    /// Where the last exchange ended.
+    ended: usize,
+}
+
+impl Log {
+    /// Those of the present exchange.
+    fn present(&self) -> &[Seen] {
+        self.frames.get(self.since..).unwrap_or_default()
+    }
+}
+
 /// The conversation.
 pub struct Session<'a> {
     bus: &'a mut dyn Bus,
     name: String,
     pub(crate) cell: CellId,
     pub(crate) format: Format,
-    /// Frames of the cell and of the bench.
-    log: Vec<Seen>,
-    /// Where the present exchange begins there: what was sent for it may come before it.
-    since: usize,
-    /// Where the last exchange ended there.
-    ended: usize,
+    log: Log,
     /// Packets of the cell.
     pub(crate) heard: Vec<Heard>,
     /// Where the present exchange begins there.
@@ -112,7 +124,7 @@ pub struct Session<'a> {
     /// Joints whose answers came so late that the cell may have skipped them.
     pub(crate) skips: u16,
     /// What was counted of the bus.
-    ledger: Ledger,
+    accounts: Accounts,
     /// What was found.
     pub findings: Findings,
     pub(crate) known: Known,
@@ -144,15 +156,13 @@ impl<'a> Session<'a> {
             name: name.to_owned(),
             cell,
             format,
-            log: Vec::new(),
-            since: 0,
-            ended: 0,
+            log: Log::default(),
             heard: Vec::new(),
             from: 0,
             consumed: 0,
             segments: [const { (Segment::NONE, Micros(0)) }; 8],
             skips: 0,
-            ledger: Ledger::default(),
+            accounts: Accounts::default(),
             findings: Findings::default(),
             known: Known::default(),
             about: About::default(),
@@ -216,10 +226,8 @@ impl<'a> Session<'a> {
         if is_so {
             self.findings.pass(id);
         } else if !self.clock.skipped {
-            let (log, since, name) = (&self.log, self.since, &self.name);
-            self.findings.fail(id, what(), || {
-                log.get(since..).unwrap_or_default().iter().map(|seen| line(name, seen)).collect()
-            });
+            let (log, name) = (&self.log, &self.name);
+            self.findings.fail(id, what(), || log.present().iter().map(|seen| line(name, seen)).collect());
         }
         is_so
     }
@@ -239,7 +247,8 @@ impl<'a> Session<'a> {
     /// The same where what came is expected.
     pub(crate) fn start(&mut self) {
         self.clock.skipped = false;
-        (self.since, self.from, self.consumed) = (self.ended, self.heard.len(), self.heard.len());
+        self.log.since = self.log.ended;
+        (self.from, self.consumed) = (self.heard.len(), self.heard.len());
         self.lateness();
         self.clock.late = Span(0);
     }
@@ -247,7 +256,7 @@ impl<'a> Session<'a> {
     /// What came since the exchange began was expected.
     pub(crate) fn consume(&mut self) {
         self.consumed = self.heard.len();
-        self.ended = self.log.len();
+        self.log.ended = self.log.frames.len();
     }
 
     /// What came since the last exchange ended.
@@ -264,7 +273,7 @@ impl<'a> Session<'a> {
     pub(crate) fn forget_counts(&mut self) {
         self.sent = None;
         self.segments = [const { (Segment::NONE, Micros(0)) }; 8];
-        self.ledger = Ledger::default();
+        self.accounts = Accounts::default();
     }
 
     /// Nothing that was written is taken for granted any more.
@@ -286,11 +295,11 @@ impl<'a> Session<'a> {
     /// The same; when each was on the bus.
     pub(crate) fn send_all(&mut self, frames: &[Frame]) -> Result<Vec<Micros>, Stop> {
         let Some(last) = frames.last() else { return Ok(Vec::new()) };
-        let before = self.log.len();
+        let before = self.log.frames.len();
         self.bus.send(frames)?;
         let give_up = self.bus.now() + ON_BUS;
         loop {
-            let own = self.log.get(before..).unwrap_or_default().iter().filter(|seen| seen.own);
+            let own = self.log.frames.get(before..).unwrap_or_default().iter().filter(|seen| seen.own);
             let own: Vec<_> = own.map(|seen| seen.at).collect();
             if own.len() >= frames.len() {
                 return Ok(own);

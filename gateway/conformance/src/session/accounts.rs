@@ -35,7 +35,7 @@ struct Beats {
 
 /// All of that.
 #[derive(Debug, Default)]
-pub(super) struct Ledger {
+pub(super) struct Accounts {
     /// Of the test's own packets.
     segments: Vec<(Id, Segment)>,
     /// The last joints taken.
@@ -56,7 +56,7 @@ pub(super) struct Ledger {
 /// Something that does not add up: the requirement, and what is wrong.
 pub(super) type Difference = (&'static str, String);
 
-impl Ledger {
+impl Accounts {
     /// A frame of the test was on the bus; the joints of the chain, if the cell has one.
     pub(super) fn own(&mut self, seen: &Seen, cell: CellId, format: Format, joints: Option<u8>) {
         let Some(message) = self.message(seen, format) else { return };

@@ -3,7 +3,7 @@
 use protocol::time::Span;
 
 use super::Session;
-use super::ledger::BEAT;
+use super::accounts::BEAT;
 use crate::bus::Stop;
 
 /// Around a regular heartbeat nothing is asked for so long.
@@ -20,7 +20,7 @@ impl Session<'_> {
         let at = self.answers().iter().find(|it| it.beat().is_some()).map(|it| it.at);
         self.check("BEAT-1", came, || "no heartbeat came for 300 ms".to_owned());
         self.clock.regular = at;
-        if let Some((came, min, max)) = at.and_then(|at| self.ledger.regular(at)) {
+        if let Some((came, min, max)) = at.and_then(|at| self.accounts.regular(at)) {
             self.check("BEAT-1", (min..=max).contains(&came), || {
                 let due = if min == max { min.to_string() } else { format!("{min} to {max}") };
                 format!("{came} heartbeats came; {due} were due, every 250 ms and to each sync and claim")
@@ -33,7 +33,7 @@ impl Session<'_> {
 
     /// All heartbeats of the test together: a cell that is late leaves none out, unless it was for a whole 250 ms.
     pub(crate) fn check_all_beats(&mut self) {
-        let surplus = self.ledger.surplus();
+        let surplus = self.accounts.surplus();
         if self.clock.longest < BEAT {
             self.start();
             self.check("BEAT-1", surplus == 0, || {

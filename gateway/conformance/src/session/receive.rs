@@ -17,9 +17,9 @@ impl Session<'_> {
             return Ok(None);
         };
         if seen.own {
-            self.log.push(seen);
+            self.log.frames.push(seen);
             let joints = (self.known.hash != Some(0)).then_some(self.known.joints);
-            self.ledger.own(&seen, self.cell, self.format, joints);
+            self.accounts.own(&seen, self.cell, self.format, joints);
             return Ok(Some(seen));
         }
         self.look_at_time()?;
@@ -28,7 +28,7 @@ impl Session<'_> {
             return Err(Stop::Gateway(seen.frame.to_string()));
         }
         if id.node == self.cell.get() {
-            self.log.push(seen);
+            self.log.frames.push(seen);
             self.clock.last = seen.at;
             self.take(seen, id);
         }
@@ -92,7 +92,7 @@ impl Session<'_> {
 
     /// What holds of every packet: heartbeats know how many there were.
     fn look_at(&mut self, heard: &Heard) {
-        self.ledger.heard(&heard.message);
+        self.accounts.heard(&heard.message);
         if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.beat() {
             // It has been switched off and on.
             let begins = state.has(State::CLAIMING) && !self.claiming;

@@ -163,7 +163,7 @@ impl Session<'_> {
                 Reply::Refused(reason)
             }
         };
-        self.ended = self.log.len();
+        self.log.ended = self.log.frames.len();
         let place = self.heard.iter().rposition(|it| matches!(it.message, Message::Configured { .. }));
         self.consumed = place.map_or(self.heard.len(), |place| place + 1);
         Ok(reply)
@@ -266,7 +266,7 @@ impl Session<'_> {
         let whole = heard.zip(refused);
         self.check("CMD-4", whole.is_some(), || "network pages 1 and 2 did not come to a report".to_owned());
         if let Some((heard, refused)) = whole {
-            for (id, what) in self.ledger.compare(heard, refused) {
+            for (id, what) in self.accounts.compare(heard, refused) {
                 self.check(id, false, || what);
             }
         }
@@ -285,6 +285,6 @@ impl Session<'_> {
 
     /// The cell may have lost some of a burst, which its counters show.
     pub(crate) const fn forget_counters(&mut self) {
-        self.ledger.forget_counters();
+        self.accounts.forget_counters();
     }
 }
