@@ -13,7 +13,7 @@ use serde::Serialize;
 use trace::capture::Reader;
 
 use super::arguments::{Named, cell, nanos};
-use super::input::skin_for;
+use super::input::{remark_another, skin_of};
 use super::output;
 use super::print::json;
 
@@ -66,7 +66,10 @@ struct Whole<'a> {
 
 impl Explain {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let skin = skin_for(&self.files, self.skin.as_deref())?;
+        let skin = match &self.skin {
+            Some(path) => Skin::read(path).map_err(Failure::usage)?,
+            None => skin_of(&self.files)?,
+        };
         self.check(&skin)?;
         let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
         let name = reader.name().to_owned();
@@ -81,6 +84,10 @@ impl Explain {
             }
         }
         let moments = found.moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
+        // Where another skin is an error, that says all.
+        if let Some(path) = &self.skin {
+            remark_another(&self.files, path, &skin);
+        }
         let mut explanation = explain(&skin, &moments);
         if let Some(target) = &self.cell {
             let named = |bus: &str, node: u8| {
