@@ -167,7 +167,7 @@ fn what_is_no_capture_is_refused_by_its_name() {
     );
     let gone = folder.refuses("convert gone.log run.mcap", 2);
     assert_eq!(gone, "gateway: gone.log: No such file or directory (os error 2)");
-    assert_eq!(folder.refuses("convert . run.mcap", 2), "gateway: .: is a directory");
+    assert_eq!(folder.refuses("convert . run.mcap", 2), "gateway: .: it is a folder, a file is needed");
     let nowhere = "No such file or directory (os error 2); name a file in a folder that can be written";
     let said = folder.refuses("convert words.txt none/run.mcap", 2);
     assert_eq!(said, format!("gateway: none/run.mcap: {nowhere}"));

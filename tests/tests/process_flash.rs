@@ -91,7 +91,7 @@ fn what_is_no_regular_file_is_no_flash_and_delays_nothing() {
     let (kind, mode) = (rustix::fs::FileType::Fifo, rustix::fs::Mode::from_raw_mode(0o600));
     rustix::fs::mknodat(rustix::fs::CWD, &path, kind, mode, 0).unwrap();
     let ended = place.bench(1.0, "--flash flash --quiet").end();
-    let why = "flash of cell 3 (flash/vcan0-3.flash): it is no regular file: move it away";
+    let why = "flash of cell 3 (flash/vcan0-3.flash): it is a named pipe, a file is needed";
     assert!(ended.code() == Some(1) && ended.stderr.contains(why), "{ended:#?}");
 }
 

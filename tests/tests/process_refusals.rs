@@ -119,7 +119,7 @@ fn files_that_are_not_there_are_named() {
     for (words, expected) in [
         ("run nowhere.toml", "nowhere.toml: No such file or directory (os error 2)"),
         ("run skin.toml --scenario nowhere.toml", "nowhere.toml: No such file or directory (os error 2)"),
-        ("run .", ".: Is a directory (os error 21)"),
+        ("run .", ".: it is a folder, a file is needed"),
         (
             "run skin.toml --cell-node /nowhere",
             "cell-node is not at /nowhere: build it with `cargo build --release`, or name its path with \

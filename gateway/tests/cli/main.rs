@@ -79,7 +79,7 @@ fn times_names_and_directions_are_those_of_the_log() {
     let log = "(0000000012.000034567)   can0  123#11.22 T\r\n# more\n\n(1.000000) slcan0 20c##1 R";
     child.stdin.take().unwrap().write_all(log.as_bytes()).unwrap();
     let Output { status, stdout, .. } = child.wait_with_output().unwrap();
-    let expected = "(12.000034567) can0 123#1122 T\tforeign no packet: 2 data bytes, not 8\n\
+    let expected = "(0000000012.000034567) can0 123#1122 T\tforeign no packet: 2 data bytes, not 8\n\
                     (1.000000) slcan0 20C##1 R\tforeign no packet: 0 data bytes, not 16\n";
     assert_eq!((status.code(), text(&stdout)), (Some(0), expected));
 }
@@ -439,17 +439,21 @@ fn every_command_has_help_with_an_example() {
 }
 
 #[test]
-fn a_file_without_an_end_is_read_up_to_a_limit() {
+fn what_is_no_file_or_too_long_is_not_read() {
     let urdf = format!("{}/examples/panda.urdf", env!("CARGO_MANIFEST_DIR"));
-    for command in [
-        "skin check /dev/zero",
-        "skin import /dev/zero --tip hand",
-        &format!("skin import {urdf} --tip hand --cells /dev/zero"),
-    ] {
-        let said = refusal(command, 2);
-        assert!(
-            said.contains("/dev/zero: it is longer than 16777216 bytes, the most that are read"),
-            "{said}"
-        );
+    let folder = tempfile::tempdir().unwrap();
+    let long = folder.path().join("long.toml");
+    std::fs::File::create(&long).unwrap().set_len((16 << 20) + 1).unwrap();
+    let long = long.to_str().unwrap();
+    let too_long = "it is longer than 16777216 bytes, the most that are read";
+    for (file, why) in [("/dev/zero", "it is a device, a file is needed"), (long, too_long)] {
+        for command in [
+            format!("skin check {file}"),
+            format!("skin import {file} --tip hand"),
+            format!("skin import {urdf} --tip hand --cells {file}"),
+        ] {
+            let said = refusal(&command, 2);
+            assert!(said.contains(&format!("{file}: {why}")), "{said}");
+        }
     }
 }
