@@ -139,7 +139,7 @@ fn describe(skin: &Description) -> String {
     let Description { name, robot, timing, events: _, buses, controller, safety: _, cells } = skin;
     let controller = match &controller.kind {
         ControllerKind::Kinesthetic { .. } => "kinesthetic controller".to_owned(),
-        ControllerKind::External { socket } => format!("external controller at {socket}"),
+        ControllerKind::External { socket, .. } => format!("external controller at {socket}"),
     };
     let every = cells.first().map(|cell| format!(" (every {} us)", skin.parameters(cell).period_us));
     let mut text = format!(

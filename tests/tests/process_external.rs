@@ -43,6 +43,25 @@ fn the_example_in_python_moves_the_arm() {
 }
 
 #[test]
+fn a_controller_that_begins_later_is_waited_for() {
+    let place = place(250);
+    let bench = place.running_bench(60.0, "");
+    // Three times as long as it may be missing once it has begun.
+    std::thread::sleep(Duration::from_millis(1_500));
+    let python = python(&place);
+    place.test_client().waits_for_motion();
+    bench.signal(Signal::TERM);
+    let ended = bench.end().well();
+    assert!(!ended.stderr.contains("halted"), "{}", ended.stderr);
+    place.is_left_clean();
+    let summary = place.summary();
+    assert!(summary.count("/loop/bad_cycles", NOBODY) >= 250, "{:#}", summary.0);
+    assert_eq!(summary.0["halts"], serde_json::json!([]));
+    summary.adds_up();
+    drop(python);
+}
+
+#[test]
 fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_ack() {
     let place = place(250);
     let first = python(&place);

@@ -21,7 +21,7 @@ use protocol::id::Command;
 use protocol::message::Joints;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{LostBus, MAX_ROBOT_JOINTS, Safety, Skin};
+use protocol::skin::{ControllerKind, LostBus, MAX_ROBOT_JOINTS, Safety, Skin};
 use protocol::time::Micros;
 
 use crate::controller::{BadCycle, Controller, Input, Step};
@@ -126,6 +126,9 @@ pub struct Cycle {
     /// The last broadcast's place in the schedule.
     slot: Option<u64>,
     bad_in_a_row: u32,
+    /// Until when a controller may take to begin; none once it has begun.
+    starts: Option<Micros>,
+    good_in_a_row: u32,
     halted: Option<Halt>,
     halts: u32,
     resumes: u32,
@@ -157,6 +160,11 @@ impl Cycle {
             broadcasts: 0,
             slot: None,
             bad_in_a_row: 0,
+            starts: match &skin.controller.kind {
+                ControllerKind::External { start, .. } => Some(Micros(0) + *start),
+                ControllerKind::Kinesthetic { .. } => None,
+            },
+            good_in_a_row: 0,
             halted: None,
             halts: 0,
             resumes: 0,
@@ -238,11 +246,11 @@ impl Cycle {
             Step::Move(_) => None,
             Step::Bad(why) => Some(why),
         };
-        let command = if self.comparator(bad) { Some(Command::Halt) } else { heard };
+        let command = if self.count(bad, tick.time) { Some(Command::Halt) } else { heard };
         let velocity = match step {
             Step::Move(velocity) if self.halted.is_none() => velocity,
-            // Without an answer the robot goes on as it was for a while; halted, it stands.
-            Step::Bad(_) if self.halted.is_none() => input.qdot,
+            // Without an answer the robot goes on as it was for a while; then it stands, halted or not.
+            Step::Bad(_) if self.halted.is_none() && self.bad_in_a_row < self.safety.bad_cycles => input.qdot,
             Step::Move(_) | Step::Bad(_) => [0.0; MAX_ROBOT_JOINTS],
         };
         let moved = self.robot.step(&velocity, self.tick_seconds);
@@ -312,14 +320,20 @@ impl Cycle {
         heard
     }
 
-    /// Counts bad cycles; returns whether this one reached the limit.
-    fn comparator(&mut self, bad: Option<BadCycle>) -> bool {
+    /// Counts bad cycles; returns whether this one halts the robot.
+    fn count(&mut self, bad: Option<BadCycle>, now: Micros) -> bool {
         let Some(why) = bad else {
             self.bad_in_a_row = 0;
+            self.good_in_a_row = self.good_in_a_row.saturating_add(1);
+            // It has begun when it has answered as often in a row as it may fail later.
+            self.starts = self.starts.filter(|_| self.good_in_a_row < self.safety.bad_cycles);
             return false;
         };
+        self.good_in_a_row = 0;
         self.bad_in_a_row = self.bad_in_a_row.saturating_add(1);
-        let halt = self.bad_in_a_row >= self.safety.bad_cycles && self.halted.is_none();
+        let begins = matches!(why, BadCycle::NoPeer | BadCycle::NoAnswer)
+            && self.starts.is_some_and(|until| now < until);
+        let halt = self.bad_in_a_row >= self.safety.bad_cycles && !begins && self.halted.is_none();
         if halt {
             self.halted = Some(Halt::BadCycles(why));
         }

@@ -22,7 +22,7 @@ pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>
         (MotionKind::Kinesthetic, ControllerKind::Kinesthetic { inertia, damping }) => {
             Box::new(Kinesthetic::with(skin, inertia, damping))
         }
-        (MotionKind::Kinesthetic, ControllerKind::External { socket }) => {
+        (MotionKind::Kinesthetic, ControllerKind::External { socket, .. }) => {
             Box::new(External::listen(Path::new(socket), skin)?)
         }
     })

@@ -5,6 +5,7 @@ use super::{Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing, ra
 use crate::document::{Fault, Place};
 use crate::fixed::Q;
 use crate::parameters::Contact;
+use crate::time::Span;
 
 pub(super) type Checked<T> = Result<T, Fault>;
 
@@ -118,8 +119,9 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
         values.map_or_else(|| Ok(vec![usual; joints]), |values| each_positive(key, values))
     };
     let kind = if at.key("kind").word(&raw.kind, &[("kinesthetic", true), ("external", false)])? {
-        if raw.socket.is_some() {
-            return Err(at.key("socket").fault("", "only with kind = \"external\""));
+        let external = [("socket", raw.socket.is_some()), ("start_s", raw.start_s.is_some())];
+        if let Some((key, _)) = external.into_iter().find(|(_, is_there)| *is_there) {
+            return Err(at.key(key).fault("", "only with kind = \"external\""));
         }
         ControllerKind::Kinesthetic {
             inertia: each_or("inertia", raw.inertia, 1.0)?,
@@ -131,7 +133,14 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
             return Err(at.key("kind").fault("\"external\"", why));
         }
         let why = "the path of a Unix socket is needed with kind = \"external\"";
-        ControllerKind::External { socket: raw.socket.ok_or_else(|| at.key("socket").fault("", why))? }
+        let start_s = raw.start_s.unwrap_or(5.0);
+        if !(0.0..=3_600.0).contains(&start_s) {
+            return Err(at.key("start_s").fault(start_s, "0 to 3600 s are possible"));
+        }
+        ControllerKind::External {
+            socket: raw.socket.ok_or_else(|| at.key("socket").fault("", why))?,
+            start: micros(start_s),
+        }
     };
     let max_speed = match (raw.max_speed, raw.max_speed_rad_s) {
         (Some(_), Some(_)) => {
@@ -142,6 +151,11 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
         (given, None) => each_or("max_speed", given, 2.0)?,
     };
     Ok(Controller { kind, max_speed })
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within an hour")]
+fn micros(seconds: f64) -> Span {
+    Span((seconds * 1e6).round() as u64)
 }
 
 fn safety(raw: &raw::Safety) -> Checked<Safety> {

@@ -20,6 +20,7 @@ use crate::fixed::{Q1_14, TorqueFormat};
 use crate::id::CellId;
 use crate::packet::Length;
 use crate::parameters::{Contact, Events, Parameters, Pose, Row, Sensing};
+use crate::time::Span;
 
 pub use reach::{REACH, reach};
 pub use robot::{Base, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
@@ -133,6 +134,8 @@ pub enum ControllerKind {
     External {
         /// Path of the socket that the gateway listens on.
         socket: String,
+        /// How long it may take to begin: until then it may be missing, and the robot stands.
+        start: Span,
     },
 }
 

@@ -178,12 +178,21 @@ pub(super) struct Controller {
     pub(super) max_speed: Option<Vec<f64>>,
     pub(super) max_speed_rad_s: Option<Vec<f64>>,
     pub(super) socket: Option<String>,
+    pub(super) start_s: Option<f64>,
 }
 
 impl Default for Controller {
     fn default() -> Self {
         let kind = "kinesthetic".to_owned();
-        Self { kind, inertia: None, damping: None, max_speed: None, max_speed_rad_s: None, socket: None }
+        Self {
+            kind,
+            inertia: None,
+            damping: None,
+            max_speed: None,
+            max_speed_rad_s: None,
+            socket: None,
+            start_s: None,
+        }
     }
 }
 

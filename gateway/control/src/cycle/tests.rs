@@ -3,6 +3,7 @@ use crate::controller::Kinesthetic;
 use crate::robot::SimulatedArm;
 use model::table::Sums;
 use model::testing;
+use protocol::time::Span;
 
 struct Dead;
 
@@ -54,6 +55,50 @@ fn bad_cycles_in_a_row_halt_once_and_a_resume_releases() {
     bus.halts = 1;
     let halted = cycle.tick(tick(100), 0, [works(&bus)]);
     assert_eq!((halted.record.halted, halted.command), (Some(Halt::Frame), Some(Command::Halt)));
+}
+
+/// Misses its answers as often as it is told to, again and again after as many good ones.
+struct Absent {
+    misses: Vec<u64>,
+    ticks: u64,
+}
+
+impl Controller for Absent {
+    fn step(&mut self, _: &Input) -> Step {
+        self.ticks += 1;
+        let moves = [0.5; MAX_ROBOT_JOINTS];
+        if self.misses.contains(&self.ticks) { Step::Bad(BadCycle::NoAnswer) } else { Step::Move(moves) }
+    }
+}
+
+#[test]
+fn another_program_may_take_its_time_to_begin() {
+    let mut skin = testing::skin();
+    let limit = u64::from(skin.safety.bad_cycles);
+    let kind = |start| ControllerKind::External { socket: "arm.sock".to_owned(), start };
+    let halts = |skin: &Skin, misses: Vec<u64>| {
+        let robot = SimulatedArm::new(skin, [0.0; MAX_ROBOT_JOINTS]);
+        let mut cycle = Cycle::new(skin, Box::new(Absent { misses, ticks: 0 }), Box::new(robot));
+        let bus = Sums::default();
+        let records: Vec<_> =
+            (0..3_000).map(|number| cycle.tick(tick(number), 0, [works(&bus)]).record).collect();
+        let halted = records.iter().position(|record| record.halted.is_some()).map(|tick| tick as u64);
+        (halted, records)
+    };
+    skin.controller.kind = kind(Span::from_millis(4_000));
+    // Nobody comes for 3 s, answers a few times and is away again for longer than is tolerated later.
+    let late: Vec<_> = (1..=1_500).chain(1_510..=1_800).collect();
+    let (halted, records) = halts(&skin, late);
+    assert_eq!(halted, None);
+    assert_eq!(records[1_499].command, [0.0; MAX_ROBOT_JOINTS]);
+    assert_eq!(records[1_509].command[..6], [0.5; 6], "it goes on as it was, for a while");
+    assert_eq!(records[1_700].command, [0.0; MAX_ROBOT_JOINTS], "then it stands");
+    assert_eq!(halts(&skin, (1..=3_000).collect()).0, Some(2_000), "the time is over");
+    // Once it has begun it is judged as ever, also within the time.
+    let begun = (limit + 1..=3_000).collect();
+    assert_eq!(halts(&skin, begun).0, Some(2 * limit - 1));
+    skin.controller.kind = kind(Span(0));
+    assert_eq!(halts(&skin, (1..=3_000).collect()).0, Some(limit - 1));
 }
 
 #[test]

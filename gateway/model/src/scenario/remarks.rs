@@ -18,7 +18,7 @@ impl Scenario {
 }
 
 fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
-    let ControllerKind::External { socket } = &skin.controller.kind else { return None };
+    let ControllerKind::External { socket, .. } = &skin.controller.kind else { return None };
     let unused = !matches!(motion, MotionKind::Kinesthetic);
     unused.then(|| {
         format!(
