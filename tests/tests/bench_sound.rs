@@ -152,7 +152,7 @@ fn cells_answer_in_a_few_microseconds_of_virtual_time() {
     (0..4).for_each(|place| bench.press(place, 1.0));
     bench.run_epochs(50);
     bench.finish();
-    let last = bench.gateway.table.last_reply();
+    let last = bench.gateway.table.delays().of_last_replies();
     assert!(last.len() > 49 && last.max() < 500, "{} {}", last.len(), last.max());
     assert_eq!(bench.epoch(), Span(16_000));
 }

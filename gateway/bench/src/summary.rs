@@ -308,6 +308,10 @@ pub struct BusSummary {
     pub dropped_by_bus: u64,
     /// From a broadcast to its last reply in time, by the kernel's time stamps.
     pub last_reply_us: Quantiles,
+    /// From a broadcast to each reply, late ones included.
+    pub reply_us: Quantiles,
+    /// At heartbeats, for how long joints had stood on the bus that the cell had not taken.
+    pub joints_not_taken_us: Quantiles,
 }
 
 impl BusSummary {
@@ -356,7 +360,9 @@ impl BusSummary {
             sent: kinds(&|kind| counters.sent(kind)),
             events: events.filter(|(_, count)| *count > 0).collect(),
             dropped_by_bus: dropped,
-            last_reply_us: Quantiles::of(table.last_reply(), 1.0),
+            last_reply_us: Quantiles::of(table.delays().of_last_replies(), 1.0),
+            reply_us: Quantiles::of(table.delays().of_replies(), 1.0),
+            joints_not_taken_us: Quantiles::of(table.delays().of_joints_not_taken(), 1.0),
         }
     }
 }

@@ -140,6 +140,7 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
             }
         }
         rows.row("last sum after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
+        hearing(rows, bus);
         return;
     }
     rows.row("replies due", replies.due, complete);
@@ -148,6 +149,14 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, spoken(why)));
     rows.row("  missing", missing, explained(&reasons, replies.unknown));
     rows.row("last reply after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
+    rows.row("  each reply, µs", quantiles(&bus.reply_us), "late ones included");
+    hearing(rows, bus);
+}
+
+/// How late cells hear what stands on the bus.
+fn hearing(rows: &mut Rows, bus: &BusSummary) {
+    let why = "late here: the machine; lost above: the bus";
+    rows.row("joints not yet taken at heartbeats, µs", quantiles(&bus.joints_not_taken_us), why);
 }
 
 /// A key of the summary in words.

@@ -3,7 +3,7 @@
 use protocol::message::Joints;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
-use protocol::time::Micros;
+use protocol::time::{Micros, Span};
 
 use super::Table;
 use super::cell::Cell;
@@ -18,8 +18,8 @@ pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; MAX_JOINTS]> + 'a;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Broadcast {
     pub(super) epoch: Epoch,
-    /// The epochs that may still be answered, in the order in which the bus carried them, newest first.
-    recent: [Option<Epoch>; LATEST + 1],
+    /// The epochs that may still be answered and when they stood on the bus, in that order, newest first.
+    recent: [Option<(Epoch, Micros)>; LATEST + 1],
     /// Broadcasts before this one.
     pub(super) number: u64,
     at: Micros,
@@ -41,7 +41,22 @@ impl Broadcast {
     /// How many broadcasts before the newest one that of an epoch was, if it may still be answered. Not by the epochs'
     /// difference: broadcasts may be lost on the way back, or change places.
     pub(super) fn lag(&self, epoch: Epoch) -> Option<usize> {
-        self.recent.iter().flatten().position(|&recent| recent == epoch)
+        self.recent.iter().flatten().position(|&(recent, _)| recent == epoch)
+    }
+
+    /// When the broadcast `lag` before the newest stood on the bus.
+    pub(super) fn stood_at(&self, lag: usize) -> Micros {
+        self.recent.get(lag).copied().flatten().map_or(self.at, |(_, at)| at)
+    }
+
+    /// For how long, at `now`, joints had stood on the bus that a cell had not taken which took `taken` last. Of more than a
+    /// few, since the oldest of these.
+    pub(super) fn not_taken_for(&self, taken: Epoch, now: Micros) -> Span {
+        let recent = self.recent.iter().flatten().count();
+        self.lag(taken)
+            .unwrap_or(recent)
+            .checked_sub(1)
+            .map_or(Span(0), |first| now.since(self.stood_at(first)))
     }
 
     /// Its number, its epoch, and when it stood on the bus.
@@ -72,7 +87,7 @@ impl Table {
         let mut recent = self.broadcast.map_or([None; LATEST + 1], |before| before.recent);
         recent.rotate_right(1);
         if let Some(newest) = recent.first_mut() {
-            *newest = Some(epoch);
+            *newest = Some((epoch, at));
         }
         self.close_epoch();
         self.release_decayed(epoch);
@@ -119,8 +134,7 @@ impl Table {
     pub(super) fn close_epoch(&mut self) {
         let Some(before) = self.broadcast else { return };
         if let Some(last) = before.last_reply {
-            // The histogram grows by itself; it cannot refuse.
-            let _ = self.last_reply.record(last.since(before.at).0);
+            self.delays.last_reply(last.since(before.at));
         }
         if let Some(root_totals) = &mut self.root_totals {
             let (due, complete) = root_totals.close();
@@ -145,7 +159,7 @@ impl Table {
     fn release_decayed(&mut self, epoch: Epoch) {
         // Broadcasts may change places on the way back: the newest is not always the last that came.
         let recent = self.broadcast.iter().flat_map(|broadcast| broadcast.recent.into_iter().flatten());
-        let gap = recent.map(|before| epoch.since(before)).min().unwrap_or(0);
+        let gap = recent.map(|(before, _)| epoch.since(before)).min().unwrap_or(0);
         let over = i64::from(gap) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1;
         if core::mem::take(&mut self.interrupted) || over {
             self.each_cell(Cell::release);

@@ -80,7 +80,9 @@ impl Table {
         }
         if let Message::Network { epoch, page, .. } = *message {
             match page {
-                NetworkPage::Heartbeat(heartbeat) => self.take_heartbeat(place, &update, &heartbeat, epoch),
+                NetworkPage::Heartbeat(heartbeat) => {
+                    self.take_heartbeat(at, place, &update, &heartbeat, epoch)
+                }
                 NetworkPage::Heard(_) => {
                     cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.since(epoch)));
                 }
@@ -98,8 +100,21 @@ impl Table {
         }
     }
 
-    fn take_heartbeat(&mut self, place: usize, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) {
+    fn take_heartbeat(
+        &mut self,
+        at: Micros,
+        place: usize,
+        update: &Update,
+        heartbeat: &Heartbeat,
+        epoch: Epoch,
+    ) {
         let Some(cell) = self.cells.get_mut(place) else { return };
+        let takes_joints = update.word == Some(Word::Known)
+            && !heartbeat.state.has(State::CLAIMING)
+            && !heartbeat.state.has(State::HALTED);
+        if takes_joints && let Some(broadcast) = &self.broadcast {
+            self.delays.not_taken(broadcast.not_taken_for(epoch, at));
+        }
         if heartbeat.state.has(State::DUPLICATE) {
             self.counters.count(Event::Duplicate);
             self.notices.push_back(Notice::Duplicate(cell.node));
@@ -139,6 +154,7 @@ impl Table {
         }
         let format = self.carried.torque_format;
         let was_due = cell.answer(number, lag);
+        self.delays.reply(at.since(broadcast.stood_at(lag)));
         if lag == 0 {
             broadcast.last_reply = Some(at);
             broadcast.in_time += u32::from(was_due);

@@ -12,6 +12,7 @@
 mod accuracy;
 mod cell;
 mod counters;
+mod delays;
 mod epoch;
 mod hear;
 mod held;
@@ -22,7 +23,6 @@ mod switched;
 
 use std::collections::{BTreeMap, VecDeque};
 
-use hdrhistogram::Histogram;
 use protocol::can::{Format, Frame};
 use protocol::fixed::TorqueFormat;
 use protocol::id::{CellId, Command, Id, Kind, Node};
@@ -34,7 +34,6 @@ use protocol::time::Micros;
 
 use crate::central::Central;
 use crate::network::check::Seen;
-use crate::quantiles::histogram;
 
 use epoch::Broadcast;
 use held::{Change, to_nm};
@@ -44,6 +43,7 @@ use switched::Switched;
 pub use accuracy::{Accuracy, Errors, Rounded};
 pub use cell::{Cell, Said, Status};
 pub use counters::{Counters, Event};
+pub use delays::Delays;
 pub use epoch::Positions;
 pub use replies::Replies;
 pub use root_totals::{Contributions, SumCounts};
@@ -138,7 +138,7 @@ pub struct Table {
     accuracy: Accuracy,
     /// Of the epoch that was closed last, see [`Table::difference`].
     difference: Option<[f64; MAX_JOINTS]>,
-    last_reply: Histogram<u64>,
+    delays: Delays,
     notices: VecDeque<Notice>,
 }
 
@@ -194,7 +194,7 @@ impl Table {
             counters: Counters::default(),
             accuracy: Accuracy::default(),
             difference: None,
-            last_reply: histogram(),
+            delays: Delays::default(),
             notices: VecDeque::new(),
         }
     }
@@ -291,10 +291,10 @@ impl Table {
         self.unknown_nodes.iter().map(|(node, heartbeat)| (*node, heartbeat))
     }
 
-    /// From a broadcast to its last reply in time, in µs, for each epoch with a reply.
+    /// How long cells take.
     #[must_use]
-    pub const fn last_reply(&self) -> &Histogram<u64> {
-        &self.last_reply
+    pub const fn delays(&self) -> &Delays {
+        &self.delays
     }
 
     /// The notices, oldest first, each once.
@@ -396,7 +396,7 @@ impl Table {
             *root_totals = RootTotals::default();
         }
         (self.counters, self.accuracy) = (Counters::default(), Accuracy::default());
-        self.last_reply.reset();
+        self.delays.reset();
         self.notices.clear();
     }
 

@@ -69,7 +69,7 @@ impl Draft<'_> {
         let row = |bus_figures: &LinkId| {
             let account = bus_figures.account();
             let counters = bus_figures.table.counters();
-            let reply = Quantiles::of(bus_figures.table.last_reply(), 1.0);
+            let reply = Quantiles::of(bus_figures.table.delays().of_last_replies(), 1.0);
             let numbers = [
                 account.due,
                 account.in_time,
