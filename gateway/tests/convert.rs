@@ -161,6 +161,22 @@ fn what_is_no_capture_is_refused_by_its_name() {
          lines like `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`"
     );
     assert!(folder.refuses("convert run.pcapng run.mcap", 2).contains("is a packet capture"));
+    for (name, begins, what) in [
+        ("drive.mf4", "UnFinMF 4.11", "is an MDF file"),
+        (
+            "drive.asc",
+            "date Wed Jan 1 10:00:00.000 2025\nbase hex  timestamps absolute\n",
+            "is a Vector ASC log",
+        ),
+        ("drive.trc", ";$FILEVERSION=2.1\n;$STARTTIME=45000.5\n", "is a PEAK trace"),
+        ("drive.csv", "timestamp,arbitration_id,extended,remote,error,dlc,data\n", "is a table in CSV"),
+        ("edge.csv", "TimestampEpoch;BusChannel;ID;IDE;DLC\n1.0;1;123;0;8\n", "is a table in CSV"),
+        ("lfs.mcap", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "is a Git LFS pointer"),
+    ] {
+        std::fs::write(folder.path(name), begins).unwrap();
+        let said = folder.refuses(&format!("convert {name} run.mcap"), 2);
+        assert!(said.contains(what) && said.contains("can_logconvert") | said.contains("git lfs"), "{said}");
+    }
     assert_eq!(
         folder.refuses("convert empty.mcap run.log", 1),
         "gateway: empty.mcap: there is no frame in it"

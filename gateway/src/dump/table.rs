@@ -2,6 +2,7 @@
 
 use analysis::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, Report};
 use comfy_table::Table;
+use model::decode::ErrorFrame;
 use trace::capture::{Extras, Topic};
 
 use crate::print::{self, Rows, decimals, filled, list, or, words};
@@ -93,7 +94,8 @@ fn foreign(bus: &BusReport) -> Table {
             FrameType::Data if id.wrong_crc > 0 => format!("{} wrong CRC", id.wrong_crc),
             FrameType::Data => String::new(),
             FrameType::Remote => "remote".to_owned(),
-            FrameType::Error => "error".to_owned(),
+            FrameType::Error => u32::from_str_radix(&id.id, 16)
+                .map_or_else(|_| String::new(), |bits| ErrorFrame::of_id(bits).to_string()),
         };
         let [first, last] = [id.first_s, id.last_s].map(|s| format!("{s:.3}"));
         vec![id.id.clone(), id.frames.to_string(), decimals(id.frames_per_s, 1, ""), first, last, bytes, what]

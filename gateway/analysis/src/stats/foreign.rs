@@ -91,7 +91,7 @@ pub struct ForeignId {
 impl Foreigners {
     pub(super) fn take(&mut self, nanos: u64, frame: &Frame, why: Foreign) {
         let of = match why {
-            Foreign::Error => FrameType::Error,
+            Foreign::Error(_) => FrameType::Error,
             Foreign::Remote => FrameType::Remote,
             Foreign::Extended | Foreign::Data(_) => FrameType::Data,
         };
@@ -99,7 +99,7 @@ impl Foreigners {
         self.tried += match why {
             Foreign::Data(PacketError::Crc { .. }) => 1,
             Foreign::Data(PacketError::Incomplete) => groups(frame),
-            Foreign::Data(_) | Foreign::Extended | Foreign::Remote | Foreign::Error => 0,
+            Foreign::Data(_) | Foreign::Extended | Foreign::Remote | Foreign::Error(_) => 0,
         };
         let key = (of, frame.raw_id());
         if self.identifiers.len() == IDENTIFIERS && !self.identifiers.contains_key(&key) {

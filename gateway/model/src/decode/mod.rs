@@ -10,6 +10,7 @@
 //! `ok`, `segment` (a frame before the last of a packet; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`, `ambiguous`; a packet
 //! without a known meaning: `meaning`.
 
+mod error_frame;
 pub mod json;
 pub mod parameter;
 pub mod pick;
@@ -17,6 +18,7 @@ pub mod settle;
 mod text;
 mod wires;
 
+pub use error_frame::ErrorFrame;
 pub use text::InUnits;
 
 use protocol::can::{Format, Frame};
@@ -73,17 +75,17 @@ pub enum Foreign {
     #[error("remote frame")]
     Remote,
     /// The driver's report of an error.
-    #[error("error frame of the driver")]
-    Error,
+    #[error("error frame: {0}")]
+    Error(ErrorFrame),
     /// A data frame with an 11-bit identifier under which no packets come.
     #[error("no packet: {0}")]
     Data(PacketError),
 }
 
 impl Foreign {
-    const fn of(frame: &Frame) -> Self {
+    fn of(frame: &Frame) -> Self {
         if frame.is_error() {
-            Self::Error
+            Self::Error(ErrorFrame::of(frame))
         } else if frame.is_remote() {
             Self::Remote
         } else {

@@ -381,7 +381,20 @@ fn messages_over_wires_have_their_text() {
 fn foreign_frames_have_a_reason() {
     assert_eq!(text("1F334455#11"), "foreign 29-bit identifier");
     assert_eq!(text("20C#R8"), "foreign remote frame");
-    assert_eq!(text("20000004#0001000000000000"), "foreign error frame of the driver");
+    for (frame, expected) in [
+        ("20000004#0001000000000000", "controller-problem{rx-overflow}"),
+        (
+            "20000204#000C000000008060",
+            "controller-problem{rx-error-warning,tx-error-warning},error-counter-tx-rx{128}{96}",
+        ),
+        ("20000088#0000041900000000", "protocol-violation{bit-stuffing-error}{location 0x19},bus-error"),
+        ("20000002#0500000000000000", "lost-arbitration{at bit 5}"),
+        ("20000060#0000000000000000", "no-acknowledgement-on-tx,bus-off"),
+        ("20000000#0000000000000000", "class 0x0"),
+        ("20000004#", "controller-problem"),
+    ] {
+        assert_eq!(text(frame), format!("foreign error frame: {expected}"));
+    }
 }
 
 #[test]

@@ -23,7 +23,16 @@ const MAGIC: &[(&[u8], Kind)] = &[
     (b"\xA1\xB2\x3C\x4D", PCAP),
     (b"\x0A\x0D\x0D\x0A", PCAP),
     (b"LOGG", Kind::Other("a BLF file", EXPORT)),
-    (b"MDF  ", Kind::Other("an MDF file", EXPORT)),
+    (b"MDF  ", MDF),
+    (b"UnFinMF ", MDF),
+    (b"date ", Kind::Other("a Vector ASC log", EXPORT)),
+    (b";$FILEVERSION", TRC),
+    (b"\xEF\xBB\xBF;$FILEVERSION", TRC),
+    (b"timestamp", CSV),
+    (b"Timestamp", CSV),
+    (b"Time Stamp", CSV),
+    (b"\xEF\xBB\xBFTime", CSV),
+    (b"version https://git-lfs", Kind::Other("a Git LFS pointer to a file", "fetch it with `git lfs pull`")),
     (b"#ROSBAG V", Kind::Other("a ROS 1 bag", "make an MCAP of it")),
     (
         b"SQLite format 3",
@@ -33,7 +42,18 @@ const MAGIC: &[(&[u8], Kind)] = &[
     (b"\xFE\xFF", UTF_16),
 ];
 
-const PCAP: Kind = Kind::Other("a packet capture", "take the capture as a candump log (candump -l)");
+const MDF: Kind = Kind::Other("an MDF file", EXPORT);
+const TRC: Kind = Kind::Other("a PEAK trace", EXPORT);
+const CSV: Kind = Kind::Other(
+    "a table in CSV",
+    "python-can's can_logconvert makes a candump log of its own tables; of others write lines like \
+     `(1700000000.123456) can0 123#00`",
+);
+const PCAP: Kind = Kind::Other(
+    "a packet capture",
+    "write lines like `(1700000000.123456) can0 123#00` from what `tshark -T fields -e frame.time_epoch -e can.id \
+     -e data.data -r FILE` shows, or take the capture with `candump -l`",
+);
 const UTF_16: Kind = Kind::Other("text in UTF-16", "save it as UTF-8");
 
 /// What is read as a capture.

@@ -1,0 +1,100 @@
+//! What a driver's error frame reports, in candump's words (`include/linux/can/error.h`).
+
+use core::fmt::{Display, Formatter, Result};
+
+use protocol::can::Frame;
+
+/// The bits of the identifier.
+const CLASSES: [&str; 10] = [
+    "tx-timeout",
+    "lost-arbitration",
+    "controller-problem",
+    "protocol-violation",
+    "transceiver-status",
+    "no-acknowledgement-on-tx",
+    "bus-off",
+    "bus-error",
+    "restarted-after-bus-off",
+    "error-counter-tx-rx",
+];
+const LOST_ARBITRATION: u32 = 1 << 1;
+const CONTROLLER: u32 = 1 << 2;
+const PROTOCOL: u32 = 1 << 3;
+const TRANSCEIVER: u32 = 1 << 4;
+const COUNTERS: u32 = 1 << 9;
+
+/// The bits of data byte 1.
+const CONTROLLER_PROBLEMS: [&str; 7] = [
+    "rx-overflow",
+    "tx-overflow",
+    "rx-error-warning",
+    "tx-error-warning",
+    "rx-error-passive",
+    "tx-error-passive",
+    "back-to-error-active",
+];
+
+/// The bits of data byte 2.
+const VIOLATIONS: [&str; 8] = [
+    "single-bit-error",
+    "frame-format-error",
+    "bit-stuffing-error",
+    "tx-dominant-bit-error",
+    "tx-recessive-bit-error",
+    "bus-overload",
+    "active-error",
+    "error-on-tx",
+];
+
+/// What an error frame reports.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct ErrorFrame {
+    classes: u32,
+    data: [u8; 8],
+}
+
+impl ErrorFrame {
+    pub(super) fn of(frame: &Frame) -> Self {
+        let mut data = [0; 8];
+        data.iter_mut().zip(frame.data()).for_each(|(byte, got)| *byte = *got);
+        Self { classes: frame.id(), data }
+    }
+
+    /// What an identifier alone reports.
+    #[must_use]
+    pub const fn of_id(id: u32) -> Self {
+        Self { classes: id & 0x1FFF_FFFF, data: [0; 8] }
+    }
+}
+
+/// The names of the bits that are set.
+fn names<'a>(bits: u32, names: &'a [&str]) -> impl Iterator<Item = &'a str> {
+    names.iter().enumerate().filter(move |(bit, _)| bits >> bit & 1 != 0).map(|(_, name)| *name)
+}
+
+impl Display for ErrorFrame {
+    fn fmt(&self, f: &mut Formatter<'_>) -> Result {
+        let [arbitration, controller, violation, place, transceiver, _, tx, rx] = self.data;
+        let details = |bits: u8, all: &[&str]| names(bits.into(), all).collect::<Vec<_>>().join(",");
+        let mut is_first = true;
+        for (bit, name) in (0..).zip(CLASSES) {
+            let class = self.classes & 1 << bit;
+            if class == 0 {
+                continue;
+            }
+            let more = match class {
+                LOST_ARBITRATION if arbitration > 0 => format!("{{at bit {arbitration}}}"),
+                CONTROLLER if controller > 0 => format!("{{{}}}", details(controller, &CONTROLLER_PROBLEMS)),
+                PROTOCOL if violation > 0 || place > 0 => {
+                    format!("{{{}}}{{location 0x{place:02X}}}", details(violation, &VIOLATIONS))
+                }
+                TRANSCEIVER if transceiver > 0 => format!("{{0x{transceiver:02X}}}"),
+                COUNTERS => format!("{{{tx}}}{{{rx}}}"),
+                _ => String::new(),
+            };
+            let comma = if core::mem::take(&mut is_first) { "" } else { "," };
+            write!(f, "{comma}{name}{more}")?;
+        }
+        if is_first { write!(f, "class 0x{:X}", self.classes) } else { Ok(()) }
+    }
+}
