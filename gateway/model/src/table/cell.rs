@@ -400,6 +400,15 @@ impl Cell {
         self.contact.reset();
     }
 
+    /// Another sender wrote what it answers, or whether it obeys stimuli: what it is due to answer is unknown until the next
+    /// stimulus.
+    pub(super) fn switched_by_others(&mut self) {
+        let due = self.outstanding.clear();
+        // A due contribution to a sum is missing there.
+        self.replies.miss(if self.sums.is_some() { 0 } else { due }, true);
+        self.contact.reset();
+    }
+
     /// Nothing more will come: outstanding replies are missing.
     pub(super) fn settle(&mut self) {
         self.tracked.account.finish();

@@ -30,11 +30,13 @@ pub enum Event {
     Duplicate,
     /// Another gateway.
     OtherGateway,
+    /// Another sender wrote what a cell answers, or whether it obeys stimuli.
+    Switched,
 }
 
 impl Event {
     /// All events, in the order of their counters.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::Length,
         Self::Crc,
         Self::Meaning,
@@ -47,6 +49,7 @@ impl Event {
         Self::Saturated,
         Self::Duplicate,
         Self::OtherGateway,
+        Self::Switched,
     ];
 
     /// The name that tables and summaries use.
@@ -65,6 +68,7 @@ impl Event {
             Self::Saturated => "saturated",
             Self::Duplicate => "duplicate number",
             Self::OtherGateway => "second gateway",
+            Self::Switched => "switched by others",
         }
     }
 }

@@ -1,8 +1,9 @@
 //! Frames on the bus, and their effects on the table.
 
 use protocol::id::{Id, Node};
-use protocol::message::{From, Heartbeat, Message, NetworkPage, SensorPage, State};
+use protocol::message::{From, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::{Epoch, Words};
+use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use super::cell::Cell;
@@ -10,6 +11,9 @@ use super::held::Change;
 use super::root_totals::{RootTotals, Sum, Taken};
 use super::{Event, Notice, Positions, Table};
 use crate::tracker::{Update, Word};
+
+/// What decides about a cell's answers and takes effect at once.
+const SWITCHED: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
 
 impl Table {
     /// A frame of this gateway, read back from the bus.
@@ -31,11 +35,15 @@ impl Table {
     pub(super) fn hear(&mut self, at: Micros, id: Id, message: &Message) {
         // Messages of a gateway may also come from a command line.
         match *message {
-            Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } => {
+            Message::Joints { .. } => {
                 self.counters.count(Event::OtherGateway);
-                self.snapshot.sums.other_gateways += 1;
-                self.notices.push_back(Notice::OtherGateway);
+                // A gateway goes on; a frame of its kind may come from anybody.
+                if self.outsiders.joints_at(at) {
+                    self.snapshot.sums.other_gateways += 1;
+                    self.notices.push_back(Notice::OtherGateway);
+                }
             }
+            Message::Network { from: Node::Gateway, .. } => self.counters.count(Event::OtherGateway),
             Message::Halt => {
                 self.snapshot.sums.halts += 1;
                 self.each_cell(Cell::halt);
@@ -45,6 +53,12 @@ impl Table {
                 self.cells.iter_mut().for_each(Cell::resume);
             }
             Message::Stimulus { to, from, page } => self.stimulate(to, from, page),
+            Message::Configure { to, request: Request::Write { number, .. }, .. }
+                if SWITCHED.iter().any(|parameter| parameter.number() == number) =>
+            {
+                self.counters.count(Event::Switched);
+                self.cells.iter_mut().filter(|cell| to.names(cell.node)).for_each(Cell::switched_by_others);
+            }
             Message::Sync | Message::Report | Message::Configure { .. } => {}
             Message::Sum { .. }
             | Message::Torque { .. }
@@ -68,7 +82,7 @@ impl Table {
                 from: Node::Cell(node), page: NetworkPage::Heartbeat(heartbeat), ..
             } = *message
             {
-                self.unknown_nodes.insert(node, heartbeat);
+                self.outsiders.nodes.insert(node, heartbeat);
             }
             return;
         };

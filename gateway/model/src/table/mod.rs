@@ -16,12 +16,13 @@ mod delays;
 mod epoch;
 mod hear;
 mod held;
+mod outsiders;
 mod replies;
 mod root_totals;
 mod sensed;
 mod switched;
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 
 use protocol::can::{Format, Frame};
 use protocol::fixed::TorqueFormat;
@@ -37,6 +38,7 @@ use crate::network::check::Seen;
 
 use epoch::Broadcast;
 use held::{Change, to_nm};
+use outsiders::Outsiders;
 use root_totals::RootTotals;
 use switched::Switched;
 
@@ -71,7 +73,7 @@ pub struct Sums {
     pub halts: u32,
     /// Resumes on the bus that this gateway did not send.
     pub resumes: u32,
-    /// Frames of another gateway.
+    /// Joints of another gateway that goes on.
     pub other_gateways: u32,
 }
 
@@ -127,8 +129,7 @@ pub struct Table {
     broadcast: Option<Broadcast>,
     /// Sums along the tree, where cells answer with them.
     root_totals: Option<RootTotals>,
-    /// Nodes that the skin does not have, each with its last heartbeat.
-    unknown_nodes: BTreeMap<CellId, Heartbeat>,
+    outsiders: Outsiders,
     /// The bus was lost since the last broadcast.
     interrupted: bool,
     /// In whole steps, so that the sum never drifts.
@@ -187,7 +188,7 @@ impl Table {
             segments: vec![Segment::NONE; 1 << 11],
             broadcast: None,
             root_totals: summed.then(RootTotals::default),
-            unknown_nodes: BTreeMap::new(),
+            outsiders: Outsiders::default(),
             interrupted: false,
             sum: [0; MAX_JOINTS],
             snapshot,
@@ -288,7 +289,7 @@ impl Table {
 
     /// Nodes that send and that the skin does not have, each with its last heartbeat.
     pub fn unknown_nodes(&self) -> impl Iterator<Item = (CellId, &Heartbeat)> {
-        self.unknown_nodes.iter().map(|(node, heartbeat)| (*node, heartbeat))
+        self.outsiders.nodes.iter().map(|(node, heartbeat)| (*node, heartbeat))
     }
 
     /// How long cells take.

@@ -1,0 +1,32 @@
+//! Senders that are not of this bench.
+
+use std::collections::BTreeMap;
+
+use protocol::id::CellId;
+use protocol::message::Heartbeat;
+use protocol::time::{Micros, Span};
+
+/// So many joints of another sender within [`WITHIN`] are a gateway's.
+const JOINTS: usize = 4;
+/// The slowest gateway sends fifteen in it.
+const WITHIN: Span = Span::from_millis(1_000);
+
+/// What others send.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Outsiders {
+    /// Nodes that the skin does not have, each with its last heartbeat.
+    pub(super) nodes: BTreeMap<CellId, Heartbeat>,
+    /// When the last joints came, newest first.
+    joints: [Option<Micros>; JOINTS],
+}
+
+impl Outsiders {
+    /// Takes joints of another sender; whether a gateway sends them.
+    pub(super) fn joints_at(&mut self, at: Micros) -> bool {
+        self.joints.rotate_right(1);
+        if let Some(newest) = self.joints.first_mut() {
+            *newest = Some(at);
+        }
+        self.joints.last().copied().flatten().is_some_and(|oldest| at.since(oldest) <= WITHIN)
+    }
+}
