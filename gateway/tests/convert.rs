@@ -173,7 +173,7 @@ fn what_is_no_capture_is_refused_by_its_name() {
         ("edge.csv", "TimestampEpoch;BusChannel;ID;IDE;DLC\n1.0;1;123;0;8\n", "is a table in CSV"),
         ("lfs.mcap", "version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "is a Git LFS pointer"),
     ] {
-        std::fs::write(folder.path(name), begins).unwrap();
+        fs::write(folder.path(name), begins).unwrap();
         let said = folder.refuses(&format!("convert {name} run.mcap"), 2);
         assert!(said.contains(what) && said.contains("can_logconvert") | said.contains("git lfs"), "{said}");
     }
