@@ -44,8 +44,13 @@ impl Beginning {
         Some(Self { factory, identity, held })
     }
 
-    /// The node that begins now. It takes more than a third of a small microcontroller's memory: let it stay where it is
-    /// built.
+    /// What the factory wrote.
+    #[must_use]
+    pub const fn factory(&self) -> &Factory {
+        &self.factory
+    }
+
+    /// The node that begins now.
     #[must_use]
     pub fn node(&self, now: Micros) -> Node {
         // There are no sensors on these boards: contacts come as stimuli.
@@ -55,8 +60,7 @@ impl Beginning {
 
 impl<'a, B: Board> Cell<'a, B> {
     /// A cell that starts now, and joins its bus.
-    pub fn start(mut board: B, beginning: &Beginning, node: &'a mut Node) -> Self {
-        let factory = beginning.factory;
+    pub fn start(mut board: B, factory: Factory, node: &'a mut Node) -> Self {
         board.open(&factory);
         let wired = factory.link_ids.iter().enumerate();
         let wired = wired.fold(0, |wired, (port, link_id)| wired | u8::from(link_id.is_some()) << port);
