@@ -33,7 +33,9 @@ mod start {
     fn begin<'a>(board: &mut Chosen, place: &'a mut MaybeUninit<Node>) -> Option<(Factory, &'a mut Node)> {
         let beginning = Beginning::read(board)?;
         let now = board.now();
-        Some((*beginning.factory(), place::build(place, &beginning, now)))
+        let node = place::build(place, &beginning, now);
+        beginning.restore(node);
+        Some((*beginning.factory(), node))
     }
 
     /// The cell starts again, with what flash holds.

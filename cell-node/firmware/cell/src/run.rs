@@ -50,11 +50,16 @@ impl Beginning {
         &self.factory
     }
 
-    /// The node that begins now.
+    /// The node that begins now; it has to [`restore`](Self::restore) what flash holds.
     #[must_use]
     pub fn node(&self, now: Micros) -> Node {
         // There are no sensors on these boards: contacts come as stimuli.
-        Node::new(self.identity, self.factory.format, &self.held, true, now)
+        Node::unconfigured(self.identity, self.factory.format, true, now)
+    }
+
+    /// Gives the node what flash holds.
+    pub fn restore(&self, node: &mut Node) {
+        node.restore(&self.held);
     }
 }
 
