@@ -126,12 +126,23 @@ impl<'a, B: Board> Cell<'a, B> {
         }
     }
 
+    /// The image of what the node has for flash; whether it has any.
+    // Not inlined, so that the parameters are off the stack when it is written.
+    #[inline(never)]
+    fn image(&self, into: &mut flash::Bytes) -> bool {
+        let Some(kept) = self.node.poll_store() else { return false };
+        flash::encode_into(into, self.node.identity().serial, &kept);
+        true
+    }
+
     /// Writes what the node has for flash; whether it is there.
     // Not inlined, so that the image is off the stack when the node takes its parameters into use.
     #[inline(never)]
     fn write(&mut self) -> Option<bool> {
-        let kept = self.node.poll_store()?;
-        let image = flash::encode(self.node.identity().serial, &kept);
+        let mut image = flash::Bytes::new();
+        if !self.image(&mut image) {
+            return None;
+        }
         let written = store::write(self.board.flash(), &image).is_ok();
         Some(written && self.board.keep_elsewhere(&image))
     }
