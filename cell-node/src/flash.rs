@@ -9,7 +9,7 @@
 
 use protocol::id::CellId;
 use protocol::packet::crc16;
-use protocol::parameters::{IMAGE_BYTES, Image, MAX_IMAGE_BYTES, Parameters};
+use protocol::parameters::{IMAGE_BYTES, MAX_IMAGE_BYTES, Parameters};
 use thiserror::Error;
 
 use crate::identity::Identity;
@@ -82,14 +82,22 @@ pub enum FlashError {
 /// The bytes to keep.
 #[must_use]
 pub fn encode(serial: u32, kept: &Kept) -> Bytes {
+    let mut bytes = Bytes::new();
+    encode_into(&mut bytes, serial, kept);
+    bytes
+}
+
+/// The same into an empty buffer, so that a small stack has it once.
+pub fn encode_into(bytes: &mut Bytes, serial: u32, kept: &Kept) {
     let number = kept.number.map_or(0, CellId::get);
-    let zeros = || [0; IMAGE_BYTES].into_iter().collect();
-    let image: Image = kept.parameters.map_or_else(zeros, |parameters| parameters.image());
     let serial = serial.to_le_bytes();
-    let parts: [&[u8]; 5] = [MAGIC, &[VERSION, number], &serial, &[kept.parameters.is_some().into()], &image];
-    let body: Bytes = parts.into_iter().flatten().copied().collect();
-    let crc = crc16(&body).to_le_bytes();
-    body.into_iter().chain(crc).collect()
+    let head: [&[u8]; 4] = [MAGIC, &[VERSION, number], &serial, &[kept.parameters.is_some().into()]];
+    bytes.extend(head.into_iter().flatten().copied());
+    match &kept.parameters {
+        Some(parameters) => parameters.image_parts().for_each(|part| bytes.extend(part)),
+        None => bytes.extend([0; IMAGE_BYTES]),
+    }
+    bytes.extend(crc16(bytes).to_le_bytes());
 }
 
 /// What was kept. Never panics.

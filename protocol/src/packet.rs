@@ -56,6 +56,13 @@ pub fn crc16(bytes: &[u8]) -> u16 {
     CRC.checksum(bytes)
 }
 
+/// The same of bytes that come in parts.
+pub(crate) fn crc16_of<const N: usize>(parts: impl Iterator<Item = [u8; N]>) -> u16 {
+    let mut digest = CRC.digest();
+    parts.for_each(|part| digest.update(&part));
+    digest.finalize()
+}
+
 /// The words that begin so; the others are 0.
 #[must_use]
 pub fn words<const N: usize>(first: [i16; N]) -> [i16; WORDS] {

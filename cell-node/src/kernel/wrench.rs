@@ -20,7 +20,7 @@ mod fold;
 mod joint;
 mod range;
 
-use protocol::fixed::Q1_14;
+use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
 use self::fold::fold;
@@ -132,20 +132,30 @@ impl<S: Scalar> Wrench<S> {
     pub const fn rounding(&self) -> &TorqueRounding {
         &self.rounding
     }
-}
 
-impl<S: Scalar> Kernel<S> for Wrench<S> {
-    fn new(parameters: &Parameters) -> Self {
+    /// The kernel of no cell: every J is zero.
+    pub(crate) fn nothing() -> Self {
+        Self {
+            joint: 0,
+            contact: Wrenched { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] },
+            links: const { [Link::NOTHING; MAX_ROWS] },
+            rows: 0,
+            bound: MAX_J,
+            rounding: TorqueRounding::new(TorqueFormat::default(), MAX_J),
+        }
+    }
+
+    /// Becomes the kernel of these parameters, in its place: it is large for a stack.
+    pub(crate) fn prepare(&mut self, parameters: &Parameters) {
         let chain = chain(parameters);
         let mut read = Live::NOTHING; // by the rows further down: nothing below joint 1
         let mut joints = Joint::ALL.into_iter().peekable();
-        let mut links = core::array::from_fn(|index| {
+        for (index, link) in self.links.iter_mut().enumerate() {
             let row = chain.get(index).copied().unwrap_or_default();
-            let link;
-            (link, read) = Link::new(&row, read);
+            (*link, read) = Link::new(&row, read);
             let joint = if row.moves() { joints.next() } else { joints.peek().copied() };
-            Link { joint: joint.unwrap_or(Joint::J14), ..link }
-        });
+            link.joint = joint.unwrap_or(Joint::J14);
+        }
         let nothing = Wrenched { force: [S::Number::zero(); 3], moment: [S::Number::zero(); 3] };
         let mut contact = chain.last().map_or(nothing, |last| fold(&parameters.pose, last));
         // Fixed rows between the cell and the joint that moves it.
@@ -162,13 +172,21 @@ impl<S: Scalar> Kernel<S> for Wrench<S> {
                 link.twist_and_shift::<Held>(&mut contact, length(row.d));
             }
         }
-        links.get_mut(..rows).unwrap_or_default().reverse();
+        self.links.get_mut(..rows).unwrap_or_default().reverse();
         let slides = chain.iter().any(|row| row.kind == RowKind::Prismatic);
         let below = chain.get(..rows.saturating_sub(1)).unwrap_or_default();
-        let bound = if slides { None } else { bound(&contact, below) }.unwrap_or(MAX_J);
-        let rounding = TorqueRounding::new(parameters.torque_format, bound);
-        let joint = if rows == 0 { 0 } else { parameters.joint.into() };
-        Self { joint, contact, links, rows, bound, rounding }
+        self.bound = if slides { None } else { bound(&contact, below) }.unwrap_or(MAX_J);
+        self.rounding = TorqueRounding::new(parameters.torque_format, self.bound);
+        self.joint = if rows == 0 { 0 } else { parameters.joint.into() };
+        (self.contact, self.rows) = (contact, rows);
+    }
+}
+
+impl<S: Scalar> Kernel<S> for Wrench<S> {
+    fn new(parameters: &Parameters) -> Self {
+        let mut kernel = Self::nothing();
+        kernel.prepare(parameters);
+        kernel
     }
 
     #[inline(always)]
@@ -255,6 +273,12 @@ fn down<'a, S: Scalar + 'a>(
 }
 
 impl<N: Number> Link<N> {
+    /// The link of no row.
+    const NOTHING: Self = {
+        let (joint, kind, zero) = (Joint::J1, RowKind::Revolute, Q1_14::ZERO);
+        Self { due: 0, joint, kind, a: zero, d: zero, offset: zero, twist: Twist::None, constant: None }
+    };
+
     /// The link of a row, when the rows below it read `read` of what it turned; and what it reads itself.
     fn new(row: &Row, read: Live) -> (Self, Live) {
         let twist = Twist::new(row.alpha);

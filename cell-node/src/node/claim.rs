@@ -103,7 +103,7 @@ impl Node {
 
     /// The cell's state: its flags, and what can be derived.
     pub(super) fn state(&self) -> State {
-        let in_use = self.configuration.in_use.as_ref();
+        let in_use = self.configuration.in_use();
         self.flags
             .with(State::CONFIGURED, in_use.is_some())
             .with(State::ACTIVE, self.active)

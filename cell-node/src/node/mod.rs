@@ -74,27 +74,41 @@ impl Node {
     /// A cell that starts now: its first heartbeat is its address claim, and it obeys stimuli in
     /// `test_mode`.
     #[must_use]
-    // Built where the caller wants it: inlined, it is built on the stack and copied.
-    #[inline(never)]
     pub fn new(identity: Identity, format: Format, flash: &Flash, test_mode: bool, now: Micros) -> Self {
+        let mut node = Self::unconfigured(identity, format, test_mode, now);
+        node.restore(flash);
+        node
+    }
+
+    /// The same before it has what flash holds: [`Node::restore`] comes next, before anything else.
+    #[must_use]
+    // Built where the caller wants it: inlined, it is built on the stack and copied. So are its large parts.
+    #[inline(never)]
+    pub fn unconfigured(identity: Identity, format: Format, test_mode: bool, now: Micros) -> Self {
         Self {
             identity,
             claim: AddressClaim::new(identity, now),
-            configuration: Configuration::new(flash),
+            configuration: Configuration::new(),
             switches: Switches::default(),
             stimuli: Stimuli::default(),
             sensing: Sensing::default(),
             summing: Summing::new(now),
             receiver: Receiver::new(format),
             heard: Heard::default(),
-            flags: State::default()
-                .with(State::FLASH_DAMAGED, *flash == Flash::Damaged)
-                .with(State::TEST_MODE, test_mode),
+            flags: State::default().with(State::TEST_MODE, test_mode),
             epoch: None,
             active: false,
             storing: None,
             outbox: Deque::new(),
             sent: 0,
+        }
+    }
+
+    /// Starts with what flash holds.
+    pub fn restore(&mut self, flash: &Flash) {
+        self.flags = self.flags.with(State::FLASH_DAMAGED, *flash == Flash::Damaged);
+        if let Flash::Sound(parameters) = flash {
+            self.configuration.start(parameters);
         }
     }
 
@@ -156,9 +170,9 @@ impl Node {
     /// What has to go into flash; then comes [`Node::handle_stored`].
     #[must_use]
     pub fn poll_store(&self) -> Option<Kept> {
-        let parameters = match self.storing? {
-            Storing::Parameters(parameters, _) => Some(parameters),
-            Storing::NodeId => self.configuration.in_use.as_ref().map(|in_use| in_use.parameters),
+        let parameters = match self.storing.as_ref()? {
+            Storing::Parameters(parameters, _) => Some(*parameters),
+            Storing::NodeId => self.configuration.in_use().map(|in_use| in_use.parameters),
         };
         Some(Kept { number: self.identity.cell, parameters })
     }
@@ -181,7 +195,7 @@ impl Node {
 
     /// How long joints, torques and sums are, once it is configured.
     fn length(&self) -> Option<Length> {
-        self.configuration.in_use.as_ref().map(InUse::length)
+        self.configuration.in_use().map(InUse::length)
     }
 
     /// By slot of the reassembly.
@@ -277,7 +291,7 @@ impl Node {
         }
         // All frames before these joints have been received.
         self.check_missing(now);
-        let in_use = self.configuration.in_use.as_ref();
+        let in_use = self.configuration.in_use();
         if in_use.is_some_and(|in_use| in_use.parameters.joints != joints.in_use) {
             count(&mut self.receiver.refused.meaning);
             return;
@@ -313,7 +327,7 @@ impl Node {
 
     /// Answers with its own torque; one answer of zero marks the end of a contact.
     fn answer_joints(&mut self, epoch: Epoch, torque: Option<Torque<'_>>) {
-        let (Some(from), Some(in_use)) = (self.identity.cell, &self.configuration.in_use) else { return };
+        let (Some(from), Some(in_use)) = (self.identity.cell, self.configuration.in_use()) else { return };
         let torque = match torque {
             Some(torque) => {
                 self.active = true;
@@ -330,7 +344,7 @@ impl Node {
 
     /// What is due before the next joints is sent now, while the cell is awake: hellos and a heartbeat.
     fn speak_before_the_next_joints(&mut self, now: Micros) {
-        let Some(in_use) = self.configuration.in_use.as_ref() else { return };
+        let Some(in_use) = self.configuration.in_use() else { return };
         let next_joints = now + in_use.period();
         self.summing.network.hello_by(now, next_joints);
         self.tell_tree(now);

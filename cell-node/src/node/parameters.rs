@@ -43,7 +43,7 @@ impl Node {
             (Some(Parameter::Commit), Request::Write { words, .. }) => {
                 match self.configuration.staged_with(words) {
                     Ok(parameters) => {
-                        self.storing = Some(Storing::Parameters(parameters, tag));
+                        self.storing = Some(Storing::Parameters(*parameters, tag));
                         return;
                     }
                     Err(reason) => Err(reason),
@@ -57,12 +57,17 @@ impl Node {
     /// Flash was written, or could not be.
     pub fn handle_stored(&mut self, written: bool) {
         // A node id that could not be stored is assigned again after the next start.
-        let Some(Storing::Parameters(parameters, tag)) = self.storing.take() else { return };
+        let Some(Storing::Parameters(parameters, tag)) = &self.storing else {
+            self.storing = None;
+            return;
+        };
+        let tag = *tag;
         if written {
             self.configuration.activate(parameters);
             self.flags = self.flags.with(State::FLASH_DAMAGED, false);
         }
-        let hash = || padded([parameters.hash().cast_signed()]);
+        self.storing = None;
+        let hash = || padded([self.configuration.hash().cast_signed()]);
         let words = written.then(hash).ok_or(Answer::FLASH_FAILED);
         self.answer(tag, Parameter::Commit.number(), true, words);
     }

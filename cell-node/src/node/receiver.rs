@@ -19,6 +19,7 @@ pub(super) struct Receiver {
 }
 
 impl Receiver {
+    #[inline(never)]
     pub(super) fn new(format: Format) -> Self {
         Self { format, segments: [Segment::NONE; HEARD], refused: Refused::default() }
     }

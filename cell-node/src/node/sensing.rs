@@ -166,7 +166,7 @@ impl Node {
     /// What is due before the next joints is sent now, while the cell is awake. Not where the period is that of
     /// the joints or shorter: all cells would send at once, each time.
     pub(super) fn sense_before_the_next_joints(&mut self, now: Micros) {
-        let Some(in_use) = self.configuration.in_use.as_ref() else { return };
+        let Some(in_use) = self.configuration.in_use() else { return };
         let joints = in_use.period();
         if let Mode::Continuous { period_ms } = self.switches.sensing
             && Span::from_millis(period_ms.into()) > joints

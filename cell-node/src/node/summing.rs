@@ -78,6 +78,7 @@ pub(super) struct Summing {
 
 impl Summing {
     /// A cell that is not wired.
+    #[inline(never)]
     pub(super) fn new(now: Micros) -> Self {
         let report = TreeReport { due: true, next: now, round: 0 };
         Self { network: Network::new(now), report, ..Self::default() }

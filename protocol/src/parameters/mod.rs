@@ -32,7 +32,7 @@ pub use rows::{Row, RowKind};
 pub use switches::{Events, LinksDown, Reply, Sensing, Slots};
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
-use crate::packet::{MAX_WORDS, WORDS, crc16, words};
+use crate::packet::{MAX_WORDS, WORDS, crc16_of, words};
 
 /// The longest chain of joints.
 pub const MAX_JOINTS: usize = MAX_WORDS;
@@ -177,7 +177,7 @@ pub struct Contact {
 }
 
 /// All that a cell computes with.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Parameters {
     /// The joint k that moves the cell's link, 1 to `joints`.
     pub joint: u8,
@@ -197,6 +197,30 @@ pub struct Parameters {
     pub period_us: u16,
     /// The chain; rows beyond those in use are zero.
     pub rows: [Row; MAX_ROWS],
+}
+
+impl Default for Parameters {
+    fn default() -> Self {
+        const ZERO: Parameters = Parameters {
+            joint: 0,
+            joints: 0,
+            row: 0,
+            table_rows: 0,
+            torque_format: TorqueFormat::Q3_12,
+            pose: Pose { position: [Q1_14::ZERO; 3], normal: [Q1_14::ZERO; 3] },
+            contact: Contact {
+                alpha_c: Q3_12::ZERO,
+                alpha_p: Q5_10::ZERO,
+                contact_threshold: Q5_10::ZERO,
+                proximity_threshold: Q1_14::ZERO,
+                force_threshold: Q5_10::ZERO,
+            },
+            period_us: 0,
+            rows: [Row::ZERO; MAX_ROWS],
+        };
+        // A constant: the default of an array is code for each of its elements.
+        ZERO
+    }
 }
 
 /// Bytes of the parameters of a chain of up to 6 rows, as they are hashed and kept.
@@ -371,8 +395,22 @@ impl Parameters {
     /// All stored parameters as bytes, in the order of [`Parameter::stored`], words little endian.
     #[must_use]
     pub fn image(&self) -> Image {
-        let words = Parameter::stored(self.table().len()).flat_map(|parameter| self.words(parameter));
-        words.flat_map(i16::to_le_bytes).collect()
+        self.image_parts().flatten().collect()
+    }
+
+    /// [`Parameters::image`], one parameter after the other: a small stack has no room for all of them.
+    pub fn image_parts(&self) -> impl Iterator<Item = [u8; WORDS * 2]> {
+        Parameter::stored(self.table().len()).map(|parameter| self.image_part(parameter))
+    }
+
+    /// The bytes of one parameter.
+    #[inline(never)]
+    fn image_part(&self, parameter: Parameter) -> [u8; WORDS * 2] {
+        let mut bytes = [0; WORDS * 2];
+        for (bytes, word) in bytes.as_chunks_mut().0.iter_mut().zip(self.words(parameter)) {
+            *bytes = word.to_le_bytes();
+        }
+        bytes
     }
 
     /// Reads an image and checks it.
@@ -387,7 +425,8 @@ impl Parameters {
             parameters.set(parameter, chunk.map(i16::from_le_bytes))?;
         }
         parameters.check()?;
-        if parameters.image() != image {
+        let (parts, rest) = image.as_chunks();
+        if !rest.is_empty() || !parameters.image_parts().eq(parts.iter().copied()) {
             let (rows, joints) = (parameters.table_rows.into(), parameters.joints.into());
             return Err(ParameterError::Rows { got: rows, joints });
         }
@@ -397,7 +436,7 @@ impl Parameters {
     /// The configuration hash that heartbeats carry: CRC-16 (as in packets) over [`Parameters::image`].
     #[must_use]
     pub fn hash(&self) -> u16 {
-        crc16(&self.image())
+        crc16_of(self.image_parts())
     }
 }
 

@@ -47,6 +47,15 @@ pub struct Row {
 }
 
 impl Row {
+    /// A revolute row without lengths and angles.
+    pub(super) const ZERO: Self = Self {
+        kind: RowKind::Revolute,
+        a: Q1_14::ZERO,
+        d: Q1_14::ZERO,
+        alpha: Q1_14::ZERO,
+        theta_offset: Q1_14::ZERO,
+    };
+
     /// Whether it has a joint.
     #[must_use]
     pub fn moves(&self) -> bool {

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`board`] | what a board has to offer |
 //! | [`run`] | the cell's loop |
+//! | `place` | its state, built in a static |
 //! | [`store`] | parameters in two pages of flash, safe against a loss of power |
 //! | [`slcan`] | a board without a CAN controller: frames as lines over a serial line |
 //! | `boards` | the boards: a file each |
@@ -13,6 +14,8 @@
 pub mod board;
 #[cfg(target_os = "none")]
 pub mod boards;
+#[cfg(target_os = "none")]
+pub mod place;
 pub mod run;
 pub mod slcan;
 pub mod store;

@@ -5,21 +5,37 @@
 
 #[cfg(target_os = "none")]
 mod start {
+    use core::mem::MaybeUninit;
     use core::panic::PanicInfo;
 
     use cell::board::Board as _;
     use cell::boards::Chosen;
+    use cell::place;
     use cell::run::{Beginning, Cell};
+    use cell_node::node::Node;
     use cortex_m::peripheral::SCB;
     use cortex_m_rt::{ExceptionFrame, entry, exception};
+    use protocol::factory::Factory;
 
     #[entry]
     fn main() -> ! {
+        // The cell's state, off the stack: `entry` makes the only reference to it.
+        static mut NODE: MaybeUninit<Node> = MaybeUninit::uninit();
         let mut board = Chosen::take();
         // Nobody has written who this is, so that it must not send; it waits to be loaded again.
-        let Some(beginning) = Beginning::read(&mut board) else { board.rest() };
-        let mut node = beginning.node(board.now());
-        match Cell::start(board, &beginning, &mut node).run() {}
+        let Some((factory, node)) = begin(&mut board, NODE) else { board.rest() };
+        match Cell::start(board, factory, node).run() {}
+    }
+
+    /// What the factory wrote, and the node that begins now.
+    // Not inlined, so that what flash held is off the stack when the cell runs.
+    #[inline(never)]
+    fn begin<'a>(board: &mut Chosen, place: &'a mut MaybeUninit<Node>) -> Option<(Factory, &'a mut Node)> {
+        let beginning = Beginning::read(board)?;
+        let now = board.now();
+        let node = place::build(place, &beginning, now);
+        beginning.restore(node);
+        Some((*beginning.factory(), node))
     }
 
     /// The cell starts again, with what flash holds.

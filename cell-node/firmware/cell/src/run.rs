@@ -44,19 +44,28 @@ impl Beginning {
         Some(Self { factory, identity, held })
     }
 
-    /// The node that begins now. It takes more than a third of a small microcontroller's memory: let it stay where it is
-    /// built.
+    /// What the factory wrote.
+    #[must_use]
+    pub const fn factory(&self) -> &Factory {
+        &self.factory
+    }
+
+    /// The node that begins now; it has to [`restore`](Self::restore) what flash holds.
     #[must_use]
     pub fn node(&self, now: Micros) -> Node {
         // There are no sensors on these boards: contacts come as stimuli.
-        Node::new(self.identity, self.factory.format, &self.held, true, now)
+        Node::unconfigured(self.identity, self.factory.format, true, now)
+    }
+
+    /// Gives the node what flash holds.
+    pub fn restore(&self, node: &mut Node) {
+        node.restore(&self.held);
     }
 }
 
 impl<'a, B: Board> Cell<'a, B> {
     /// A cell that starts now, and joins its bus.
-    pub fn start(mut board: B, beginning: &Beginning, node: &'a mut Node) -> Self {
-        let factory = beginning.factory;
+    pub fn start(mut board: B, factory: Factory, node: &'a mut Node) -> Self {
         board.open(&factory);
         let wired = factory.link_ids.iter().enumerate();
         let wired = wired.fold(0, |wired, (port, link_id)| wired | u8::from(link_id.is_some()) << port);
@@ -117,12 +126,23 @@ impl<'a, B: Board> Cell<'a, B> {
         }
     }
 
+    /// The image of what the node has for flash; whether it has any.
+    // Not inlined, so that the parameters are off the stack when it is written.
+    #[inline(never)]
+    fn image(&self, into: &mut flash::Bytes) -> bool {
+        let Some(kept) = self.node.poll_store() else { return false };
+        flash::encode_into(into, self.node.identity().serial, &kept);
+        true
+    }
+
     /// Writes what the node has for flash; whether it is there.
     // Not inlined, so that the image is off the stack when the node takes its parameters into use.
     #[inline(never)]
     fn write(&mut self) -> Option<bool> {
-        let kept = self.node.poll_store()?;
-        let image = flash::encode(self.node.identity().serial, &kept);
+        let mut image = flash::Bytes::new();
+        if !self.image(&mut image) {
+            return None;
+        }
         let written = store::write(self.board.flash(), &image).is_ok();
         Some(written && self.board.keep_elsewhere(&image))
     }

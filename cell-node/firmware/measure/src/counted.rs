@@ -50,10 +50,16 @@ pub(crate) extern "C" fn torque_words(
     Torque::new(moved, Force::from_steps(force.into())).write_words(rounding, out);
 }
 
-/// A configured cell with its node id.
-pub(crate) fn node(parameters: &Parameters) -> Node {
+/// A cell with its node id; [`configure`] comes next. Apart from that, because a microcontroller has no room for two.
+pub(crate) fn node() -> Node {
     let identity = Identity { cell: CellId::new(12).ok(), serial: 100_012 };
-    Node::new(identity, Format::Fd, &Flash::Sound(*parameters), true, Micros(0))
+    Node::unconfigured(identity, Format::Fd, true, Micros(0))
+}
+
+/// Gives the cell its parameters.
+#[inline(never)]
+pub(crate) fn configure(node: &mut Node, parameters: &Parameters) {
+    node.restore(&Flash::Sound(*parameters));
 }
 
 /// Waits until the cell owns its node id and presses it with 3 N; the joints that it has to answer.

@@ -55,15 +55,12 @@ impl Machine {
     pub(crate) fn task(&self) -> u8 {
         task().unwrap_or(b'w')
     }
-
-    /// Bytes of stack that were in use at some time; 0 where that is not known.
-    pub(crate) fn stack(&self) -> u32 {
-        stack()
-    }
 }
 
 #[cfg(target_os = "none")]
 mod emulated {
+    use core::arch::asm;
+
     use cortex_m_semihosting::debug::{EXIT_FAILURE, EXIT_SUCCESS, exit};
     use cortex_m_semihosting::nr::open;
     use cortex_m_semihosting::{hio, syscall};
@@ -73,9 +70,11 @@ mod emulated {
     /// With what the stack is painted before it is used.
     const PAINT: u32 = 0xCCCC_CCCC;
 
+    /// More than the registers that a function saves, maybe after it has read the stack pointer.
+    const OWN: usize = 64;
+
     unsafe extern "C" {
-        static _stack_end: u32;
-        static _stack_start: u32;
+        static mut _stack_end: u32;
     }
 
     pub(super) fn put(line: &[u8]) {
@@ -94,13 +93,44 @@ mod emulated {
         letter.filter(|letter| failed == 0 && *letter != 0)
     }
 
-    pub(super) fn stack() -> u32 {
-        let (mut place, top) = (&raw const _stack_end, &raw const _stack_start);
-        // SAFETY: all words from the stack's end to its start are readable memory.
-        while place < top && unsafe { place.read_volatile() } == PAINT {
+    /// The stack pointer.
+    #[inline(always)]
+    fn stack_pointer() -> usize {
+        let pointer;
+        // SAFETY: it reads a register.
+        unsafe { asm!("mov {}, sp", out(reg) pointer, options(nomem, nostack, preserves_flags)) };
+        pointer
+    }
+
+    /// Paints the stack that is free; where the caller's frame ends.
+    // Inlined: the caller's stack pointer, and not its own.
+    #[inline(always)]
+    pub(crate) fn painted_stack() -> usize {
+        let top = stack_pointer();
+        paint();
+        top
+    }
+
+    #[inline(never)]
+    fn paint() {
+        let mut place = &raw mut _stack_end;
+        let top = stack_pointer() - OWN;
+        while place.addr() < top {
+            // SAFETY: memory from the stack's end to below this frame, which nothing uses: there are no interrupts, and
+            // this function calls none.
+            unsafe { place.write_volatile(PAINT) };
             place = place.wrapping_add(1);
         }
-        u32::try_from(top as usize - place as usize).unwrap_or_default()
+    }
+
+    /// Bytes of stack that were in use at some time since it was painted, below this address.
+    pub(crate) fn used_stack(top: usize) -> u32 {
+        let mut place = &raw const _stack_end;
+        // SAFETY: all words from the stack's end to its start are readable memory.
+        while place.addr() < top && unsafe { place.read_volatile() } == PAINT {
+            place = place.wrapping_add(1);
+        }
+        u32::try_from(top - place.addr()).unwrap_or_default()
     }
 
     /// Ends the emulator.
@@ -119,9 +149,9 @@ mod emulated {
 }
 
 #[cfg(target_os = "none")]
-pub(crate) use emulated::end;
+pub(crate) use emulated::{end, painted_stack, used_stack};
 #[cfg(target_os = "none")]
-use emulated::{put, stack, task};
+use emulated::{put, task};
 
 #[cfg(not(target_os = "none"))]
 fn put(line: &[u8]) {
@@ -134,7 +164,13 @@ fn task() -> Option<u8> {
     std::env::args().nth(1)?.bytes().next()
 }
 
+/// Here that is not known.
 #[cfg(not(target_os = "none"))]
-fn stack() -> u32 {
+pub(crate) fn painted_stack() -> usize {
+    0
+}
+
+#[cfg(not(target_os = "none"))]
+pub(crate) fn used_stack(_: usize) -> u32 {
     0
 }

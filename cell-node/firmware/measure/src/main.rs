@@ -12,6 +12,7 @@ mod machine;
 use cases::CASES;
 use cell_node::contact::{MAX_J, TorqueRounding};
 use cell_node::kernel::{Kernel, Projection, Wrench};
+use cell_node::node::Node;
 use machine::Machine;
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::message::Joints;
@@ -78,19 +79,18 @@ fn count(machine: &mut Machine) {
             _ => continue,
         }
         kernels(case);
-        reply(case);
+        reply(case, false);
         machine.text(case.chain().name);
         machine.words([i16::from(case.joint)].into_iter());
         machine.line();
     }
 }
 
-/// How much of the stack one reply took, its cell and those who called it included.
+/// How much of the stack one reply took, and how large the cell's state is, which may lie anywhere.
 fn stack(machine: &mut Machine) {
     let case = CASES.iter().rfind(|case| case.is_counted());
-    case.into_iter().for_each(reply);
-    let used = machine.stack();
-    machine.number(used);
+    machine.number(case.map_or(0, |case| reply(case, true)));
+    machine.number(u32::try_from(size_of::<Node>()).unwrap_or(u32::MAX));
     machine.line();
 }
 
@@ -106,14 +106,22 @@ fn kernels(case: &cases::Case) {
     counted::torque_words(&jacobian, parameters.joint, case.force, &mut torque, kernel.rounding());
 }
 
-/// One reply of a cell on this chain.
+/// One reply of a cell on this chain; how many bytes of stack it took, if that is asked for.
 #[inline(never)]
-fn reply(case: &cases::Case) {
-    let mut node = counted::node(&case.parameters());
+fn reply(case: &cases::Case, measures_stack: bool) -> u32 {
+    let mut node = counted::node();
+    counted::configure(&mut node, &case.parameters());
     let joints = Joints { positions: case.joints(), in_use: case.chain().joints() };
-    let Some(frame) = counted::pressed(&mut node, joints) else { return };
+    let Some(frame) = counted::pressed(&mut node, joints) else { return 0 };
     let mut answer = frame;
+    if !measures_stack {
+        counted::reply(&mut node, &frame, &mut answer);
+        return 0;
+    }
+    // The state is in this function's frame, above what is painted.
+    let top = machine::painted_stack();
     counted::reply(&mut node, &frame, &mut answer);
+    machine::used_stack(top)
 }
 
 #[cfg(not(target_os = "none"))]

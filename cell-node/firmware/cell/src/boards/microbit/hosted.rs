@@ -55,6 +55,7 @@ impl Drop for File {
 }
 
 /// What the file holds, as far as there is room; `None` where there is no file.
+#[inline(never)]
 pub(super) fn load(into: &mut [u8]) -> Option<usize> {
     let file = Path::given()?.open(READ)?;
     // SAFETY: a buffer and its size.
@@ -63,6 +64,8 @@ pub(super) fn load(into: &mut [u8]) -> Option<usize> {
 }
 
 /// Puts the image in the file's place; whether it is there.
+// Not inlined, so that the paths are off the stack of whoever calls it.
+#[inline(never)]
 pub(super) fn store(image: &[u8]) -> bool {
     let Some(path) = Path::given() else { return false };
     let part = path.part();
