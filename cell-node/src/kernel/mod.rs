@@ -33,9 +33,11 @@
 //! twists four for each vector; lengths that are zero cost nothing. Parameters that
 //! [`Parameters::check`] refuses are safe: with a joint k that does not exist, every J is zero.
 
+mod joint;
 #[cfg(any(feature = "oracle", test))]
 pub mod oracle;
 mod projection;
+mod rounding;
 mod scalar;
 mod wrench;
 
@@ -82,6 +84,11 @@ fn chain(parameters: &Parameters) -> &[Row] {
 fn length<N: Number>(word: Q1_14) -> Option<N> {
     (word != Q1_14::ZERO).then(|| N::word(word))
 }
+
+/// Where this is called the compiler keeps out of the straight path.
+#[cold]
+#[inline(always)]
+const fn seldom() {}
 
 /// Sine and cosine of a constant angle.
 fn settled_turn<N: Number>(angle: Q1_14) -> [N; 2] {

@@ -14,13 +14,20 @@
 //!
 //! Reused as in the paper's count: `a_l x_l` is the joint's own translation without a further product;
 //! joints whose axes are parallel (alpha = 0) turn by one sum of angles, so that X and Y are those of
-//! the first of them; and components that are 0 or 1 whatever the joints ([`Component`]) are neither
-//! multiplied nor added. What no later step reads is not computed.
+//! the first of them; and components that are 0 or 1 whatever the joints are neither multiplied nor
+//! added: [`Frame`] says which they are, worked out once. What no later step reads is not computed.
+
+mod axes;
+mod range;
 
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
-use super::{Kernel, Number, Scalar, Twist, chain, length};
+use self::axes::{Axis, Frame, Height, Level, Mix, ToBase, Turn, Vector, negate};
+use self::range::is_bounded;
+use super::joint::Joint;
+use super::rounding::{Bounded, Held, Rounding};
+use super::{Kernel, Number, Scalar, Twist, chain, seldom};
 
 /// The projection kernel, of one cell.
 ///
@@ -28,284 +35,393 @@ use super::{Kernel, Number, Scalar, Twist, chain, length};
 /// 6 cosines; the paper counts 103, 57, 6 and 6 (Eq. 27).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Projection<S: Scalar = Q1_14> {
-    /// The joint that moves the cell; 0 when there is none.
-    joint: usize,
-    /// Whether all axes are upright: then the cell's height and the vertical force are unused.
-    upright: bool,
-    /// The cell in the frame of joint k.
-    position: [S::Number; 3],
-    /// Where the contact pushes, in the same frame.
-    force: [S::Number; 3],
+    /// Where the contact pushes, in the frame of joint k.
+    force: Vector<S::Number>,
+    /// The cell in the same frame.
+    position: Vector<S::Number>,
+    /// How a vector of this frame becomes one of the base's.
+    to_base: ToBase,
+    /// Whether no number can leave the range of a word; then nothing is held.
+    bounded: bool,
     /// From the first row up; those of `rows` are in use.
     links: [Link<S::Number>; MAX_ROWS],
     rows: usize,
 }
 
 /// One row of the robot's table.
+// In this order: what is read first lies where a short instruction of a Cortex-M0 reaches it.
+#[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Link<N> {
+    /// What has to be computed: bits of [`due`].
+    due: u32,
+    /// Which joint moves it; nobody asks that of a fixed row.
+    joint: Joint,
+    /// How its turn mixes x and y, and its twist the other two.
+    mixes: [Mix; 2],
+    /// What is known of z_(l-1).
+    axis: Axis,
     kind: RowKind,
-    /// d of a prismatic joint, to which its position is added.
-    slide: Q1_14,
+    a: Q1_14,
+    /// Without the position of a prismatic joint; nothing of the first row: it shifts along the axis of joint 1, which has
+    /// no moment about it.
+    d: Q1_14,
     /// theta_offset.
     offset: Q1_14,
     twist: Twist<N>,
-    a: Option<N>,
-    /// Absent for joint 1 too: it shifts along the axis of joint 1, which has no moment about it.
-    d: Option<N>,
-    /// Whether x_l is used.
-    x: bool,
-    /// Whether this ends a group of parallel axes; then v_l is used.
-    ends: bool,
 }
 
-/// A component of an axis in the base frame.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Component<N> {
-    /// 0, whatever the joints are.
-    Zero,
-    /// 1, whatever the joints are.
-    One,
-    /// -1, whatever the joints are.
-    MinusOne,
-    /// It depends on the joints.
-    Varies(N),
+/// What of a row is computed.
+mod due {
+    /// x_l, and so a sine.
+    pub(super) const X: u32 = 1;
+    /// All axes: it ends a group of parallel axes.
+    pub(super) const ENDS: u32 = 2;
+    /// z_(l-1), kept for the joints of this group.
+    pub(super) const Z: u32 = 4;
+    /// a, and x_l is kept.
+    pub(super) const A: u32 = 8;
+    /// d.
+    pub(super) const D: u32 = 16;
+    /// Its joint turns it.
+    pub(super) const TURNS: u32 = 32;
+    /// It turns from the axes before the group of parallel axes that it goes on with.
+    pub(super) const GOES_ON: u32 = 64;
 }
 
-type Axis<N> = [Component<N>; 3];
-
-/// What the way down needs of joint l: x_l and z_(l-1).
-#[derive(Clone, Copy, Debug)]
-struct Step<N> {
-    x: Axis<N>,
-    z: Axis<N>,
-    /// The joint's; zero of a fixed row.
-    position: Q1_14,
-}
+/// What the steps down need of the axes: z_(l-1) of a group of parallel axes, below it x_l of its rows.
+type Kept<N> = heapless::Vec<Vector<N>, { 2 * MAX_ROWS }>;
 
 impl<S: Scalar> Kernel<S> for Projection<S> {
     fn new(parameters: &Parameters) -> Self {
         let chain = chain(parameters);
-        let links = core::array::from_fn(|index| {
-            let row = parameters.rows.get(index).copied().unwrap_or_default();
-            Link::new(&row, index == 0, index + 1 == chain.len())
-        });
+        let (mut frame, mut goes_on) = (Frame::BASE, false);
+        let mut joints = Joint::ALL.into_iter();
+        let mut links = [Link::new(&Row::default(), Joint::J1, frame, false); MAX_ROWS];
+        for (index, (link, row)) in links.iter_mut().zip(chain).enumerate() {
+            let joint = if row.moves() { joints.next() } else { None }.unwrap_or(Joint::J1);
+            *link = Link::new(row, joint, frame, index + 1 == chain.len());
+            if goes_on {
+                link.due |= due::GOES_ON;
+            }
+            if index == 0 && row.kind != RowKind::Prismatic {
+                (link.due, link.d) = (link.due & !due::D, Q1_14::ZERO);
+            }
+            goes_on = !link.is_due(due::ENDS);
+            if !goes_on {
+                (frame, _) = frame.after(link.twist);
+            }
+        }
         let (_, below) = chain.split_last().unzip();
-        let upright = |row: &Row| matches!(row.alpha.to_bits(), 0 | i16::MIN);
+        let is_upright = |row: &Row| matches!(row.alpha.to_bits(), 0 | i16::MIN);
         let slides = chain.iter().any(|row| row.kind == RowKind::Prismatic);
+        let position = parameters.pose.position.map(S::Number::word);
+        let force = parameters.pose.normal.map(|word| S::Number::word(word).negative());
         Self {
-            joint: if chain.is_empty() { 0 } else { parameters.joint.into() },
-            rows: chain.len(),
-            upright: !slides && below.unwrap_or_default().iter().all(upright),
-            position: parameters.pose.position.map(S::Number::word),
-            force: parameters.pose.normal.map(|word| S::Number::word(word).negative()),
+            force,
+            position,
+            to_base: ToBase::new(frame, !slides && below.unwrap_or_default().iter().all(is_upright)),
+            bounded: !slides && is_bounded(force, position, links.get(..chain.len()).unwrap_or_default()),
             links,
+            rows: chain.len(),
         }
     }
 
+    #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
-        let links = self.links.get(..self.rows).unwrap_or_default();
-        let position_of = |link: &Link<S::Number>, moving: &mut core::slice::Iter<'_, Q1_14>| {
-            if link.kind == RowKind::Fixed { None } else { moving.next() }.copied().unwrap_or_default()
-        };
+        let mut kept = Kept::new();
+        let [zero, one] = [S::Number::zero(), S::Number::one()];
+        let mut axes = [[one, zero, zero], [zero, one, zero], [zero, zero, one]];
+        let axes = self.axes(joints, axes.each_mut(), &mut kept);
+        if self.bounded {
+            self.down::<Bounded>(axes, &kept, None, jacobian);
+        } else {
+            seldom();
+            self.down_held(axes, &kept, joints, jacobian);
+        }
+    }
+}
 
-        let [mut x, mut y, mut z] = Component::BASE;
-        let mut steps = [Step { x, z, position: Q1_14::ZERO }; MAX_ROWS];
-        let mut group = None;
-        let mut moving = joints.iter();
-        for (step, link) in steps.iter_mut().zip(links) {
-            step.position = position_of(link, &mut moving);
-            let angle = link.angle(group, step.position);
-            group = (!link.ends).then_some(angle);
-            step.z = z;
-            if !link.x {
+impl<S: Scalar> Projection<S> {
+    /// The rows from the base to the cell.
+    #[inline(always)]
+    fn links(&self) -> &[Link<S::Number>] {
+        self.links.get(..self.rows).unwrap_or_default()
+    }
+
+    /// The axes of the cell's frame, from the base up: x, y, z.
+    #[inline(always)]
+    fn axes<'a>(
+        &self,
+        joints: &[Q1_14; MAX_JOINTS],
+        [x, mut y, mut z]: [&'a mut Vector<S::Number>; 3],
+        kept: &mut Kept<S::Number>,
+    ) -> [&'a Vector<S::Number>; 3] {
+        let mut group = Q1_14::ZERO;
+        for link in self.links() {
+            group = link.angle(group, joints);
+            if !link.is_due(due::X) {
                 continue;
             }
-            let [sine, cosine] = S::Number::sine_cosine(angle);
-            step.x = combine(x, y, |x, y| Sum::Nothing.plus(cosine, x).plus(sine, y));
-            if link.ends {
-                let v = combine(x, y, |x, y| Sum::Nothing.plus(cosine, y).minus(sine, x));
-                x = step.x;
-                [y, z] = link.twist.turn_axes(v, z);
+            let turn = Turn(S::Number::sine_cosine(group));
+            let [mix, _] = link.mixes;
+            // There is room for two of each row.
+            if !link.is_due(due::ENDS) {
+                let _ = kept.push(turn.ahead(mix, x, y));
+                continue;
             }
+            turn.both(mix, x, y);
+            if link.is_due(due::A) {
+                let _ = kept.push(*x);
+            }
+            if link.is_due(due::Z) {
+                let _ = kept.push(*z);
+            }
+            link.twist_by_alpha(&mut y, &mut z);
         }
+        [x, y, z]
+    }
 
-        let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (x, y, z);
-        let to_base = |[a, b, c]: [S::Number; 3]| {
-            let row = |x, y, z| Sum::Nothing.plus(a, x).plus(b, y).plus(c, z).component().number();
-            [row(x0, y0, z0), row(x1, y1, z1), if self.upright { S::Number::zero() } else { row(x2, y2, z2) }]
-        };
-        let force = to_base(self.force);
-        let mut position = to_base(self.position);
-        let mut moving = jacobian.get_mut(..self.joint).unwrap_or_default().iter_mut().rev();
-        for (step, link) in steps.iter().zip(links).rev() {
-            position = link.shift(position, step, self.upright);
-            let entry = match link.kind {
-                RowKind::Revolute => triple_product(step.z, position, force),
-                RowKind::Prismatic => along(step.z, force),
-                RowKind::Fixed => continue,
+    /// J, from the cell down to the base; with the positions of joints where some may slide.
+    #[inline(always)]
+    fn down<R: Rounding>(
+        &self,
+        axes: [&Vector<S::Number>; 3],
+        kept: &Kept<S::Number>,
+        slides: Option<&[Q1_14; MAX_JOINTS]>,
+        jacobian: &mut [S; MAX_JOINTS],
+    ) {
+        let [force, mut position] = self.in_base::<R>(axes);
+        let [.., mut z] = axes;
+        let mut kept = kept.iter().rev();
+        for link in self.links().iter().rev() {
+            if link.is_due(due::Z) {
+                let Some(axis) = kept.next() else { return };
+                z = axis;
+            }
+            let slides = slides.filter(|_| link.kind == RowKind::Prismatic);
+            let d = match slides.and_then(|joints| link.joint.of(joints)) {
+                Some(position) => Some(S::Number::word(link.d.saturating_add(*position))),
+                None => link.is_due(due::D).then(|| S::Number::word(link.d)),
             };
-            if let Some(row) = moving.next() {
+            let turned = link.step_down::<R>(&mut position, &force, z, d, || kept.next());
+            let entry = match turned {
+                Some(entry) => entry,
+                None if slides.is_some() => link.along::<R>(z, &force),
+                None => continue,
+            };
+            if let Some(row) = link.joint.of_mut(jacobian) {
                 *row = S::from_number(entry);
             }
         }
     }
+
+    /// The same of any chain.
+    #[inline(never)]
+    fn down_held(
+        &self,
+        axes: [&Vector<S::Number>; 3],
+        kept: &Kept<S::Number>,
+        joints: &[Q1_14; MAX_JOINTS],
+        jacobian: &mut [S; MAX_JOINTS],
+    ) {
+        self.down::<Held>(axes, kept, Some(joints), jacobian);
+    }
+
+    /// The force and the cell's position in the base frame.
+    #[inline(always)]
+    fn in_base<R: Rounding>(&self, [x, y, z]: [&Vector<S::Number>; 3]) -> [Vector<S::Number>; 2] {
+        let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (*x, *y, *z);
+        let vectors = [self.force, self.position];
+        let two = |a: S::Number, x, b: S::Number, y| R::round(R::plus::<S::Number>(a.times(x), b.times(y)));
+        let three = |[a, b, c]: Vector<S::Number>, x, y, z| {
+            R::round(R::plus::<S::Number>(R::plus::<S::Number>(a.times(x), b.times(y)), c.times(z)))
+        };
+        let level = match self.to_base.level {
+            Level::Xz => vectors.map(|[a, _, c]| [two(a, x0, c, z0), two(a, x1, c, z1)]),
+            Level::Xy => vectors.map(|[a, b, _]| [two(a, x0, b, y0), two(a, x1, b, y1)]),
+            Level::All => vectors.map(|vector| [three(vector, x0, y0, z0), three(vector, x1, y1, z1)]),
+        };
+        let height = match self.to_base.height {
+            Height::Nothing => [S::Number::zero(); 2],
+            Height::Y => vectors.map(|[_, b, _]| b),
+            Height::MinusY => vectors.map(|[_, b, _]| R::negative(b)),
+            Height::Z => vectors.map(|[_, _, c]| c),
+            Height::MinusZ => vectors.map(|[_, _, c]| R::negative(c)),
+            Height::Yz => vectors.map(|[_, b, c]| two(b, y2, c, z2)),
+            Height::Xz => vectors.map(|[a, _, c]| two(a, x2, c, z2)),
+            Height::Xy => vectors.map(|[a, b, _]| two(a, x2, b, y2)),
+            Height::All => vectors.map(|vector| three(vector, x2, y2, z2)),
+        };
+        let ([[f0, f1], [p0, p1]], [f2, p2]) = (level, height);
+        [[f0, f1, f2], [p0, p1, p2]]
+    }
 }
 
 impl<N: Number> Link<N> {
-    fn new(row: &Row, first: bool, last: bool) -> Self {
+    /// The link of a row that turns such a frame; the last one, or not.
+    fn new(row: &Row, joint: Joint, frame: Frame, last: bool) -> Self {
         let ends = last || row.alpha != Q1_14::ZERO;
-        let a = length(row.a);
+        let (a, d) = (row.a != Q1_14::ZERO, row.d != Q1_14::ZERO);
+        let twist = Twist::new(row.alpha);
+        let axis = frame.z();
+        let (_, twisting) = frame.after(twist);
+        let due = [
+            (ends || a, due::X),
+            (ends, due::ENDS),
+            (ends && !axis.is_upright(), due::Z),
+            (a, due::A),
+            (d, due::D),
+            (row.kind == RowKind::Revolute, due::TURNS),
+        ];
         Self {
+            due: due.into_iter().fold(0, |all, (is_due, bit)| if is_due { all | bit } else { all }),
+            joint,
+            mixes: [frame.turn(), twisting],
+            axis,
             kind: row.kind,
-            slide: row.d,
+            a: row.a,
+            d: row.d,
             offset: row.theta_offset,
-            twist: Twist::new(row.alpha),
-            a,
-            d: if first { None } else { length(row.d) },
-            x: ends || a.is_some(),
-            ends,
+            twist,
         }
     }
 
-    /// The angle from the axes before the group of parallel joints to this joint's.
-    fn angle(&self, group: Option<Q1_14>, position: Q1_14) -> Q1_14 {
-        let own = match self.kind {
-            RowKind::Revolute => N::plus_angle(position, self.offset),
-            RowKind::Prismatic | RowKind::Fixed => self.offset,
+    fn is_due(&self, bit: u32) -> bool {
+        self.due & bit != 0
+    }
+
+    /// The angle from the axes before the group of parallel joints to this joint's; with that of the joint before it.
+    #[inline(always)]
+    fn angle(&self, group: Q1_14, joints: &[Q1_14; MAX_JOINTS]) -> Q1_14 {
+        let mut angle = self.offset;
+        if self.is_due(due::TURNS)
+            && let Some(position) = self.joint.of(joints)
+        {
+            angle = N::plus_angle(*position, angle);
+        }
+        if self.is_due(due::GOES_ON) { N::plus_angle(group, angle) } else { angle }
+    }
+
+    /// y_l and z_l, in place of v_l and the z before it; these two change places where they have to.
+    #[inline(always)]
+    fn twist_by_alpha<'a>(&self, y: &mut &'a mut Vector<N>, z: &mut &'a mut Vector<N>) {
+        match self.twist {
+            Twist::None => {}
+            Twist::Ahead => {
+                negate(y);
+                core::mem::swap(y, z);
+            }
+            Twist::Half => {
+                negate(y);
+                negate(z);
+            }
+            Twist::Back => {
+                negate(z);
+                core::mem::swap(y, z);
+            }
+            Twist::Other { sine, cosine } => {
+                seldom();
+                twist_by(Turn([sine, cosine]), self.mixes, y, z);
+            }
+        }
+    }
+
+    /// p_(l-1) from p_l (Eq. 24), and J of a joint that turns: (z x p) . f (Eq. 8).
+    #[inline(always)]
+    fn step_down<'a, R: Rounding>(
+        &self,
+        p: &mut Vector<N>,
+        &[f0, f1, f2]: &Vector<N>,
+        z: &Vector<N>,
+        d: Option<N>,
+        mut kept: impl FnMut() -> Option<&'a Vector<N>>,
+    ) -> Option<N>
+    where
+        N: 'a,
+    {
+        let ([p0, p1, p2], [z0, z1, z2]) = (p, *z);
+        let a = || N::word(self.a);
+        let level = |m0: N, m1: N| R::plus::<N>(f0.times(m0), f1.times(m1));
+        let moment = match self.axis {
+            // Below an upright axis all are upright, and nobody reads a height.
+            Axis::Up | Axis::Down => {
+                if self.is_due(due::A) {
+                    let ([x0, x1, _], a) = (*kept()?, a());
+                    *p0 = R::more(*p0, a.times(x0));
+                    *p1 = R::more(*p1, a.times(x1));
+                }
+                if !self.is_due(due::TURNS) {
+                    return None;
+                }
+                if self.axis == Axis::Up {
+                    level(R::negative(*p1), *p0)
+                } else {
+                    level(*p1, R::negative(*p0))
+                }
+            }
+            Axis::Level => {
+                if self.is_due(due::A) {
+                    let ([x0, x1, x2], a) = (*kept()?, a());
+                    shift::<R, N>(p0, a.times(x0), d, z0);
+                    shift::<R, N>(p1, a.times(x1), d, z1);
+                    *p2 = R::more(*p2, a.times(x2));
+                } else if let Some(d) = d {
+                    *p0 = R::more(*p0, d.times(z0));
+                    *p1 = R::more(*p1, d.times(z1));
+                }
+                if !self.is_due(due::TURNS) {
+                    return None;
+                }
+                let [m0, m1] = [R::round(p2.times(z1)), R::round(R::negative(*p2).times(z0))];
+                let m2 = R::difference(p1.times(z0), p0.times(z1));
+                R::plus::<N>(level(m0, m1), f2.times(m2))
+            }
+            Axis::Any => {
+                if self.is_due(due::A) {
+                    let ([x0, x1, x2], a) = (*kept()?, a());
+                    shift::<R, N>(p0, a.times(x0), d, z0);
+                    shift::<R, N>(p1, a.times(x1), d, z1);
+                    shift::<R, N>(p2, a.times(x2), d, z2);
+                } else if let Some(d) = d {
+                    *p0 = R::more(*p0, d.times(z0));
+                    *p1 = R::more(*p1, d.times(z1));
+                    *p2 = R::more(*p2, d.times(z2));
+                }
+                if !self.is_due(due::TURNS) {
+                    return None;
+                }
+                let m0 = R::difference(p2.times(z1), p1.times(z2));
+                let m1 = R::difference(p0.times(z2), p2.times(z0));
+                let m2 = R::difference(p1.times(z0), p0.times(z1));
+                R::plus::<N>(level(m0, m1), f2.times(m2))
+            }
         };
-        group.map_or(own, |group| N::plus_angle(group, own))
+        Some(R::round(moment))
     }
 
-    /// p_(l-1) from p_l (Eq. 24).
-    fn shift(&self, [p0, p1, p2]: [N; 3], step: &Step<N>, upright: bool) -> [N; 3] {
-        let ([x0, x1, x2], [z0, z1, z2]) = (step.x, step.z);
-        let slides = self.kind == RowKind::Prismatic;
-        let d = if slides { Some(N::word(self.slide.saturating_add(step.position))) } else { self.d };
-        let shift = |p: N, x, z| {
-            let sum = self.a.map_or(Sum::Word(p), |a| Sum::Word(p).plus(a, x));
-            d.map_or(sum, |d| sum.plus(d, z)).component().number()
-        };
-        [shift(p0, x0, z0), shift(p1, x1, z1), if upright { p2 } else { shift(p2, x2, z2) }]
-    }
-}
-
-impl<N: Number> Twist<N> {
-    /// The second and the third axis after the twist, from those before it.
-    fn turn_axes(self, v: Axis<N>, z: Axis<N>) -> [Axis<N>; 2] {
-        match self {
-            Self::None => [v, z],
-            Self::Ahead => [z, v.map(Component::negative)],
-            Self::Half => [v.map(Component::negative), z.map(Component::negative)],
-            Self::Back => [z.map(Component::negative), v],
-            Self::Other { sine, cosine } => [
-                combine(v, z, |v, z| Sum::Nothing.plus(cosine, v).plus(sine, z)),
-                combine(v, z, |v, z| Sum::Nothing.plus(cosine, z).minus(sine, v)),
-            ],
+    /// z . f, of a prismatic joint.
+    fn along<R: Rounding>(&self, &[z0, z1, z2]: &Vector<N>, &[f0, f1, f2]: &Vector<N>) -> N {
+        match self.axis {
+            Axis::Up => f2,
+            Axis::Down => R::negative(f2),
+            Axis::Level => R::round(R::plus::<N>(f0.times(z0), f1.times(z1))),
+            Axis::Any => R::round(R::plus::<N>(R::plus::<N>(f0.times(z0), f1.times(z1)), f2.times(z2))),
         }
     }
 }
 
-/// z . f, of a prismatic joint.
-fn along<N: Number>([z0, z1, z2]: Axis<N>, [f0, f1, f2]: [N; 3]) -> N {
-    Sum::Nothing.plus(f0, z0).plus(f1, z1).plus(f2, z2).component().number()
+/// A component of the position with the product of a, and with that of d.
+#[inline(always)]
+fn shift<R: Rounding, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N) {
+    *position = match d {
+        None => R::more(*position, by_a),
+        Some(d) => R::more_and_more(*position, by_a, d.times(z)),
+    };
 }
 
-/// (z x p) . f (Eq. 8).
-fn triple_product<N: Number>([z0, z1, z2]: Axis<N>, [p0, p1, p2]: [N; 3], [f0, f1, f2]: [N; 3]) -> N {
-    let m0 = Sum::Nothing.plus(p2, z1).minus(p1, z2).component();
-    let m1 = Sum::Nothing.plus(p0, z2).minus(p2, z0).component();
-    let m2 = Sum::Nothing.plus(p1, z0).minus(p0, z1).component();
-    Sum::Nothing.plus(f0, m0).plus(f1, m1).plus(f2, m2).component().number()
-}
-
-/// One sum for each component of two axes.
-fn combine<N: Number>(
-    [a0, a1, a2]: Axis<N>,
-    [b0, b1, b2]: Axis<N>,
-    sum: impl Fn(Component<N>, Component<N>) -> Sum<N>,
-) -> Axis<N> {
-    [sum(a0, b0).component(), sum(a1, b1).component(), sum(a2, b2).component()]
-}
-
-impl<N: Number> Component<N> {
-    /// The base frame's own axes.
-    const BASE: [Axis<N>; 3] = [
-        [Self::One, Self::Zero, Self::Zero],
-        [Self::Zero, Self::One, Self::Zero],
-        [Self::Zero, Self::Zero, Self::One],
-    ];
-
-    fn negative(self) -> Self {
-        match self {
-            Self::Zero => Self::Zero,
-            Self::One => Self::MinusOne,
-            Self::MinusOne => Self::One,
-            Self::Varies(number) => Self::Varies(number.negative()),
-        }
-    }
-
-    fn number(self) -> N {
-        match self {
-            Self::Zero => N::zero(),
-            Self::One => N::one(),
-            Self::MinusOne => N::one().negative(),
-            Self::Varies(number) => number,
-        }
-    }
-}
-
-/// A sum of products that is as wide as it has to be.
-#[derive(Clone, Copy)]
-enum Sum<N: Number> {
-    Nothing,
-    Word(N),
-    Wide(N::Wide),
-}
-
-impl<N: Number> Sum<N> {
-    /// With the product of a number and a component.
-    fn plus(self, factor: N, component: Component<N>) -> Self {
-        match component {
-            Component::Zero => self,
-            Component::One => match self.wide() {
-                None => Self::Word(factor),
-                Some(sum) => Self::Wide(N::plus(sum, factor.widen())),
-            },
-            Component::MinusOne => match self.wide() {
-                None => Self::Word(factor.negative()),
-                Some(sum) => Self::Wide(N::minus(sum, factor.widen())),
-            },
-            Component::Varies(number) => Self::Wide(match self.wide() {
-                None => factor.times(number),
-                Some(sum) => N::plus(sum, factor.times(number)),
-            }),
-        }
-    }
-
-    /// Without the product of a number and a component.
-    fn minus(self, factor: N, component: Component<N>) -> Self {
-        let Component::Varies(number) = component else { return self.plus(factor, component.negative()) };
-        Self::Wide(match self.wide() {
-            None => factor.negative().times(number),
-            Some(sum) => N::minus(sum, factor.times(number)),
-        })
-    }
-
-    fn wide(self) -> Option<N::Wide> {
-        match self {
-            Self::Nothing => None,
-            Self::Word(word) => Some(word.widen()),
-            Self::Wide(sum) => Some(sum),
-        }
-    }
-
-    /// The sum, rounded once.
-    fn component(self) -> Component<N> {
-        match self {
-            Self::Nothing => Component::Zero,
-            Self::Word(word) => Component::Varies(word),
-            Self::Wide(sum) => Component::Varies(N::round(sum)),
-        }
-    }
+/// The same of a twist that is none by quarter turns.
+#[inline(never)]
+fn twist_by<N: Number>(turn: Turn<N>, [_, mix]: [Mix; 2], y: &mut Vector<N>, z: &mut Vector<N>) {
+    turn.both(mix, y, z);
 }

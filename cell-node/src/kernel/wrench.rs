@@ -17,16 +17,16 @@
 //! stored words. What nobody reads further down the chain is not computed: [`Live`] says what is, worked out once.
 
 mod fold;
-mod joint;
 mod range;
 
 use protocol::fixed::{Q1_14, TorqueFormat};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
 use self::fold::fold;
-use self::joint::Joint;
-use self::range::{Bounded, Held, Rounding, bound};
-use super::{Kernel, Number, Scalar, Twist, chain, length, settled_turn};
+use self::range::bound;
+use super::joint::Joint;
+use super::rounding::{Bounded, Held, Rounding};
+use super::{Kernel, Number, Scalar, Twist, chain, length, seldom, settled_turn};
 use crate::contact::{MAX_J, TorqueRounding};
 
 /// The wrench kernel, of one cell.
@@ -434,11 +434,6 @@ impl<N: Number> Link<N> {
         self.turn_by_offset(wrench);
     }
 }
-
-/// Where this is called the compiler keeps out of the straight path.
-#[cold]
-#[inline(always)]
-const fn seldom() {}
 
 /// `Rz` by its sine and cosine.
 struct Turn<N>([N; 2]);

@@ -1,0 +1,255 @@
+//! The axes of a frame in the base frame: what is known of them whatever the joints are, and how they turn.
+//!
+//! The first two components of an axis are alike: both are numbers that depend on the joints, but in the axes that are
+//! upright, and in those of the base. So an axis is told by its third one, [`Axis`], and two axes that turn into each
+//! other by how those go together, [`Mix`].
+
+use crate::kernel::{Number, Twist};
+
+/// The components of an axis, or of another vector, in the base frame.
+pub(super) type Vector<N> = [N; 3];
+
+/// What is known of an axis.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Axis {
+    /// It is (0, 0, 1).
+    Up,
+    /// It is (0, 0, -1).
+    Down,
+    /// Its third component is 0.
+    Level,
+    /// Nothing.
+    Any,
+}
+
+/// Which products there are where a turn makes two axes of two: `c a + s b` and `c b - s a`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Mix {
+    /// None: they are the base's first two.
+    Base,
+    /// b is up.
+    Up,
+    /// b is down.
+    Down,
+    /// Both third components are 0.
+    Level,
+    /// That of a is 0.
+    Second,
+    /// That of b is 0.
+    First,
+    /// All.
+    Both,
+}
+
+/// What is known of the axes of a frame: x, y and z.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Frame {
+    known: [Axis; 3],
+    /// Whether x and y are the base's.
+    base: bool,
+}
+
+impl Frame {
+    pub(super) const BASE: Self = Self { known: [Axis::Level, Axis::Level, Axis::Up], base: true };
+
+    /// What is known of z.
+    pub(super) fn z(self) -> Axis {
+        let [.., z] = self.known;
+        z
+    }
+
+    /// How a turn about z mixes x and y.
+    pub(super) fn turn(self) -> Mix {
+        let [x, y, _] = self.known;
+        if self.base { Mix::Base } else { Mix::new(x, y) }
+    }
+
+    /// The frame after a turn about z and a twist about the new x; and how that mixes the other two.
+    pub(super) fn after<N>(self, twist: Twist<N>) -> (Self, Mix) {
+        let (x, v) = self.turn().axes();
+        let z = self.z();
+        let mix = Mix::new(v, z);
+        let (y, z) = match twist {
+            Twist::None => (v, z),
+            Twist::Ahead => (z, v.opposite()),
+            Twist::Half => (v.opposite(), z.opposite()),
+            Twist::Back => (z.opposite(), v),
+            Twist::Other { .. } => mix.axes(),
+        };
+        (Self { known: [x, y, z], base: false }, mix)
+    }
+}
+
+impl Axis {
+    pub(super) fn is_upright(self) -> bool {
+        matches!(self, Self::Up | Self::Down)
+    }
+
+    /// What is known of the opposite axis.
+    fn opposite(self) -> Self {
+        match self {
+            Self::Up => Self::Down,
+            Self::Down => Self::Up,
+            Self::Level | Self::Any => self,
+        }
+    }
+}
+
+impl Mix {
+    fn new(a: Axis, b: Axis) -> Self {
+        match (a, b) {
+            (Axis::Level, Axis::Up) => Self::Up,
+            (Axis::Level, Axis::Down) => Self::Down,
+            (Axis::Level, Axis::Level) => Self::Level,
+            (Axis::Level, Axis::Any) => Self::Second,
+            (Axis::Any, Axis::Level) => Self::First,
+            // The first of them is never upright.
+            (Axis::Up | Axis::Down | Axis::Any, _) => Self::Both,
+        }
+    }
+
+    /// What is known of both results.
+    fn axes(self) -> (Axis, Axis) {
+        match self {
+            Self::Base | Self::Level => (Axis::Level, Axis::Level),
+            Self::Up | Self::Down | Self::First | Self::Second | Self::Both => (Axis::Any, Axis::Any),
+        }
+    }
+}
+
+/// How a vector of a frame becomes one of the base's: by which products of its components and the axes'.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct ToBase {
+    pub(super) level: Level,
+    pub(super) height: Height,
+}
+
+/// By which of the axes the vector's first two components are computed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Level {
+    Xy,
+    Xz,
+    All,
+}
+
+/// The same of its third one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Height {
+    /// Nobody reads it.
+    Nothing,
+    /// No product: the axis is up or down.
+    Y,
+    MinusY,
+    Z,
+    MinusZ,
+    Xy,
+    Xz,
+    Yz,
+    All,
+}
+
+impl ToBase {
+    /// By what is known of the frame's axes; without a height where nobody reads one.
+    pub(super) fn new(Frame { known, .. }: Frame, upright: bool) -> Self {
+        let [_, y, z] = known;
+        let level = if y.is_upright() {
+            Level::Xz
+        } else if z.is_upright() {
+            Level::Xy
+        } else {
+            Level::All
+        };
+        let height = match known {
+            _ if upright => Height::Nothing,
+            [_, Axis::Up, _] => Height::Y,
+            [_, Axis::Down, _] => Height::MinusY,
+            [_, _, Axis::Up] => Height::Z,
+            [_, _, Axis::Down] => Height::MinusZ,
+            [Axis::Level, _, _] => Height::Yz,
+            [_, Axis::Level, _] => Height::Xz,
+            [_, _, Axis::Level] => Height::Xy,
+            _ => Height::All,
+        };
+        Self { level, height }
+    }
+}
+
+/// A turn, by its sine and cosine.
+///
+/// Axes are of length 1 but for what rounding and the sine's error add; so that no component of one can leave the range
+/// of a word, and none is held: see [`super::range`].
+#[derive(Clone, Copy)]
+pub(super) struct Turn<N>(pub(super) [N; 2]);
+
+impl<N: Number> Turn<N> {
+    /// `c a + s b`.
+    #[inline(always)]
+    pub(super) fn ahead(self, mix: Mix, &[a0, a1, a2]: &Vector<N>, &[b0, b1, b2]: &Vector<N>) -> Vector<N> {
+        let Self([sine, cosine]) = self;
+        match mix {
+            Mix::Base => [cosine, sine, N::zero()],
+            Mix::Up => [product(cosine, a0), product(cosine, a1), sine],
+            Mix::Down => [product(cosine, a0), product(cosine, a1), sine.bounded_negative()],
+            Mix::Level => [self.sum(a0, b0), self.sum(a1, b1), N::zero()],
+            Mix::Second => [self.sum(a0, b0), self.sum(a1, b1), product(sine, b2)],
+            Mix::First => [self.sum(a0, b0), self.sum(a1, b1), product(cosine, a2)],
+            Mix::Both => [self.sum(a0, b0), self.sum(a1, b1), self.sum(a2, b2)],
+        }
+    }
+
+    /// That in place of a, and `c b - s a` in place of b.
+    #[inline(always)]
+    pub(super) fn both(self, mix: Mix, [a0, a1, a2]: &mut Vector<N>, [b0, b1, b2]: &mut Vector<N>) {
+        let Self([sine, cosine]) = self;
+        let turn = |a: &mut N, b: &mut N| (*a, *b) = (self.sum(*a, *b), self.difference(*b, *a));
+        // Where b is nothing, and where a is.
+        let first =
+            |a: &mut N, b: &mut N| (*a, *b) = (product(cosine, *a), product(sine.bounded_negative(), *a));
+        let second = |a: &mut N, b: &mut N| (*a, *b) = (product(sine, *b), product(cosine, *b));
+        match mix {
+            Mix::Base => {
+                (*a0, *a1) = (cosine, sine);
+                (*b0, *b1) = (sine.bounded_negative(), cosine);
+            }
+            Mix::Up | Mix::Down => {
+                first(a0, b0);
+                first(a1, b1);
+                (*a2, *b2) = if mix == Mix::Up {
+                    (sine, cosine)
+                } else {
+                    (sine.bounded_negative(), cosine.bounded_negative())
+                };
+            }
+            Mix::Level | Mix::Second | Mix::First | Mix::Both => {
+                turn(a0, b0);
+                turn(a1, b1);
+                match mix {
+                    Mix::Second => second(a2, b2),
+                    Mix::First => first(a2, b2),
+                    Mix::Both => turn(a2, b2),
+                    Mix::Base | Mix::Up | Mix::Down | Mix::Level => {}
+                }
+            }
+        }
+    }
+
+    fn sum(self, a: N, b: N) -> N {
+        let Self([sine, cosine]) = self;
+        N::bounded(N::bounded_plus(cosine.times(a), sine.times(b)))
+    }
+
+    fn difference(self, b: N, a: N) -> N {
+        let Self([sine, cosine]) = self;
+        N::bounded(N::bounded_minus(cosine.times(b), sine.times(a)))
+    }
+}
+
+fn product<N: Number>(factor: N, number: N) -> N {
+    N::bounded(factor.times(number))
+}
+
+/// The opposite axis.
+#[inline(always)]
+pub(super) fn negate<N: Number>([x, y, z]: &mut Vector<N>) {
+    (*x, *y, *z) = (x.bounded_negative(), y.bounded_negative(), z.bounded_negative());
+}
