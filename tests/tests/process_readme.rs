@@ -16,7 +16,7 @@ const PICTURE: &str = include_str!("../../docs/explanation/report-torque.svg");
 /// What `cargo build --release` makes for the user. It is built already, so this one build is replaced.
 const PROGRAMS: [&str; 3] = ["gateway", "cell-node", "vcan-setup"];
 /// The other programs that the commands may use. Nothing else is found.
-const TOOLS: [&str; 5] = ["ln", "mkdir", "python3", "sed", "sleep"];
+const TOOLS: [&str; 6] = ["ln", "mkdir", "python3", "sed", "sleep", "tac"];
 /// For all commands; a machine that others use too takes a third of it.
 const LIMIT: Duration = Duration::from_secs(300);
 
