@@ -1,9 +1,10 @@
 //! A private directory for embedded buses.
 
-use std::fs::Permissions;
+use std::fs::{File, Permissions};
 use std::os::unix::fs::PermissionsExt;
 use std::path::PathBuf;
 
+use protocol::bus::embedded::mark;
 use protocol::usage::Failure;
 use tempfile::{Builder, TempDir};
 
@@ -15,5 +16,10 @@ pub(super) fn directory(what: &str) -> Result<TempDir, Failure> {
     let folder = Some(std::env::temp_dir()).filter(fits).unwrap_or_else(|| PathBuf::from("/tmp"));
     let mine = Permissions::from_mode(0o700);
     let made = Builder::new().prefix(&format!("skinbus-{what}-")).permissions(mine).tempdir_in(folder);
-    made.map_err(|error| Failure::run(format!("{error}; set SKINBUS_DIR to a directory of your own")))
+    let failed = |error| Failure::run(format!("{error}; set SKINBUS_DIR to a directory of your own"));
+    let made = made.map_err(failed)?;
+    // If this program is killed, the last server removes it.
+    let marked = File::open(made.path()).and_then(|directory| Ok(mark(directory)?));
+    marked.map_err(failed)?;
+    Ok(made)
 }

@@ -198,6 +198,14 @@ fn times_that_run_backwards_are_counted_and_keep_their_order() {
     assert_eq!(converted(&mcap, Format::Candump).0, log.as_bytes());
 }
 
+#[test]
+fn times_of_each_bus_are_compared_with_its_own() {
+    let backwards = |log: &str| converted(log.as_bytes(), Format::Mcap).1.backwards;
+    let apart = "(3.000000) can0 001#\n(1.000000) can1 002#\n(4.000000) can0 003#\n(2.000000) can1 004#\n";
+    assert_eq!(backwards(apart), None);
+    assert_eq!(backwards(&apart.replace("(2.", "(0.")), Some((1, 4)));
+}
+
 /// A recording of several chunks, and its frames' times and data.
 fn recording() -> (Vec<u8>, Vec<(u64, Vec<u8>)>) {
     let mut log = String::new();

@@ -32,6 +32,9 @@ fn a_run_comes_back_bit_for_bit_at_its_own_times_in_lockstep_and_as_fast_as_it_c
             replayed.all_came_back_in_time(&ended)
         };
         counts.push(count);
+        let timed = !route.contains("--max") && !route.contains("--lockstep");
+        assert_eq!(!replayed.0["late_us"].is_null(), timed);
+        assert_eq!(ended.stdout.contains("lateness"), timed, "{}", ended.stdout);
         assert_eq!(replayed.number("/refused") + replayed.number("/lost"), 0);
         assert!(ended.stdout.contains("bit for bit"), "{}", ended.stdout);
     }

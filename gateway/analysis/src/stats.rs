@@ -26,8 +26,6 @@ mod foreign;
 pub struct Stats {
     /// Times of the earliest and the latest frame.
     span: Option<(u64, u64)>,
-    /// Time of the frame before.
-    last: u64,
     /// What grows as frames come.
     counts: Report,
     bus_stats: Vec<LinkId>,
@@ -36,6 +34,8 @@ pub struct Stats {
 /// One bus.
 #[derive(Debug)]
 struct LinkId {
+    /// Time of the frame before.
+    last: u64,
     /// What grows as frames come.
     counts: BusReport,
     kinds: [Count; NAMES.len()],
@@ -122,7 +122,7 @@ pub struct Report {
     pub duration_s: f64,
     /// Frames of all buses.
     pub frames: u64,
-    /// Frames whose time is before that of the frame before them.
+    /// Frames whose time is before that of the frame before them on their bus.
     pub times_backwards: u64,
     /// Lost frames of an unknown bus, by the notes of the recorder.
     pub dropped: u64,
@@ -253,14 +253,16 @@ impl Stats {
     pub fn take(&mut self, record: &Record<'_>, decoded: &Decoded) {
         let nanos = record.time.nanos;
         self.counts.frames += 1;
-        self.counts.times_backwards += u64::from(nanos < self.last);
-        self.last = nanos;
         let (earliest, latest) = self.span.unwrap_or((nanos, nanos));
         self.span = Some((earliest.min(nanos), latest.max(nanos)));
-        match self.bus_stats(record.interface) {
-            Some(bus_stats) => bus_stats.take(record, decoded),
-            None => self.counts.frames_of_other_buses += 1,
-        }
+        let Some(bus_stats) = self.bus_stats(record.interface) else {
+            self.counts.frames_of_other_buses += 1;
+            return;
+        };
+        bus_stats.take(record, decoded);
+        // Buses are read in turn, so that only frames of one bus have an order.
+        let back = nanos < std::mem::replace(&mut bus_stats.last, nanos);
+        self.counts.times_backwards += u64::from(back);
     }
 
     /// Frames were lost before this point; the bus is empty where it is unknown.
@@ -310,6 +312,7 @@ fn rate(count: u64, nanos: u64) -> Option<f64> {
 impl LinkId {
     fn new(bus: &str) -> Self {
         Self {
+            last: 0,
             counts: BusReport { bus: bus.to_owned(), ..BusReport::default() },
             kinds: [Count::default(); NAMES.len()],
             wires: Count::default(),

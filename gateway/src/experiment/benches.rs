@@ -14,6 +14,7 @@ use paper::{Effort, recorded};
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use rustix::process::{Pid, Signal, kill_process};
+use trace::files::write_whole;
 
 use crate::arguments::Programs;
 use crate::buses;
@@ -43,7 +44,7 @@ impl Benches {
         let [skin, scenario, recording, summary] =
             [file(".toml"), self.folder.join("arm-touches.toml"), file(".mcap"), file(".json")];
         for (path, text) in [(&skin, text.as_str()), (&scenario, arm::scenario(effort))] {
-            fs::write(path, text).map_err(|error| failed(path, &error))?;
+            write_whole(path, text, true).map_err(|error| failed(path, &error))?;
         }
         let own = std::env::current_exe().map_err(|error| failed(Path::new("gateway"), &error))?;
         let buses = buses::directory("experiment")?;

@@ -1,11 +1,11 @@
 //! A folder whose files get their names together, when everything is done.
 
-use std::fs::{self, File};
-use std::io::{self, Write};
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 
 use protocol::usage::Failure;
-use trace::files::rename;
+use trace::files::{rename, sync_folder, write_whole};
 
 use crate::output::Force;
 
@@ -52,9 +52,7 @@ impl Folder {
 
     /// Writes a file.
     pub(super) fn write(&self, name: &str, text: &str) -> Result<(), Failure> {
-        let mut file = File::create_new(self.inside.join(name)).map_err(|error| self.failed(name, &error))?;
-        let written = file.write_all(text.as_bytes()).and_then(|()| file.sync_all());
-        written.map_err(|error| self.failed(name, &error))
+        write_whole(&self.inside.join(name), text, false).map_err(|error| self.failed(name, &error))
     }
 
     /// Everything gets its name; files of the same names are replaced with `force` only.
@@ -64,6 +62,11 @@ impl Folder {
             let name = entry.file_name();
             rename(&entry.path(), &self.path.join(&name), self.force.force)
                 .map_err(|error| self.failed(&name.to_string_lossy(), &error))?;
+        }
+        sync_folder(&self.inside);
+        if self.made {
+            // Folders above it may have been made with it.
+            self.path.ancestors().for_each(sync_folder);
         }
         Ok(())
     }

@@ -7,7 +7,10 @@ use super::Filter;
 
 pub(super) use client::Embedded;
 pub use client::seqpacket;
-pub use directory::{DirectoryError, address, make_directory, open_directory, socket_name, usual_directory};
+pub use directory::{
+    DirectoryError, MARK, address, make_directory, mark, open_directory, remove_directory, socket_name,
+    usual_directory,
+};
 
 mod client;
 mod directory;

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use protocol::bus::BusError;
 use protocol::bus::embedded::{
-    DirectoryError, address, make_directory, open_directory, seqpacket, socket_name,
+    DirectoryError, address, make_directory, open_directory, remove_directory, seqpacket, socket_name,
 };
 use rustix::fs::{AtFlags, FileType, FlockOperation};
 use rustix::io::Errno;
@@ -49,7 +49,8 @@ pub enum PlaceError {
     },
 }
 
-/// A listening socket in its directory; dropping it removes both, the directory only when it is empty.
+/// A listening socket in its directory; dropping it removes both, the directory only when it is
+/// empty and a server made it.
 #[derive(Debug)]
 pub(super) struct Place {
     pub(super) listener: OwnedFd,
@@ -103,7 +104,7 @@ impl Place {
         let stat = rustix::fs::statat(&directory, &self.file, AtFlags::SYMLINK_NOFOLLOW)?;
         if (stat.st_dev, stat.st_ino) == self.inode {
             rustix::fs::unlinkat(&directory, &self.file, AtFlags::empty())?;
-            rustix::fs::rmdir(&self.directory)?;
+            remove_directory(&directory, &self.directory)?;
         }
         Ok(())
     }
@@ -111,7 +112,8 @@ impl Place {
 
 impl Drop for Place {
     fn drop(&mut self) {
-        // Nothing more can be done: another program removed it, or the directory has other buses.
+        // Nothing more can be done: another program removed it, or the directory has other buses or is
+        // the user's.
         let _ = self.remove();
     }
 }

@@ -32,6 +32,27 @@ fn of_many_that_start_at_once_over_a_stale_socket_one_wins() {
     }
 }
 
+#[test]
+fn a_directory_of_the_user_stays_and_one_of_ours_goes_with_its_last_bus() {
+    let parent = TempDir::new().unwrap();
+    let [users, ours] = ["users", "ours"].map(|name| parent.path().join(name));
+    std::fs::DirBuilder::new().mode(0o700).create(&users).unwrap();
+    for _ in 0..2 {
+        Served::start_in(&users, BUS).unwrap().stop().unwrap();
+        assert_eq!(std::fs::read_dir(&users).unwrap().count(), 0);
+    }
+    let [first, second] = [BUS, "vcan1"].map(|name| Served::start_in(&ours, name).unwrap());
+    first.stop().unwrap();
+    assert!(ours.exists());
+    let file = ours.join("mine");
+    std::fs::write(&file, "").unwrap();
+    second.stop().unwrap();
+    assert!(file.exists());
+    std::fs::remove_file(file).unwrap();
+    Served::start_in(&ours, BUS).unwrap().stop().unwrap();
+    assert!(!ours.exists());
+}
+
 /// What a server that was killed leaves behind.
 fn leave_stale_socket(directory: &Path) {
     drop(protocol::bus::embedded::make_directory(directory).unwrap());

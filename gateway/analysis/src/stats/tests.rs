@@ -236,6 +236,20 @@ fn times_that_run_backwards_are_counted_and_the_duration_is_that_of_all() {
 }
 
 #[test]
+fn times_of_each_bus_are_compared_with_its_own() {
+    let backwards = |times: [(&str, u64); 4]| {
+        let mut tape = Tape::default();
+        for (bus, ms) in times {
+            tape.ms = ms;
+            tape.frame(bus, Frame::classic(1, &[]).unwrap());
+        }
+        tape.stats.report().times_backwards
+    };
+    assert_eq!(backwards([("can0", 30), ("can1", 10), ("can0", 40), ("can1", 20)]), 0);
+    assert_eq!(backwards([("can0", 30), ("can1", 20), ("can0", 40), ("can1", 10)]), 1);
+}
+
+#[test]
 fn a_claim_of_an_owned_node_id_is_no_restart_and_no_loss() {
     let counts = |intruded: bool, lost: u16| {
         let mut tape = Tape::default();

@@ -1,8 +1,10 @@
 //! The frames of a run as candump text.
 
+use std::fs;
 use std::io;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
 
 use protocol::candump::{Record, Timestamp, write_record};
 
@@ -14,11 +16,18 @@ use trace::recording::account::Written;
 /// Bytes that are written together.
 const PIECE: usize = 64 << 10;
 
-/// A log that is being written. The first error ends it at its last whole line.
+/// Between two looks whether the log still has its name.
+const LOOK: Duration = Duration::from_secs(1);
+
+/// A log that is being written. The first error of writing ends it at its last whole line.
 #[derive(Debug)]
 pub struct Text {
     log: LogFile,
     failed: bool,
+    /// Whether another program moved or changed it.
+    moved: bool,
+    /// When that was looked at last.
+    looked: Instant,
     /// Lines that wait to be written.
     lines: String,
     /// Frames in them.
@@ -41,7 +50,8 @@ impl Text {
             LogFile::create(&target.path, force, stopped)?
         };
         let lines = String::with_capacity(PIECE + 256);
-        Ok(Self { log, failed: false, lines, waiting: 0, frames: 0, lost: 0 })
+        let (failed, moved, looked) = (false, false, Instant::now());
+        Ok(Self { log, failed, moved, looked, lines, waiting: 0, frames: 0, lost: 0 })
     }
 
     /// Its name.
@@ -84,11 +94,35 @@ impl Text {
         if self.lines.len() < PIECE { Ok(()) } else { self.flush() }
     }
 
+    /// Whether nothing more is written.
+    #[must_use]
+    pub const fn is_over(&self) -> bool {
+        self.failed
+    }
+
     /// Hands the lines that wait to the kernel: readers that follow the log see them, and a killed run keeps them.
     ///
     /// # Errors
-    /// When the log cannot be written; reported once.
+    /// When the log cannot be written, or has been moved or changed; reported once.
     pub fn flush(&mut self) -> io::Result<()> {
+        self.write()?;
+        if self.looked.elapsed() < LOOK {
+            return Ok(());
+        }
+        self.looked = Instant::now();
+        self.look()
+    }
+
+    fn look(&mut self) -> io::Result<()> {
+        if self.moved || self.failed {
+            return Ok(());
+        }
+        let looked = self.log.look();
+        self.moved = looked.is_err();
+        looked
+    }
+
+    fn write(&mut self) -> io::Result<()> {
         let put = self.log.append(&self.lines);
         if put.is_ok() {
             self.frames += self.waiting;
@@ -101,21 +135,32 @@ impl Text {
         put
     }
 
-    /// Ends the log, also after an error: the file, frames that were lost, and whether all was written.
-    pub fn finish(mut self) -> (Written, u64, io::Result<()>) {
-        let put = self.flush();
-        let Self { log, frames, lost, .. } = self;
-        let (path, bytes) = (log.path().display().to_string(), log.bytes());
-        let ended = log.finish();
-        let finished = put.and(ended);
-        (Written { path, format: "candump", frames, messages: frames, bytes }, lost, finished)
+    /// Ends the log, also after an error: the file, if it has its name, frames that are not in it, and whether all was
+    /// written.
+    pub fn finish(mut self) -> (Option<Written>, u64, io::Result<()>) {
+        let put = self.write();
+        let put = put.and(self.look());
+        let there = if self.moved { self.log.lines("(").ok().flatten() } else { Some(self.frames) };
+        let Self { log, frames: written, lost, .. } = self;
+        let frames = there.unwrap_or(0).min(written);
+        let path = log.path().display().to_string();
+        let file = there.map(|_| {
+            let bytes = if self.moved {
+                fs::metadata(log.path()).map_or(0, |about| about.len())
+            } else {
+                log.bytes()
+            };
+            Written { path, format: "candump", frames, messages: frames, bytes }
+        });
+        let finished = put.and(log.finish());
+        (file, lost + (written - frames), finished)
     }
 
     /// Ends the log of a run that never began: the file, or none if nothing was received.
     pub fn discard(mut self) -> Option<Written> {
         // The error to report is why the run did not begin.
         let _ = self.flush();
-        (self.frames > 0).then(|| self.finish().0)
+        (self.frames > 0).then(|| self.finish().0).flatten()
     }
 }
 
@@ -144,7 +189,7 @@ mod tests {
         text.frame("vcan0", &seen(2)).unwrap();
         let (written, lost, finished) = text.finish();
         finished.unwrap();
-        let log = std::fs::read_to_string(&path).unwrap();
+        let (log, written) = (fs::read_to_string(&path).unwrap(), written.unwrap());
         let expected = "(0.000001) vcan0 123#010203\n\
             DROPCOUNT: dropped 3 CAN frames on 'vcan0' socket (total drops 3)\n(0.000002) vcan0 123#010203\n";
         assert_eq!(log, expected);
@@ -157,7 +202,54 @@ mod tests {
         let errors = (0..10_000).filter(|&at| text.frame("vcan0", &seen(at)).is_err()).count();
         assert_eq!(errors, 1);
         let (written, lost, _) = text.finish();
-        assert_eq!((written.frames, lost), (0, 10_000));
+        assert_eq!((written.unwrap().frames, lost), (0, 10_000));
+    }
+
+    /// What another program does to a log of five frames, after which three more come: which errors are reported, the
+    /// frames in the file that the summary names, if it names one, and how many are lost.
+    fn disturbed(disturb: impl FnOnce(&Path)) -> (Vec<String>, Option<u64>, u64) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run.log");
+        let mut log = text(&path);
+        let mut said = Vec::new();
+        let mut frames = |log: &mut Text, count| {
+            for at in 0..count {
+                log.frame("vcan0", &seen(at)).unwrap();
+                log.looked = Instant::now().checked_sub(LOOK).unwrap();
+                said.extend(log.flush().err());
+            }
+        };
+        frames(&mut log, 5);
+        disturb(&path);
+        frames(&mut log, 3);
+        assert!(!log.is_over());
+        let (written, lost, finished) = log.finish();
+        said.extend(finished.err());
+        let is_there = written.as_ref().map(|file| (file.path.clone(), file.bytes));
+        let there = fs::metadata(&path).ok().filter(|_| written.is_some());
+        assert_eq!(is_there, there.map(|about| (path.display().to_string(), about.len())));
+        (said.iter().map(ToString::to_string).collect(), written.map(|file| file.frames), lost)
+    }
+
+    #[test]
+    fn a_log_that_another_program_moves_or_changes_is_reported_once_and_its_frames_are_counted() {
+        assert_eq!(disturbed(|_| {}), (Vec::new(), Some(8), 0));
+        let gone: [fn(&Path); 3] = [
+            |path| fs::remove_file(path).unwrap(),
+            |path| fs::rename(path, path.with_extension("old")).unwrap(),
+            |path| {
+                fs::rename(path, path.with_extension("old")).unwrap();
+                fs::write(path, "(0.000001) vcan0 123#\n").unwrap();
+            },
+        ];
+        for gone in gone {
+            let (said, frames, lost) = disturbed(gone);
+            assert_eq!((said.len(), frames, lost), (1, None, 8), "{said:?}");
+            assert!(said[0].starts_with("another program renamed, removed or replaced it"), "{said:?}");
+        }
+        let (said, frames, lost) = disturbed(|path| fs::write(path, "").unwrap());
+        assert_eq!((said.len(), frames, lost), (1, Some(3), 5), "{said:?}");
+        assert!(said[0].starts_with("another program changed it"), "{said:?}");
     }
 
     #[test]
@@ -168,7 +260,7 @@ mod tests {
         for at in 1..4 {
             log.frame("vcan0", &seen(at)).unwrap();
             log.flush().unwrap();
-            let there = std::fs::read_to_string(&path).unwrap();
+            let there = fs::read_to_string(&path).unwrap();
             assert!(there.ends_with(&format!("(0.{at:06}) vcan0 123#010203\n")), "{there}");
         }
     }
@@ -182,6 +274,6 @@ mod tests {
         let mut log = text(&path);
         log.frame("vcan0", &seen(1)).unwrap();
         assert_eq!(log.discard().unwrap().frames, 1);
-        assert_eq!(std::fs::read_to_string(&path).unwrap(), "(0.000001) vcan0 123#010203\n");
+        assert_eq!(fs::read_to_string(&path).unwrap(), "(0.000001) vcan0 123#010203\n");
     }
 }

@@ -361,11 +361,11 @@ impl Work {
         if let Some(text) = self.files.text.take() {
             let path = text.path().display().to_string();
             let (file, unwritten, finished) = text.finish();
-            recording.files.push(file);
+            recording.files.extend(file);
             lost = lost.max(unwritten);
-            // The reason was reported before.
+            // What happened during the run was reported before.
             if let Err(error) = finished {
-                self.files.errors.push(Said::BrokeOff(format!("{path}: {error}")));
+                self.files.errors.push(Said::Else(format!("{path}: {error}")));
             }
         }
         self.say();
@@ -391,7 +391,8 @@ impl Files {
         if let Some(text) = &mut self.text
             && let Err(error) = write(text)
         {
-            self.errors.push(Said::BrokeOff(format!("{}: {error}", text.path().display())));
+            let what = format!("{}: {error}", text.path().display());
+            self.errors.push(if text.is_over() { Said::BrokeOff(what) } else { Said::Else(what) });
         }
     }
 

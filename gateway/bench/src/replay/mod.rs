@@ -130,7 +130,9 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
     let skin_override = skin_override.transpose()?;
     // Until now there was nothing to clean up.
     let signalled = caught(&[SIGHUP, SIGINT, SIGTERM])?;
-    let idle = matches!(options.pace, Pace::Timed(_)).then(|| idle_lateness(GRID_NS));
+    // In lockstep cells say when a frame is sent, not its time.
+    let timed = matches!(options.pace, Pace::Timed(_)) && !options.lockstep;
+    let idle = timed.then(|| idle_lateness(GRID_NS));
     let recorded = start::recorded_skin(&extras);
     let mut buses = start::open(options, &survey, &routes, skin_override.as_ref(), recorded.as_ref())?;
     for bus_link in buses.bus_links.iter() {

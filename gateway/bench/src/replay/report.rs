@@ -32,7 +32,7 @@ pub struct Summary {
     pub sent_at_once: u64,
     /// Each bus.
     pub buses: Vec<BusSummary>,
-    /// How late frames were sent; none of a replay without times.
+    /// How late frames were sent; none of a replay without times, nor of lockstep.
     pub late_us: Option<Quantiles>,
     /// How late the same machine wakes a thread when nothing else runs.
     pub idle_late_us: Option<Quantiles>,

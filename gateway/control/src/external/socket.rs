@@ -7,6 +7,8 @@ use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::path::{Path, PathBuf};
 
 use protocol::skin::Skin;
+use rustix::fs::{Mode, fchmod};
+use rustix::net::SocketAddrUnix;
 use thiserror::Error;
 
 use super::datagram::{MAX_ANSWER_BYTES, State};
@@ -44,6 +46,14 @@ pub enum SocketError {
     NotASocket {
         /// The socket's path.
         path: PathBuf,
+    },
+    /// The file system gives the socket other permissions.
+    #[error("{}: the socket has mode {mode:04o} and not 0600, so that others may connect; name a path on another file system", path.display())]
+    Mode {
+        /// The socket's path.
+        path: PathBuf,
+        /// Its permission bits.
+        mode: u32,
     },
     /// The system refused.
     #[error("{}: cannot listen on this socket", path.display())]
@@ -135,14 +145,14 @@ impl Drop for External {
 
 fn bind(path: &Path) -> Result<UnixDatagram, SocketError> {
     let system = |source| SocketError::System { path: path.to_owned(), source };
-    let socket = match UnixDatagram::bind(path) {
+    let socket = match bind_private(path) {
         Err(error) if error.kind() == ErrorKind::AddrInUse => {
             if !std::fs::symlink_metadata(path).map_err(system)?.file_type().is_socket() {
                 return Err(SocketError::NotASocket { path: path.to_owned() });
             }
             match UnixDatagram::unbound().and_then(|probe| probe.connect(path)) {
                 Err(error) if error.kind() == ErrorKind::ConnectionRefused => {
-                    std::fs::remove_file(path).and_then(|()| UnixDatagram::bind(path))
+                    std::fs::remove_file(path).and_then(|()| bind_private(path))
                 }
                 Ok(()) | Err(_) => return Err(SocketError::Live { path: path.to_owned() }),
             }
@@ -151,6 +161,21 @@ fn bind(path: &Path) -> Result<UnixDatagram, SocketError> {
     };
     let socket = socket.map_err(system)?;
     socket.set_nonblocking(true).map_err(system)?;
+    let mode = std::fs::symlink_metadata(path).map_err(system)?.mode() & 0o7777;
+    if mode & 0o077 != 0 {
+        // Nothing was received from it.
+        let _ = std::fs::remove_file(path);
+        return Err(SocketError::Mode { path: path.to_owned(), mode });
+    }
+    Ok(socket)
+}
+
+/// Binds a socket to which only its user may send, whatever the umask is. Linux gives the file the mode of the socket
+/// that is bound, so there is no moment in which others may.
+fn bind_private(path: &Path) -> io::Result<UnixDatagram> {
+    let socket = UnixDatagram::unbound()?;
+    fchmod(&socket, Mode::RUSR | Mode::WUSR)?;
+    rustix::net::bind(&socket, &SocketAddrUnix::new(path)?)?;
     Ok(socket)
 }
 

@@ -1,5 +1,7 @@
+use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixDatagram;
 use std::path::{Path, PathBuf};
+use std::process;
 
 use proptest::prelude::*;
 use tempfile::TempDir;
@@ -272,6 +274,31 @@ fn a_socket_is_replaced_when_dead_refused_when_live_and_removed_at_the_end() {
     assert_eq!(std::fs::read_to_string(&path).unwrap(), "notes");
     let nowhere = folder.path().join("none/controller.sock");
     assert!(listen(&nowhere).unwrap_err().to_string().ends_with("cannot listen on this socket"));
+}
+
+#[test]
+fn only_its_user_may_connect_whatever_the_umask_is() {
+    // The umask is that of a whole process.
+    const CHILD: &str = "SKINBUS_TEST_OF_THE_UMASK";
+    if std::env::var_os(CHILD).is_some() {
+        let (_folder, path, _gateway) = gateway();
+        let mode = |path: &Path| std::fs::symlink_metadata(path).unwrap().permissions().mode() & 0o777;
+        assert_eq!(mode(&path), 0o600);
+        let open = path.with_file_name("open.sock");
+        let _open = UnixDatagram::bind(&open).unwrap();
+        assert_eq!(mode(&open), 0o777, "the umask is 0");
+        return;
+    }
+    let name = std::thread::current().name().unwrap().to_owned();
+    let child = process::Command::new("sh")
+        .args(["-c", "umask 0 && exec \"$0\" --exact \"$1\""])
+        .arg(std::env::current_exe().unwrap())
+        .arg(name)
+        .env(CHILD, "1")
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&child.stdout);
+    assert!(child.status.success() && said.contains("1 passed"), "{said}");
 }
 
 #[test]

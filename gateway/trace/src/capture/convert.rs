@@ -5,7 +5,11 @@ use std::io::{self, Write};
 use super::log::{LogWriter, Style, Wrote};
 use super::mcap::McapWriter;
 use super::{CaptureError, Entry, Format, Note, NoteKind, Reader};
+use protocol::candump::Record;
 use thiserror::Error;
+
+/// Buses whose times are compared.
+const BUSES: usize = 64;
 
 /// Where entries go.
 #[derive(Debug)]
@@ -80,7 +84,7 @@ pub struct Converted {
     pub shortened: u64,
     /// Notes that are not in the output.
     pub omitted: u64,
-    /// How often a frame is older than the one before it, and the first of them, counted from 1.
+    /// How often a frame is older than the one before it on its bus, and the first of them, counted from 1.
     pub backwards: Option<(u64, u64)>,
 }
 
@@ -110,7 +114,7 @@ pub fn convert<W: Write>(
     mut unreadable: impl FnMut(&Note<'_>, &str) -> Result<(), String>,
 ) -> Result<Converted, ConvertError> {
     let mut done = Converted::default();
-    let mut newest = 0;
+    let mut clocks = Vec::new();
     loop {
         let entry = match from.next() {
             Ok(Some(entry)) => entry,
@@ -122,7 +126,7 @@ pub fn convert<W: Write>(
             }
         };
         match &entry {
-            Entry::Frame(record) => done.frame(record.time.nanos, &mut newest),
+            Entry::Frame(record) => done.frame(record, &mut clocks),
             Entry::Note(note) => {
                 done.note(&note.kind);
                 if let NoteKind::Unreadable(why) = &note.kind {
@@ -146,12 +150,20 @@ pub fn convert<W: Write>(
 }
 
 impl Converted {
-    fn frame(&mut self, nanos: u64, newest: &mut u64) {
+    /// `clocks` are the times of the last frames of each bus.
+    fn frame(&mut self, record: &Record<'_>, clocks: &mut Vec<(String, u64)>) {
         self.frames += 1;
-        if nanos < *newest {
+        let nanos = record.time.nanos;
+        let Some((_, last)) = clocks.iter_mut().find(|(bus, _)| bus == record.interface) else {
+            if clocks.len() < BUSES {
+                clocks.push((record.interface.to_owned(), nanos));
+            }
+            return;
+        };
+        if nanos < *last {
             self.backwards.get_or_insert((0, self.frames)).0 += 1;
         }
-        *newest = nanos;
+        *last = nanos;
     }
 
     fn note(&mut self, kind: &NoteKind) {

@@ -1,7 +1,7 @@
 //! Logs: files that are there, and can be followed, while they grow.
 
 use std::fs::{self, File, OpenOptions};
-use std::io::{self, Write};
+use std::io::{self, BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -113,10 +113,52 @@ impl LogFile {
         match &self.state {
             _ if written.is_ok() => self.bytes += lines.len() as u64,
             // A part of a line would be no line. If that fails too, nothing more can be done.
-            State::Ours(file) => drop(file.set_len(self.bytes)),
+            State::Ours(file) => {
+                // It is only ever made shorter: somebody else may have done so.
+                if file.metadata().is_ok_and(|about| about.len() > self.bytes) {
+                    let _ = file.set_len(self.bytes);
+                }
+            }
             State::Old(_) | State::Stream(_) => {}
         }
         written
+    }
+
+    /// Sees that the file still has its name and holds what was written.
+    ///
+    /// # Errors
+    /// When another program has renamed, removed or truncated it, or written to it.
+    pub fn look(&self) -> io::Result<()> {
+        let State::Ours(file) = &self.state else { return Ok(()) };
+        let about = file.metadata()?;
+        let (bytes, written) = (about.len(), self.bytes);
+        let why = if !is_still(&self.path, identity(&about)) {
+            "another program renamed, removed or replaced it while it was written; what comes goes on to the file \
+             that was opened"
+                .to_owned()
+        } else if bytes != written {
+            format!(
+                "another program changed it while it was written: it has {bytes} bytes, and {written} were written"
+            )
+        } else {
+            return Ok(());
+        };
+        Err(io::Error::other(why))
+    }
+
+    /// The lines that stand in the file of its name and begin in a way; none where that is not the file that is written.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn lines(&self, begin: &str) -> io::Result<Option<u64>> {
+        let State::Ours(file) = &self.state else { return Ok(None) };
+        let there = open_unfollowed(&self.path);
+        let Some(there) = there.ok().filter(|there| is_same(there, file)) else { return Ok(None) };
+        let mut lines = 0;
+        for line in BufReader::new(there).split(b'\n') {
+            lines += u64::from(line?.starts_with(begin.as_bytes()));
+        }
+        Ok(Some(lines))
     }
 
     /// A new file takes the place of the old one, whose other names, and readers, keep it.
@@ -156,6 +198,11 @@ impl Drop for LogFile {
             let _ = fs::remove_file(&self.path);
         }
     }
+}
+
+fn is_same(one: &File, other: &File) -> bool {
+    let of = |file: &File| file.metadata().ok().map(|about| identity(&about));
+    of(one).is_some_and(|is| Some(is) == of(other))
 }
 
 /// Makes a file that nobody else has, and holds it.

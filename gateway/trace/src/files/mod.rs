@@ -7,14 +7,14 @@ pub mod log;
 mod target;
 
 use std::fs::{self, File, OpenOptions};
-use std::io;
+use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
 pub use log::LogFile;
 pub use protocol::input::folder_of;
-use target::{Target, open_stream, or_exists, part_of, sync_folder};
-pub use target::{check, check_regular, rename, suffixed, sync, with_hint};
+use target::{Target, open_stream, or_exists, part_of};
+pub use target::{check, check_regular, rename, suffixed, sync, sync_folder, with_hint};
 pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed};
 
 /// A file that has a name only when it is whole. Until then it has none at all, and so is gone with a
@@ -95,6 +95,16 @@ impl Drop for WholeFile {
             let _ = fs::remove_file(part_of(&self.path));
         }
     }
+}
+
+/// Writes a whole file; as [`WholeFile`].
+///
+/// # Errors
+/// When it cannot be written, and what to do.
+pub fn write_whole(path: &Path, text: &str, force: bool) -> io::Result<()> {
+    let (whole, mut file) = WholeFile::create(path, force)?;
+    file.write_all(text.as_bytes())?;
+    whole.finish()
 }
 
 #[cfg(test)]

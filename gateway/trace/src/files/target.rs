@@ -219,7 +219,7 @@ pub fn sync(path: &Path) -> io::Result<()> {
 }
 
 /// Makes the names in a file's folder durable. A file system that cannot does what it can.
-pub(super) fn sync_folder(path: &Path) {
+pub fn sync_folder(path: &Path) {
     let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());
 }
 

@@ -2,14 +2,17 @@
 
 use std::fs::DirBuilder;
 use std::io;
-use std::os::fd::OwnedFd;
+use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
-use rustix::fs::{Mode, OFlags};
+use rustix::fs::{AtFlags, Mode, OFlags};
 use rustix::io::Errno;
 use rustix::net::SocketAddrUnix;
 use thiserror::Error;
+
+/// The file in a directory that a program made for its buses, and so may remove with the last of them.
+pub const MARK: &str = ".skinbus";
 
 /// Where embedded buses live unless told otherwise: `$SKINBUS_DIR`, else `$XDG_RUNTIME_DIR/skinbus`, else
 /// `/tmp/skinbus-<user>`.
@@ -99,14 +102,49 @@ pub fn open_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
     Ok(directory)
 }
 
-/// Makes the directory (mode 0700) unless it is there, then opens it.
+/// Makes the directory (mode 0700) unless it is there, then opens it. One that was made here has a [`MARK`].
 ///
 /// # Errors
 /// As [`open_directory`], or when it cannot be made.
 pub fn make_directory(path: &Path) -> Result<OwnedFd, DirectoryError> {
+    let io = |source| DirectoryError::Io { path: path.to_owned(), source };
     match DirBuilder::new().mode(0o700).create(path) {
-        Ok(()) => open_directory(path),
+        Ok(()) => {
+            let directory = open_directory(path)?;
+            mark(&directory).map_err(|errno| io(errno.into()))?;
+            Ok(directory)
+        }
         Err(error) if error.kind() == io::ErrorKind::AlreadyExists => open_directory(path),
-        Err(source) => Err(DirectoryError::Io { path: path.to_owned(), source }),
+        Err(source) => Err(io(source)),
     }
+}
+
+/// Leaves the [`MARK`] in a directory that was made here.
+///
+/// # Errors
+/// When it cannot be written.
+pub fn mark(directory: impl AsFd) -> Result<(), Errno> {
+    let flags = OFlags::CREATE | OFlags::EXCL | OFlags::WRONLY | OFlags::CLOEXEC;
+    match rustix::fs::openat(directory, MARK, flags, Mode::RUSR | Mode::WUSR) {
+        Ok(_) | Err(Errno::EXIST) => Ok(()),
+        Err(errno) => Err(errno),
+    }
+}
+
+/// Removes a directory in which there is nothing but the [`MARK`]: the user's own directory has none and stays.
+/// Whoever calls this holds the lock on it.
+///
+/// # Errors
+/// When there is something else in it, no mark, or it cannot be removed.
+pub fn remove_directory(directory: impl AsFd, path: &Path) -> Result<(), Errno> {
+    for entry in rustix::fs::Dir::read_from(&directory)? {
+        if ![".", "..", MARK].map(str::as_bytes).contains(&entry?.file_name().to_bytes()) {
+            return Err(Errno::NOTEMPTY);
+        }
+    }
+    rustix::fs::unlinkat(&directory, MARK, AtFlags::empty())?;
+    // Somebody may have put a file in it meanwhile; it is still one that was made here.
+    rustix::fs::rmdir(path).inspect_err(|_| {
+        let _ = mark(&directory);
+    })
 }
