@@ -138,8 +138,7 @@ impl Text {
     /// Ends the log, also after an error: the file, if it has its name, frames that are not in it, and whether all was
     /// written.
     pub fn finish(mut self) -> (Option<Written>, u64, io::Result<()>) {
-        let put = self.write();
-        let put = put.and(self.look());
+        let (put, looked) = (self.write(), self.look());
         let there = if self.moved { self.log.lines("(").ok().flatten() } else { Some(self.frames) };
         let Self { log, frames: written, lost, .. } = self;
         let frames = there.unwrap_or(0).min(written);
@@ -152,8 +151,8 @@ impl Text {
             };
             Written { path, format: "candump", frames, messages: frames, bytes }
         });
-        let finished = put.and(log.finish());
-        (file, lost + (written - frames), finished)
+        let finished = log.finish();
+        (file, lost + (written - frames), put.and(looked).and(finished))
     }
 
     /// Ends the log of a run that never began: the file, or none if nothing was received.
