@@ -1,6 +1,5 @@
 //! One skin cell as a process, or several in one.
 
-use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -66,8 +65,7 @@ fn range(text: &str) -> Result<(u8, u8), String> {
 
 /// One line in one piece, for hundreds of cells may share this standard error.
 fn say(text: impl core::fmt::Display) {
-    // When it is closed, there is no reader.
-    let _ = std::io::stderr().write_all(format!("cell-node: {text}\n").as_bytes());
+    protocol::usage::say(&format!("cell-node: {text}"));
 }
 
 fn main() -> ExitCode {

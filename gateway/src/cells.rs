@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 use bench::cells::Watch;
 use clap::Args;
 use protocol::skin::Skin;
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, draw, print, shown_lines};
 
 use self::show::{Known, Shown};
 use super::arguments::{BusKind, bus_of, seconds};
@@ -76,7 +76,7 @@ impl Cells {
             if self.watch && drawn.elapsed() >= DRAW {
                 drawn = Instant::now();
                 let text = show(&watch)?;
-                print(&if terminal { show::screen(&text) } else { text })?;
+                if terminal { draw(&show::screen(&shown_lines(&text))) } else { print(&text) }?;
             }
         }
         if self.watch {

@@ -124,7 +124,8 @@ impl Dump {
         let pick = Pick { kinds: self.kind.clone(), nodes: self.node.clone(), from: self.from, to: self.to };
         let max = self.max.unwrap_or(u64::MAX);
         let to_out = BufWriter::new(Stoppable::new(&out));
-        let mut show = Show::new(to_out, self.format, pick, self.contact, how, max);
+        let show = Show::new(to_out, self.format, pick, self.contact, how, max);
+        let mut show = show.on_terminal(out.is_terminal());
         if let Some(path) = &self.skin {
             let skin = Skin::read(path).map_err(Failure::usage)?;
             remark_another(&self.sources, path, &skin);

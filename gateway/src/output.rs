@@ -6,8 +6,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use protocol::stop::Stoppable;
-use protocol::usage::Failure;
+use protocol::usage::{Failure, say};
 use trace::files::{WholeFile, check, folder_of};
 
 /// Whether files that exist may be overwritten.
@@ -88,5 +87,5 @@ fn place(path: &Path) -> PathBuf {
 
 /// Prints a line on standard error; if that is closed, the line is dropped.
 pub(crate) fn note(text: impl Display) {
-    let _ = Stoppable::new(io::stderr()).write_all(format!("{text}\n").as_bytes());
+    say(&text.to_string());
 }

@@ -1,10 +1,11 @@
 //! Output of values: words, rows, tables, JSON.
 
+use std::borrow::Cow;
 use std::fmt::Display;
 
 use comfy_table::{CellAlignment, ColumnConstraint, ContentArrangement, Table, presets};
 use model::quantiles::Quantiles;
-use protocol::usage::Failure;
+use protocol::usage::{Failure, shown, shown_lines};
 use serde::Serialize;
 
 /// A space before a name that stays when the name takes two lines.
@@ -16,12 +17,26 @@ const NAMES: usize = 12;
 
 /// A value as JSON in lines.
 pub(crate) fn json(value: &impl Serialize) -> Result<String, Failure> {
-    serde_json::to_string_pretty(value).map(|text| text + "\n").map_err(Failure::run)
+    serde_json::to_string_pretty(value).map(|text| harmless(text) + "\n").map_err(Failure::run)
 }
 
 /// The same in one line.
 pub(crate) fn json_line(value: &impl Serialize) -> Result<String, Failure> {
-    serde_json::to_string(value).map(|text| text + "\n").map_err(Failure::run)
+    serde_json::to_string(value).map(|text| harmless(text) + "\n").map_err(Failure::run)
+}
+
+/// JSON that says the same without characters that a terminal obeys: those that stand as they are in its strings are
+/// written like `\u009b`.
+pub(crate) fn harmless(json: String) -> String {
+    // Its own are line feeds, and it has no tabs.
+    if matches!(shown_lines(&json), Cow::Borrowed(_)) {
+        return json;
+    }
+    let letter = |letter: char| match shown_lines(letter.encode_utf8(&mut [0; 4])) {
+        Cow::Borrowed(same) => same.to_owned(),
+        Cow::Owned(_) => format!("\\u{:04x}", u32::from(letter)),
+    };
+    json.chars().map(letter).collect()
 }
 
 /// What stands between commas.
@@ -70,7 +85,8 @@ pub(crate) fn quantiles(quantiles: &Quantiles) -> String {
     format!("{p50:.0} / {p90:.0} / {p99:.0} / {max:.0}")
 }
 
-/// A table with a border, numbers to the right in the columns that are of numbers.
+/// A table with a border, numbers to the right in the columns that are of numbers. A name in a row is [`shown`]; a head
+/// may have lines.
 pub(crate) fn table<H: Into<String>>(
     head: impl IntoIterator<Item = H>,
     rows: impl IntoIterator<Item = Vec<String>>,
@@ -78,7 +94,10 @@ pub(crate) fn table<H: Into<String>>(
 ) -> Table {
     let mut table = Table::new();
     table.load_style(presets::UTF8_BORDERS_ONLY).set_content_arrangement(ContentArrangement::Dynamic);
-    table.set_header(head.into_iter().map(Into::into).collect::<Vec<String>>()).add_rows(rows);
+    table.set_header(head.into_iter().map(|head| shown_lines(&head.into()).into_owned()));
+    table.add_rows(
+        rows.into_iter().map(|row| row.iter().map(|text| shown(text).into_owned()).collect::<Vec<_>>()),
+    );
     for (index, column) in table.column_iter_mut().enumerate() {
         if is_of_numbers(index) {
             column.set_cell_alignment(CellAlignment::Right);
@@ -121,7 +140,7 @@ pub(crate) struct Rows(Table);
 impl Rows {
     /// A [`readable`] table with this head and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
-        Self(readable(table([name.to_string(), value.to_string(), beside.to_string()], [], |_| false)))
+        Self(readable(table(line(name, value, beside), [], |_| false)))
     }
 
     /// The same where names are not broken, however narrow the terminal.
@@ -138,14 +157,14 @@ impl Rows {
     }
 
     pub(crate) fn section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
-        self.0.add_row([name.to_string(), value.to_string(), beside.to_string()]);
+        self.0.add_row(line(name, value, beside));
     }
 
     pub(crate) fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
         let name = format!("  {name}");
         let text = name.trim_start_matches(' ');
         let indented = INDENT.repeat(name.len() - text.len()) + text;
-        self.0.add_row([indented, value.to_string(), beside.to_string()]);
+        self.0.add_row(line(indented, value, beside));
     }
 
     /// A row of something that there is, or none.
@@ -154,4 +173,9 @@ impl Rows {
             self.row(name, count, beside);
         }
     }
+}
+
+/// A row's texts, [`shown`].
+fn line(name: impl Display, value: impl Display, beside: impl Display) -> [String; 3] {
+    [name.to_string(), value.to_string(), beside.to_string()].map(|text| shown(&text).into_owned())
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use protocol::input;
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print, shown};
 use trace::recording::recover::RecoverError;
 use trace::recording::{names, repair};
 
@@ -50,6 +50,6 @@ impl Recover {
             }
             (recovered, Some(bytes)) => format!("{out}, {bytes} bytes: {recovered}"),
         };
-        print(&format!("{line}\n"))
+        print(&format!("{}\n", shown(&line)))
     }
 }

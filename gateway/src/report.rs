@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use analysis::report::run::{self, ReportError};
 use analysis::report::{figure::Page, page, svg};
 use clap::Args;
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print, shown};
 use protocol::wire_time::bit_rate;
 
 use super::output::{Force, apart, note};
@@ -78,7 +78,8 @@ impl Report {
         let figures = drawings(&report.page).count();
         let beside =
             self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
-        print(&format!("{}: {figures} figures{beside}\n", output.display()))
+        let said = format!("{}: {figures} figures{beside}", output.display());
+        print(&format!("{}\n", shown(&said)))
     }
 
     /// What is there is not overwritten unless that is asked for.

@@ -8,7 +8,7 @@ use clap::{Args, Subcommand};
 use model::scenario::{BusFault, FaultKind, MotionKind, Scenario as Description, SensorFault};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print, shown};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
@@ -161,11 +161,12 @@ impl Plan {
         } else {
             format!("{} rad", words(&motion.start))
         };
+        let (file, skin) = (shown(file), shown(skin));
         let head = format!(
             "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start}{how}\n",
             count(events.len(), "event")
         );
-        let remarks: String = remarks.iter().map(|remark| format!("remark: {remark}\n")).collect();
+        let remarks: String = remarks.iter().map(|remark| format!("remark: {}\n", shown(remark))).collect();
         if events.is_empty() {
             return head + "nobody touches the skin, and nothing breaks\n" + &remarks;
         }

@@ -15,7 +15,7 @@ use protocol::can::Format;
 use protocol::fixed::TorqueFormat;
 use protocol::packet::crc16;
 use protocol::skin::{Cell, ControllerKind, Reply, Skin as Description};
-use protocol::usage::{Failure, print};
+use protocol::usage::{Failure, print, shown};
 
 use super::arguments::{FORMATS, Word, bus_names, one_of};
 use super::output::Force;
@@ -142,11 +142,12 @@ fn describe(skin: &Description) -> String {
         ControllerKind::External { socket, .. } => format!("external controller at {socket}"),
     };
     let every = cells.first().map(|cell| format!(" (every {} us)", skin.parameters(cell).period_us));
+    let (name, robot_name) = (shown(name), shown(&robot.name));
     let mut text = format!(
         "{name}: {}, {}\nrobot: {}, {}\ntiming: control loop {} Hz, joints {} Hz{}, {controller}\n",
         count(cells.len(), "cell"),
         count(buses.len(), "bus"),
-        robot.name,
+        robot_name,
         count(robot.joints.len(), "joint"),
         timing.control_hz,
         timing.broadcast_hz(),
@@ -158,7 +159,7 @@ fn describe(skin: &Description) -> String {
         let names =
             words(chain.joints.iter().filter_map(|joint| robot.joints.get(*joint)).map(|joint| &joint.name));
         let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
-        text += &format!("chain {}: {joints} in {rows}: {names}\n", chain.name);
+        text += &format!("chain {}: {joints} in {rows}: {}\n", shown(&chain.name), shown(&names));
     }
     for (index, bus) in buses.iter().enumerate() {
         let format = bus.format.name();

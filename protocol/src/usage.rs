@@ -1,9 +1,9 @@
-//! Command lines: errors in one line with their exit codes, wrong use, output whose reader may leave, and words
-//! that can be typed again.
+//! Command lines: errors in one line with their exit codes, wrong use, output whose reader may leave, text that a
+//! terminal only shows, and words that can be typed again.
 
 use std::borrow::Cow;
 use std::fmt::{self, Display};
-use std::io::{self, ErrorKind, Write};
+use std::io::{self, ErrorKind, IsTerminal, Write};
 use std::process::ExitCode;
 
 use crate::stop::Stoppable;
@@ -60,18 +60,62 @@ impl Display for Failure {
 pub fn end(program: &str, done: Result<(), Failure>) -> ExitCode {
     let Err(Failure { text, code }) = done else { return ExitCode::SUCCESS };
     if !text.is_empty() {
-        // When it is closed, there is no reader.
-        let _ = Stoppable::new(io::stderr()).write_all(format!("{program}: {text}\n").as_bytes());
+        say(&format!("{program}: {text}"));
     }
     ExitCode::from(code)
 }
 
-/// Writes a text to standard output.
+/// Writes a line to standard error in one piece, as [`shown`]. When that is closed, there is no reader.
+pub fn say(line: &str) {
+    let _ = Stoppable::new(io::stderr()).write_all(format!("{}\n", shown(line)).as_bytes());
+}
+
+/// Writes a text to standard output; to a terminal as [`shown_lines`].
 ///
 /// # Errors
 /// As [`written`].
 pub fn print(text: &str) -> Result<(), Failure> {
+    if io::stdout().is_terminal() { draw(&shown_lines(text)) } else { draw(text) }
+}
+
+/// Writes a text to standard output as it is, also what a terminal obeys.
+///
+/// # Errors
+/// As [`written`].
+pub fn draw(text: &str) -> Result<(), Failure> {
     written(Stoppable::new(io::stdout()).write_all(text.as_bytes()))
+}
+
+/// A name or a line as a terminal shows it and does not obey it: controls, and what turns the direction of text, are
+/// written like `\u{1b}`.
+#[must_use]
+pub fn shown(text: &str) -> Cow<'_, str> {
+    escaped(text, is_obeyed)
+}
+
+/// The same of a text of several lines: its line feeds and tabs stay.
+#[must_use]
+pub fn shown_lines(text: &str) -> Cow<'_, str> {
+    escaped(text, |letter| is_obeyed(letter) && !matches!(letter, '\n' | '\t'))
+}
+
+const fn is_obeyed(letter: char) -> bool {
+    matches!(letter, '\0'..='\u{1f}' | '\u{7f}'..='\u{9f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+}
+
+fn escaped(text: &str, is_escaped: impl Fn(char) -> bool) -> Cow<'_, str> {
+    if !text.contains(&is_escaped) {
+        return Cow::Borrowed(text);
+    }
+    let mut whole = String::with_capacity(text.len() + 16);
+    for letter in text.chars() {
+        if is_escaped(letter) {
+            whole.extend(letter.escape_unicode());
+        } else {
+            whole.push(letter);
+        }
+    }
+    Cow::Owned(whole)
 }
 
 /// The end of writing to standard output: who read it may have left, as `head` does, and that is fine.
@@ -137,6 +181,18 @@ mod tests {
         assert_eq!(one_line(said), expected.replace(" ; ", "; "));
         let said = "error: invalid value 'x' for '--node'\n\nFor more information, try '--help'.\n";
         assert_eq!(one_line(said), "invalid value 'x' for '--node'; try '--help'");
+    }
+    #[test]
+    fn a_terminal_is_shown_controls_and_obeys_none() {
+        assert!(matches!(shown("vcan0 µs — 中"), Cow::Borrowed("vcan0 µs — 中")));
+        assert!(matches!(shown_lines("a\tb\n"), Cow::Borrowed("a\tb\n")));
+        assert_eq!(shown("\x1b[2J\0\x7f"), r"\u{1b}[2J\u{0}\u{7f}");
+        assert_eq!(shown("a\r\n\tb"), r"a\u{d}\u{a}\u{9}b");
+        assert_eq!(shown_lines("a\r\n\tb\u{9b}"), "a\\u{d}\n\tb\\u{9b}");
+        assert_eq!(shown("\u{80}\u{9f}\u{a0}"), "\\u{80}\\u{9f}\u{a0}");
+        assert_eq!(shown("\u{202a}\u{202e}\u{2066}\u{2069}"), r"\u{202a}\u{202e}\u{2066}\u{2069}");
+        // A name that was shown once is the same when it is shown again.
+        assert_eq!(shown(&shown("\x1b")), shown("\x1b"));
     }
     #[test]
     fn a_word_can_be_typed_again() {

@@ -1,5 +1,6 @@
 //! Output for each frame.
 
+use std::borrow::Cow;
 use std::fmt::Write as _;
 use std::io::{self, Write};
 use std::sync::Arc;
@@ -16,8 +17,10 @@ use protocol::message::Message;
 use protocol::schema::Units;
 use protocol::skin::Skin;
 use protocol::time::Micros;
+use protocol::usage::shown;
 
 use crate::output::note;
+use crate::print::harmless;
 
 /// Colours of a terminal.
 const DIM: &str = "\x1b[2m";
@@ -68,6 +71,7 @@ pub(super) struct Show<W> {
     /// When the first frame came.
     first: Option<u64>,
     raw: String,
+    is_terminal: bool,
 }
 
 impl<W: Write> Show<W> {
@@ -84,7 +88,14 @@ impl<W: Write> Show<W> {
             left: max,
             first: None,
             raw: String::new(),
+            is_terminal: false,
         }
+    }
+
+    /// The output is a terminal, which obeys controls in the names of buses.
+    pub(super) const fn on_terminal(mut self, is_terminal: bool) -> Self {
+        self.is_terminal = is_terminal;
+        self
     }
 
     /// Takes the units of the skin's buses; of others they stay the default. Before the first frame.
@@ -166,16 +177,25 @@ impl<W: Write> Show<W> {
             return Ok(());
         }
         let said = decoded.in_units(units);
+        let interface = &self.name(record.interface);
         match &mut self.how {
             How::Stats(stats) => stats.take(record, decoded),
-            How::Json => json::write(&mut self.out, record, decoded, units)?,
+            How::Json => {
+                // Nothing else in it is free text.
+                if let Cow::Borrowed(_) = shown(record.interface) {
+                    json::write(&mut self.out, record, decoded, units)?;
+                } else {
+                    let mut line = Vec::new();
+                    json::write(&mut line, record, decoded, units)?;
+                    self.out.write_all(harmless(String::from_utf8_lossy(&line).into_owned()).as_bytes())?;
+                }
+            }
             How::Brief { colour } => {
                 // Where times run backwards a frame may be before the first one.
                 let (sign, since) = if nanos < first { ("-", first - nanos) } else { ("", nanos - first) };
                 let (seconds, micros) = (since / 1_000_000_000, since / 1_000 % 1_000_000);
                 let (dim, of, plain) = if *colour { (DIM, of(decoded), PLAIN) } else { ("", "", "") };
-                let bus = record.interface;
-                writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {bus}{plain} {of}{said}{plain}")?;
+                writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {interface}{plain} {of}{said}{plain}")?;
             }
             How::Lines { colour } => {
                 self.raw.clear();
@@ -185,7 +205,7 @@ impl<W: Write> Show<W> {
                     Some(Direction::Received) => " R",
                 };
                 // A string takes everything.
-                let _ = write!(self.raw, "{record}{way}");
+                let _ = write!(self.raw, "{}{way}", Record { interface, ..*record });
                 let raw = &self.raw;
                 if *colour {
                     let colour = of(decoded);
@@ -197,6 +217,12 @@ impl<W: Write> Show<W> {
         }
         self.left -= 1;
         Ok(())
+    }
+
+    /// A bus as it stands in a line: on a terminal without what that obeys, elsewhere as the capture has it, but for what
+    /// ends a line or a column.
+    fn name<'a>(&self, bus: &'a str) -> Cow<'a, str> {
+        if self.is_terminal || bus.contains(['\n', '\t']) { shown(bus) } else { Cow::Borrowed(bus) }
     }
 
     /// Frames were lost before this point.
@@ -232,5 +258,43 @@ fn of(decoded: &Decoded) -> &'static str {
             Kind::Configure | Kind::Configured => GREEN,
             Kind::Network => DIM,
         },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::candump;
+
+    /// What is written of a frame on this bus.
+    fn line(bus: &str, how: How, is_terminal: bool) -> String {
+        let pick = Pick { kinds: Vec::new(), nodes: Vec::new(), from: None, to: None };
+        let mut show = Show::new(Vec::new(), None, pick, false, how, 1).on_terminal(is_terminal);
+        let frame = candump::parse_frame("123#00").unwrap();
+        let time = Timestamp::six_digits(1_000_000_000);
+        show.frame(&Record { time, interface: bus, frame, direction: None }).unwrap();
+        show.finish().unwrap();
+        String::from_utf8(show.out).unwrap()
+    }
+
+    #[test]
+    fn the_name_of_a_bus_makes_no_line_and_no_column_and_a_terminal_does_not_obey_it() {
+        let forged = "can0 1#\tok\n(2.000000) can1";
+        for is_terminal in [false, true] {
+            for how in [How::Lines { colour: false }, How::Brief { colour: false }] {
+                let said = line(forged, how, is_terminal);
+                assert_eq!(said.matches('\n').count(), 1, "{said}");
+                assert!(said.contains(r"can0 1#\u{9}ok\u{a}(2.000000) can1"), "{said}");
+            }
+        }
+        let escapes = "can\x1b[2J\u{9b}";
+        assert!(
+            line(escapes, How::Lines { colour: false }, false)
+                .starts_with("(1.000000) can\x1b[2J\u{9b} 123#00\t")
+        );
+        let said = line(escapes, How::Lines { colour: false }, true);
+        assert!(said.starts_with("(1.000000) can\\u{1b}[2J\\u{9b} 123#00\t"), "{said}");
+        let said = line(escapes, How::Json, false);
+        assert!(said.contains(r#""bus":"can\u001b[2J\u009b""#), "{said}");
     }
 }

@@ -2,6 +2,7 @@
 
 use analysis::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, Report};
 use comfy_table::Table;
+use protocol::usage::shown;
 use trace::capture::{Extras, Topic};
 
 use crate::print::{self, Rows, decimals, filled, list, or, words};
@@ -85,7 +86,7 @@ const FOREIGN: usize = 40;
 
 /// One line a foreign identifier, those with the most frames.
 fn foreign(bus: &BusReport) -> Table {
-    let head = [&format!("{} foreign", bus.bus), "frames", "per s", "first s", "last s", "bytes", ""];
+    let head = [&format!("{} foreign", shown(&bus.bus)), "frames", "per s", "first s", "last s", "bytes", ""];
     let line = |id: &ForeignId| {
         let (min, most) = (id.bytes_min, id.bytes_max);
         let bytes = if min == most { min.to_string() } else { format!("{min}..{most}") };
@@ -120,8 +121,9 @@ fn cells(bus: &BusReport) -> Table {
         (count > 0).then(|| count.to_string())
     }
     const STATE: &str = "last state";
+    let name = shown(&bus.bus);
     let columns: [Column<'_>; 16] = [
-        (&bus.bus, |cell| Some(cell.node.to_string())),
+        (&name, |cell| Some(cell.node.to_string())),
         ("torques", |cell| Some(cell.torques.to_string())),
         ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}"))),
         ("epochs", |cell| Some(format!("{}..{}", cell.first_epoch?, cell.last_epoch?))),

@@ -6,6 +6,7 @@ use analysis::explain::{
     BusExplained, CellExplained, Explanation, Force, JACOBIAN_STEPS, Origin, Row, Total, Verdict,
 };
 use protocol::fixed::TorqueFormat;
+use protocol::usage::shown;
 
 use crate::print::{self, decimals, or};
 
@@ -23,6 +24,7 @@ pub(super) enum What {
 /// All of it; `first` is the time of the capture's first frame.
 pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation, what: What) -> String {
     let mut text = String::new();
+    let name = shown(name);
     for bus in &explanation.buses {
         let at = seconds(bus.at_ns.saturating_sub(first));
         let halted = if bus.halted { ", halted" } else { "" };

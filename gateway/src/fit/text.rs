@@ -6,6 +6,7 @@ use analysis::fit::verdict::{Answer, percent};
 use analysis::fit::{BusFit, Rated, Row, Spread, Whole, name};
 use protocol::parameters::Sensing;
 use protocol::skin::Skin;
+use protocol::usage::shown;
 
 use crate::print::{self, Rows, count, decimals, list, or};
 
@@ -52,7 +53,7 @@ pub(super) fn table(skin: &Skin, rows: &[Row]) -> String {
          cells   that a bus has time for; transceivers drive about {}\n\
          buses   for {cells} cells, and what asks for so many: time or nodes\n\
          roots   sums with only the roots on this bus; sums of all cells save no frame\n",
-        skin.name,
+        shown(&skin.name),
         millis(case.period_ns),
         micros(case.computation_ns),
         what(case),

@@ -9,7 +9,7 @@ use analysis::shadow::{
     Stretches,
 };
 
-use crate::print::{Rows, list, or};
+use crate::print::{Rows, harmless, list, or};
 
 /// Writes the frames that have left the model, one object a line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
@@ -27,7 +27,7 @@ fn write_frame(line: &mut Vec<u8>, bus: Option<&str>, frame: &Shaded) -> io::Res
     line.extend_from_slice(b"{\"time\":");
     seconds(line, Some(nanos));
     line.extend_from_slice(b",\"bus\":");
-    serde_json::to_writer(&mut *line, &bus)?;
+    line.extend_from_slice(harmless(serde_json::to_string(&bus)?).as_bytes());
     write!(line, ",\"id\":\"{}\"", Identifier(id, extended))?;
     for (key, bits) in [("nominal", bits.map(|bits| bits.nominal)), ("data", bits.map(|bits| bits.data))] {
         write!(line, ",\"{key}_bits\":")?;

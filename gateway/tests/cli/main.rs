@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 mod live;
+mod terminal;
 
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;

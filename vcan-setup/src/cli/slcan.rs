@@ -1,6 +1,5 @@
 //! `vcan-setup slcan`.
 
-use std::io::Write;
 use std::os::unix::net::UnixStream;
 
 use clap::Args;
@@ -134,6 +133,5 @@ fn no_signals(error: std::io::Error) -> Failure {
 }
 
 fn say(text: &str) {
-    // When it is closed, there is no reader.
-    let _ = std::io::stderr().write_all(format!("vcan-setup: {text}\n").as_bytes());
+    protocol::usage::say(&format!("vcan-setup: {text}"));
 }

@@ -1,18 +1,17 @@
 //! The progress line of a run: rewritten in place on a terminal, as wide as that is, printed periodically elsewhere.
 
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use protocol::stop::Stoppable;
+use protocol::usage::shown;
 
 /// How often the line is renewed on a terminal, and elsewhere.
 const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
 
 /// Writes a line on standard error in one piece, as the cells write there too.
 pub fn say(line: &str) {
-    // If it is closed, progress is not needed.
-    let _ = Stoppable::new(std::io::stderr()).write_all(format!("{line}\n").as_bytes());
+    protocol::usage::say(line);
 }
 
 /// The progress line, on standard error.
@@ -62,7 +61,7 @@ impl Progress {
             return say(&text());
         }
         self.due = now + here;
-        self.bar.set_message(text());
+        self.bar.set_message(shown(&text()).into_owned());
         self.bar.tick();
     }
 
