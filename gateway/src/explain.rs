@@ -13,7 +13,7 @@ use serde::Serialize;
 use trace::capture::Reader;
 
 use super::arguments::{Named, cell, nanos};
-use super::input::{remark_another, skin_of};
+use super::input::{no_frame, remark_another, skin_of};
 use super::output;
 use super::print::json;
 
@@ -82,6 +82,9 @@ impl Explain {
             if count > 0 {
                 output::note(format_args!("{name}: {count} {what}"));
             }
+        }
+        if found.is_empty {
+            return Err(no_frame(&reader));
         }
         let moments = found.moments.map_err(|error| Failure::run(format!("{name}: {error}")))?;
         // Where another skin is an error, that says all.

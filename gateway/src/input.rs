@@ -20,7 +20,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 use trace::capture::{Format, Note, NoteKind, ORIGIN, Reader};
 
 use super::output;
-use super::print::{count, list};
+use super::print::{count, some};
 
 /// How long a signal to end may wait, when nothing comes.
 pub(crate) const LOOK: Duration = Duration::from_millis(200);
@@ -187,7 +187,7 @@ pub(crate) fn others(reader: &Reader) -> String {
     let attached = extras.attachments.iter().map(|(name, _)| format!("attachment {name}"));
     let facts = extras.metadata.iter().filter(|(name, _)| name != ORIGIN);
     let facts = facts.map(|(name, _)| format!("metadata {name}"));
-    list(topics.chain(attached).chain(facts))
+    some(&topics.chain(attached).chain(facts).collect::<Vec<_>>())
 }
 
 /// What a capture lacks.

@@ -322,7 +322,8 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain empty.log --skin skin.toml --epoch 7",
             1,
-            "empty.log: none of its buses (none) is one of the skin's (vcan0)",
+            "empty.log: there is no frame in 1 line; what candump prints or logs is read: lines like \
+             `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`",
         ),
         (
             "explain nosuch.log --skin skin.toml --epoch 7",

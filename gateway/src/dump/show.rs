@@ -222,7 +222,7 @@ impl<W: Write> Show<W> {
     /// A bus as it stands in a line: on a terminal without what that obeys, elsewhere as the capture has it, but for what
     /// ends a line or a column.
     fn name<'a>(&self, bus: &'a str) -> Cow<'a, str> {
-        if self.is_terminal || bus.contains(['\n', '\r', '\t']) { shown(bus) } else { Cow::Borrowed(bus) }
+        if self.is_terminal || bus.contains(['\n', '\t']) { shown(bus) } else { Cow::Borrowed(bus) }
     }
 
     /// Frames were lost before this point.

@@ -19,6 +19,8 @@ pub struct Found {
     pub dropped: u64,
     /// Lines before that which cannot be read.
     pub unreadable: u64,
+    /// Whether there is no frame at all.
+    pub is_empty: bool,
 }
 
 /// Reads a capture from its beginning up to the requested joints.
@@ -53,5 +55,6 @@ pub fn find(reader: &mut Reader, skin: &Skin, requested: Requested) -> Result<Fo
             },
         }
     }
-    Ok(Found { moments: watch.moments(), first_ns: first.unwrap_or_default(), dropped, unreadable })
+    let is_empty = first.is_none();
+    Ok(Found { moments: watch.moments(), is_empty, first_ns: first.unwrap_or_default(), dropped, unreadable })
 }
