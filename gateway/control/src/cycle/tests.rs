@@ -94,7 +94,7 @@ fn another_program_may_take_its_time_to_begin() {
     assert_eq!(records[1_509].command[..6], [0.5; 6], "it goes on as it was, for a while");
     assert_eq!(records[1_700].command, [0.0; MAX_ROBOT_JOINTS], "then it stands");
     assert_eq!(halts(&skin, (1..=3_000).collect()).0, Some(2_000), "the time is over");
-    // Once it has begun it is judged as ever, also within the time.
+    // Once it has begun it is counted as ever, also within the time.
     let begun = (limit + 1..=3_000).collect();
     assert_eq!(halts(&skin, begun).0, Some(2 * limit - 1));
     skin.controller.kind = kind(Span(0));
