@@ -45,6 +45,7 @@ fn the_example_in_python_moves_the_arm() {
 #[test]
 fn a_controller_that_begins_later_is_waited_for() {
     let place = place(250);
+    place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 20.0"));
     let bench = place.running_bench(60.0, "");
     // Three times as long as it may be missing once it has begun.
     std::thread::sleep(Duration::from_millis(1_500));

@@ -11,7 +11,7 @@ pub(crate) fn place(bad_cycles: u32) -> Place {
     let text: String = text.lines().filter(kinesthetic).map(|line| format!("{line}\n")).collect();
     let text = text.replace(
         "kind = \"kinesthetic\"",
-        &format!("kind = \"external\"\nsocket = \"{}\"", socket.display()),
+        &format!("kind = \"external\"\nstart_s = 0.0\nsocket = \"{}\"", socket.display()),
     );
     let safety = format!("\n[safety]\nbad_cycles = {bad_cycles}\n\n[controller]");
     place.write("skin.toml", &text.replace("\n[controller]", &safety));
