@@ -2,6 +2,7 @@
 
 use std::io::{self, Write};
 
+use super::last_times::LastTimes;
 use super::log::{LogWriter, Style, Wrote};
 use super::mcap::McapWriter;
 use super::{CaptureError, Entry, Format, Note, NoteKind, Reader};
@@ -114,7 +115,7 @@ pub fn convert<W: Write>(
     mut unreadable: impl FnMut(&Note<'_>, &str) -> Result<(), String>,
 ) -> Result<Converted, ConvertError> {
     let mut done = Converted::default();
-    let mut clocks = Vec::new();
+    let mut last_times = LastTimes::default();
     loop {
         let entry = match from.next() {
             Ok(Some(entry)) => entry,
@@ -126,7 +127,7 @@ pub fn convert<W: Write>(
             }
         };
         match &entry {
-            Entry::Frame(record) => done.frame(record, &mut clocks),
+            Entry::Frame(record) => done.frame(record, &mut last_times),
             Entry::Note(note) => {
                 done.note(&note.kind);
                 if let NoteKind::Unreadable(why) = &note.kind {
@@ -150,20 +151,12 @@ pub fn convert<W: Write>(
 }
 
 impl Converted {
-    /// `clocks` are the times of the last frames of each bus.
-    fn frame(&mut self, record: &Record<'_>, clocks: &mut Vec<(String, u64)>) {
+    fn frame(&mut self, record: &Record<'_>, last_times: &mut LastTimes<BUSES>) {
         self.frames += 1;
         let nanos = record.time.nanos;
-        let Some((_, last)) = clocks.iter_mut().find(|(bus, _)| bus == record.interface) else {
-            if clocks.len() < BUSES {
-                clocks.push((record.interface.to_owned(), nanos));
-            }
-            return;
-        };
-        if nanos < *last {
+        if last_times.replace(record.interface, nanos).is_some_and(|last| nanos < last) {
             self.backwards.get_or_insert((0, self.frames)).0 += 1;
         }
-        *last = nanos;
     }
 
     fn note(&mut self, kind: &NoteKind) {

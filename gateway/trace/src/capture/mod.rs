@@ -11,6 +11,7 @@
 
 pub mod convert;
 mod extras;
+mod last_times;
 pub mod log;
 mod magic;
 mod mcap;

@@ -8,6 +8,7 @@ use std::fmt;
 use protocol::candump::Timestamp;
 
 use super::console::Stamp;
+use crate::capture::last_times::LastTimes;
 
 /// From one frame to the next where there are no times.
 const STEP_NS: u64 = 1_000;
@@ -112,8 +113,7 @@ impl Clock {
 /// What times of several lines say of what they are relative to.
 #[derive(Debug, Default)]
 pub(super) struct Evidence {
-    /// The last time of each bus.
-    last: Vec<(String, u64)>,
+    last: LastTimes<BUSES>,
     compared: u32,
     smaller: u32,
     same: u32,
@@ -121,16 +121,10 @@ pub(super) struct Evidence {
 
 impl Evidence {
     pub(super) fn take(&mut self, interface: &str, nanos: u64) {
-        let Some((_, last)) = self.last.iter_mut().find(|(name, _)| name == interface) else {
-            if self.last.len() < BUSES {
-                self.last.push((interface.to_owned(), nanos));
-            }
-            return;
-        };
+        let Some(last) = self.last.replace(interface, nanos) else { return };
         self.compared += 1;
-        self.smaller += u32::from(nanos < *last);
-        self.same += u32::from(nanos == *last && nanos > 0);
-        *last = nanos;
+        self.smaller += u32::from(nanos < last);
+        self.same += u32::from(nanos == last && nanos > 0);
     }
 
     pub(super) const fn is_enough(&self) -> bool {
