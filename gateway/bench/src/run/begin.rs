@@ -10,11 +10,11 @@ use protocol::message::Message;
 use protocol::packet::Epoch;
 use protocol::parameters::{Parameter, Sensing};
 use protocol::time::Span;
+use protocol::usage::say;
 
 use super::RunError;
 use super::bench::{Bench, LOOK};
 use super::launch::{Ended, LISTEN, Plan, STARTING, program};
-use super::progress::say;
 use super::receiver::BusEvent;
 use crate::setup::{Timeout, names};
 use crate::view::View;

@@ -8,11 +8,11 @@ use protocol::bus::BusKind;
 use protocol::message::Message;
 use protocol::skin::Cell;
 use protocol::time::Micros;
+use protocol::usage::say;
 
 use super::RunError;
 use super::bench::{Bench, BusLink};
 use super::measured::Measured;
-use super::progress::say;
 use super::realtime::wall;
 use super::receiver::ReceiverResult;
 use super::watch::LOOK;

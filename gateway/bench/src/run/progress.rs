@@ -4,15 +4,10 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
-use protocol::usage::shown;
+use protocol::usage::{say, shown};
 
 /// How often the line is renewed on a terminal, and elsewhere.
 const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
-
-/// Writes a line on standard error in one piece, as the cells write there too.
-pub fn say(line: &str) {
-    protocol::usage::say(line);
-}
 
 /// The progress line, on standard error.
 #[derive(Debug)]

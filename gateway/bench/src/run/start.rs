@@ -11,13 +11,13 @@ use protocol::can::Format;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{self, Reply};
+use protocol::usage::say;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::bench::{Bench, BusLink};
 use super::launch::{Processes, ServedBus, allow_files, open_or_serve, program};
 use super::link::{Link, ReceiveEnd, Slot};
 use super::network::Network;
-use super::progress::say;
 use super::receiver::{BusEvent, Receiver};
 use super::roots::{ReceiveFilter, Roots};
 use super::{Options, RunError, realtime};
