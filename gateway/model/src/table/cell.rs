@@ -393,16 +393,12 @@ impl Cell {
 
     /// The bus is lost: due replies may have been sent and lost.
     pub(super) fn interrupt(&mut self) {
-        let due = self.outstanding.clear();
-        // A due contribution to a sum is missing there.
-        self.replies.miss(if self.sums.is_some() { 0 } else { due }, true);
+        self.forget_contact();
         self.tracked.account.interrupt();
-        self.contact.reset();
     }
 
-    /// Another sender wrote what it answers, or whether it obeys stimuli: what it is due to answer is unknown until the next
-    /// stimulus.
-    pub(super) fn switched_by_others(&mut self) {
+    /// Its contact state is no longer known, until the next stimulus: what is due is in doubt.
+    pub(super) fn forget_contact(&mut self) {
         let due = self.outstanding.clear();
         // A due contribution to a sum is missing there.
         self.replies.miss(if self.sums.is_some() { 0 } else { due }, true);

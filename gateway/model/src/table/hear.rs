@@ -57,7 +57,7 @@ impl Table {
                 if SWITCHED.iter().any(|parameter| parameter.number() == number) =>
             {
                 self.counters.count(Event::Switched);
-                self.cells.iter_mut().filter(|cell| to.names(cell.node)).for_each(Cell::switched_by_others);
+                self.cells.iter_mut().filter(|cell| to.names(cell.node)).for_each(Cell::forget_contact);
             }
             Message::Sync | Message::Report | Message::Configure { .. } => {}
             Message::Sum { .. }
