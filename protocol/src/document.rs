@@ -19,6 +19,7 @@ use toml::de::{DeTable, DeValue};
 
 use crate::fixed::{OutOfRange, Q};
 use crate::input;
+use crate::time::Span;
 
 /// One step from the file's root to a value.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -202,6 +203,13 @@ pub const LONGEST: u64 = 16 << 20;
 /// The most keys, values and tables of a TOML file, by the signs that each of them needs. A skin of 10 000 cells has 280 000;
 /// this many cost at most 0.5 GB of memory.
 const MOST_SIGNS: usize = 500_000;
+
+/// A length of time of so many seconds, which are not negative and no more than a file allows.
+#[must_use]
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bounded by whoever calls")]
+pub fn span(seconds: f64) -> Span {
+    Span((seconds * 1e6).round() as u64)
+}
 
 /// The text of a file of at most [`LONGEST`] bytes.
 ///

@@ -2,10 +2,9 @@
 
 use super::{Cell, buses, cells};
 use super::{Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing, raw, robot, sensing};
-use crate::document::{Fault, Place};
+use crate::document::{Fault, Place, span};
 use crate::fixed::Q;
 use crate::parameters::Contact;
-use crate::time::Span;
 
 pub(super) type Checked<T> = Result<T, Fault>;
 
@@ -139,7 +138,7 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
         }
         ControllerKind::External {
             socket: raw.socket.ok_or_else(|| at.key("socket").fault("", why))?,
-            start: micros(start_s),
+            start: span(start_s),
         }
     };
     let max_speed = match (raw.max_speed, raw.max_speed_rad_s) {
@@ -151,11 +150,6 @@ fn controller(raw: raw::Controller, joints: usize) -> Checked<Controller> {
         (given, None) => each_or("max_speed", given, 2.0)?,
     };
     Ok(Controller { kind, max_speed })
-}
-
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within an hour")]
-fn micros(seconds: f64) -> Span {
-    Span((seconds * 1e6).round() as u64)
 }
 
 fn safety(raw: &raw::Safety) -> Checked<Safety> {

@@ -3,7 +3,7 @@
 use core::f64::consts::TAU;
 use std::collections::HashMap;
 
-use protocol::document::{Fault as Wrong, Place};
+use protocol::document::{Fault as Wrong, Place, span};
 use protocol::fixed::{Q, Q1_14};
 use protocol::skin::{MAX_ROBOT_JOINTS, Reply, Skin};
 use protocol::time::{Micros, Span};
@@ -38,7 +38,7 @@ impl EndS {
     /// A moment within the scenario.
     pub(super) fn moment(self, at: &Place, seconds: f64) -> Checked<Micros> {
         if (0.0..self.0).contains(&seconds) {
-            return Ok(Micros(micros(seconds)));
+            return Ok(Micros(span(seconds).0));
         }
         let why = format_args!("the scenario goes from 0 to duration_s = {}", self.0);
         Err(at.fault(seconds, why))
@@ -51,14 +51,9 @@ pub(super) const LONGEST_S: f64 = 3.2e7;
 /// A length of time.
 pub(super) fn length(at: &Place, seconds: f64) -> Checked<Span> {
     if (1e-6..=LONGEST_S).contains(&seconds) {
-        return Ok(Span(micros(seconds)));
+        return Ok(span(seconds));
     }
     Err(at.fault(seconds, "must be above 0, and at most 3.2e7"))
-}
-
-#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "bounded by whoever calls")]
-fn micros(seconds: f64) -> u64 {
-    (seconds * 1e6).round() as u64
 }
 
 fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
