@@ -1,8 +1,10 @@
 //! The statistics of a capture as tables.
 
+use std::collections::BTreeMap;
+
 use analysis::stats::{BusReport, CellReport, Epochs, ForeignFrames, ForeignId, FrameType, Report};
 use comfy_table::Table;
-use model::decode::ErrorFrame;
+use model::decode::error_classes;
 use protocol::usage::shown;
 use trace::capture::{Extras, Topic};
 
@@ -57,7 +59,7 @@ fn numbers(rows: &mut Rows, bus: &BusReport) {
     rows.any("  11-bit identifiers", standard, "");
     rows.any("  29-bit identifiers", extended, "");
     rows.any("  remote frames", remote, "");
-    rows.any("  error frames", error, "");
+    rows.any("  error frames", error, list(reported(&bus.foreign)));
     if packets_by_chance >= 0.05 {
         let chance = format!("{packets_by_chance:.1}");
         rows.row("  packets by chance", chance, "expected");
@@ -82,6 +84,17 @@ fn beside(rows: &mut Rows, extras: &Extras) {
     }
 }
 
+/// How many error frames report what; one may report several things.
+fn reported(foreign: &ForeignFrames) -> Vec<String> {
+    let mut counts = BTreeMap::<&str, u64>::new();
+    for id in foreign.identifiers.iter().filter(|id| id.of == FrameType::Error) {
+        for class in u32::from_str_radix(&id.id, 16).into_iter().flat_map(error_classes) {
+            *counts.entry(class).or_default() += id.frames;
+        }
+    }
+    counts.into_iter().map(|(class, count)| format!("{count} {class}")).collect()
+}
+
 /// Foreign identifiers that are shown; --json has all.
 const FOREIGN: usize = 40;
 
@@ -95,8 +108,7 @@ fn foreign(bus: &BusReport) -> Table {
             FrameType::Data if id.wrong_crc > 0 => format!("{} wrong CRC", id.wrong_crc),
             FrameType::Data => String::new(),
             FrameType::Remote => "remote".to_owned(),
-            FrameType::Error => u32::from_str_radix(&id.id, 16)
-                .map_or_else(|_| String::new(), |bits| ErrorFrame::of_id(bits).to_string()),
+            FrameType::Error => "error".to_owned(),
         };
         let [first, last] = [id.first_s, id.last_s].map(|s| format!("{s:.3}"));
         vec![id.id.clone(), id.frames.to_string(), decimals(id.frames_per_s, 1, ""), first, last, bytes, what]

@@ -59,12 +59,11 @@ impl ErrorFrame {
         data.iter_mut().zip(frame.data()).for_each(|(byte, got)| *byte = *got);
         Self { classes: frame.id(), data }
     }
+}
 
-    /// What an identifier alone reports.
-    #[must_use]
-    pub const fn of_id(id: u32) -> Self {
-        Self { classes: id & 0x1FFF_FFFF, data: [0; 8] }
-    }
+/// The classes of error that the identifier of an error frame names.
+pub fn error_classes(id: u32) -> impl Iterator<Item = &'static str> {
+    names(id, &CLASSES)
 }
 
 /// The names of the bits that are set.

@@ -18,7 +18,7 @@ pub mod settle;
 mod text;
 mod wires;
 
-pub use error_frame::ErrorFrame;
+pub use error_frame::{ErrorFrame, error_classes};
 pub use text::InUnits;
 
 use protocol::can::{Format, Frame};
