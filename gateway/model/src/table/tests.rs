@@ -158,3 +158,30 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
     assert_eq!(result(true), result(false));
     assert_eq!((result(true).2.due, result(true).5, result(true).6), (3, 3, 0));
 }
+
+#[test]
+fn heartbeats_say_for_how_long_joints_were_not_taken() {
+    let cell = CellId::new(1).unwrap();
+    let joints = |epoch| Message::Joints { epoch, joints: Joints { in_use: 6, ..Joints::default() } };
+    let mut table = Table::new(&crate::testing::skin(), 0);
+    let mut hear = |at_ms: u64, message: Message| {
+        let own = matches!(message, Message::Joints { .. });
+        for frame in message.encode().frames(Format::Fd) {
+            table.handle_frame(Micros(at_ms * 1_000), own, &frame, &mut |_| None);
+        }
+        let delays = table.delays().of_joints_not_taken();
+        (delays.len(), delays.max())
+    };
+    let beat = |epoch, sent, state| {
+        let page = NetworkPage::Heartbeat(Heartbeat { serial: 7, sent, state, ..Heartbeat::default() });
+        Message::Network { from: Node::Cell(cell), epoch: Epoch(epoch), page }
+    };
+    hear(0, joints(Epoch(1)));
+    hear(16, joints(Epoch(2)));
+    assert_eq!(hear(17, beat(0, 1, State::default())), (0, 0), "its first one: it may have begun just now");
+    assert_eq!(hear(18, beat(2, 2, State::default())), (1, 0), "it has taken the newest");
+    assert_eq!(hear(20, beat(1, 3, State::default())), (2, 4_000), "epoch 2 stands there since 16 ms");
+    assert_eq!(hear(40, beat(1, 4, State::HALTED)), (2, 4_000), "halted it takes none");
+    hear(48, joints(Epoch(3)));
+    assert_eq!(hear(90, beat(1, 5, State::default())), (3, 74_000), "since the first that it has not taken");
+}
