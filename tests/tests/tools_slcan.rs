@@ -10,8 +10,9 @@ use std::fmt::Write as _;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
 
-use process::{Place, until};
+use process::{Place, TIMEOUT};
 use protocol::bus::{Bus, Inbox, Options};
 use protocol::can::{BIT_RATE_SWITCH, EXTENDED, Format, Frame};
 use rustix::process::Signal;
@@ -108,12 +109,17 @@ fn check(format: Format, options: &str) {
         }
     }
     let (mut inbox, mut received) = (Inbox::new(), Vec::new());
-    until("python-can's frames", || {
+    let give_up = Instant::now() + TIMEOUT;
+    while received.len() < FRAMES && Instant::now() < give_up {
         while bus.receive(&mut inbox).unwrap() > 0 {
             received.extend(inbox.frames().map(|received| received.frame));
         }
-        (received.len() >= FRAMES).then_some(())
-    });
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    if received.len() < FRAMES {
+        bridge.signal(Signal::TERM);
+        panic!("{} of {FRAMES} frames came from python-can: {:#?}", received.len(), bridge.end());
+    }
     assert!(received == to_us, "all of them, in order");
     assert!(child.0.wait().unwrap().success());
 
