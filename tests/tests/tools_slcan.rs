@@ -7,7 +7,7 @@ mod process;
 mod slcan;
 
 use std::fmt::Write as _;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write as _};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
@@ -97,29 +97,42 @@ fn check(format: Format, options: &str) {
     let file = to_us.iter().map(|frame| line(frame) + "\n").collect::<String>();
     let mut command = Command::new(python);
     command.arg(here.join("tools/slcan.py")).arg(&theirs.path).arg(format.name());
-    command.arg(place.write("frames", &file)).arg(FRAMES.to_string()).stdout(Stdio::piped());
+    command
+        .arg(place.write("frames", &file))
+        .arg(FRAMES.to_string())
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped());
     let mut child = Python(command.spawn().unwrap());
+    let mut credit = child.0.stdin.take().unwrap();
     let mut printed = BufReader::new(child.0.stdout.take().unwrap()).lines().map(Result::unwrap);
     assert_eq!(printed.next().as_deref(), Some("ready"));
 
+    // As many each way at the same time; a sender that nothing holds back fills the queue of a bus that is late.
+    let (mut inbox, mut received) = (Inbox::new(), Vec::new());
     for burst in to_them.chunks(BURST) {
+        writeln!(credit, "{}", burst.len()).unwrap();
         bus.send(burst).unwrap();
         for frame in burst {
-            assert_eq!(printed.next(), Some(line(frame)));
+            let got = printed.next();
+            if got != Some(line(frame)) {
+                bridge.signal(Signal::TERM);
+                panic!("{got:?} came, and not {:?}: {:#?}", line(frame), bridge.end());
+            }
+        }
+        let (expected, give_up) = (received.len() + burst.len(), Instant::now() + TIMEOUT);
+        while received.len() < expected {
+            if Instant::now() > give_up {
+                bridge.signal(Signal::TERM);
+                panic!("{} of {expected} frames came from python-can: {:#?}", received.len(), bridge.end());
+            }
+            if bus.receive(&mut inbox).unwrap() > 0 {
+                received.extend(inbox.frames().map(|received| received.frame));
+            } else {
+                std::thread::sleep(Duration::from_millis(1));
+            }
         }
     }
-    let (mut inbox, mut received) = (Inbox::new(), Vec::new());
-    let give_up = Instant::now() + TIMEOUT;
-    while received.len() < FRAMES && Instant::now() < give_up {
-        while bus.receive(&mut inbox).unwrap() > 0 {
-            received.extend(inbox.frames().map(|received| received.frame));
-        }
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    if received.len() < FRAMES {
-        bridge.signal(Signal::TERM);
-        panic!("{} of {FRAMES} frames came from python-can: {:#?}", received.len(), bridge.end());
-    }
+    drop(credit);
     assert!(received == to_us, "all of them, in order");
     assert!(child.0.wait().unwrap().success());
 

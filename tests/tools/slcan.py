@@ -3,9 +3,11 @@
     slcan.py TERMINAL fd|classic FRAMES COUNT
 
 A frame is a line of: identifier in hexadecimal, kind (of x extended, r remote, f FD, b bit rate switch; - for none),
-number of bytes, and the bytes in hexadecimal or -. It prints "ready", then COUNT frames as they come.
+number of bytes, and the bytes in hexadecimal or -. It prints "ready", then COUNT frames as they come. Each line of its
+standard input is a number of frames that it may send.
 """
 
+import itertools
 import sys
 import threading
 
@@ -57,7 +59,11 @@ def main() -> None:
         frames = [read(line) for line in file]
     with can.Bus(interface="slcan", channel=terminal, sleep_after_open=0, **rates) as bus:
         print("ready", flush=True)
-        sender = threading.Thread(target=lambda: [bus.send(frame) for frame in frames])
+        waiting = iter(frames)
+        credits = (int(line) for line in sys.stdin)
+        sender = threading.Thread(
+            target=lambda: [bus.send(frame) for credit in credits for frame in itertools.islice(waiting, credit)]
+        )
         sender.start()
         for _ in range(int(count)):
             message = bus.recv(30)
