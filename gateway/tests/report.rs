@@ -60,6 +60,12 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
         format!("run.log is no MCAP recording, and frames alone are not enough: {made}")
     );
     assert!(refuses(&folder, "picture.mcap", 2).contains("is a zip archive"));
+    let mut damaged = fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/recordings/fd.mcap")).unwrap();
+    let skin = damaged.windows(9).position(|bytes| bytes == b"skin.toml").unwrap();
+    damaged[skin + 200] ^= 0xFF;
+    write("damaged.mcap", &damaged);
+    let said = refuses(&folder, "damaged.mcap", 1);
+    assert!(said.starts_with("damaged.mcap is damaged: the checksum of an attachment"), "{said}");
     assert!(refuses(&folder, "nowhere.mcap", 2).starts_with("nowhere.mcap: "));
     assert!(refuses(&folder, ". -o out.html", 2).starts_with(".: "));
 }

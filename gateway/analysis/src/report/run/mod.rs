@@ -151,8 +151,12 @@ fn open(paths: &[PathBuf]) -> Result<(Reader, Option<u64>), ReportError> {
 fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), ReportError> {
     let (mut items, bytes) = open(paths)?;
     let name = items.name().to_owned();
-    // What stands before the first message is known when it is open.
-    let mut run = Run::begin(&name, bytes.unwrap_or(0), items.extras(), options)?;
+    // What stands before the first message is known when it is open, unless it is damaged there.
+    let begun = Run::begin(&name, bytes.unwrap_or(0), items.extras(), options);
+    if items.extras().skin().is_none() {
+        items.next_item()?;
+    }
+    let mut run = begun?;
     run.files = paths.iter().map(|path| path.display().to_string()).collect();
     let damaged = loop {
         match items.next_item() {
