@@ -191,11 +191,11 @@ impl Oracle {
                     mirror.holder = Some(truth.from);
                 }
             }
-            Message::Network { .. } | Message::Sensors { .. } | Message::Configured { .. } => {
-                mirror.arrived += 1;
-            }
-            Message::Sum { .. }
-            | Message::Halt
+            Message::Network { .. }
+            | Message::Sensors { .. }
+            | Message::Configured { .. }
+            | Message::Sum { .. } => mirror.arrived += 1,
+            Message::Halt
             | Message::Joints { .. }
             | Message::Sync
             | Message::Resume

@@ -191,6 +191,8 @@ pub struct UplinkSummary {
     pub unknown: u64,
     /// Arrived more often than sent.
     pub surplus: u64,
+    /// Of these, heartbeats of other senders under a cell's node id.
+    pub outsiders: u64,
     /// Arrived of what a cell sent between its last heartbeat and its restart: what else it sent then is
     /// unknown.
     pub in_doubt: u64,
@@ -395,6 +397,7 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
         outage: total.outage,
         unknown: unexplained - dropped,
         surplus: total.surplus,
+        outsiders: total.outsiders,
         in_doubt: total.in_doubt,
         unsettled: total.unsettled,
         restarts: total.restarts,

@@ -35,11 +35,11 @@ impl Cell {
         now.since(self.last)
     }
 
-    fn says(&mut self, page: &NetworkPage) {
+    fn says(&mut self, now: Micros, page: &NetworkPage) {
         match *page {
             NetworkPage::Heartbeat(heartbeat) => {
                 let before = self.claim.serial();
-                if self.claim.hear(&heartbeat) == Word::Claimant {
+                if matches!(self.claim.hear(now, &heartbeat), Word::Claimant | Word::Outsider) {
                     self.other = Some(heartbeat.serial);
                 } else if before.is_some_and(|before| before != heartbeat.serial) {
                     // All that is known is of the other cell.
@@ -80,7 +80,7 @@ impl Listing {
         let cell = self.cells.entry(from.get()).or_default();
         cell.last = now;
         if let Message::Network { page, .. } = message {
-            cell.says(page);
+            cell.says(now, page);
         }
     }
 

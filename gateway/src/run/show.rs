@@ -216,6 +216,7 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
     ];
     rows.row("  lost", lost, explained(&reasons, up.unknown));
     rows.any("  surplus", up.surplus, "");
+    rows.any("  of other senders", up.outsiders, "");
     rows.any("  in doubt", up.in_doubt, "");
     rows.any("  after the last heartbeat", up.unsettled, "");
     rows.any("  restarts of cells", up.restarts, "what they sent last is in doubt");

@@ -10,6 +10,7 @@ use protocol::message::{
 use protocol::packet::{Epoch, Words};
 use protocol::parameters::Parameter;
 use protocol::skin::Skin;
+use protocol::time::Micros;
 use serde::Serialize;
 
 use super::not_found::NotFound;
@@ -455,11 +456,13 @@ impl Cell {
     /// Takes a heartbeat under the cell's node id; whether it is the cell's.
     fn heartbeat(&mut self, at_ns: u64, heartbeat: &Heartbeat) -> bool {
         let obeys = heartbeat.state.has(State::TEST_MODE);
-        match self.claim.hear(heartbeat) {
-            Word::Claimant | Word::Overtaken => return false,
+        match self.claim.hear(Micros(at_ns / 1_000), heartbeat) {
+            Word::Claimant | Word::Outsider | Word::Overtaken => return false,
             Word::Started { .. } => self.mode(obeys, Origin::Start { at_ns }),
-            Word::First | Word::Known | Word::Shared if !obeys => self.contact.reset(),
-            Word::First | Word::Known | Word::Shared => {}
+            // What seemed a start was none, and its contact state before that is not kept.
+            Word::Shared => self.contact.reset(),
+            Word::First | Word::Known if !obeys => self.contact.reset(),
+            Word::First | Word::Known => {}
         }
         self.contact.set_obeys(obeys);
         self.hash = Some(heartbeat.configuration);

@@ -106,8 +106,9 @@ impl Cell {
     }
 
     fn heartbeat(&mut self, heartbeat: &Heartbeat, placed_packet: &Arc<PlacedPacket>) {
-        let word = self.claim.hear(heartbeat);
-        if word == Word::Claimant {
+        let at = placed_packet.frames.last().map_or(Micros(0), |seen| Micros(seen.at_nanos / 1_000));
+        let word = self.claim.hear(at, heartbeat);
+        if matches!(word, Word::Claimant | Word::Outsider) {
             return;
         }
         if let Word::Started { .. } = word {

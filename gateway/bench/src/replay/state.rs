@@ -16,6 +16,7 @@ use protocol::id::{CellId, Node};
 use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::Parameter;
+use protocol::time::Micros;
 
 use super::touched::Touched;
 
@@ -137,7 +138,9 @@ impl State {
                 cell.learn(page, ());
             }
         } else if let Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } = message {
-            let started = |claim: &mut Claim| matches!(claim.hear(heartbeat), Word::Started { .. });
+            // In the order of the capture; that its times are right is not sure.
+            let hear = |claim: &mut Claim| claim.hear(Micros(0), heartbeat);
+            let started = |claim: &mut Claim| matches!(hear(claim), Word::Started { .. });
             if self.claims.named(*from).iter_mut().any(started) {
                 self.start_again(*from);
             }

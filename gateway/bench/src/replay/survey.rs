@@ -336,7 +336,7 @@ impl Cell {
         let word = self.tracked.hear(Micros(nanos / 1_000), message, None).word;
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
-                Some(Word::Claimant | Word::Overtaken) | None => return,
+                Some(Word::Claimant | Word::Outsider | Word::Overtaken) | None => return,
                 // After a start its counters begin again.
                 Some(Word::Started { .. }) => self.report = Some((Heard::default(), joints.0, joints.1)),
                 Some(Word::First | Word::Known | Word::Shared) => {}

@@ -183,7 +183,7 @@ impl Commission {
 
     fn hear(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) {
         let before = self.address_table.holder(number).filter(|&serial| serial != heartbeat.serial);
-        if let Some([one, other]) = self.address_table.hear(number, heartbeat) {
+        if let Some([one, other]) = self.address_table.hear(now, number, heartbeat) {
             for (serial, other) in [(one, other), (other, one)] {
                 self.fail(serial, Reason::Shared { number, other });
             }

@@ -151,7 +151,7 @@ impl Cell {
 
     /// Its last heartbeat.
     #[must_use]
-    pub const fn heartbeat(&self) -> Option<Heartbeat> {
+    pub fn heartbeat(&self) -> Option<Heartbeat> {
         self.tracked.claim().heartbeat()
     }
 
@@ -196,8 +196,9 @@ impl Cell {
 
     /// Takes its heartbeat, with what that means.
     pub(super) fn take_heartbeat(&mut self, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
-        // Of a claimant: it does not have the node id, and may never have it.
-        let Some(word) = update.word.filter(|word| *word != Word::Claimant) else { return Change::default() };
+        // Of a claimant or an outsider: it does not have the node id, and may never have it.
+        let of_owner = |word: &Word| !matches!(word, Word::Claimant | Word::Outsider);
+        let Some(word) = update.word.filter(of_owner) else { return Change::default() };
         let started = matches!(word, Word::Started { .. } | Word::Shared);
         (self.said.heartbeat, self.last_joints) = (true, epoch);
         if word != Word::Overtaken {
@@ -216,7 +217,9 @@ impl Cell {
         }
         if started {
             self.contact.reset();
-            self.contact.learn(SensorPage::Skin(SkinSensors::default()), ());
+            if word != Word::Shared {
+                self.contact.learn(SensorPage::Skin(SkinSensors::default()), ());
+            }
             self.sensed.restart();
             self.switched.restart();
             self.doubt();

@@ -1,6 +1,9 @@
 //! Which cell has a node id, and whether a heartbeat is of a cell that has restarted.
 
 use protocol::message::{Heartbeat, State};
+use protocol::time::{Micros, Span};
+
+use super::DEAD_AFTER;
 
 /// What a heartbeat of a node id means.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -9,15 +12,17 @@ pub enum Word {
     First,
     /// A further one of the cell that has the id.
     Known,
-    /// An old one of that cell: a later one came before it.
+    /// An old one of that cell, or its last one again: it tells nothing new.
     Overtaken,
     /// The first one since the cell started.
     Started {
         /// Whether the cell, or another one that had the id before, sent something before that.
         again: bool,
     },
-    /// Of the cell that had the id before, which did not claim it again: two cells use it in turn.
+    /// Of the sender that had the id before, which goes on: two use it in turn, and what seemed a start was none.
     Shared,
+    /// Of another sender, while the cell that has the id is alive; only after two used it in turn.
+    Outsider,
     /// Another cell claims the id, and will give up the claim.
     Claimant,
 }
@@ -25,64 +30,140 @@ pub enum Word {
 /// A counter that falls back by more than this is of a cell that has restarted, not of an overtaken heartbeat.
 const OVERTAKES: u16 = 128;
 
+/// More than a cell sends until it is found dead: three packets for each of 500 joints a second are 900.
+const AT_MOST: u16 = 2_048;
+
+/// A cell claims its id for 250 ms or longer; less 10 ms, by which a frame may have been late.
+const CLAIM_TAKES: Span = Span::from_millis(240);
+
 /// The address claim of one node id: which cell has it.
 ///
 /// A cell is identified by its serial number. While it claims the id it yields to a cell that has it already, so a
 /// claim of a settled cell's id does not change that cell's state.
+///
+/// A heartbeat is not signed, and old ones may be sent again. So a start is believed at once, and taken back when the
+/// counter before it goes on; from then on a start is believed only of an id whose cell is silent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Claim {
-    owner: Option<Heartbeat>,
-    /// Of the last one before it that was another cell.
+    owner: Option<Life>,
+    /// The owner before the last start, or before the first one of several while it may be alive.
+    before: Option<Life>,
+    /// Of the last owner before it that was another cell.
     previous: Option<Heartbeat>,
+    /// Two senders used the id in turn.
+    is_contested: bool,
+}
+
+/// A cell from one start to the next: its last heartbeat.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+struct Life {
+    heartbeat: Heartbeat,
+    at: Micros,
+    /// When it claimed the id, if that was heard.
+    claimed: Option<Micros>,
+}
+
+impl Life {
+    fn is_alive(&self, at: Micros) -> bool {
+        at.since(self.at) <= DEAD_AFTER
+    }
+
+    /// How many packets it has sent since its last heartbeat, if this one can be its next.
+    fn sent(&self, at: Micros, heartbeat: &Heartbeat) -> Option<u16> {
+        let sent = heartbeat.sent.wrapping_sub(self.heartbeat.sent);
+        let is_next = self.heartbeat.serial == heartbeat.serial && self.is_alive(at);
+        (is_next && (1..=AT_MOST).contains(&sent)).then_some(sent)
+    }
+
+    /// Whether it still claims the id, so that a heartbeat without CLAIMING is not its.
+    fn claims_until(&self, at: Micros, heartbeat: &Heartbeat) -> bool {
+        let claims = |heartbeat: &Heartbeat| heartbeat.state.has(State::CLAIMING);
+        let settles = claims(&self.heartbeat) && !claims(heartbeat);
+        settles && self.claimed.is_some_and(|claimed| at.since(claimed) < CLAIM_TAKES)
+    }
 }
 
 impl Claim {
-    /// Takes a heartbeat of this node id. This is the one place that detects a restart.
-    pub fn hear(&mut self, heartbeat: &Heartbeat) -> Word {
-        let word = self.word(heartbeat);
-        if !matches!(word, Word::Overtaken | Word::Claimant) {
-            let before = self.owner.replace(*heartbeat);
-            self.previous = before.filter(|owner| owner.serial != heartbeat.serial).or(self.previous);
+    /// Takes a heartbeat of this node id, which came at `at`. This is the one place that detects a restart.
+    pub fn hear(&mut self, at: Micros, heartbeat: &Heartbeat) -> Word {
+        let word = self.word(at, heartbeat);
+        if matches!(word, Word::Overtaken | Word::Claimant | Word::Outsider) {
+            return word;
         }
+        let claims = heartbeat.state.has(State::CLAIMING);
+        let claimed = match self.owner {
+            Some(owner) if matches!(word, Word::Known) => owner.claimed,
+            Some(_) | None => claims.then_some(at),
+        };
+        let owner = self.owner.replace(Life { heartbeat: *heartbeat, at, claimed });
+        match word {
+            Word::Started { .. } => self.before = self.before.filter(|life| life.is_alive(at)).or(owner),
+            Word::Shared => (self.before, self.is_contested) = (None, true),
+            Word::First | Word::Known | Word::Overtaken | Word::Outsider | Word::Claimant => {}
+        }
+        let owner = owner.map(|owner| owner.heartbeat);
+        self.previous = owner.filter(|owner| owner.serial != heartbeat.serial).or(self.previous);
         word
     }
 
-    fn word(&self, heartbeat: &Heartbeat) -> Word {
+    /// Whether a start that was heard may still be taken back.
+    pub(super) fn is_in_question(&self, at: Micros) -> bool {
+        self.before.is_some_and(|before| before.is_alive(at))
+    }
+
+    fn word(&self, at: Micros, heartbeat: &Heartbeat) -> Word {
         let claims = heartbeat.state.has(State::CLAIMING);
         let Some(owner) = &self.owner else {
             // A cell claims its id for half a second at most.
             return if claims { Word::Started { again: false } } else { Word::First };
         };
-        if owner.serial != heartbeat.serial {
+        let begins = match () {
+            () if self.is_contested && owner.is_alive(at) => Word::Outsider,
+            () => Word::Started { again: true },
+        };
+        let of_before = self.before.and_then(|before| before.sent(at, heartbeat));
+        if owner.heartbeat.serial != heartbeat.serial {
             return match (self.is_settled(), claims) {
                 (_, true) => Word::Claimant,
-                (true, false) if self.had_it_before(heartbeat.serial) => Word::Shared,
-                (true, false) => Word::Started { again: true },
+                (true, false) if of_before.is_some() => Word::Shared,
+                (true, false) => begins,
                 // The claimant did not get the id.
                 (false, false) => Word::First,
             };
         }
-        let back = owner.sent.wrapping_sub(heartbeat.sent);
+        // The first packet of a life is a claim.
+        if claims && heartbeat.sent == 0 {
+            return begins;
+        }
+        match (owner.sent(at, heartbeat), of_before) {
+            // By the counters it can be either's.
+            (Some(_), Some(_)) if owner.claims_until(at, heartbeat) => return Word::Shared,
+            (Some(sent), Some(before)) if before < sent && owner.claimed.is_none() => return Word::Shared,
+            (Some(_), _) => return Word::Known,
+            (None, Some(_)) => return Word::Shared,
+            (None, None) => {}
+        }
+        let back = owner.heartbeat.sent.wrapping_sub(heartbeat.sent);
         match back.cast_signed() {
-            // The first packet of a life is a claim.
-            _ if claims && heartbeat.sent == 0 => Word::Started { again: true },
-            ..=0 => Word::Known,
+            0 => Word::Overtaken,
+            ..0 if !owner.is_alive(at) => Word::Known,
+            ..0 => begins,
             // The second heartbeat of a life is the one after the claim.
-            _ if heartbeat.sent <= 1 || back > OVERTAKES => Word::Started { again: true },
+            _ if heartbeat.sent <= 1 || back > OVERTAKES => begins,
             _ => Word::Overtaken,
         }
     }
 
     /// The last heartbeat of the cell that has the id, or is the first one to claim it.
     #[must_use]
-    pub const fn heartbeat(&self) -> Option<Heartbeat> {
-        self.owner
+    pub fn heartbeat(&self) -> Option<Heartbeat> {
+        self.owner.map(|owner| owner.heartbeat)
     }
 
     /// The serial number of that cell.
     #[must_use]
     pub fn serial(&self) -> Option<u32> {
-        self.owner.map(|owner| owner.serial)
+        self.heartbeat().map(|heartbeat| heartbeat.serial)
     }
 
     /// The serial number of the cell that had the id before that one, or claimed it.
@@ -91,15 +172,10 @@ impl Claim {
         self.previous.map(|owner| owner.serial)
     }
 
-    /// Whether this cell had the id before the one that has it, and did not only claim it.
-    fn had_it_before(&self, serial: u32) -> bool {
-        self.previous.is_some_and(|owner| owner.serial == serial && !owner.state.has(State::CLAIMING))
-    }
-
     /// Whether that cell reports this state.
     #[must_use]
     pub fn says(&self, state: State) -> bool {
-        self.owner.is_some_and(|owner| owner.state.has(state))
+        self.owner.is_some_and(|owner| owner.heartbeat.state.has(state))
     }
 
     /// Whether a cell has the id, and so answers.
@@ -115,13 +191,18 @@ mod tests {
 
     const AGAIN: Word = Word::Started { again: true };
 
+    /// A heartbeat every 100 ms.
     fn words(said: &[(u32, u16, State)]) -> Vec<Word> {
+        words_at(said.iter().zip(0..).map(|(&(serial, sent, state), at)| (at * 100, serial, sent, state)))
+    }
+
+    /// At times in ms.
+    fn words_at(said: impl IntoIterator<Item = (u64, u32, u16, State)>) -> Vec<Word> {
         let mut claim = Claim::default();
-        said.iter()
-            .map(|&(serial, sent, state)| {
-                claim.hear(&Heartbeat { serial, sent, state, ..Heartbeat::default() })
-            })
-            .collect()
+        let hear = |(ms, serial, sent, state)| {
+            claim.hear(Micros(ms * 1_000), &Heartbeat { serial, sent, state, ..Heartbeat::default() })
+        };
+        said.into_iter().map(hear).collect()
     }
 
     #[test]
@@ -155,14 +236,67 @@ mod tests {
     fn two_cells_that_use_one_id_in_turn_do_not_restart_each_time() {
         let settled = State::default();
         let said = [(7, 90, settled), (9, 40, settled), (7, 91, settled), (9, 41, settled), (9, 42, settled)];
-        assert_eq!(words(&said), [Word::First, AGAIN, Word::Shared, Word::Shared, Word::Known]);
+        assert_eq!(words(&said), [Word::First, AGAIN, Word::Shared, Word::Outsider, Word::Outsider]);
+    }
+
+    #[test]
+    fn old_heartbeats_that_are_sent_again_take_a_living_cells_id_once_at_most() {
+        let (claims, settled) = (State::CLAIMING, State::default());
+        let (shared, outsider, known) = (Word::Shared, Word::Outsider, Word::Known);
+        // Its own counter is at 900, an old one at 100.
+        let said =
+            [(0, 7, 900, settled), (50, 7, 100, settled), (250, 7, 916, settled), (300, 7, 116, settled)];
+        assert_eq!(words_at(said), [Word::First, AGAIN, shared, outsider]);
+        // Two old ones before its next one, then a start.
+        let said = [
+            (0, 7, 900, settled),
+            (10, 7, 100, settled),
+            (200, 7, 116, settled),
+            (250, 7, 916, settled),
+            (260, 7, 0, claims),
+            (490, 7, 1, settled),
+            (500, 7, 932, settled),
+        ];
+        let expected = [Word::First, AGAIN, known, shared, outsider, outsider, known];
+        assert_eq!(words_at(said), expected);
+        // A claim of a cell that has hardly sent anything: its next heartbeat comes before the claim can end.
+        let said = [(0, 7, 9, settled), (60, 7, 0, claims), (250, 7, 12, settled)];
+        assert_eq!(words_at(said), [Word::First, AGAIN, shared]);
+        // A counter that is ahead.
+        let said =
+            [(0, 7, 900, settled), (10, 7, 9_000, settled), (250, 7, 916, settled), (260, 7, 9_020, settled)];
+        assert_eq!(words_at(said), [Word::First, AGAIN, shared, outsider]);
+        // The cell is gone; whoever has its id then is believed.
+        let said = [(0, 7, 900, settled), (10, 7, 100, settled), (250, 7, 916, settled), (900, 7, 0, claims)];
+        assert_eq!(words_at(said), [Word::First, AGAIN, shared, AGAIN]);
+    }
+
+    #[test]
+    fn a_quick_restart_is_not_taken_for_an_old_heartbeat() {
+        let (claims, settled) = (State::CLAIMING, State::default());
+        for sent in [1, 2, 9, 300] {
+            let said = [
+                (0, 7, sent, settled),
+                (100, 7, 0, claims),
+                (360, 7, 1, settled),
+                (610, 7, sent + 1, settled),
+            ];
+            assert_eq!(words_at(said), [Word::First, AGAIN, Word::Known, Word::Known], "{sent}");
+        }
+        // A cell that has been away for long.
+        assert_eq!(
+            words_at([(0, 7, 900, settled), (60_000, 7, 30_000, settled)]),
+            [Word::First, Word::Known]
+        );
     }
 
     #[test]
     fn the_cell_that_had_the_id_before_is_remembered() {
         let mut claim = Claim::default();
+        let mut sent = 0;
         let mut hear = |serial, state| {
-            claim.hear(&Heartbeat { serial, state, ..Heartbeat::default() });
+            claim.hear(Micros(0), &Heartbeat { serial, state, sent, ..Heartbeat::default() });
+            sent += 1;
             (claim.serial(), claim.previous(), claim.is_settled())
         };
         let (claims, settled) = (State::CLAIMING, State::default());

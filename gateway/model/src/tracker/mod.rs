@@ -94,19 +94,27 @@ impl Tracked {
             return Update { revived, ..Update::default() };
         };
         let away = self.account.is_interrupted();
-        let mut word = self.claim.hear(heartbeat);
+        if !self.claim.is_in_question(at) {
+            self.account.confirm();
+        }
+        let mut word = self.claim.hear(at, heartbeat);
         if let Word::Started { again } = &mut word {
             *again |= !is_first;
         }
         match word {
             Word::Known => self.account.settle(heartbeat.sent),
-            Word::First | Word::Shared => self.account.begin(heartbeat.sent, false),
+            Word::First => self.account.begin(heartbeat.sent, false),
+            Word::Shared => {
+                self.account.take_back(heartbeat.sent);
+                // Some may be the other sender's.
+                self.pages = Pages::default();
+            }
             Word::Started { again } => {
                 self.account.begin(heartbeat.sent, again);
                 self.pages = Pages::default();
             }
-            Word::Overtaken => {}
-            Word::Claimant => self.account.intrude(),
+            Word::Overtaken => self.account.pass_over(),
+            Word::Claimant | Word::Outsider => self.account.intrude(),
         }
         self.account.heartbeat_at(joints);
         let returned = away && matches!(word, Word::First | Word::Known | Word::Started { again: false });

@@ -17,6 +17,8 @@ pub struct Uplink {
     pub outage: u64,
     /// Arrived more often than sent: repeated on the way, or sent by another cell with this node id.
     pub surplus: u64,
+    /// Of the surplus, heartbeats of other senders under this node id: of a cell that claims it, or older ones again.
+    pub outsiders: u64,
     /// Arrived with nothing to compare it with: before a cell's first heartbeat, and between its last one
     /// and a restart. How many more it sent then is not known.
     pub in_doubt: u64,
@@ -34,6 +36,14 @@ pub struct Uplink {
 /// has not arrived by then never will.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Account {
+    now: Ledger,
+    /// As if the last start had been none; for [`Account::take_back`].
+    before: Option<Ledger>,
+}
+
+/// An account, and what its next heartbeat is compared with.
+#[derive(Clone, Copy, Debug, Default)]
+struct Ledger {
     total: Uplink,
     /// What the cell had sent with its last heartbeat, modulo 2^16.
     reported: Option<u16>,
@@ -63,53 +73,111 @@ impl Account {
     /// What it comes to so far.
     #[must_use]
     pub const fn uplink(&self) -> Uplink {
-        Uplink { unsettled: self.arrived, ..self.total }
+        Uplink { unsettled: self.now.arrived, ..self.now.total }
     }
 
     /// The bus is lost: packets of the cell do not arrive until its next heartbeat.
-    pub const fn interrupt(&mut self) {
-        self.interrupted = true;
+    pub fn interrupt(&mut self) {
+        self.each(|ledger| ledger.interrupted = true);
     }
 
     /// Whether the bus was lost since the cell's last heartbeat: it is not known whether the cell is back on it.
     #[must_use]
     pub const fn is_interrupted(&self) -> bool {
-        self.interrupted
+        self.now.interrupted
     }
 
     /// A packet arrived.
-    pub(super) const fn arrive(&mut self) {
-        self.arrived += 1;
+    pub(super) fn arrive(&mut self) {
+        self.each(|ledger| ledger.arrived += 1);
     }
 
     /// A frame with this cell's identifier arrived that cannot be used.
-    pub const fn reject(&mut self) {
-        self.arrived += 1;
-        self.rejected += 1;
+    pub fn reject(&mut self) {
+        self.each(|ledger| {
+            ledger.arrived += 1;
+            ledger.rejected += 1;
+        });
     }
 
     /// The gateway does not take this cell's sums.
     pub fn without_sums(&mut self) {
-        self.sums.get_or_insert_default();
+        self.each(|ledger| _ = ledger.sums.get_or_insert_default());
     }
 
     /// The cell reports how many sums it has sent, modulo 2^16; `joints` is the number of the newest.
     pub(super) fn sums_sent(&mut self, reported: u16, joints: Option<u64>) {
-        let Some(sums) = &mut self.sums else { return };
-        let before = sums.reported.replace(reported).unwrap_or(reported);
-        sums.count += u64::from(reported.wrapping_sub(before));
-        sums.page_at = joints;
+        self.now.sums_sent(reported, joints);
     }
 
     /// Its heartbeat came after the joints of this number; the account is settled already.
     pub(super) const fn heartbeat_at(&mut self, joints: Option<u64>) {
-        if let Some(sums) = &mut self.sums {
+        if let Some(sums) = &mut self.now.sums {
             sums.heartbeat_at = joints;
         }
     }
 
     /// No more comes: accounts for missing packets that were sums which the gateway does not take.
     pub fn finish(&mut self) {
+        self.now.finish();
+    }
+
+    /// The first heartbeat of a cell since it started has arrived; the cell had sent `sent` packets before it, modulo
+    /// 2^16. `again` if the cell was there before.
+    pub(super) fn begin(&mut self, sent: u16, again: bool) {
+        if again {
+            self.before.get_or_insert(self.now);
+        }
+        self.before.iter_mut().for_each(Ledger::intrude);
+        self.now.begin(sent, again);
+    }
+
+    /// A further heartbeat has arrived; the cell had sent `sent` packets before it, modulo 2^16.
+    pub(super) fn settle(&mut self, sent: u16) {
+        self.before.iter_mut().for_each(Ledger::intrude);
+        self.now.settle(sent);
+    }
+
+    /// An old heartbeat of the cell since its last start has arrived.
+    pub(super) fn pass_over(&mut self) {
+        self.before.iter_mut().for_each(Ledger::intrude);
+    }
+
+    /// The last start was one, and is not taken back.
+    pub(super) const fn confirm(&mut self) {
+        self.before = None;
+    }
+
+    /// A heartbeat has arrived that goes on where the account was before the last start: that was none.
+    pub(super) fn take_back(&mut self, sent: u16) {
+        if let Some(before) = self.before.take() {
+            self.now = before;
+            self.now.settle(sent);
+        } else {
+            self.now.begin(sent, false);
+        }
+    }
+
+    /// The heartbeat that has just arrived is of another sender under this node id.
+    pub(super) fn intrude(&mut self) {
+        self.each(Ledger::intrude);
+    }
+
+    fn each(&mut self, change: impl Fn(&mut Ledger)) {
+        change(&mut self.now);
+        self.before.iter_mut().for_each(change);
+    }
+}
+
+impl Ledger {
+    fn sums_sent(&mut self, reported: u16, joints: Option<u64>) {
+        let Some(sums) = &mut self.sums else { return };
+        let before = sums.reported.replace(reported).unwrap_or(reported);
+        sums.count += u64::from(reported.wrapping_sub(before));
+        sums.page_at = joints;
+    }
+
+    fn finish(&mut self) {
         let Some(sums) = &mut self.sums else { return };
         // With joints between its page and its heartbeat, it may have sent more sums than the page counts.
         let at_most = if sums.page_at == sums.heartbeat_at { sums.count - sums.found } else { u64::MAX };
@@ -120,9 +188,7 @@ impl Account {
         sums.count = sums.count.max(sums.found);
     }
 
-    /// The first heartbeat of a cell since it started has arrived; the cell had sent `sent` packets before it, modulo
-    /// 2^16. `again` if the cell was there before.
-    pub(super) fn begin(&mut self, sent: u16, again: bool) {
+    fn begin(&mut self, sent: u16, again: bool) {
         if again {
             self.total.restarts += 1;
             self.finish();
@@ -139,8 +205,7 @@ impl Account {
         self.rejected = 0;
     }
 
-    /// A further heartbeat has arrived; the cell had sent `sent` packets before it, modulo 2^16.
-    pub(super) fn settle(&mut self, sent: u16) {
+    fn settle(&mut self, sent: u16) {
         let Some(before) = self.reported else { return self.begin(sent, false) };
         let reported = sent.wrapping_add(1);
         let (arrived, rejected) = (core::mem::take(&mut self.arrived), core::mem::take(&mut self.rejected));
@@ -156,11 +221,11 @@ impl Account {
         self.reported = Some(reported);
     }
 
-    /// The packet that has just arrived is of another cell, which claims this one's node id.
-    pub(super) const fn intrude(&mut self) {
+    fn intrude(&mut self) {
         self.arrived -= 1;
         self.total.delivered += 1;
         self.total.surplus += 1;
+        self.total.outsiders += 1;
     }
 }
 
@@ -205,21 +270,47 @@ mod tests {
         account.settle(8);
         assert_eq!(lost(&account), (9, 6, 4), "the bus is back");
         account.interrupt();
+        account.arrive();
         account.begin(0, true);
         account.arrive();
         account.settle(2);
         assert_eq!(lost(&account), (12, 7, 4), "a restart begins a new account");
     }
 
+    #[test]
+    fn a_start_that_was_none_is_taken_back_with_all_that_came_since() {
+        let mut account = Account::default();
+        account.arrive();
+        account.begin(900, false);
+        account.arrive(); // a torque
+        account.arrive();
+        account.begin(100, true); // an old heartbeat again
+        account.arrive(); // a torque
+        account.arrive();
+        account.settle(104); // another old one
+        assert_eq!(account.uplink().restarts, 1);
+        account.arrive();
+        account.take_back(904); // the cell's own: it sent three torques before it
+        let uplink = account.uplink();
+        assert_eq!((uplink.restarts, uplink.in_doubt, uplink.unsettled), (0, 0, 0));
+        assert_eq!((uplink.sent, uplink.lost), (5, 1), "{uplink:?}");
+        assert_eq!((uplink.delivered, uplink.surplus, uplink.outsiders), (6, 2, 2), "{uplink:?}");
+    }
+
     proptest! {
         #[test]
-        fn an_account_always_adds_up(said in proptest::collection::vec((any::<u16>(), 0_u64..9, 0_u64..9, any::<bool>(), any::<Option<(u16, Option<u64>)>>()), 0..20), takes_sums: bool) {
+        fn an_account_always_adds_up(said in proptest::collection::vec((any::<u16>(), 0_u64..9, 0_u64..9, 0_u8..3, any::<Option<(u16, Option<u64>)>>()), 0..20), takes_sums: bool) {
             let mut account = Account::default();
             if !takes_sums { account.without_sums(); }
-            for (said, arrived, rejected, restarted, sums) in said {
+            for (said, arrived, rejected, what, sums) in said {
                 for _ in 0..arrived { account.arrive(); }
                 for _ in 0..rejected { account.reject(); }
-                if restarted { account.begin(said, true); } else { account.settle(said); }
+                account.arrive();
+                match what {
+                    0 => account.begin(said, true),
+                    1 => account.settle(said),
+                    _ => account.take_back(said),
+                }
                 if let Some((sums, at)) = sums { account.sums_sent(sums, at); }
             }
             account.finish();

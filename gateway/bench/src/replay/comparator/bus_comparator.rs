@@ -7,6 +7,7 @@ use protocol::id::{CellId, Node};
 use protocol::message::{Answer, Heard, Joints, Message, NetworkPage};
 use protocol::packet::{Epoch, Words};
 use protocol::schema::Units;
+use protocol::time::Micros;
 
 use super::WINDOW;
 use super::sums::{Sums, Trees};
@@ -341,7 +342,7 @@ impl BusComparator {
         let present = self.present.entry(cell).or_default();
         match *page {
             NetworkPage::Heartbeat(heartbeat) => {
-                if present.claim.hear(&heartbeat) == Word::Claimant {
+                if matches!(present.claim.hear(Micros(0), &heartbeat), Word::Claimant | Word::Outsider) {
                     return;
                 }
                 present.is_given_up = false;

@@ -1,0 +1,207 @@
+//! Whole benches on which somebody sends frames that a bench does not expect: the accounts stay exact, and no cell's
+//! torque changes.
+
+#![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
+
+use model::table::Replies;
+use protocol::can::{ERROR, EXTENDED, Format, Frame};
+use protocol::id::{CellId, Id, Kind, Node};
+use protocol::message::{
+    Answer, Heard, Heartbeat, Message, NetworkPage, Ports, Refused, Request, SensorPage, State, Tree,
+};
+use protocol::packet::{Epoch, Packet};
+use protocol::parameters::Parameter;
+use protocol::time::Span;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use skinbus_tests::accounts;
+use skinbus_tests::bench::{Act, Bench, touch};
+use skinbus_tests::gateway::epoch_of;
+use skinbus_tests::skins;
+
+const CELLS: usize = 4;
+const FRAMES: u32 = 400;
+
+/// What somebody sends.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum What {
+    /// Of other protocols.
+    Foreign,
+    Extended,
+    Remote,
+    ErrorFrame,
+    /// Under a cell's identifier, and no packet.
+    WrongChecksum,
+    WrongLength,
+    HalfPacket,
+    /// Under a cell's node id.
+    OldHeartbeat,
+    HeartbeatAhead,
+    LastHeartbeatAgain,
+    HeartbeatOfAnother,
+    Claim,
+    ClaimOfAnother,
+    StaleTorque,
+    Sensors,
+    Counters,
+    Place,
+    Answer,
+    Sum,
+    /// Of nodes that the skin does not have.
+    UnknownNode,
+    /// Of a gateway or a command line.
+    Requests,
+    GatewaysHeartbeat,
+}
+
+const ALL: [What; 22] = [
+    What::Foreign,
+    What::Extended,
+    What::Remote,
+    What::ErrorFrame,
+    What::WrongChecksum,
+    What::WrongLength,
+    What::HalfPacket,
+    What::OldHeartbeat,
+    What::HeartbeatAhead,
+    What::LastHeartbeatAgain,
+    What::HeartbeatOfAnother,
+    What::Claim,
+    What::ClaimOfAnother,
+    What::StaleTorque,
+    What::Sensors,
+    What::Counters,
+    What::Place,
+    What::Answer,
+    What::Sum,
+    What::UnknownNode,
+    What::Requests,
+    What::GatewaysHeartbeat,
+];
+
+impl What {
+    /// Whether the gateway counts it as a packet of the cell whose node id it has.
+    fn is_of_a_cell(self) -> bool {
+        use What::*;
+        let none = [Foreign, Extended, Remote, ErrorFrame, UnknownNode, Requests, GatewaysHeartbeat];
+        !none.contains(&self)
+    }
+
+    /// Whether it is a heartbeat that is not the cell's own.
+    fn is_an_outsider(self) -> bool {
+        use What::*;
+        [OldHeartbeat, HeartbeatAhead, HeartbeatOfAnother, Claim, ClaimOfAnother].contains(&self)
+    }
+
+    fn act(self, bench: &Bench, dice: &mut Pcg64Mcg, place: usize) -> Act {
+        let cell = &bench.gateway.table.cells()[place];
+        let (from, own) = (cell.node, cell.heartbeat().unwrap());
+        let epoch = epoch_of(bench.gateway.broadcasts() - 1);
+        let network = |page| Act::Inject(Message::Network { from: Node::Cell(from), epoch, page });
+        let beat = |heartbeat| network(NetworkPage::Heartbeat(heartbeat));
+        let settled = Heartbeat { state: own.state, ..own };
+        let words: [i16; 6] = dice.random();
+        let frame = |kind: Kind, node: u8, format| {
+            let packet = Packet { id: Id { kind, node }, words: [3; 6].into(), epoch, count: 6 };
+            packet.frames(format).next().unwrap()
+        };
+        match self {
+            Self::Foreign => Act::Babble(Frame::classic(0x0F1, &dice.random::<[u8; 8]>()).unwrap()),
+            Self::Extended => Act::Babble(Frame::classic(0x18F0_0400 | EXTENDED, &[1, 2, 3]).unwrap()),
+            Self::Remote => {
+                Act::Babble(Frame::remote(frame(Kind::Torque, from.get(), Format::Fd).id(), 8).unwrap())
+            }
+            Self::ErrorFrame => {
+                Act::Babble(Frame::classic(0x4 | ERROR, &[0, 0x20, 0, 0, 0, 0, 96, 0]).unwrap())
+            }
+            Self::WrongChecksum => {
+                let torque = frame(Kind::Torque, from.get(), Format::Fd);
+                let mut data = [0; 16];
+                data.copy_from_slice(torque.data());
+                data[3] ^= 0x10;
+                Act::Babble(Frame::fd(torque.id(), 0, &data).unwrap())
+            }
+            Self::WrongLength => {
+                Act::Babble(Frame::fd(frame(Kind::Torque, from.get(), Format::Fd).id(), 0, &[7; 12]).unwrap())
+            }
+            Self::HalfPacket => Act::Babble(frame(Kind::Torque, from.get(), Format::Classic)),
+            Self::OldHeartbeat => beat(Heartbeat { sent: own.sent.wrapping_sub(1_000), ..settled }),
+            Self::HeartbeatAhead => beat(Heartbeat { sent: own.sent.wrapping_add(9_000), ..settled }),
+            Self::LastHeartbeatAgain => beat(settled),
+            Self::HeartbeatOfAnother => {
+                beat(Heartbeat { serial: bench.cell_slots[place].identity.serial ^ 0x5A5A, ..settled })
+            }
+            Self::Claim => beat(Heartbeat { sent: 0, state: State::CLAIMING, ..own }),
+            Self::ClaimOfAnother => {
+                beat(Heartbeat { serial: own.serial - 1, sent: 0, state: State::CLAIMING, ..own })
+            }
+            Self::StaleTorque => Act::Inject(Message::Torque {
+                from,
+                epoch: Epoch(epoch.0.wrapping_sub(9)),
+                torque: words.into(),
+            }),
+            Self::Sensors => {
+                Act::Inject(Message::Sensors { from, epoch, page: SensorPage::Skin(touch(3.0)) })
+            }
+            Self::Counters if dice.random() => network(NetworkPage::Heard(Heard::default())),
+            Self::Counters => network(NetworkPage::Refused(Refused { crc: 9, ..Refused::default() })),
+            Self::Place if dice.random() => network(NetworkPage::Tree(Tree::default())),
+            Self::Place => network(NetworkPage::Ports(Ports::default())),
+            Self::Answer => {
+                let answer = Answer::Value { number: Parameter::Reply.number(), written: true, words: words };
+                Act::Inject(Message::Configured { from, tag: 3, answer })
+            }
+            Self::Sum => Act::Inject(Message::Sum { from, epoch, torque: words.into(), count: 3 }),
+            Self::UnknownNode => {
+                let from = Node::Cell(CellId::new(200).unwrap());
+                Act::Inject(Message::Network { from, epoch, page: NetworkPage::Heartbeat(settled) })
+            }
+            Self::Requests if dice.random() => Act::Inject(Message::Sync),
+            Self::Requests if dice.random() => Act::Inject(Message::Report),
+            Self::Requests => {
+                let request = Request::Read { number: Parameter::Identity.number() };
+                Act::Inject(Message::Configure { to: Node::Cell(from), tag: 7, request })
+            }
+            Self::GatewaysHeartbeat => {
+                let page = NetworkPage::Heartbeat(Heartbeat::default());
+                Act::Inject(Message::Network { from: Node::Gateway, epoch, page })
+            }
+        }
+    }
+}
+
+#[test]
+fn no_frame_that_somebody_sends_changes_an_account_or_a_torque() {
+    for (seed, what) in (0..).zip(ALL) {
+        let mut bench = Bench::new(&skins::arm(CELLS as u8, Format::Fd), seed).started();
+        (0..CELLS).for_each(|place| bench.press(place, 1.0 + 0.2 * place as f64));
+        bench.run_epochs(20);
+        bench.oracle.compares = false;
+        let mut dice = Pcg64Mcg::seed_from_u64(seed);
+        let mut sent = [0; CELLS];
+        for _ in 0..FRAMES {
+            let place = dice.random_range(0..CELLS);
+            sent[place] += 1;
+            let act = what.act(&bench, &mut dice, place);
+            bench.act(act);
+            bench.run(Span(dice.random_range(0..20_000)));
+        }
+        // The next heartbeat of each cell comes.
+        bench.run_epochs(30);
+        bench.finish();
+        accounts::check(&bench);
+        let table = &bench.gateway.table;
+        for (cell, sent) in table.cells().iter().zip(sent) {
+            let uplink = cell.uplink();
+            assert_eq!((uplink.lost, uplink.restarts, uplink.in_doubt), (0, 0, 0), "{what:?}: {uplink:?}");
+            let forged = if what.is_of_a_cell() { sent } else { 0 };
+            assert_eq!(uplink.surplus, forged, "{what:?}: {uplink:?}");
+            let outsiders = if what.is_an_outsider() { sent } else { 0 };
+            assert_eq!(uplink.outsiders, outsiders, "{what:?}: {uplink:?}");
+            let Replies { due, in_time, missing, in_doubt, .. } = cell.replies;
+            assert_eq!(missing, in_doubt, "{what:?}: {:?}", cell.replies);
+            assert!(in_time * 100 >= due * 99, "{what:?}: {:?}", cell.replies);
+        }
+        assert!(table.accuracy().single.max() < 1e-3, "{what:?}: {:?}", table.accuracy());
+    }
+}
