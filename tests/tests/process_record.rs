@@ -246,6 +246,27 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     assert_eq!(place.read("old.mcap"), "somebody's");
 }
 
+#[test]
+fn a_file_that_another_program_moves_while_it_is_written_counts_as_lost_and_the_next_one_begins() {
+    let place = Place::new();
+    place.pressed();
+    let bench = place.running_bench(4.0, "--record run.mcap");
+    std::thread::sleep(Duration::from_millis(500));
+    fs::rename(place.path("run.mcap.part"), place.path("elsewhere.mcap")).unwrap();
+    let ended = bench.end();
+    assert_eq!(ended.code(), Some(1), "{ended:#?}");
+    let summary = place.summary();
+    assert_eq!(parts(&summary), ["run-1.mcap"]);
+    let frames = |name: &str| Recorded::read(&place.path(name)).lines("/can/vcan0").len() as u64;
+    let (moved, kept) = (frames("elsewhere.mcap"), frames("run-1.mcap"));
+    assert!(moved > 20 && kept > 20, "{moved} {kept}");
+    let of = |key: &str| summary.number(&format!("/recording/{key}"));
+    assert_eq!((of("lost_write"), of("frames")), (moved, kept), "{:#}", summary.0);
+    let why = summary.0["recording"]["errors"][0].as_str().unwrap();
+    assert!(why.starts_with("run.mcap.part: another program renamed, removed or replaced it"), "{why}");
+    assert!(!place.path("run.mcap").exists());
+}
+
 /// A bench in a shell that first runs a command.
 fn in_shell(place: &Place, before: &str, run: &str, after: &str) -> process::Ended {
     let gateway = process::program("gateway");

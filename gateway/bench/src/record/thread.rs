@@ -2,7 +2,6 @@
 
 use std::io;
 use std::mem;
-use std::path::Path;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, Sender};
 use std::thread;
@@ -20,10 +19,10 @@ use super::topics::{OF_ROBOT, Topics};
 use super::{Outputs, Stop};
 use crate::run::realtime::wall;
 use trace::capture::{Note, NoteKind};
-use trace::files::sync;
-use trace::recording::account::{Recording, Written};
+use trace::recording::account::Count;
+use trace::recording::account::Recording;
 use trace::recording::layout::Layout;
-use trace::recording::series::{Count, Head, Said, Series};
+use trace::recording::series::{Head, Said, Series};
 use trace::recording::window::{WINDOW_NS, Window};
 use trace::ros2::skin::ContactState;
 use trace::ros2::standard::{Diagnosis, Level, Point};
@@ -344,12 +343,6 @@ impl Work {
         let mut lost = 0;
         if let Some(mut series) = self.files.series.take() {
             let (files, unwritten) = series.finish();
-            for Written { path, .. } in &files {
-                // During the run the recorder must not wait for the disk; now it may.
-                if let Err(error) = sync(Path::new(path)) {
-                    self.files.errors.push(Said::Else(format!("{path}: {error}")));
-                }
-            }
             recording.files = files;
             recording.messages_late = series.late();
             lost = unwritten.frames;

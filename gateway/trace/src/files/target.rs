@@ -208,16 +208,6 @@ pub fn rename(from: &Path, to: &Path, force: bool) -> io::Result<()> {
     }
 }
 
-/// Makes a file that has its name outlive a loss of power.
-///
-/// # Errors
-/// When the disk does not take it.
-pub fn sync(path: &Path) -> io::Result<()> {
-    File::open(path)?.sync_all()?;
-    sync_folder(path);
-    Ok(())
-}
-
 /// Makes the names in a file's folder durable. A file system that cannot does what it can.
 pub fn sync_folder(path: &Path) {
     let _ = File::open(folder_of(path)).and_then(|folder| folder.sync_all());

@@ -1,6 +1,7 @@
 //! What a recording came to.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use serde::Serialize;
 
@@ -17,6 +18,37 @@ pub struct Written {
     pub messages: u64,
     /// Its size.
     pub bytes: u64,
+}
+
+/// How many.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Count {
+    /// Frames.
+    pub frames: u64,
+    /// Other messages.
+    pub others: u64,
+}
+
+impl Count {
+    /// A frame of a bus.
+    pub const FRAME: Self = Self { frames: 1, others: 0 };
+
+    /// So many other messages.
+    #[must_use]
+    pub const fn others(others: u64) -> Self {
+        Self { frames: 0, others }
+    }
+
+    pub(super) fn add(&mut self, other: Self) {
+        self.frames += other.frames;
+        self.others += other.others;
+    }
+
+    /// What a file came to in which it is.
+    pub(super) fn in_file(self, path: &Path, bytes: u64) -> Written {
+        let Self { frames, others } = self;
+        Written { path: path.display().to_string(), format: "mcap", frames, messages: frames + others, bytes }
+    }
 }
 
 /// What a run's recording came to.

@@ -124,15 +124,21 @@ impl Part {
     /// # Errors
     /// When it cannot have it.
     pub fn finish(&self, force: bool) -> io::Result<()> {
-        if !is_still(&self.path, self.is) {
+        if !self.is_there() {
             return Err(io::Error::other(format!("{} is another file now", self.path.display())));
         }
         rename(&self.path, &self.goal, force)
     }
 
+    /// Whether it still has its name for now.
+    #[must_use]
+    pub fn is_there(&self) -> bool {
+        is_still(&self.path, self.is)
+    }
+
     /// Takes the file away, if it is still there.
     pub fn remove(&self) {
-        if is_still(&self.path, self.is) {
+        if self.is_there() {
             // The next run takes it away.
             let _ = fs::remove_file(&self.path);
         }

@@ -13,9 +13,10 @@ use std::time::{Duration, Instant};
 
 use rustix::fs::statvfs;
 
-use super::account::Written;
+use super::account::{Count, Written};
 use super::file::FileWriter;
 use super::names::{self, Part};
+use super::publish::{Ended, Published, Publisher};
 use super::recover::RecoverError;
 use super::repair::{self, Repaired};
 use super::sink::{Gauge, Sink};
@@ -28,6 +29,8 @@ const BUFFER: usize = 64 << 10;
 const RETRY: Duration = Duration::from_secs(5);
 /// A file that is to end waits so long at most for what holds it: any traffic may look like a segment.
 const HOLD: Duration = Duration::from_millis(500);
+/// Between two looks whether a file still has its name.
+const LOOK: Duration = Duration::from_secs(1);
 /// Room on a disk that was full before it is tried again.
 const ROOM: u64 = 64 << 20;
 
@@ -128,6 +131,8 @@ struct Open<T> {
     /// Bytes before the first message.
     head: u64,
     began: Instant,
+    /// When it was looked at whether it still has its name.
+    looked: Instant,
     /// Since when it is large or old enough.
     enough: Option<Instant>,
     /// In the file, flushed.
@@ -153,37 +158,6 @@ struct Broken {
     kept: Count,
 }
 
-/// How many.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Count {
-    /// Frames.
-    pub frames: u64,
-    /// Other messages.
-    pub others: u64,
-}
-
-impl Count {
-    /// A frame of a bus.
-    pub const FRAME: Self = Self { frames: 1, others: 0 };
-
-    /// So many other messages.
-    #[must_use]
-    pub const fn others(others: u64) -> Self {
-        Self { frames: 0, others }
-    }
-
-    pub(super) fn add(&mut self, other: Self) {
-        self.frames += other.frames;
-        self.others += other.others;
-    }
-
-    /// What a file came to in which it is.
-    fn in_file(self, path: &Path, bytes: u64) -> Written {
-        let Self { frames, others } = self;
-        Written { path: path.display().to_string(), format: "mcap", frames, messages: frames + others, bytes }
-    }
-}
-
 /// The files of a recording; `T` is what a file's channels are kept in.
 #[derive(Debug)]
 pub struct Series<T> {
@@ -203,6 +177,8 @@ pub struct Series<T> {
     /// When the last error was.
     failed: Option<Instant>,
     broken: Vec<Broken>,
+    /// Ends files that are whole, each with what is in it and its bytes.
+    publisher: Publisher<(Count, u64)>,
     written: Vec<Written>,
     lost: Count,
     /// Messages of files that have ended which came when the file was past their time.
@@ -234,6 +210,7 @@ impl<T> Series<T> {
             open: None,
             failed: None,
             broken: Vec::new(),
+            publisher: Publisher::new(force),
             written: Vec::new(),
             lost: Count::default(),
             late: 0,
@@ -273,7 +250,19 @@ impl<T> Series<T> {
         let (writer, topics, gauge) = begin().inspect_err(|_: &io::Error| part.remove())?;
         let (window, head, began) = (Window::new(self.now), gauge.bytes(), Instant::now());
         let (kept, written) = (Count::default(), Count::default());
-        Ok(Open { writer, window, topics, part, gauge, head, began, enough: None, kept, written })
+        Ok(Open {
+            writer,
+            window,
+            topics,
+            part,
+            gauge,
+            head,
+            began,
+            looked: began,
+            enough: None,
+            kept,
+            written,
+        })
     }
 
     /// Tells the recorder's time, in ns since 1970, by which messages are put in order.
@@ -309,6 +298,7 @@ impl<T> Series<T> {
     /// Hands on what has waited long enough; ends a file that is large or old enough, as soon as nothing `holds` it, or
     /// whose disk is full. Whether another file should be begun with [`Series::next`].
     pub fn flush(&mut self, holds: bool) -> bool {
+        self.take_published();
         let Some(open) = &mut self.open else {
             let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY);
             return due && has_room(&self.path);
@@ -318,6 +308,13 @@ impl<T> Series<T> {
             return false;
         }
         open.kept.add(std::mem::take(&mut open.written));
+        if open.looked.elapsed() >= LOOK {
+            open.looked = Instant::now();
+            if !open.part.is_there() {
+                self.end();
+                return true;
+            }
+        }
         open.gauge.reserve_for(open.writer.chunks());
         if open.gauge.is_full() {
             self.end();
@@ -395,16 +392,21 @@ impl<T> Series<T> {
         }
         open.kept.add(open.written);
         self.late += open.window.late();
-        let (kept, gauge, part) = (open.kept, open.gauge, open.part);
-        let path = match part.finish(self.force) {
-            Ok(()) => part.goal,
-            Err(error) => {
-                let (goal, there) = (part.goal.display(), part.path.display());
-                self.said.push(Said::Else(format!("{goal}: {error}; the recording is {there}")));
-                part.path
+        let (sink, _) = open.writer.into_inner().into_parts();
+        let about = (open.kept, open.gauge.bytes());
+        self.publisher.publish(Ended { file: sink.into_file(), part: open.part, about });
+    }
+
+    /// Notes the files that have their names by now.
+    fn take_published(&mut self) {
+        for Published { path, about: (kept, bytes), error } in self.publisher.done() {
+            self.said.extend(error.map(Said::Else));
+            match path {
+                Some(path) => self.written.push(kept.in_file(&path, bytes)),
+                // Wherever it is, it is whole; but nobody is told where.
+                None => self.lost.add(kept),
             }
-        };
-        self.written.push(kept.in_file(&path, gauge.bytes()));
+        }
     }
 
     /// The file takes nothing more.
@@ -437,6 +439,8 @@ impl<T> Series<T> {
     /// Ends the recording: its files, and what was lost.
     pub fn finish(&mut self) -> (Vec<Written>, Count) {
         self.end();
+        self.publisher.finish();
+        self.take_published();
         for Broken { part, file, kept } in std::mem::take(&mut self.broken) {
             let from = part.open().map_err(RecoverError::Read);
             let goal = || part.goal.clone();

@@ -10,8 +10,8 @@
 
 use std::io::{self, Write};
 
+use super::account::Count;
 use super::file::{Channel, FileWriter};
-use super::series::Count;
 use crate::ros2::Message;
 
 /// How long a message waits for others that are older, in ns.

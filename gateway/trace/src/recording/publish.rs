@@ -1,0 +1,110 @@
+//! Gives files their names when the disk has them. Syncing takes as long as the disk takes, which a recorder cannot
+//! wait for: a thread does it, one file after the other.
+
+use std::fs::File;
+use std::io;
+use std::path::PathBuf;
+use std::sync::mpsc::{self, Receiver, Sender};
+use std::thread::{self, JoinHandle};
+
+use super::names::Part;
+use crate::files::sync_folder;
+
+/// A file that has ended, and what is told of it once it has its name.
+#[derive(Debug)]
+pub(super) struct Ended<T> {
+    /// The file, which is held until then.
+    pub(super) file: File,
+    pub(super) part: Part,
+    pub(super) about: T,
+}
+
+/// A file with the name that it keeps.
+#[derive(Debug)]
+pub(super) struct Published<T> {
+    /// None if another program renamed or removed it.
+    pub(super) path: Option<PathBuf>,
+    pub(super) about: T,
+    /// Why it is not the name that it was to have.
+    pub(super) error: Option<String>,
+}
+
+/// The thread, and what it has done.
+#[derive(Debug)]
+pub(super) struct Publisher<T> {
+    force: bool,
+    running: Option<(Sender<Ended<T>>, JoinHandle<()>)>,
+    sender: Sender<Published<T>>,
+    published: Receiver<Published<T>>,
+}
+
+impl<T: Send + 'static> Publisher<T> {
+    /// Takes the place of other files only with `force`.
+    pub(super) fn new(force: bool) -> Self {
+        let (sender, published) = mpsc::channel();
+        Self { force, running: None, sender, published }
+    }
+
+    /// Syncs a file and gives it its name, in its turn.
+    pub(super) fn publish(&mut self, ended: Ended<T>) {
+        if self.running.is_none() {
+            self.running = self.start().ok();
+        }
+        let unsent = match &self.running {
+            Some((sender, _)) => sender.send(ended).err().map(|mpsc::SendError(ended)| ended),
+            None => Some(ended),
+        };
+        if let Some(ended) = unsent {
+            // Without a thread the recorder waits; what comes meanwhile waits in its queue.
+            let _ = self.sender.send(publish(ended, self.force));
+        }
+    }
+
+    fn start(&self) -> io::Result<(Sender<Ended<T>>, JoinHandle<()>)> {
+        let (sender, receiver) = mpsc::channel::<Ended<T>>();
+        let (published, force) = (self.sender.clone(), self.force);
+        let work = move || {
+            for ended in receiver {
+                let _ = published.send(publish(ended, force));
+            }
+        };
+        Ok((sender, thread::Builder::new().name("sync".into()).spawn(work)?))
+    }
+
+    /// Those that have their names by now.
+    pub(super) fn done(&self) -> impl Iterator<Item = Published<T>> {
+        self.published.try_iter()
+    }
+
+    /// Waits until all have.
+    pub(super) fn finish(&mut self) {
+        if let Some((sender, thread)) = self.running.take() {
+            drop(sender);
+            // Its panics are reported where they happen.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Only what a loss of power leaves whole has the name of a whole file.
+fn publish<T>(Ended { file, part, about }: Ended<T>, force: bool) -> Published<T> {
+    let named = file.sync_all().and_then(|()| part.finish(force));
+    match named {
+        Ok(()) => {
+            sync_folder(&part.goal);
+            Published { path: Some(part.goal), about, error: None }
+        }
+        Err(error) => {
+            let (goal, there) = (part.goal.display(), part.path.display());
+            if !part.is_there() {
+                let error = format!(
+                    "{there}: another program renamed, removed or replaced it while it was written; it is whole \
+                     wherever it is now, and what is in it counts as lost"
+                );
+                return Published { path: None, about, error: Some(error) };
+            }
+            let error = Some(format!("{goal}: {error}; the recording is {there}"));
+            Published { path: Some(part.path), about, error }
+        }
+    }
+}
