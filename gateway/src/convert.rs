@@ -220,6 +220,12 @@ impl Convert {
 
     /// What OUT is to be, by its name.
     fn format(&self) -> Result<Format, Failure> {
+        if is_standard(&self.to) && io::stdout().is_terminal() {
+            let why = "standard output is a terminal, and a log may have anything in it";
+            return Err(Failure::usage(format!(
+                "-: {why}: pipe it on, name a file, or look at it with `gateway dump`"
+            )));
+        }
         let other = fs::metadata(&self.to).is_ok_and(|there| !there.is_file() && !there.is_dir());
         match self.to.extension().and_then(OsStr::to_str) {
             Some("mcap") => Ok(Format::Mcap),

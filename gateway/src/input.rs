@@ -215,8 +215,13 @@ impl Missing {
     /// Reports it at the end; also what has become of CAN XL frames.
     pub(crate) fn tell(&self, reader: &Reader, can_xl: &str) {
         let name = reader.name();
+        // Of a recording they are notes.
+        let unread = match reader.lines() {
+            0 => format!("{} could not be read", count(self.lines, "line of a log")),
+            lines => format!("{} of {lines} lines could not be read", self.lines),
+        };
         let said = [
-            (self.lines, format!("{} of {} lines could not be read", self.lines, reader.lines())),
+            (self.lines, unread),
             (self.frames, format!("{} frames are missing: the recorder lost them", self.frames)),
             (self.can_xl, format!("CAN XL frames are {can_xl}: {}", self.can_xl)),
         ];

@@ -65,6 +65,7 @@ pub(crate) fn count(count: impl TryInto<u64>, one: &str) -> String {
     match one {
         _ if count == 1 => format!("1 {one}"),
         "bus" | "touch" => format!("{count} {one}es"),
+        "line of a log" => format!("{count} lines of a log"),
         _ => format!("{count} {one}s"),
     }
 }
@@ -135,17 +136,27 @@ pub(crate) fn filled<H, T, F: Fn(&T) -> Option<String>>(
 }
 
 /// What is printed: a name, a value, and what it is to be compared with.
-pub(crate) struct Rows(Table);
+pub(crate) struct Rows {
+    table: Table,
+    /// The letters of a name in one line, on a narrow terminal.
+    name_width: Option<usize>,
+}
 
 impl Rows {
     /// A [`readable`] table with this head and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
-        Self(readable(table(line(name, value, beside), [], |_| false)))
+        let mut table = readable(table(line(name, value, beside), [], |_| false));
+        let width = table.width().filter(|&width| width < WIDTH).map(|width| width * 2 / 5);
+        if let (Some(_), Some(names)) = (width, table.column_mut(0)) {
+            names.set_constraint(ColumnConstraint::ContentWidth);
+        }
+        Self { table, name_width: width.map(usize::from) }
     }
 
     /// The same where names are not broken, however narrow the terminal.
     pub(crate) fn names_in_one_line(mut self) -> Self {
-        if let Some(names) = self.0.column_mut(0) {
+        self.name_width = None;
+        if let Some(names) = self.table.column_mut(0) {
             names.set_constraint(ColumnConstraint::ContentWidth);
         }
         self
@@ -153,18 +164,16 @@ impl Rows {
 
     /// The table as it is printed.
     pub(crate) fn text(&self) -> String {
-        format!("{}\n", self.0).replace(INDENT, " ")
+        format!("{}\n", self.table).replace(INDENT, " ")
     }
 
     pub(crate) fn section(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
-        self.0.add_row(line(name, value, beside));
+        let [name, value, beside] = line(name, value, beside);
+        self.table.add_row([folded(&name, self.name_width), value, beside]);
     }
 
     pub(crate) fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
-        let name = format!("  {name}");
-        let text = name.trim_start_matches(' ');
-        let indented = INDENT.repeat(name.len() - text.len()) + text;
-        self.0.add_row(line(indented, value, beside));
+        self.section(format!("  {name}"), value, beside);
     }
 
     /// A row of something that there is, or none.
@@ -178,4 +187,50 @@ impl Rows {
 /// A row's texts, [`shown`].
 fn line(name: impl Display, value: impl Display, beside: impl Display) -> [String; 3] {
     [name.to_string(), value.to_string(), beside.to_string()].map(|text| shown(&text).into_owned())
+}
+
+/// A name in lines of so many letters; all but the first are indented further. A longer word is broken.
+fn folded(name: &str, width: Option<usize>) -> String {
+    let words = name.trim_start_matches(' ');
+    let indent = name.len() - words.len();
+    let mut folded = INDENT.repeat(indent);
+    let (mut taken, mut is_first) = (indent, true);
+    for word in words.split(' ') {
+        let letters = word.chars().count();
+        if !is_first && width.is_some_and(|width| taken + 1 + letters > width) {
+            folded.push('\n');
+            folded.push_str(&INDENT.repeat(indent + 2));
+            taken = indent + 2;
+        } else if !is_first {
+            folded.push(' ');
+            taken += 1;
+        }
+        for letter in word.chars() {
+            if width.is_some_and(|width| taken >= width.max(indent + 8)) {
+                folded.push('\n');
+                folded.push_str(&INDENT.repeat(indent + 2));
+                taken = indent + 2;
+            }
+            folded.push(letter);
+            taken += 1;
+        }
+        is_first = false;
+    }
+    folded
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_long_name_is_folded_between_words_and_keeps_its_indent() {
+        let of = |width| folded("  joints not yet taken at heartbeats, µs", width).replace(INDENT, ".");
+        assert_eq!(of(None), "..joints not yet taken at heartbeats, µs");
+        assert_eq!(of(Some(24)), "..joints not yet taken\n....at heartbeats, µs");
+        assert_eq!(
+            of(Some(4)),
+            "..joints\n....not\n....yet\n....taken\n....at\n....heartb\n....eats,\n....µs"
+        );
+    }
 }

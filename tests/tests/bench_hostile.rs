@@ -19,7 +19,7 @@ use skinbus_tests::bench::{Act, Bench, touch};
 use skinbus_tests::gateway::epoch_of;
 use skinbus_tests::skins;
 
-const CELLS: usize = 4;
+const CELLS: u8 = 4;
 const FRAMES: u32 = 400;
 
 /// What somebody sends.
@@ -148,7 +148,7 @@ impl What {
             Self::Place if dice.random() => network(NetworkPage::Tree(Tree::default())),
             Self::Place => network(NetworkPage::Ports(Ports::default())),
             Self::Answer => {
-                let answer = Answer::Value { number: Parameter::Reply.number(), written: true, words: words };
+                let answer = Answer::Value { number: Parameter::Reply.number(), written: true, words };
                 Act::Inject(Message::Configured { from, tag: 3, answer })
             }
             Self::Sum => Act::Inject(Message::Sum { from, epoch, torque: words.into(), count: 3 }),
@@ -173,14 +173,14 @@ impl What {
 #[test]
 fn no_frame_that_somebody_sends_changes_an_account_or_a_torque() {
     for (seed, what) in (0..).zip(ALL) {
-        let mut bench = Bench::new(&skins::arm(CELLS as u8, Format::Fd), seed).started();
-        (0..CELLS).for_each(|place| bench.press(place, 1.0 + 0.2 * place as f64));
+        let mut bench = Bench::new(&skins::arm(CELLS, Format::Fd), seed).started();
+        (0..CELLS).for_each(|place| bench.press(place.into(), 1.0 + 0.2 * f64::from(place)));
         bench.run_epochs(20);
         bench.oracle.compares = false;
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
-        let mut sent = [0; CELLS];
+        let mut sent = [0; CELLS as usize];
         for _ in 0..FRAMES {
-            let place = dice.random_range(0..CELLS);
+            let place = dice.random_range(0..usize::from(CELLS));
             sent[place] += 1;
             let act = what.act(&bench, &mut dice, place);
             bench.act(act);

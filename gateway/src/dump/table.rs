@@ -13,7 +13,7 @@ use crate::print::{self, Rows, decimals, filled, list, or, words};
 /// All of it: what the capture is, each bus, and each bus' cells.
 pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extras>) -> String {
     let head = format!("{what}, {:.3} s", report.duration_s);
-    let mut rows = Rows::new(name, head, format!("{} frames", report.frames));
+    let mut rows = Rows::new(name, head, print::count(report.frames, "frame"));
     rows.any("frames before the one before them", report.times_backwards, "times run backwards");
     rows.any("frames missing", report.dropped, "lost by the recorder");
     rows.any("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
@@ -40,7 +40,7 @@ fn per_s(rate: Option<f64>) -> String {
 }
 
 fn numbers(rows: &mut Rows, bus: &BusReport) {
-    rows.section(&bus.bus, format!("{} frames", bus.frames), per_s(bus.frames_per_s));
+    rows.section(&bus.bus, print::count(bus.frames, "frame"), per_s(bus.frames_per_s));
     for kind in &bus.kinds {
         rows.row(kind.kind, kind.packets, per_s(kind.packets_per_s));
     }

@@ -56,6 +56,7 @@ fn no_name_that_a_file_chose_is_obeyed() {
         format!("dump {x} --brief"),
         format!("dump {x} --json"),
         format!("dump {x} --stats"),
+        format!("convert {x} -"),
         format!("dump {x} --stats --json"),
         format!("dump {y} --strict"),
         format!("dump {y} --stats"),
