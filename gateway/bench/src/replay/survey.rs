@@ -19,6 +19,9 @@ use trace::capture::Latched;
 /// A cell that sends nothing for so long is absent, in ns.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
 
+/// So many joints at most pass a page of counters on its way.
+const PASSED: u64 = 64;
+
 /// A part of a capture, in ns after its first frame.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Part {
@@ -380,10 +383,14 @@ impl Cell {
             let taken = heard.joints.wrapping_sub(before.joints);
             let repeated = heard.joints_repeated.wrapping_sub(before.joints_repeated);
             let known = u64::from(taken) + u64::from(repeated);
-            self.untaken += joints.saturating_sub(joints_before).saturating_sub(known);
-            match self.accounted.last_mut() {
-                Some((_, until)) if *until == from => *until = last,
-                _ => self.accounted.push((from, last)),
+            let between = joints.saturating_sub(joints_before);
+            // More than there were are not of one life: what seemed a start was none.
+            if known <= between + PASSED {
+                self.untaken += between.saturating_sub(known);
+                match self.accounted.last_mut() {
+                    Some((_, until)) if *until == from => *until = last,
+                    _ => self.accounted.push((from, last)),
+                }
             }
         }
         self.report = Some((heard, joints, last));
@@ -413,4 +420,23 @@ pub const fn is_input(id: Id) -> bool {
 #[must_use]
 pub fn is_joints(id: Id) -> bool {
     id == Id::command(Command::Joints)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counters_that_cannot_be_of_one_life_account_for_no_joints() {
+        let mut cell = Cell::new(0, None);
+        let mut report = |joints, after, last| {
+            cell.report(Heard { joints, ..Heard::default() }, Some((after, last)));
+            (cell.untaken, cell.accounted.clone())
+        };
+        assert_eq!(report(0, 100, 10), (0, vec![]));
+        // An old heartbeat seemed a start, and then its own counters came.
+        assert_eq!(report(2_000, 150, 20), (0, vec![]));
+        assert_eq!(report(2_040, 200, 30), (10, vec![(20, 30)]));
+        assert_eq!(report(2_090, 250, 40), (10, vec![(20, 40)]));
+    }
 }
