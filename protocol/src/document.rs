@@ -287,3 +287,20 @@ fn line_and_column(text: &str, at: usize) -> (usize, usize) {
     let line = before.rsplit('\n').next().unwrap_or(before);
     (before.matches('\n').count() + 1, line.chars().count() + 1)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn seconds_are_spans_and_too_much_is_not_read() {
+        assert_eq!((span(1.5), span(0.000_000_6)), (Span(1_500_000), Span(1)));
+        let of = |signs| {
+            let text = format!("#{}", ".".repeat(signs));
+            parse("x.toml", &text, |_: toml::Table| Ok(())).map_err(|error| error.to_string())
+        };
+        assert_eq!(of(MOST_SIGNS), Ok(()));
+        assert!(of(MOST_SIGNS + 1).unwrap_err().contains("it has 500001 of the signs"));
+        assert!(of(MOST_SIGNS * 2).is_err());
+    }
+}

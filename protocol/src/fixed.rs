@@ -407,4 +407,11 @@ mod tests {
             prop_assert_eq!(i64::from(half.round::<12>().to_bits()), whole + 1);
         }
     }
+
+    #[test]
+    fn a_torque_format_has_its_range() {
+        let format = TorqueFormat::Q3_12;
+        assert_eq!((format.real(i16::MIN), format.real(1), format.bound()), (-8.0, 1.0 / 4_096.0, 8.0));
+        assert_eq!([Q3_12::MIN, Q3_12::ZERO, Q3_12::MAX].map(Q::is_saturated), [true, false, true]);
+    }
 }

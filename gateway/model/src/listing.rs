@@ -147,4 +147,14 @@ mod tests {
         let (_, cell) = listing.cells().next().unwrap();
         assert_eq!((cell.other, cell.heard), (Some(7), None));
     }
+
+    #[test]
+    fn a_cell_that_takes_a_node_id_is_as_old_as_its_last_packet() {
+        let mut listing = Listing::new();
+        let beat = |serial| NetworkPage::Heartbeat(Heartbeat { serial, sent: 9, ..Heartbeat::default() });
+        listing.hear(Micros(10), Format::Fd, &says(3, beat(7)));
+        listing.hear(Micros(900_000), Format::Fd, &says(3, beat(8)));
+        let (_, cell) = listing.cells().next().unwrap();
+        assert_eq!((cell.age(Micros(900_400)), cell.other), (Span(400), Some(7)));
+    }
 }

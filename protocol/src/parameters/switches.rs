@@ -173,3 +173,15 @@ pub struct LinksDown {
     /// Bit p: port p receives nothing; bit 4 is the wire to the gateway's side.
     pub deaf: u8,
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_the_bits_of_ports_are_looked_at() {
+        for (word, deaf) in [(0, 0), (0b1_0010, 0b1_0010), (-1, 0x1F), (0x7FE0, 0)] {
+            assert_eq!(LinksDown::from_words([word, 0, 0, 0, 0, 0]).deaf, deaf);
+        }
+    }
+}

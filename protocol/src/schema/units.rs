@@ -91,3 +91,20 @@ impl Field {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::schema::packets;
+
+    #[test]
+    fn what_grows_with_the_chain_has_the_unit_of_its_joint() {
+        let units = Units { prismatic: 0b10, ..Units::default() };
+        let fields = || packets().iter().flat_map(|packet| packet.layouts.iter().flat_map(|it| &it.fields));
+        let positions = fields().find(|field| field.format == Format::Position).unwrap();
+        assert_eq!([0, 1, 2].map(|joint| positions.unit_in(joint, units)), ["rad", "m", "rad"]);
+        let torques = fields().find(|field| field.format == Format::Torque).unwrap();
+        assert_eq!([0, 1].map(|joint| torques.unit_in(joint, units)), ["Nm", "N"]);
+        assert_eq!([0, 1].map(|joint| torques.unit_in(joint, Units::default())), ["Nm", "Nm"]);
+    }
+}

@@ -151,4 +151,16 @@ mod tests {
         let arm = [turning(0.0, FRAC_PI_2, 0.0), slide];
         is_near(reach(&arm, [0.3, 0.0, 0.0]), (0.3_f64).hypot(0.9));
     }
+
+    #[test]
+    fn a_point_is_carried_by_the_transform_of_its_row() {
+        let row = DenavitHartenberg { a: 0.5, alpha: FRAC_PI_2, d: 9.0, theta_offset: 0.0 };
+        // Rx takes y to z and z to -y; Tx and Tz follow; Rz takes x to y.
+        let carried = carry(&row, 0.25, FRAC_PI_2, [1.0, 2.0, 3.0], true);
+        carried.iter().zip([3.0, 1.5, 2.25]).for_each(|(got, target)| is_near(*got, target));
+        let tilted = DenavitHartenberg { alpha: FRAC_PI_2 / 2.0, ..row };
+        let half = 0.5_f64.sqrt();
+        let carried = carry(&tilted, 0.0, 0.0, [0.0, 1.0, 2.0], false);
+        carried.iter().zip([0.0, -half, 3.0 * half]).for_each(|(got, target)| is_near(*got, target));
+    }
 }

@@ -97,3 +97,17 @@ impl Display for ErrorFrame {
         if is_first { write!(f, "class 0x{:X}", self.classes) } else { Ok(()) }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn details_are_shown_where_there_are_some() {
+        let of = |data| ErrorFrame { classes: PROTOCOL, data }.to_string();
+        let name = of([0; 8]);
+        assert!(!name.contains('{'), "{name}");
+        assert_eq!(of([0, 0, 0, 8, 0, 0, 0, 0]), format!("{name}{{}}{{location 0x08}}"));
+        assert_eq!(of([0, 0, 4, 0, 0, 0, 0, 0]), format!("{name}{{bit-stuffing-error}}{{location 0x00}}"));
+    }
+}

@@ -233,3 +233,25 @@ impl SumError {
         (self.epochs, self.sum) = (0, [0.0; MAX_JOINTS]);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn errors_have_a_mean_and_a_maximum_and_add_up() {
+        let mut errors = Errors::default();
+        assert_eq!(errors.mean(), None);
+        [0.5, -1.0, 3.0].into_iter().for_each(|error| errors.add(error));
+        assert_eq!((errors.mean(), errors.max(), errors.count()), (Some(1.5), 3.0, 3));
+        assert_eq!((errors.with(errors).mean(), errors.with(errors).count()), (Some(1.5), 6));
+    }
+
+    #[test]
+    fn torques_beyond_the_range_of_a_format_are_counted_apart() {
+        let (format, mut rounded) = (TorqueFormat::Q3_12, Rounded::default());
+        [1.0, 1.0 + 0.25 / 4_096.0, 8.0, -9.0].into_iter().for_each(|torque| rounded.take(format, torque));
+        assert_eq!((rounded.errors.count(), rounded.errors.max(), rounded.beyond), (2, 0.25 / 4_096.0, 2));
+        assert_eq!(rounded.with(rounded).beyond, 4);
+    }
+}

@@ -125,3 +125,22 @@ impl Counters {
         self.events.get(event as usize).copied().unwrap_or(0)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn epochs_and_packets_are_counted_by_what_they_are() {
+        let mut counters = Counters::default();
+        [(false, false), (true, false), (true, true), (false, true)]
+            .into_iter()
+            .for_each(|(due, complete)| counters.epoch(due, complete));
+        assert_eq!((counters.epochs, counters.epochs_due, counters.epochs_complete), (4, 2, 1));
+        counters.frame(Kind::Torque, false);
+        counters.frame(Kind::Torque, false);
+        counters.frame(Kind::Command, true);
+        let of = |kind| (counters.received(kind), counters.sent(kind));
+        assert_eq!([Kind::Torque, Kind::Command].map(of), [(2, 0), (0, 1)]);
+    }
+}

@@ -30,3 +30,18 @@ impl Outsiders {
         self.joints.last().copied().flatten().is_some_and(|oldest| at.since(oldest) <= WITHIN)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn four_joints_within_a_second_are_of_a_gateway() {
+        let of = |every_ms: u64| {
+            let mut outsiders = Outsiders::default();
+            (0..5).map(|at| outsiders.joints_at(Micros(at * every_ms * 1_000))).collect::<Vec<_>>()
+        };
+        assert_eq!(of(333), [false, false, false, true, true]);
+        assert_eq!(of(334), [false; 5]);
+    }
+}

@@ -104,3 +104,19 @@ impl Outstanding {
         self.expected.iter().flatten().find(|expected| expected.number == number).copied()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_answer_is_to_the_broadcast_so_many_before_the_newest_and_counts_once() {
+        let mut outstanding = Outstanding::default();
+        [true, false, true].into_iter().for_each(|due| _ = outstanding.open(due));
+        assert!(outstanding.is_due());
+        assert_eq!([0, 0, 1, 2, 2].map(|lag| outstanding.answer(lag)), [true, false, false, true, false]);
+        assert_eq!(outstanding.clear(), 0);
+        (0..5).for_each(|_| _ = outstanding.open(true));
+        assert_eq!(outstanding.clear(), 4, "the newest, and three before it");
+    }
+}

@@ -221,3 +221,19 @@ impl Contributions {
         self.unasked += u64::from(came - all);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sum_with_one_word_at_either_end_of_its_range_is_saturated() {
+        let of = |word: i16| {
+            let mut words = [1; MAX_JOINTS];
+            words[2] = word.into();
+            Sum { count: 3, words }.is_saturated()
+        };
+        let words = [0, i16::MAX, i16::MIN, i16::MAX - 1, i16::MIN + 1];
+        assert_eq!(words.map(of), [false, true, true, false, false]);
+    }
+}

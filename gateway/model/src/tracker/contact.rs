@@ -153,8 +153,20 @@ mod tests {
     #[test]
     fn a_cell_that_measures_takes_no_stimuli() {
         let mut contact = Contact::default();
+        assert_eq!(contact.obeys(), None);
         contact.set_obeys(false);
+        assert_eq!(contact.obeys(), Some(false));
         contact.push(From::Next, press(1.0), 1, None);
         assert_eq!(latch(&mut contact, 0), None);
+    }
+
+    #[test]
+    fn a_stimulus_is_late_at_its_own_joints_and_after_them() {
+        let of = |first, last: Option<u8>| is_late(From::Epoch(Epoch(first)), last.map(Epoch));
+        assert_eq!(
+            [of(5, Some(4)), of(5, Some(5)), of(255, Some(1)), of(5, None)],
+            [false, true, true, false]
+        );
+        assert!(!is_late(From::Next, Some(Epoch(5))));
     }
 }

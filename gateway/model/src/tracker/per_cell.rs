@@ -44,3 +44,21 @@ impl<T> PerCell<T> {
         CellId::all().zip(&mut self.0)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addressees_name_one_all_or_none() {
+        let mut numbers = PerCell::<u8>::default();
+        let five = CellId::new(5).unwrap();
+        numbers.named(Node::Cell(five)).iter_mut().for_each(|number| *number += 1);
+        numbers.named(Node::Everyone).iter_mut().for_each(|number| *number += 1);
+        assert!(numbers.named(Node::Gateway).is_empty());
+        let twice: Vec<_> =
+            numbers.iter().filter(|(_, number)| **number == 2).map(|(cell, _)| cell).collect();
+        assert_eq!((twice, numbers.iter().count()), (vec![five], CellId::COUNT));
+        assert_eq!(numbers.get(five), Some(&2));
+    }
+}

@@ -357,3 +357,11 @@ fn exchanged_cells_and_cells_without_a_node_id_are_named() {
         ]
     );
 }
+
+#[test]
+fn a_wire_that_works_in_one_direction_says_which() {
+    let ends = |carries: Carries| carries.between(cell(2), cell(5));
+    assert_eq!(ends(Carries::Nothing), "does not work");
+    assert_eq!(ends(Carries::There), "works only from cell 2 to cell 5");
+    assert_eq!(ends(Carries::Back), "works only from cell 5 to cell 2");
+}
