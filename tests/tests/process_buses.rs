@@ -75,7 +75,7 @@ fn ended_well(place: &Place, bench: Running, server: Option<Running>, times: u64
 #[test]
 fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same() {
     let place = place();
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(60.0, "--record run.mcap");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     let cells = bench.cells();
     for times in 1..=2 {
@@ -92,6 +92,24 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
     let summary = place.summary();
     assert_eq!(summary.total("/loop/bad_cycles"), 0, "{:#}", summary.0);
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
+    // What the cells answer now was lost with the bus then, and is no difference.
+    for capture in ["run.mcap", "run.log"] {
+        place.start("gateway", &format!("convert {capture} notes.log --force")).end().well();
+        let lines = place.read("notes.log");
+        assert_eq!(
+            lines.lines().filter(|line| *line == "# the bus 'vcan1' was lost").count(),
+            2,
+            "{capture}"
+        );
+        assert_eq!(
+            lines.lines().filter(|line| *line == "# the bus 'vcan1' works again").count(),
+            2,
+            "{capture}"
+        );
+        let replay =
+            format!("replay {capture} --skin skin.toml --spawn --expect --lockstep --bus-kind embedded");
+        place.start("gateway", &replay).end().well();
+    }
 }
 
 #[test]

@@ -9,6 +9,7 @@ use super::force::Seen;
 use crate::view::View;
 use control::cycle::turn::{BusState, Timed};
 use model::table::Status;
+use trace::capture::BusNote;
 
 /// Frames of a bus that may wait: more than a second of a full bus.
 pub const FRAMES: usize = 65_536;
@@ -35,6 +36,13 @@ pub enum Captured {
         at_nanos: u64,
         /// How many.
         frames: u64,
+    },
+    /// The bus was lost, or works again.
+    Bus {
+        /// When this was known, in ns since 1970.
+        at_nanos: u64,
+        /// Which of the two.
+        what: BusNote,
     },
 }
 
@@ -93,6 +101,12 @@ impl Outlet {
     pub fn dropped(&mut self, at_nanos: u64, frames: u64) {
         // A full queue is reported by itself.
         let _ = self.frames.push(Captured::Dropped { at_nanos, frames });
+    }
+
+    /// Reports that the bus was lost, or works again.
+    pub fn bus(&mut self, at_nanos: u64, what: BusNote) {
+        // In a full queue frames are lost, which is reported by itself.
+        let _ = self.frames.push(Captured::Bus { at_nanos, what });
     }
 
     /// Whether contact states are recorded.

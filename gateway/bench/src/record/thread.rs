@@ -199,6 +199,11 @@ impl Work {
                     let place = format!("CAN frames on '{name}' socket");
                     self.files.dropped(at_nanos, Some((bus, name)), frames, &place, seen.dropped);
                 }
+                Captured::Bus { at_nanos, what } => {
+                    let line = what.text(name);
+                    self.files.text(|text| text.note(&format!("# {line}")));
+                    self.files.note(at_nanos, Some((bus, name)), NoteKind::Text, &line);
+                }
                 Captured::Unrecorded { at_nanos, frames } => {
                     seen.unrecorded += frames;
                     let place = format!("CAN frames on '{name}' in the queue to the recorder");

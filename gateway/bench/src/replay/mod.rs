@@ -192,7 +192,8 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
                         progress.note(&line);
                     }
                 }
-                NoteKind::Text | NoteKind::CanXl => {}
+                NoteKind::Text => survey.note(&note),
+                NoteKind::CanXl => {}
             },
         }
     }

@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use model::tracker::{Account, DEAD_AFTER, Tracked, Word};
+use model::tracker::{Account, DEAD_AFTER, LATEST, Tracked, Word};
 use protocol::can::Format;
 use protocol::candump::Record;
 use protocol::id::{CellId, Command, Id, Node};
@@ -14,7 +14,7 @@ use protocol::time::Micros;
 
 use super::state::State;
 use model::decode::{Decoded, Decoder};
-use trace::capture::Latched;
+use trace::capture::{BusNote, Latched, Note};
 
 /// A cell that sends nothing for so long is absent, in ns.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
@@ -63,6 +63,8 @@ pub struct Bus {
     pub joints: u64,
     /// When the last of them was on it, in ns since 1970.
     last_joints: u64,
+    /// When those came that may still be answered, newest first.
+    recent_joints: [u64; LATEST + 1],
     /// Of these, those before the last request for a report; none if there was no request.
     at_report: Option<(u64, u64)>,
     /// Whether a cell reported its counters, or something was latched when the capture began: then a part of a
@@ -114,6 +116,8 @@ pub struct Cell {
     tracked: Tracked,
     /// Since when it claims its node id, which it does after each start.
     claims: Option<u64>,
+    /// Since when its bus is lost.
+    away: Option<u64>,
     /// Its counters at the last report, the joints until then, and the time of the last of them.
     report: Option<(Heard, u64, u64)>,
 }
@@ -200,6 +204,17 @@ impl Survey {
         }
     }
 
+    /// Takes a note: cells of a bus that was lost are away until they send again. Their last answers may have been lost
+    /// with it.
+    pub fn note(&mut self, note: &Note<'_>) {
+        let Some((name, BusNote::Lost)) = BusNote::of(note) else { return };
+        let Some(bus) = self.bus_named(name).and_then(|at| self.buses.get_mut(at)) else { return };
+        let since = bus.recent_joints.into_iter().filter(|at| *at > 0).min().unwrap_or(note.nanos);
+        for cell in bus.cells.values_mut() {
+            cell.away.get_or_insert(since);
+        }
+    }
+
     /// The part, in ns since 1970: from, and up to and without. From the beginning on means all, also what is older
     /// than the first frame.
     #[must_use]
@@ -271,6 +286,10 @@ impl Bus {
         } else if let Message::Joints { epoch, joints } = *message {
             self.joints += 1;
             self.last_joints = self.last_joints.max(nanos);
+            self.recent_joints.rotate_right(1);
+            if let Some(newest) = self.recent_joints.first_mut() {
+                *newest = nanos;
+            }
             if place == Place::In {
                 self.first_joints.get_or_insert((epoch, joints));
             }
@@ -306,6 +325,7 @@ impl Cell {
             tracked,
             claims: None,
             report: None,
+            away: None,
         }
     }
 
@@ -315,11 +335,17 @@ impl Cell {
             self.silences.push((last, nanos));
         }
         self.heard.1 = last.max(nanos);
+        if let Some(away) = self.away.take() {
+            self.silences.push((away, nanos));
+        }
     }
 
     /// The capture is at its end.
     fn end(&mut self, nanos: u64) {
         self.unrecorded = self.tracked.account.uplink().lost;
+        if let Some(away) = self.away {
+            self.silences.push((away, u64::MAX));
+        }
         let from = self.claims.unwrap_or(self.heard.1);
         if nanos > from.saturating_add(SILENT_NS) || self.claims.is_some() {
             self.silences.push((from, u64::MAX));

@@ -20,6 +20,7 @@ use crate::record::force::Seen;
 use crate::view::{CellView, View};
 use control::cycle::turn::Shared;
 use model::table::{Notice, Snapshot, Table};
+use trace::capture::BusNote;
 
 /// How often timeouts are checked if nothing comes, and the view is renewed.
 const LOOK: Duration = Duration::from_millis(20);
@@ -119,6 +120,7 @@ impl Receiver {
             };
             if count > 0 && self.receive_end.regain() {
                 account.outages.end(Instant::now());
+                self.note(BusNote::Back);
                 self.tell(BusEvent::Up);
             }
             self.hear(&inbox);
@@ -157,6 +159,13 @@ impl Receiver {
         })
     }
 
+    /// Notes in the recording what has become of the bus.
+    fn note(&mut self, what: BusNote) {
+        if let Some(outlet) = &mut self.outlet {
+            outlet.bus(wall(), what);
+        }
+    }
+
     /// The bus is lost, for a while or until it is opened again.
     fn lose(&mut self, inbox: &mut Inbox, account: &mut Account, error: BusError) {
         let gone = !error.may_pass();
@@ -166,6 +175,7 @@ impl Receiver {
         }
         if self.receive_end.lose(gone) {
             account.outages.begin(Instant::now());
+            self.note(BusNote::Lost);
             self.tell(if gone { BusEvent::Lost(error) } else { BusEvent::Down(error) });
         }
         if gone {

@@ -25,7 +25,7 @@ pub use parts::{Part, PartsError};
 pub use places::{Place, Places};
 pub use reader::{CaptureError, Format, Reader};
 
-pub use crate::note::{Note, NoteKind};
+pub use crate::note::{BusNote, Note, NoteKind};
 
 use std::fs::File;
 use std::io::Read;
