@@ -33,6 +33,15 @@ const OVERTAKES: u16 = 128;
 /// More than a cell sends until it is found dead: three packets for each of 500 joints a second are 900.
 const AT_MOST: u16 = 2_048;
 
+/// More than a cell sends between two heartbeats.
+const LEAP: u16 = 256;
+
+/// A cell whose counter goes on after so long without a heartbeat is not looked for any more.
+const GONE_AFTER: Span = Span::from_millis(10_000);
+
+/// So many heartbeats whose counter goes on show a start of which no claim was heard, on an id that two senders used.
+const SHOWN_BY: u8 = 3;
+
 /// A cell claims its id for 250 ms or longer; less 10 ms, by which a frame may have been late.
 const CLAIM_TAKES: Span = Span::from_millis(240);
 
@@ -52,6 +61,8 @@ pub struct Claim {
     previous: Option<Heartbeat>,
     /// Two senders used the id in turn.
     is_contested: bool,
+    /// Since then, who may have it when the owner is gone: the last heartbeat of those whose counter goes on, and how many.
+    candidate: Option<(Life, u8)>,
 }
 
 /// A cell from one start to the next: its last heartbeat.
@@ -68,11 +79,17 @@ impl Life {
         at.since(self.at) <= DEAD_AFTER
     }
 
+    /// Whether it may go on; its bus may have been lost.
+    fn may_go_on(&self, at: Micros) -> bool {
+        at.since(self.at) <= GONE_AFTER
+    }
+
     /// How many packets it has sent since its last heartbeat, if this one can be its next.
     fn sent(&self, at: Micros, heartbeat: &Heartbeat) -> Option<u16> {
         let sent = heartbeat.sent.wrapping_sub(self.heartbeat.sent);
-        let is_next = self.heartbeat.serial == heartbeat.serial && self.is_alive(at);
-        (is_next && (1..=AT_MOST).contains(&sent)).then_some(sent)
+        let is_next = self.heartbeat.serial == heartbeat.serial && self.may_go_on(at);
+        let at_most = u64::from(AT_MOST) * (1 + at.since(self.at).0 / DEAD_AFTER.0);
+        (is_next && sent.cast_signed() > 0 && u64::from(sent) <= at_most).then_some(sent)
     }
 
     /// Whether it still claims the id, so that a heartbeat without CLAIMING is not its.
@@ -86,7 +103,10 @@ impl Life {
 impl Claim {
     /// Takes a heartbeat of this node id, which came at `at`. This is the one place that detects a restart.
     pub fn hear(&mut self, at: Micros, heartbeat: &Heartbeat) -> Word {
-        let word = self.word(at, heartbeat);
+        let mut word = self.word(at, heartbeat);
+        if word == Word::Outsider && self.takes_over(at, heartbeat) {
+            word = Word::Started { again: true };
+        }
         if matches!(word, Word::Overtaken | Word::Claimant | Word::Outsider) {
             return word;
         }
@@ -96,8 +116,9 @@ impl Claim {
             Some(_) | None => claims.then_some(at),
         };
         let owner = self.owner.replace(Life { heartbeat: *heartbeat, at, claimed });
+        self.candidate = None;
         match word {
-            Word::Started { .. } => self.before = self.before.filter(|life| life.is_alive(at)).or(owner),
+            Word::Started { .. } => self.before = self.before.filter(|life| life.may_go_on(at)).or(owner),
             Word::Shared => (self.before, self.is_contested) = (None, true),
             Word::First | Word::Known | Word::Overtaken | Word::Outsider | Word::Claimant => {}
         }
@@ -108,7 +129,23 @@ impl Claim {
 
     /// Whether a start that was heard may still be taken back.
     pub(super) fn is_in_question(&self, at: Micros) -> bool {
-        self.before.is_some_and(|before| before.is_alive(at))
+        self.before.is_some_and(|before| before.may_go_on(at))
+    }
+
+    /// Whether a counter rather goes on where it was before the last start, by so many packets, than since then, by `sent`.
+    fn is_nearer(&self, at: Micros, before: u16, sent: u16) -> bool {
+        let is_alive = self.before.is_some_and(|life| life.is_alive(at));
+        before < sent && (is_alive || sent > LEAP && before < sent / 8)
+    }
+
+    /// Whether an outsider has the id now: the owner is silent, and its claim was heard or its counter goes on.
+    fn takes_over(&mut self, at: Micros, heartbeat: &Heartbeat) -> bool {
+        let claims = heartbeat.state.has(State::CLAIMING) && heartbeat.sent == 0;
+        let before = self.candidate.filter(|(life, _)| life.sent(at, heartbeat).is_some());
+        let shown = before.map_or(1, |(_, shown)| shown.saturating_add(1));
+        self.candidate = Some((Life { heartbeat: *heartbeat, at, claimed: None }, shown));
+        let is_gone = self.owner.is_none_or(|owner| !owner.is_alive(at));
+        is_gone && (claims || shown >= SHOWN_BY)
     }
 
     fn word(&self, at: Micros, heartbeat: &Heartbeat) -> Word {
@@ -118,7 +155,7 @@ impl Claim {
             return if claims { Word::Started { again: false } } else { Word::First };
         };
         let begins = match () {
-            () if self.is_contested && owner.is_alive(at) => Word::Outsider,
+            () if self.is_contested => Word::Outsider,
             () => Word::Started { again: true },
         };
         let of_before = self.before.and_then(|before| before.sent(at, heartbeat));
@@ -135,22 +172,23 @@ impl Claim {
         if claims && heartbeat.sent == 0 {
             return begins;
         }
+        let back = owner.heartbeat.sent.wrapping_sub(heartbeat.sent);
+        if back == 0 || back <= OVERTAKES && heartbeat.sent > 1 {
+            return Word::Overtaken;
+        }
         match (owner.sent(at, heartbeat), of_before) {
             // By the counters it can be either's.
-            (Some(_), Some(_)) if owner.claims_until(at, heartbeat) => return Word::Shared,
-            (Some(sent), Some(before)) if before < sent && owner.claimed.is_none() => return Word::Shared,
-            (Some(_), _) => return Word::Known,
-            (None, Some(_)) => return Word::Shared,
-            (None, None) => {}
-        }
-        let back = owner.heartbeat.sent.wrapping_sub(heartbeat.sent);
-        match back.cast_signed() {
-            0 => Word::Overtaken,
-            ..0 if !owner.is_alive(at) => Word::Known,
-            ..0 => begins,
-            // The second heartbeat of a life is the one after the claim.
-            _ if heartbeat.sent <= 1 || back > OVERTAKES => begins,
-            _ => Word::Overtaken,
+            (Some(_), Some(_)) if owner.claims_until(at, heartbeat) => Word::Shared,
+            (Some(sent), Some(before)) if owner.claimed.is_none() && self.is_nearer(at, before, sent) => {
+                Word::Shared
+            }
+            (Some(_), _) => Word::Known,
+            (None, Some(_)) => Word::Shared,
+            // It was away for long, and nothing is known of it.
+            (None, None) if back.cast_signed() < 0 && !owner.may_go_on(at) && !self.is_contested => {
+                Word::Known
+            }
+            (None, None) => begins,
         }
     }
 
@@ -269,6 +307,27 @@ mod tests {
         // The cell is gone; whoever has its id then is believed.
         let said = [(0, 7, 900, settled), (10, 7, 100, settled), (250, 7, 916, settled), (900, 7, 0, claims)];
         assert_eq!(words_at(said), [Word::First, AGAIN, shared, AGAIN]);
+    }
+
+    #[test]
+    fn a_cell_whose_bus_was_lost_goes_on_whatever_is_sent_again_meanwhile() {
+        let (claims, settled) = (State::CLAIMING, State::default());
+        let (shared, outsider, known) = (Word::Shared, Word::Outsider, Word::Known);
+        // Its id was contested before the bus was lost, or was not.
+        let said = [(0, 7, 916, settled), (10, 7, 100, settled), (250, 7, 932, settled)];
+        let meanwhile = [(1_200, 7, 100, settled), (1_250, 7, 116, settled), (1_300, 7, 100, settled)];
+        let after = [(1_750, 7, 940, settled), (2_000, 7, 956, settled)];
+        let expected = [Word::First, AGAIN, shared, outsider, outsider, outsider, known, known];
+        assert_eq!(words_at(said.into_iter().chain(meanwhile).chain(after)), expected);
+        let expected = [Word::First, AGAIN, known, Word::Overtaken, shared, known];
+        assert_eq!(words_at([said[0]].into_iter().chain(meanwhile).chain(after)), expected);
+        // A cell that restarts with a contested id: its claim is heard while it seems alive, or later, or never.
+        let starts =
+            [(400, 7, 0, claims), (660, 7, 1, settled), (910, 7, 4, settled), (1_160, 7, 8, settled)];
+        let expected = [Word::First, AGAIN, shared, outsider, outsider, AGAIN, known];
+        assert_eq!(words_at(said.into_iter().chain(starts)), expected);
+        let later = [(900, 7, 0, claims), (1_160, 7, 1, settled)];
+        assert_eq!(words_at(said.into_iter().chain(later)), [Word::First, AGAIN, shared, AGAIN, known]);
     }
 
     #[test]
