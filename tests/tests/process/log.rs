@@ -22,13 +22,13 @@ pub(crate) struct Log {
 pub(crate) type Cause = (u8, [i16; MAX_JOINTS], [i16; 6]);
 
 impl Log {
-    /// Reads a log of one bus; every line must be a frame.
+    /// Reads a log of one bus; every line must be a frame, or a comment of the recorder.
     pub(crate) fn read(text: &str, format: Format) -> Self {
         let frame = |line: &str| match candump::parse(line) {
             Ok(Line::Frame(record)) => record.frame,
             other => panic!("{line}: {other:?}"),
         };
-        Self::of(text.lines().map(frame).collect(), format)
+        Self::of(text.lines().filter(|line| !line.starts_with("# ")).map(frame).collect(), format)
     }
 
     /// Reads frames of one bus.
