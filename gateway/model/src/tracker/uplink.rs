@@ -36,14 +36,14 @@ pub struct Uplink {
 /// has not arrived by then never will.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Account {
-    now: Ledger,
+    now: Counts,
     /// As if the last start had been none; for [`Account::take_back`].
-    before: Option<Ledger>,
+    before: Option<Counts>,
 }
 
 /// An account, and what its next heartbeat is compared with.
 #[derive(Clone, Copy, Debug, Default)]
-struct Ledger {
+struct Counts {
     total: Uplink,
     /// What the cell had sent with its last heartbeat, modulo 2^16.
     reported: Option<u16>,
@@ -78,7 +78,7 @@ impl Account {
 
     /// The bus is lost: packets of the cell do not arrive until its next heartbeat.
     pub fn interrupt(&mut self) {
-        self.each(|ledger| ledger.interrupted = true);
+        self.each(|counts| counts.interrupted = true);
     }
 
     /// Whether the bus was lost since the cell's last heartbeat: it is not known whether the cell is back on it.
@@ -89,20 +89,20 @@ impl Account {
 
     /// A packet arrived.
     pub(super) fn arrive(&mut self) {
-        self.each(|ledger| ledger.arrived += 1);
+        self.each(|counts| counts.arrived += 1);
     }
 
     /// A frame with this cell's identifier arrived that cannot be used.
     pub fn reject(&mut self) {
-        self.each(|ledger| {
-            ledger.arrived += 1;
-            ledger.rejected += 1;
+        self.each(|counts| {
+            counts.arrived += 1;
+            counts.rejected += 1;
         });
     }
 
     /// The gateway does not take this cell's sums.
     pub fn without_sums(&mut self) {
-        self.each(|ledger| _ = ledger.sums.get_or_insert_default());
+        self.each(|counts| _ = counts.sums.get_or_insert_default());
     }
 
     /// The cell reports how many sums it has sent, modulo 2^16; `joints` is the number of the newest.
@@ -128,19 +128,19 @@ impl Account {
         if again {
             self.before.get_or_insert(self.now);
         }
-        self.before.iter_mut().for_each(Ledger::intrude);
+        self.before.iter_mut().for_each(Counts::intrude);
         self.now.begin(sent, again);
     }
 
     /// A further heartbeat has arrived; the cell had sent `sent` packets before it, modulo 2^16.
     pub(super) fn settle(&mut self, sent: u16) {
-        self.before.iter_mut().for_each(Ledger::intrude);
+        self.before.iter_mut().for_each(Counts::intrude);
         self.now.settle(sent);
     }
 
     /// An old heartbeat of the cell since its last start has arrived.
     pub(super) fn pass_over(&mut self) {
-        self.before.iter_mut().for_each(Ledger::intrude);
+        self.before.iter_mut().for_each(Counts::intrude);
     }
 
     /// The last start was one, and is not taken back.
@@ -160,16 +160,16 @@ impl Account {
 
     /// The heartbeat that has just arrived is of another sender under this node id.
     pub(super) fn intrude(&mut self) {
-        self.each(Ledger::intrude);
+        self.each(Counts::intrude);
     }
 
-    fn each(&mut self, change: impl Fn(&mut Ledger)) {
+    fn each(&mut self, change: impl Fn(&mut Counts)) {
         change(&mut self.now);
         self.before.iter_mut().for_each(change);
     }
 }
 
-impl Ledger {
+impl Counts {
     fn sums_sent(&mut self, reported: u16, joints: Option<u64>) {
         let Some(sums) = &mut self.sums else { return };
         let before = sums.reported.replace(reported).unwrap_or(reported);
