@@ -217,7 +217,7 @@ impl Missing {
         let name = reader.name();
         // Of a recording they are notes.
         let unread = match reader.lines() {
-            0 => format!("{} could not be read", count(self.lines, "line of a log")),
+            0 => format!("{} of a log could not be read", count(self.lines, "line")),
             lines => format!("{} of {lines} lines could not be read", self.lines),
         };
         let said = [

@@ -65,7 +65,6 @@ pub(crate) fn count(count: impl TryInto<u64>, one: &str) -> String {
     match one {
         _ if count == 1 => format!("1 {one}"),
         "bus" | "touch" => format!("{count} {one}es"),
-        "line of a log" => format!("{count} lines of a log"),
         _ => format!("{count} {one}s"),
     }
 }
@@ -195,21 +194,22 @@ fn folded(name: &str, width: Option<usize>) -> String {
     let indent = name.len() - words.len();
     let mut folded = INDENT.repeat(indent);
     let (mut taken, mut is_first) = (indent, true);
+    let begin_line = |folded: &mut String| {
+        folded.push('\n');
+        folded.push_str(&INDENT.repeat(indent + 2));
+        indent + 2
+    };
     for word in words.split(' ') {
         let letters = word.chars().count();
         if !is_first && width.is_some_and(|width| taken + 1 + letters > width) {
-            folded.push('\n');
-            folded.push_str(&INDENT.repeat(indent + 2));
-            taken = indent + 2;
+            taken = begin_line(&mut folded);
         } else if !is_first {
             folded.push(' ');
             taken += 1;
         }
         for letter in word.chars() {
             if width.is_some_and(|width| taken >= width.max(indent + 8)) {
-                folded.push('\n');
-                folded.push_str(&INDENT.repeat(indent + 2));
-                taken = indent + 2;
+                taken = begin_line(&mut folded);
             }
             folded.push(letter);
             taken += 1;

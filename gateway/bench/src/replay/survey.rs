@@ -63,10 +63,10 @@ pub struct Bus {
     pub joints: u64,
     /// When the last of them was on it, in ns since 1970.
     last_joints: u64,
-    /// When those came that may still be answered, newest first.
-    recent_joints: [u64; LATEST + 1],
     /// Of these, those before the last request for a report; none if there was no request.
     at_report: Option<(u64, u64)>,
+    /// When the joints came that may still be answered, newest first.
+    recent_joints: [u64; LATEST + 1],
     /// Whether a cell reported its counters, or something was latched when the capture began: then a part of a
     /// recording, or a truncated one, may lack what its counters would account for.
     is_accounted: bool,

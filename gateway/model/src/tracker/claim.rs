@@ -100,6 +100,11 @@ impl Life {
     }
 }
 
+/// Whether it is the first packet of a cell since it started, which is a claim.
+fn begins_a_life(heartbeat: &Heartbeat) -> bool {
+    heartbeat.state.has(State::CLAIMING) && heartbeat.sent == 0
+}
+
 impl Claim {
     /// Takes a heartbeat of this node id, which came at `at`. This is the one place that detects a restart.
     pub fn hear(&mut self, at: Micros, heartbeat: &Heartbeat) -> Word {
@@ -140,12 +145,11 @@ impl Claim {
 
     /// Whether an outsider has the id now: the owner is silent, and its claim was heard or its counter goes on.
     fn takes_over(&mut self, at: Micros, heartbeat: &Heartbeat) -> bool {
-        let claims = heartbeat.state.has(State::CLAIMING) && heartbeat.sent == 0;
         let before = self.candidate.filter(|(life, _)| life.sent(at, heartbeat).is_some());
         let shown = before.map_or(1, |(_, shown)| shown.saturating_add(1));
         self.candidate = Some((Life { heartbeat: *heartbeat, at, claimed: None }, shown));
         let is_gone = self.owner.is_none_or(|owner| !owner.is_alive(at));
-        is_gone && (claims || shown >= SHOWN_BY)
+        is_gone && (begins_a_life(heartbeat) || shown >= SHOWN_BY)
     }
 
     fn word(&self, at: Micros, heartbeat: &Heartbeat) -> Word {
@@ -154,10 +158,7 @@ impl Claim {
             // A cell claims its id for half a second at most.
             return if claims { Word::Started { again: false } } else { Word::First };
         };
-        let begins = match () {
-            () if self.is_contested => Word::Outsider,
-            () => Word::Started { again: true },
-        };
+        let begins = if self.is_contested { Word::Outsider } else { Word::Started { again: true } };
         let of_before = self.before.and_then(|before| before.sent(at, heartbeat));
         if owner.heartbeat.serial != heartbeat.serial {
             return match (self.is_settled(), claims) {
@@ -168,8 +169,7 @@ impl Claim {
                 (false, false) => Word::First,
             };
         }
-        // The first packet of a life is a claim.
-        if claims && heartbeat.sent == 0 {
+        if begins_a_life(heartbeat) {
             return begins;
         }
         let back = owner.heartbeat.sent.wrapping_sub(heartbeat.sent);
