@@ -124,7 +124,6 @@ impl core::fmt::Display for Said {
 #[derive(Debug)]
 struct Open<T> {
     writer: Writer,
-    window: Window,
     topics: T,
     part: Part,
     gauge: Arc<Gauge>,
@@ -143,8 +142,8 @@ struct Open<T> {
 
 impl<T> Open<T> {
     /// Writes what has waited long enough, or all that waits.
-    fn release(&mut self, all: bool) -> io::Result<()> {
-        let Self { writer, window, written, .. } = self;
+    fn release(&mut self, window: &mut Window, all: bool) -> io::Result<()> {
+        let Self { writer, written, .. } = self;
         written.add(if all { window.release_all(writer) } else { window.release(writer) }?);
         Ok(())
     }
@@ -174,6 +173,8 @@ pub struct Series<T> {
     /// Files of an earlier recording whose places this one takes.
     stale: Vec<PathBuf>,
     open: Option<Open<T>>,
+    /// What waits for the file that is open: one for all of them, whose buffers stay.
+    window: Window,
     /// When the last error was.
     failed: Option<Instant>,
     broken: Vec<Broken>,
@@ -181,8 +182,6 @@ pub struct Series<T> {
     publisher: Publisher<(Count, u64)>,
     written: Vec<Written>,
     lost: Count,
-    /// Messages of files that have ended which came when the file was past their time.
-    late: u64,
     /// What people should know.
     said: Vec<Said>,
 }
@@ -208,12 +207,12 @@ impl<T> Series<T> {
             now: 0,
             number: 0,
             open: None,
+            window: Window::default(),
             failed: None,
             broken: Vec::new(),
             publisher: Publisher::new(force),
             written: Vec::new(),
             lost: Count::default(),
-            late: 0,
             said: Vec::new(),
         })
     }
@@ -229,7 +228,7 @@ impl<T> Series<T> {
     }
 
     fn start(
-        &self,
+        &mut self,
         part: Part,
         file: File,
         topics: impl FnOnce(&mut Writer) -> io::Result<T>,
@@ -248,11 +247,11 @@ impl<T> Series<T> {
         };
         // There is nothing in it.
         let (writer, topics, gauge) = begin().inspect_err(|_: &io::Error| part.remove())?;
-        let (window, head, began) = (Window::new(self.now), gauge.bytes(), Instant::now());
+        self.window.begin(self.now);
+        let (head, began) = (gauge.bytes(), Instant::now());
         let (kept, written) = (Count::default(), Count::default());
         Ok(Open {
             writer,
-            window,
             topics,
             part,
             gauge,
@@ -268,8 +267,8 @@ impl<T> Series<T> {
     /// Tells the recorder's time, in ns since 1970, by which messages are put in order.
     pub fn look(&mut self, now: u64) {
         self.now = now;
-        let Some(Open { window, writer, written, .. }) = &mut self.open else { return };
-        match window.look(now, writer) {
+        let Some(Open { writer, written, .. }) = &mut self.open else { return };
+        match self.window.look(now, writer) {
             Ok(count) => written.add(count),
             Err(error) => self.break_off(&error),
         }
@@ -278,8 +277,8 @@ impl<T> Series<T> {
     /// Takes messages for the file that is open; without one they are counted.
     pub fn put(&mut self, count: Count, write: impl FnOnce(&mut Window, &mut T)) {
         let Some(open) = &mut self.open else { return self.lost.add(count) };
-        write(&mut open.window, &mut open.topics);
-        if open.window.is_full() {
+        write(&mut self.window, &mut open.topics);
+        if self.window.is_full() {
             self.release(false);
         }
     }
@@ -290,7 +289,7 @@ impl<T> Series<T> {
     }
 
     fn release(&mut self, all: bool) {
-        if let Some(Err(error)) = self.open.as_mut().map(|open| open.release(all)) {
+        if let Some(Err(error)) = self.open.as_mut().map(|open| open.release(&mut self.window, all)) {
             self.break_off(&error);
         }
     }
@@ -303,7 +302,7 @@ impl<T> Series<T> {
             let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY);
             return due && has_room(&self.path);
         };
-        if let Err(error) = open.release(false).and_then(|()| open.writer.flush()) {
+        if let Err(error) = open.release(&mut self.window, false).and_then(|()| open.writer.flush()) {
             self.break_off(&error);
             return false;
         }
@@ -368,8 +367,8 @@ impl<T> Series<T> {
 
     /// Messages that came when their file was past their time.
     #[must_use]
-    pub fn late(&self) -> u64 {
-        self.late + self.open.as_ref().map_or(0, |open| open.window.late())
+    pub const fn late(&self) -> u64 {
+        self.window.late()
     }
 
     /// Bytes of the file that is open.
@@ -386,12 +385,11 @@ impl<T> Series<T> {
     /// Ends the file and gives it its name.
     fn end(&mut self) {
         let Some(mut open) = self.open.take() else { return };
-        if let Err(error) = open.release(true).and_then(|()| open.writer.finish()) {
+        if let Err(error) = open.release(&mut self.window, true).and_then(|()| open.writer.finish()) {
             self.open = Some(open);
             return self.break_off(&error);
         }
         open.kept.add(open.written);
-        self.late += open.window.late();
         let (sink, _) = open.writer.into_inner().into_parts();
         let about = (open.kept, open.gauge.bytes());
         self.publisher.publish(Ended { file: sink.into_file(), part: open.part, about });
@@ -413,8 +411,7 @@ impl<T> Series<T> {
     fn break_off(&mut self, error: &io::Error) {
         let Some(open) = self.open.take() else { return };
         self.lost.add(open.written);
-        self.lost.add(open.window.count());
-        self.late += open.window.late();
+        self.lost.add(self.window.count());
         // What is buffered is a part of something; the file stays held until it is repaired.
         let (sink, _) = open.writer.into_inner().into_parts();
         self.broken.push(Broken { part: open.part, file: sink.into_file(), kept: open.kept });

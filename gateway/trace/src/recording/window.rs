@@ -20,6 +20,8 @@ pub const WINDOW_NS: u64 = 40_000_000;
 const MESSAGES: usize = 65_536;
 /// Their bytes at most.
 const BYTES: usize = 16 << 20;
+/// The bytes that a buffer keeps; what it grew by while a file stood still is given back.
+const KEPT: usize = 1 << 20;
 
 /// A message that waits.
 #[derive(Clone, Copy, Debug)]
@@ -36,7 +38,7 @@ struct Waiting {
     is_frame: bool,
 }
 
-/// The messages of a file that wait to be written.
+/// The messages that wait to be written, of one file after the other.
 #[derive(Debug, Default)]
 pub struct Window {
     waiting: Vec<Waiting>,
@@ -53,10 +55,12 @@ pub struct Window {
 }
 
 impl Window {
-    /// One that begins at a time, in ns since 1970.
-    #[must_use]
-    pub fn new(now: u64) -> Self {
-        Self { now, ..Self::default() }
+    /// Begins the order of another file, at a time in ns since 1970; what waits is forgotten, the buffers stay.
+    pub fn begin(&mut self, now: u64) {
+        self.waiting.clear();
+        self.bytes.clear();
+        self.latest.clear();
+        (self.now, self.released) = (now, 0);
     }
 
     /// Takes a message with its own time, in ns since 1970.
@@ -164,12 +168,17 @@ impl Window {
         let written = count(written);
         waiting.drain(..due);
         kept.clear();
-        for it in waiting {
+        for it in waiting.iter_mut() {
             let begin = kept.len();
             kept.extend_from_slice(bytes.get(it.begin..it.end).unwrap_or_default());
             (it.begin, it.end) = (begin, kept.len());
         }
         std::mem::swap(bytes, kept);
+        if bytes.len() < KEPT {
+            bytes.shrink_to(KEPT);
+            kept.shrink_to(KEPT);
+            waiting.shrink_to(KEPT / size_of::<Waiting>());
+        }
         Ok(written)
     }
 }

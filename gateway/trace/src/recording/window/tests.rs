@@ -23,7 +23,9 @@ impl Bench {
         let mut file = FileWriter::new(Vec::new()).unwrap();
         let frames = file.channel::<CanFrame<'_>>("/can/vcan0", &[]).unwrap();
         let joints = file.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
-        Self { file, window: Window::new(START), frames, joints }
+        let mut window = Window::default();
+        window.begin(START);
+        Self { file, window, frames, joints }
     }
 
     fn frame(&mut self, nanos: u64) {
