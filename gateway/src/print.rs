@@ -137,7 +137,7 @@ pub(crate) fn filled<H, T, F: Fn(&T) -> Option<String>>(
 /// What is printed: a name, a value, and what it is to be compared with.
 pub(crate) struct Rows {
     table: Table,
-    /// The letters of a name in one line, on a narrow terminal.
+    /// The letters of a name in one line.
     name_width: Option<usize>,
 }
 
@@ -145,11 +145,11 @@ impl Rows {
     /// A [`readable`] table with this head and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
         let mut table = readable(table(line(name, value, beside), [], |_| false));
-        let width = table.width().filter(|&width| width < WIDTH).map(|width| width * 2 / 5);
-        if let (Some(_), Some(names)) = (width, table.column_mut(0)) {
+        let width = table.width().unwrap_or(WIDTH) * 2 / 5;
+        if let Some(names) = table.column_mut(0) {
             names.set_constraint(ColumnConstraint::ContentWidth);
         }
-        Self { table, name_width: width.map(usize::from) }
+        Self { table, name_width: Some(usize::from(width)) }
     }
 
     /// The same where names are not broken, however narrow the terminal.
