@@ -18,8 +18,9 @@ impl Wiring {
     pub(super) fn hear_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: Words) {
         let cells = self.decode(cell, epoch, words);
         let said = &mut self.cells[cell].said;
-        if said.len() > 8 {
-            said.retain(|of, _| Epoch(*of).since(epoch) >= -4);
+        // A cell that hung goes on with what was said long before.
+        if said.len() > 64 {
+            said.retain(|of, _| Epoch(*of).since(epoch) >= -48);
         }
         said.entry(epoch.0).or_default().push((words, cells));
         let frame = Message::Sum {
