@@ -196,7 +196,7 @@ impl Wiring {
             Request::Write { number: Parameter::LinksDown.number(), words: LinksDown { deaf }.words() };
         let message = Message::Configure { to: protocol::id::Node::Cell(node_id), tag: 0, request };
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
-        self.hand(cell, self.agenda.now, Inlet::Frame(frame));
+        self.deliver(cell, Inlet::Frame(frame));
     }
 
     /// What time it is.
@@ -256,14 +256,7 @@ impl Wiring {
                     self.pass(cell);
                 }
             }
-            Event::Deliver(cell, inlet) => {
-                let now = self.agenda.now;
-                if let Life::Hangs(_, waiting) = &mut self.cells[cell].life {
-                    waiting.push_back((now, inlet));
-                } else {
-                    self.hand(cell, now, inlet);
-                }
-            }
+            Event::Deliver(cell, inlet) => self.deliver(cell, inlet),
             Event::ToGateway(root, message) => {
                 self.uplinks.handle(self.agenda.now, root, message);
                 self.gateway_sends();
@@ -276,6 +269,16 @@ impl Wiring {
             }
             Event::Joints if self.ticking => self.broadcast(),
             Event::Joints => {}
+        }
+    }
+
+    /// What comes to a cell gathers while it hangs.
+    fn deliver(&mut self, cell: usize, inlet: Inlet) {
+        let now = self.agenda.now;
+        if let Life::Hangs(_, waiting) = &mut self.cells[cell].life {
+            waiting.push_back((now, inlet));
+        } else {
+            self.hand(cell, now, inlet);
         }
     }
 
