@@ -175,8 +175,9 @@ impl Window {
         }
         std::mem::swap(bytes, kept);
         if bytes.len() < KEPT {
-            bytes.shrink_to(KEPT);
+            kept.clear();
             kept.shrink_to(KEPT);
+            bytes.shrink_to(KEPT);
             waiting.shrink_to(KEPT / size_of::<Waiting>());
         }
         Ok(written)

@@ -137,6 +137,37 @@ fn no_more_waits_than_may() {
     assert_eq!(bench.end().0.len(), 3 * MESSAGES);
 }
 
+#[test]
+fn another_file_begins_with_the_same_buffers_and_an_order_of_its_own() {
+    let mut bench = Bench::new();
+    bench.frame(START + 10 * MS);
+    bench.at(START + 60 * MS);
+    bench.joints(START);
+    assert_eq!((bench.at(START + 101 * MS).others, bench.window.late()), (1, 1));
+    bench.frame(START + 99 * MS);
+    bench.window.begin(START + 100 * MS);
+    assert_eq!(bench.window.count(), Count::default(), "it was for the file before");
+    let Bench { file, frames, joints, .. } = Bench::new();
+    let mut bench = Bench { file, frames, joints, window: bench.window };
+    bench.frame(START);
+    assert_eq!(bench.at(START + 140 * MS).frames, 1);
+    let (seen, late) = bench.end();
+    assert_eq!((seen[0].1, late), (START, 1), "late in the file before, not in this one");
+}
+
+#[test]
+fn buffers_that_grew_while_a_file_stood_still_are_given_back() {
+    let mut bench = Bench::new();
+    for at in 0..MESSAGES as u64 {
+        bench.frame(START + at);
+    }
+    assert!(bench.window.waiting.capacity() >= MESSAGES && bench.window.bytes.capacity() > KEPT);
+    bench.at(START + 100 * MS);
+    let Window { waiting, bytes, buffers, .. } = &bench.window;
+    let waiting = waiting.capacity() * size_of::<Waiting>();
+    assert!([waiting, bytes.capacity(), buffers.1.capacity()].iter().all(|&bytes| bytes <= KEPT));
+}
+
 proptest! {
     #[test]
     fn all_is_written_once_in_order_of_log_time(
