@@ -12,7 +12,7 @@ pub enum Word {
     First,
     /// A further one of the cell that has the id.
     Known,
-    /// An old one of that cell, or its last one again: it tells nothing new.
+    /// An old one of that cell, or its last one again, or one that no cell can have sent by then: it tells nothing new.
     Overtaken,
     /// The first one since the cell started.
     Started {
@@ -88,8 +88,19 @@ impl Life {
     fn sent(&self, at: Micros, heartbeat: &Heartbeat) -> Option<u16> {
         let sent = heartbeat.sent.wrapping_sub(self.heartbeat.sent);
         let is_next = self.heartbeat.serial == heartbeat.serial && self.may_go_on(at);
-        let at_most = u64::from(AT_MOST) * (1 + at.since(self.at).0 / DEAD_AFTER.0);
-        (is_next && sent.cast_signed() > 0 && u64::from(sent) <= at_most).then_some(sent)
+        (is_next && sent.cast_signed() > 0 && self.has_time_for(at, sent)).then_some(sent)
+    }
+
+    /// Whether a cell can have sent so many packets since this one's last heartbeat.
+    fn has_time_for(&self, at: Micros, sent: u16) -> bool {
+        u64::from(sent) <= u64::from(AT_MOST) * (1 + at.since(self.at).0 / DEAD_AFTER.0)
+    }
+
+    /// Whether a heartbeat is an old one of it, or its last one again.
+    fn is_past(&self, heartbeat: &Heartbeat) -> bool {
+        let back = self.heartbeat.sent.wrapping_sub(heartbeat.sent);
+        let is_same = self.heartbeat.serial == heartbeat.serial;
+        is_same && (back == 0 || back <= OVERTAKES && heartbeat.sent > 1)
     }
 
     /// Whether it still claims the id, so that a heartbeat without CLAIMING is not its.
@@ -172,10 +183,15 @@ impl Claim {
         if begins_a_life(heartbeat) {
             return begins;
         }
-        let back = owner.heartbeat.sent.wrapping_sub(heartbeat.sent);
-        if back == 0 || back <= OVERTAKES && heartbeat.sent > 1 {
+        if owner.is_past(heartbeat) {
             return Word::Overtaken;
         }
+        // What seemed a start may have been an old one too.
+        let was_before = self.before.is_some_and(|before| before.is_alive(at) && before.is_past(heartbeat));
+        if was_before && owner.claimed.is_none() {
+            return Word::Overtaken;
+        }
+        let back = owner.heartbeat.sent.wrapping_sub(heartbeat.sent);
         match (owner.sent(at, heartbeat), of_before) {
             // By the counters it can be either's.
             (Some(_), Some(_)) if owner.claims_until(at, heartbeat) => Word::Shared,
@@ -188,6 +204,8 @@ impl Claim {
             (None, None) if back.cast_signed() < 0 && !owner.may_go_on(at) && !self.is_contested => {
                 Word::Known
             }
+            // No cell that started since then can have sent so much.
+            (None, None) if !owner.has_time_for(at, heartbeat.sent) => Word::Overtaken,
             (None, None) => begins,
         }
     }
@@ -241,6 +259,30 @@ mod tests {
             claim.hear(Micros(ms * 1_000), &Heartbeat { serial, sent, state, ..Heartbeat::default() })
         };
         said.into_iter().map(hear).collect()
+    }
+
+    #[test]
+    fn two_old_heartbeats_in_order_are_no_life() {
+        let heard = [
+            (0, 1032),
+            (252, 1049),
+            (375, 883),  // an old one
+            (400, 1049), // another one
+            (508, 1066),
+            (720, 1049),
+            (756, 1083),
+            (964, 883),
+            (1006, 1100),
+        ];
+        let words = |more: u16| {
+            let of = |&(ms, sent): &(u64, u16)| (ms, 7, sent + more, State::default());
+            words_at(heard.iter().map(of))
+        };
+        let known = Word::Known;
+        let (old, outsider) = (Word::Overtaken, Word::Outsider);
+        assert_eq!(words(0), [Word::First, known, AGAIN, old, Word::Shared, old, known, outsider, known]);
+        // A cell that had started since could not have sent 2883 packets.
+        assert_eq!(words(2000), [Word::First, known, old, old, known, old, known, old, known]);
     }
 
     #[test]
@@ -303,7 +345,7 @@ mod tests {
         // A counter that is ahead.
         let said =
             [(0, 7, 900, settled), (10, 7, 9_000, settled), (250, 7, 916, settled), (260, 7, 9_020, settled)];
-        assert_eq!(words_at(said), [Word::First, AGAIN, shared, outsider]);
+        assert_eq!(words_at(said), [Word::First, Word::Overtaken, known, Word::Overtaken]);
         // The cell is gone; whoever has its id then is believed.
         let said = [(0, 7, 900, settled), (10, 7, 100, settled), (250, 7, 916, settled), (900, 7, 0, claims)];
         assert_eq!(words_at(said), [Word::First, AGAIN, shared, AGAIN]);

@@ -250,18 +250,7 @@ impl<T> Series<T> {
         self.window.begin(self.now);
         let (head, began) = (gauge.bytes(), Instant::now());
         let (kept, written) = (Count::default(), Count::default());
-        Ok(Open {
-            writer,
-            topics,
-            part,
-            gauge,
-            head,
-            began,
-            looked: began,
-            enough: None,
-            kept,
-            written,
-        })
+        Ok(Open { writer, topics, part, gauge, head, began, looked: began, enough: None, kept, written })
     }
 
     /// Tells the recorder's time, in ns since 1970, by which messages are put in order.
