@@ -230,10 +230,10 @@ impl Frame {
         self.id & EXTENDED != 0
     }
 
-    /// Whether this requests data instead of carrying it.
+    /// Whether this requests data instead of carrying it. In CAN FD no frame does, whatever its flag says.
     #[must_use]
     pub const fn is_remote(&self) -> bool {
-        self.id & REMOTE != 0
+        matches!(self.format, Format::Classic) && self.id & REMOTE != 0
     }
 
     /// Whether this is the driver's report of an error.
@@ -283,8 +283,7 @@ impl Frame {
     /// filled up with zeros, and its remote flag means nothing.
     pub(crate) fn on_wire(&self) -> &[u8] {
         let len = match self.format {
-            Format::Classic if self.is_remote() => 0,
-            Format::Classic => usize::from(self.len),
+            Format::Classic => self.data().len(),
             Format::Fd => fd_len(usize::from(self.len)),
         };
         self.data.get(..len).unwrap_or(&self.data)

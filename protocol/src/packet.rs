@@ -30,7 +30,7 @@ pub use reassembly::{Reassembly, Segment};
 
 use thiserror::Error;
 
-use crate::can::{self, Format, Frame};
+use crate::can::{self, ERROR, EXTENDED, Format, Frame, REMOTE};
 use crate::id::Id;
 
 /// CRC-16/CCITT-FALSE, which the catalogue of CRCs calls IBM-3740.
@@ -267,7 +267,7 @@ impl Packet {
 /// # Errors
 /// When it is a remote or error frame, or has a 29-bit identifier.
 pub fn data_id(frame: &Frame) -> Result<Id, PacketError> {
-    if frame.is_extended() || frame.is_remote() || frame.is_error() {
+    if frame.raw_id() & (EXTENDED | REMOTE | ERROR) != 0 {
         return Err(PacketError::Foreign);
     }
     u16::try_from(frame.id()).map(Id::from_bits).map_err(|_| PacketError::Foreign)

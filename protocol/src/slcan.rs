@@ -66,13 +66,13 @@ impl Text {
     }
 }
 
-/// A frame as a line; `None` for an error frame and for an FD frame that requests data, which never were on a bus.
+/// A frame as a line; `None` for an error frame, which never was on a bus.
 ///
 /// An FD frame of a length that CAN FD does not have is filled up with zeros. Its error state is not carried, and of a
 /// classic frame with a DLC of 9 to 15 only that it has 8 bytes.
 #[must_use]
 pub fn encode(frame: &Frame) -> Option<Text> {
-    if frame.is_error() || (frame.is_remote() && frame.format() == Format::Fd) {
+    if frame.is_error() {
         return None;
     }
     let data = frame.on_wire();
