@@ -369,10 +369,10 @@ mod tests {
 
     #[test]
     fn frames_of_other_kinds_are_foreign() {
-        let extended = Frame::fd(0x123 | can::EXTENDED, 0, &[0; 16]).unwrap();
+        let extended = Frame::fd(0x123 | EXTENDED, 0, &[0; 16]).unwrap();
         assert_eq!(Packet::from_fd(&extended), Err(PacketError::Foreign));
         assert_eq!(data_id(&Frame::remote(0x123, 8).unwrap()), Err(PacketError::Foreign));
-        let error = Frame::classic(can::ERROR | 4, &[0; 8]).unwrap();
+        let error = Frame::classic(ERROR | 4, &[0; 8]).unwrap();
         assert_eq!(data_id(&error), Err(PacketError::Foreign));
         let short = Frame::fd(0x123, 0, &[0; 12]).unwrap();
         assert_eq!(Packet::from_fd(&short), Err(PacketError::Length { expected: 16, got: 12 }));
