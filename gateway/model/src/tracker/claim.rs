@@ -12,7 +12,7 @@ pub enum Word {
     First,
     /// A further one of the cell that has the id.
     Known,
-    /// An old one of that cell, or its last one again, or one that no cell can have sent by then: it tells nothing new.
+    /// An old one of that cell, or its last one again: it tells nothing new.
     Overtaken,
     /// The first one since the cell started.
     Started {
@@ -21,7 +21,8 @@ pub enum Word {
     },
     /// Of the sender that had the id before, which goes on: two use it in turn, and what seemed a start was none.
     Shared,
-    /// Of another sender, while the cell that has the id is alive; only after two used it in turn.
+    /// Of another sender, while the cell that has the id is alive: after two used it in turn, or when no cell can have
+    /// sent so much since that one was heard.
     Outsider,
     /// Another cell claims the id, and will give up the claim.
     Claimant,
@@ -205,7 +206,7 @@ impl Claim {
                 Word::Known
             }
             // No cell that started since then can have sent so much.
-            (None, None) if !owner.has_time_for(at, heartbeat.sent) => Word::Overtaken,
+            (None, None) if !owner.has_time_for(at, heartbeat.sent) => Word::Outsider,
             (None, None) => begins,
         }
     }
@@ -282,7 +283,7 @@ mod tests {
         let (old, outsider) = (Word::Overtaken, Word::Outsider);
         assert_eq!(words(0), [Word::First, known, AGAIN, old, Word::Shared, old, known, outsider, known]);
         // A cell that had started since could not have sent 2883 packets.
-        assert_eq!(words(2000), [Word::First, known, old, old, known, old, known, old, known]);
+        assert_eq!(words(2000), [Word::First, known, outsider, old, known, old, known, outsider, known]);
     }
 
     #[test]
@@ -345,7 +346,7 @@ mod tests {
         // A counter that is ahead.
         let said =
             [(0, 7, 900, settled), (10, 7, 9_000, settled), (250, 7, 916, settled), (260, 7, 9_020, settled)];
-        assert_eq!(words_at(said), [Word::First, Word::Overtaken, known, Word::Overtaken]);
+        assert_eq!(words_at(said), [Word::First, outsider, known, outsider]);
         // The cell is gone; whoever has its id then is believed.
         let said = [(0, 7, 900, settled), (10, 7, 100, settled), (250, 7, 916, settled), (900, 7, 0, claims)];
         assert_eq!(words_at(said), [Word::First, AGAIN, shared, AGAIN]);
