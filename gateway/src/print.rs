@@ -12,6 +12,8 @@ use serde::Serialize;
 const INDENT: &str = "\u{a0}";
 /// Columns of a table that is not on a narrower terminal.
 const WIDTH: u16 = 110;
+/// Letters of a row's name in one line, where there is room for more.
+const NAME: u16 = 36;
 /// Names in a line; of more, the first few and how many there are.
 const NAMES: usize = 12;
 
@@ -145,7 +147,7 @@ impl Rows {
     /// A [`readable`] table with this head and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
         let mut table = readable(table(line(name, value, beside), [], |_| false));
-        let width = table.width().unwrap_or(WIDTH) * 2 / 5;
+        let width = (table.width().unwrap_or(WIDTH) * 2 / 5).min(NAME);
         if let Some(names) = table.column_mut(0) {
             names.set_constraint(ColumnConstraint::ContentWidth);
         }
