@@ -110,6 +110,8 @@ pub struct Cell {
     switched: Switched,
     halt: Halt,
     sent: Sent,
+    /// The same before its last start and replies then in doubt, as long as that start may be taken back.
+    before_start: Option<(Sent, u64)>,
     pub(super) outstanding: Outstanding,
     /// The number of the last broadcast that it answered.
     pub(super) answered: Option<u64>,
@@ -142,6 +144,7 @@ impl Cell {
             switched,
             halt: Halt::default(),
             sent: Sent::default(),
+            before_start: None,
             outstanding: Outstanding::default(),
             answered: None,
             held: Held::default(),
@@ -222,10 +225,10 @@ impl Cell {
             }
             self.sensed.restart();
             self.switched.restart();
-            self.doubt();
+            self.restart(word, update.taken_back, heartbeat.sent);
             (self.reply, self.deaf) = (None, 0);
-            // It counts from zero; without its first heartbeat, we compare from the next page on.
-            self.sent = Sent { first: (heartbeat.sent == 0).then(Heard::default), joints: 0 };
+        } else if !self.tracked.account.is_in_question() {
+            self.before_start = None;
         }
         // It does not release a sum, which may hold torques of other cells.
         if self.sums.is_some() || !started && heartbeat.state.has(State::ACTIVE) {
@@ -417,15 +420,32 @@ impl Cell {
         }
     }
 
-    /// It restarted: outstanding replies will never come, and its counters can no longer explain missing ones.
-    fn doubt(&mut self) {
+    /// It restarted: outstanding replies will never come, and its counters can no longer explain missing ones. Or what seemed
+    /// a restart was none: they go on, and explain all but what was outstanding.
+    fn restart(&mut self, word: Word, taken_back: bool, sent: u16) {
         let due = self.outstanding.clear();
+        let (joints, in_doubt) = (self.sent.joints, self.replies.in_doubt);
+        // It counts from zero; without its first heartbeat, we compare from the next page on.
+        let anew = Sent { first: (sent == 0).then(Heard::default), joints: 0 };
+        if let Some((before, _)) = &mut self.before_start {
+            before.joints += joints;
+        } else if word == (Word::Started { again: true }) {
+            self.before_start = Some((self.sent, in_doubt));
+        }
+        let before = self.before_start.as_mut().filter(|_| self.sums.is_none());
+        let in_doubt = before.map_or(0, |(_, in_doubt)| {
+            *in_doubt += u64::from(due);
+            *in_doubt
+        });
+        let before = self.before_start.take_if(|_| taken_back);
+        self.sent = before.map_or(anew, |(sent, _)| sent);
         if self.sums.is_some() {
             // Its contribution is missing in a sum, and its own held sum decays.
             return;
         }
         self.replies.miss(due, false);
-        self.replies.in_doubt = self.replies.missing.saturating_sub(self.replies.too_late);
+        let unexplained = self.replies.missing.saturating_sub(self.replies.too_late);
+        self.replies.in_doubt = if before.is_some() { in_doubt } else { unexplained };
         self.answered = None;
     }
 

@@ -103,6 +103,54 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_stimulus() {
 }
 
 #[test]
+fn a_start_that_was_none_takes_no_counters_that_explain_missing_replies() {
+    let cell = CellId::new(1).unwrap();
+    let joints = |epoch| {
+        (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } })
+    };
+    let network = |page| (false, Message::Network { from: Node::Cell(cell), epoch: Epoch(0), page });
+    let heartbeat = |sent| {
+        let state = State::CONFIGURED.with(State::TEST_MODE, true);
+        network(NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() }))
+    };
+    let heard =
+        |joints, joints_late| network(NetworkPage::Heard(Heard { joints, joints_late, ..Heard::default() }));
+    let contact = [protocol::fixed::Q5_10::nearest(2.0); 3];
+    let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
+    let press = (true, Message::Stimulus { to: Node::Cell(cell), from: protocol::message::From::Next, page });
+    let mut table = table(&[]);
+    let mut ms = 0;
+    let mut hear = |table: &mut Table, heard: &[(bool, Message)]| {
+        for (own, message) in heard {
+            ms += 10;
+            for frame in message.encode().frames(Format::Fd) {
+                table.handle_frame(Micros(ms * 1_000), *own, &frame, &mut |_| None);
+            }
+        }
+        let cell = table.cells().first().unwrap();
+        (cell.replies.missing, cell.replies.in_doubt, cell.unanswered())
+    };
+    // It takes two of six joints, and answers none of them.
+    let before = [
+        heartbeat(900),
+        heard(100, 7),
+        press,
+        joints(1),
+        joints(2),
+        joints(3),
+        joints(4),
+        joints(5),
+        joints(6),
+    ];
+    assert_eq!(hear(&mut table, &before), (2, 0, Some((0, 6))));
+    // An old heartbeat seems a start; two more joints, and its own heartbeat shows that it was none.
+    assert_eq!(hear(&mut table, &[heartbeat(100), press, joints(7)]), (6, 6, None));
+    let taken_back = hear(&mut table, &[heartbeat(902)]);
+    assert_eq!(taken_back, (7, 5, Some((0, 7))), "only what was outstanding is in doubt");
+    assert_eq!(hear(&mut table, &[press, joints(8), heard(102, 13)]).2, Some((6, 0)));
+}
+
+#[test]
 fn lost_joints_that_passed_a_report_on_its_way_are_counted() {
     let joints = |epoch| {
         (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } })

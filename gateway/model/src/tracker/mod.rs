@@ -66,6 +66,8 @@ pub struct Update {
     pub revived: bool,
     /// It is the cell's first heartbeat since the bus was lost, and it has not started since.
     pub returned: bool,
+    /// What seemed a start was none, and its account goes on from before that.
+    pub taken_back: bool,
 }
 
 /// One cell, by the packets of its node id.
@@ -101,11 +103,12 @@ impl Tracked {
         if let Word::Started { again } = &mut word {
             *again |= !is_first;
         }
+        let mut taken_back = false;
         match word {
             Word::Known => self.account.settle(heartbeat.sent),
             Word::First => self.account.begin(heartbeat.sent, false),
             Word::Shared => {
-                self.account.take_back(heartbeat.sent);
+                taken_back = self.account.take_back(heartbeat.sent);
                 // Some may be the other sender's.
                 self.pages = Pages::default();
             }
@@ -118,7 +121,7 @@ impl Tracked {
         }
         self.account.heartbeat_at(joints);
         let returned = away && matches!(word, Word::First | Word::Known | Word::Started { again: false });
-        Update { word: Some(word), revived, returned }
+        Update { word: Some(word), revived, returned, taken_back }
     }
 
     /// The owner of the node id, and its last heartbeat.

@@ -148,14 +148,24 @@ impl Account {
         self.before = None;
     }
 
-    /// A heartbeat has arrived that goes on where the account was before the last start: that was none.
-    pub(super) fn take_back(&mut self, sent: u16) {
-        if let Some(before) = self.before.take() {
-            self.now = before;
-            self.now.settle(sent);
-        } else {
-            self.now.begin(sent, false);
+    /// A heartbeat has arrived that goes on where the account was before the last start: that was none. Whether it is known
+    /// what there was before.
+    pub(super) fn take_back(&mut self, sent: u16) -> bool {
+        let before = self.before.take();
+        match before {
+            Some(before) => {
+                self.now = before;
+                self.now.settle(sent);
+            }
+            None => self.now.begin(sent, false),
         }
+        before.is_some()
+    }
+
+    /// Whether the last start may still be taken back.
+    #[must_use]
+    pub const fn is_in_question(&self) -> bool {
+        self.before.is_some()
     }
 
     /// The heartbeat that has just arrived is of another sender under this node id.
@@ -309,7 +319,7 @@ mod tests {
                 match what {
                     0 => account.begin(said, true),
                     1 => account.settle(said),
-                    _ => account.take_back(said),
+                    _ => _ = account.take_back(said),
                 }
                 if let Some((sums, at)) = sums { account.sums_sent(sums, at); }
             }
