@@ -111,7 +111,7 @@ pub struct Cell {
     pub untaken: u64,
     /// Between which joints its counters account for that: from after one time up to another, in ns since 1970.
     accounted: Vec<(u64, u64)>,
-    /// Whether counters account for anything on its bus; else everything missing is a difference.
+    /// Whether counters account for anything in the capture; else everything missing is a difference.
     is_accounted: bool,
     tracked: Tracked,
     /// Since when it claims its node id, which it does after each start.
@@ -196,11 +196,11 @@ impl Survey {
     /// Takes in that the capture is at its end.
     pub fn finish(&mut self) {
         let last = self.last;
-        for bus in &mut self.buses {
-            for cell in bus.cells.values_mut() {
-                cell.end(last);
-                cell.is_accounted = bus.is_accounted;
-            }
+        // Of one bus: then a bench recorded it that has counters, and in a part those of another may be missing.
+        let is_accounted = self.buses.iter().any(|bus| bus.is_accounted);
+        for cell in self.buses.iter_mut().flat_map(|bus| bus.cells.values_mut()) {
+            cell.end(last);
+            cell.is_accounted = is_accounted;
         }
     }
 
@@ -422,8 +422,8 @@ impl Cell {
         self.report = Some((heard, joints, last));
     }
 
-    /// Whether counters that it reported before and after account for joints of this time, in ns since 1970; if none on
-    /// its bus do, they explain no deviation.
+    /// Whether counters that it reported before and after account for joints of this time, in ns since 1970; if none in
+    /// the capture do, they explain no deviation.
     #[must_use]
     pub fn is_counted_at(&self, nanos: u64) -> bool {
         !self.is_accounted || self.accounted.iter().any(|&(from, until)| from < nanos && nanos <= until)
@@ -450,6 +450,8 @@ pub fn is_joints(id: Id) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use protocol::candump::Timestamp;
+
     use super::*;
 
     #[test]
@@ -464,5 +466,27 @@ mod tests {
         assert_eq!(report(2_000, 150, 20), (0, vec![]));
         assert_eq!(report(2_040, 200, 30), (10, vec![(20, 30)]));
         assert_eq!(report(2_090, 250, 40), (10, vec![(20, 40)]));
+    }
+
+    #[test]
+    fn a_part_has_counters_elsewhere_though_one_of_its_buses_began_lost() {
+        let torque =
+            Message::Torque { from: CellId::new(1).unwrap(), epoch: Epoch(3), torque: [0; 6].into() };
+        let frames: Vec<_> = torque.encode().frames(Format::Fd).collect();
+        let time = Timestamp { nanos: 5, nine_digits: true, min_digits: 0 };
+        let of = |latched: &[Latched]| {
+            let mut survey = Survey::new(Part::default());
+            survey.begin(latched);
+            for interface in ["vcan0", "vcan1"] {
+                survey.take(&Record { time, interface, frame: frames[0], direction: None });
+            }
+            survey.finish();
+            let buses = survey.buses.iter().filter(|bus| !bus.cells.is_empty());
+            buses.map(|bus| bus.cells.values().next().unwrap().is_counted_at(5)).collect::<Vec<_>>()
+        };
+        assert_eq!(of(&[]), [true, true], "a log of a bench that has no counters");
+        let frame = Message::Resume.encode().frames(Format::Fd).next().unwrap();
+        let latched = Latched { bus: "vcan0".into(), own: true, frame, nanos: 1 };
+        assert_eq!(of(&[latched]), [false, false]);
     }
 }
