@@ -440,3 +440,6 @@ fn is_stored(number: u8) -> bool {
     let parameter = Parameter::from_number(number);
     parameter.is_some_and(|it| it == Parameter::Commit || it.is_stored())
 }
+
+#[cfg(test)]
+mod tests;

@@ -361,8 +361,16 @@ mod tests {
             (&Value::Null, &Value::Null, &Value::Null)
         );
         let ports = values("ports from=12 epoch=7");
-        let third = json!({ "node": 254, "port": 3, "hears": true, "works": false, "other_version": false });
-        assert_eq!((&ports["ports"][2], &ports["changes"]), (&third, &json!(2)));
+        let states = [
+            (3, 2, true, true, false),
+            (0, 0, false, false, false),
+            (254, 3, true, false, false),
+            (7, 0, true, false, true),
+        ];
+        let states = states.map(|(node, port, hears, works, other_version)| {
+            json!({ "node": node, "port": port, "hears": hears, "works": works, "other_version": other_version })
+        });
+        assert_eq!((&ports["ports"], &ports["changes"]), (&json!(states), &json!(2)));
         let reply = values("write to=everyone tag=20 parameter=6 reply=sum");
         let sum = json!({
             "parameter": "reply", "write": true, "reply": "sum", "slot_us": 1500, "deepest": 6, "carry": true,

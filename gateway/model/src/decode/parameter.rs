@@ -267,6 +267,10 @@ mod tests {
         );
         assert_eq!(says("99", &["65536"]), "word = 65536: a word is -32768 to 32767, or 0x0 to 0xFFFF");
         assert_eq!(says("99", &["0"; 7]), "7 words are too many for parameter 99: at most 6");
+        assert_eq!(
+            write("99", &["0", "-1", "2", "3", "4", "0xFFFF"].map(str::to_owned)),
+            Ok((99, [0, -1, 2, 3, 4, -1]))
+        );
     }
 
     #[test]

@@ -94,12 +94,6 @@ impl Uplinks {
         self.wires.get(root).is_some_and(|wire| wire.is_child)
     }
 
-    /// The round of exploration.
-    #[must_use]
-    pub const fn round(&self) -> u8 {
-        self.round
-    }
-
     /// Takes a message of a root over its wire.
     pub fn handle(&mut self, now: Micros, root: usize, message: PortMessage) {
         let rank = Rank { round: self.round, depth: 0 };
@@ -215,5 +209,80 @@ impl Uplinks {
             // It assigned none: it does not know its children yet.
             self.wait = now + Span::from_millis(20);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MS: u64 = 1_000;
+
+    fn said(uplinks: &mut Uplinks) -> Vec<(usize, PortMessage)> {
+        std::iter::from_fn(|| uplinks.poll_transmit()).collect()
+    }
+
+    /// A hello of a root whose parent is the gateway's side.
+    fn hello_up(unnumbered: bool) -> PortMessage {
+        let rank = Some(Rank { round: 1, depth: 1 });
+        PortMessage::Hello(Hello {
+            version: VERSION,
+            number: 1,
+            port: 4,
+            hears: true,
+            up: true,
+            unnumbered,
+            rank,
+        })
+    }
+
+    fn hellos(messages: &[(usize, PortMessage)]) -> usize {
+        messages.iter().filter(|(_, message)| matches!(message, PortMessage::Hello(_))).count()
+    }
+
+    #[test]
+    fn hellos_that_were_skipped_are_sent_once_and_the_next_keep_their_times() {
+        let mut uplinks = Uplinks::new(2, 0, Micros(10 * MS));
+        uplinks.handle_time(Micros(9 * MS));
+        assert_eq!(said(&mut uplinks), []);
+        for (now, next) in [(10, 260), (260, 510), (1_300, 1_510), (1_510, 1_760)] {
+            uplinks.handle_time(Micros(now * MS));
+            assert_eq!((hellos(&said(&mut uplinks)), uplinks.poll_timeout()), (2, Micros(next * MS)));
+        }
+    }
+
+    #[test]
+    fn a_root_is_a_child_as_long_as_its_hellos_say_so() {
+        let mut uplinks = Uplinks::new(2, 0, Micros(0));
+        uplinks.handle(Micros(0), 1, hello_up(false));
+        assert_eq!([0, 1, 2].map(|root| uplinks.is_child(root)), [false, true, false]);
+        uplinks.handle_time(Micros(600 * MS));
+        assert!(uplinks.is_child(1));
+        uplinks.handle_time(Micros(1_000 * MS));
+        assert!(!uplinks.is_child(1), "silent");
+        uplinks.handle(Micros(1_000 * MS), 1, hello_up(false));
+        uplinks.handle(Micros(1_000 * MS), 1, PortMessage::Leave);
+        assert!(!uplinks.is_child(1), "left");
+    }
+
+    #[test]
+    fn a_walk_has_the_first_range_of_free_node_ids() {
+        let mut uplinks = Uplinks::new(1, 7, Micros(0));
+        for used in [1, 2, 5] {
+            uplinks.claimed(CellId::new(used).unwrap());
+        }
+        uplinks.handle(Micros(0), 0, hello_up(true));
+        let walk = |walk, first, last| PortMessage::NodeId(Walk { walk, first, last });
+        let walks = |uplinks: &mut Uplinks| {
+            let mut messages = said(uplinks);
+            messages.retain(|(_, message)| matches!(message, PortMessage::NodeId(_)));
+            messages
+        };
+        assert_eq!(walks(&mut uplinks), [(0, walk(8, 3, 4))]);
+        // One of them was assigned.
+        uplinks.handle(Micros(MS), 0, PortMessage::Return(Walk { walk: 8, first: 4, last: 4 }));
+        assert_eq!(walks(&mut uplinks), [(0, walk(9, 4, 4))]);
+        uplinks.handle(Micros(2 * MS), 0, PortMessage::Return(Walk { walk: 9, first: 5, last: 4 }));
+        assert_eq!(walks(&mut uplinks), [(0, walk(10, 6, CellId::MAX.get()))]);
     }
 }

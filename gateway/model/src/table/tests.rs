@@ -234,3 +234,27 @@ fn heartbeats_say_for_how_long_joints_were_not_taken() {
     hear(48, joints(Epoch(3)));
     assert_eq!(hear(90, beat(1, 5, State::default())), (3, 74), "since the first that it has not taken");
 }
+
+#[test]
+fn a_cell_is_active_stale_or_quiet_by_the_torque_that_is_held() {
+    let cell = CellId::new(1).unwrap();
+    let mut table = table(&[]);
+    let mut hear = |message: Message| {
+        let own = matches!(message, Message::Joints { .. });
+        for frame in message.encode().frames(Format::Fd) {
+            table.handle_frame(Micros(0), own, &frame, &mut |_| None);
+        }
+        table.statuses(Micros(0)).next().unwrap().1
+    };
+    let joints = |epoch| {
+        let joints = Joints { in_use: 6, ..Joints::default() };
+        Message::Joints { epoch: Epoch(epoch), joints }
+    };
+    let torque = |epoch, word| Message::Torque { from: cell, epoch: Epoch(epoch), torque: [word; 6].into() };
+    assert_eq!(hear(joints(1)), Status::Unknown);
+    let said = [torque(1, 100), joints(2), joints(3), torque(3, 100)];
+    let [active, stale, quiet] = [Status::Active, Status::Stale, Status::Quiet];
+    assert_eq!(said.map(&mut hear), [active, active, stale, active]);
+    let said = [joints(4), torque(4, 0), joints(5), joints(6)];
+    assert_eq!(said.map(&mut hear), [active, quiet, quiet, quiet]);
+}

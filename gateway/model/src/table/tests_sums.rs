@@ -158,7 +158,7 @@ fn a_roots_sum_is_held_and_decays_as_a_torque_does_and_no_heartbeat_releases_it(
         assert_eq!(sums.contributing, 2);
     }
     let sums = bench.joints(u8::try_from(1 + hold_epochs + decay_epochs).unwrap());
-    assert_eq!(first(&sums), (0.0, 0));
+    assert_eq!((first(&sums), sums.age, sums.stale), ((0.0, 0), 0, 2), "nothing of it counts any more");
 }
 
 #[test]
@@ -193,6 +193,8 @@ fn cells_that_moved_to_another_root_do_not_count_twice() {
     bench.joints(3);
     bench.sum(2, 3, 3, 29);
     assert_eq!(first(&bench.sum(1, 3, 1, 11)), (40.0, 4), "it sends again");
+    bench.joints(4);
+    assert_eq!(first(&bench.sum(2, 4, 4, 39)), (50.0, 5), "the first one may only be late");
 }
 
 #[test]
@@ -273,4 +275,27 @@ fn packets_that_the_gateway_does_not_receive_are_counted_by_their_sender() {
     assert_eq!((uplink.sent, uplink.delivered, uplink.unheard, uplink.lost), (10, 4, 5, 1), "{uplink:?}");
     let total = bench.table.uplink();
     assert_eq!((total.unheard, total.lost), (5, 1));
+}
+
+#[test]
+fn the_network_is_of_all_cells_that_are_described_or_heard() {
+    let mut bench = Bench::new(&[]);
+    let tree = Tree { parent: Some(1), depth: 1, ..Tree::default() };
+    let page = NetworkPage::Tree(tree);
+    bench.say(false, Message::Network { from: Node::Cell(cell(3)), epoch: Epoch(0), page });
+    bench.heartbeat(9, 0, State::default());
+    let seen = |bench: &Bench, at: Micros| {
+        let of =
+            |seen: Seen| (seen.node, seen.serial.is_some(), seen.heartbeat.is_some(), seen.alive, seen.tree);
+        bench.table.network(at).map(of).collect::<Vec<_>>()
+    };
+    let expected = |alive| {
+        let described = |node| (cell(node), true, true, alive, Some(tree).filter(|_| node == 3));
+        let mut all: Vec<_> = (1..=4).map(described).collect();
+        all.push((cell(9), false, true, true, None));
+        all
+    };
+    let now = Micros(bench.at);
+    assert_eq!(seen(&bench, now), expected(true));
+    assert_eq!(seen(&bench, now + DEAD_AFTER + Span(1)), expected(false));
 }

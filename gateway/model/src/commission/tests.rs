@@ -1,0 +1,126 @@
+use super::*;
+use protocol::message::Answer;
+
+const WISH: Wish = Wish { dry_run: false, verify: false };
+
+/// A skin with so many cells at different positions.
+fn skin(cells: usize) -> Skin {
+    let (head, cell) = crate::testing::SKIN.split_once("[[cell]]").unwrap();
+    let cells = (1..=cells)
+        .map(|node| {
+            cell.replace("node = 1", &format!("node = {node}")).replace("0.01,", &format!("0.0{node},"))
+        })
+        .map(|cell| format!("[[cell]]{cell}"));
+    Skin::parse("skin.toml", &(head.to_owned() + &cells.collect::<String>())).unwrap()
+}
+
+/// A commissioning in which all cells have sent a heartbeat and need everything, after it has listened.
+fn begun(skin: &Skin) -> (Commission, Micros) {
+    let mut commission = Commission::new(skin, 0, WISH, 1_000, Micros(0));
+    for cell in &skin.cells {
+        let state = State::default().with_joint(0);
+        let page = NetworkPage::Heartbeat(Heartbeat { serial: cell.serial, state, ..Heartbeat::default() });
+        let message = Message::Network { from: Node::Cell(cell.node), epoch: Epoch(0), page };
+        commission.handle_message(Micros(0), &message);
+    }
+    let now = Micros(0) + LISTEN;
+    commission.handle_time(now);
+    (commission, now)
+}
+
+/// The requests that it sends now: to whom, with which tag, and what.
+fn requests(commission: &mut Commission) -> Vec<(Node, u8, Request)> {
+    std::iter::from_fn(|| commission.poll_transmit())
+        .filter_map(|message| match message {
+            Message::Configure { to, tag, request } => Some((to, tag, request)),
+            _ => None,
+        })
+        .collect()
+}
+
+/// Lets time pass until it sends requests again.
+fn next_requests(commission: &mut Commission) -> (Micros, Vec<(Node, u8, Request)>) {
+    loop {
+        let now = commission.poll_timeout().expect("it goes on");
+        commission.handle_time(now);
+        let requests = requests(commission);
+        if !requests.is_empty() {
+            return (now, requests);
+        }
+    }
+}
+
+/// A cell has taken a write.
+fn confirm(commission: &mut Commission, now: Micros, from: CellId, tag: u8, request: Request) {
+    let Request::Write { number, words } = request else { panic!("{request:?}") };
+    let answer = Answer::Value { number, written: true, words };
+    commission.handle_message(now, &Message::Configured { from, tag, answer });
+    commission.handle_time(now);
+}
+
+#[test]
+fn a_request_to_everyone_is_repeated_while_most_cells_have_not_answered() {
+    let skin = skin(4);
+    let (mut commission, now) = begun(&skin);
+    let first = requests(&mut commission);
+    let [(Node::Everyone, tag, request)] = first[..] else { panic!("{first:?}") };
+    let (again, repeated) = next_requests(&mut commission);
+    assert_eq!((again, &repeated), (now + QUIET, &first));
+    for cell in &skin.cells[..2] {
+        confirm(&mut commission, again, cell.node, tag, request);
+    }
+    let (_, next) = next_requests(&mut commission);
+    let [(Node::Everyone, next_tag, other)] = next[..] else { panic!("{next:?}") };
+    assert_ne!((next_tag, other), (tag, request), "the other two get requests of their own");
+    assert_eq!(commission.report().repeated, 1);
+}
+
+#[test]
+fn a_write_is_repeated_after_100_ms_and_a_commit_after_400() {
+    let skin = skin(1);
+    let cell = skin.cells[0].node;
+    let (mut commission, mut now) = begun(&skin);
+    let mut sent = requests(&mut commission);
+    let repeated_after = |commission: &mut Commission, now, sent: &[_]| {
+        let (again, repeated) = next_requests(commission);
+        assert_eq!(repeated, sent);
+        again.since(now)
+    };
+    assert_eq!(repeated_after(&mut commission, now, &sent), Span::from_millis(100));
+    now = now + Span::from_millis(100);
+    loop {
+        let [(Node::Cell(_), tag, request)] = sent[..] else { panic!("{sent:?}") };
+        if matches!(request, Request::Write { number, .. } if number == Parameter::Commit.number()) {
+            break;
+        }
+        confirm(&mut commission, now, cell, tag, request);
+        sent = requests(&mut commission);
+    }
+    assert_eq!(repeated_after(&mut commission, now, &sent), Span::from_millis(400));
+}
+
+#[test]
+fn other_gateways_hear_of_one_that_sends() {
+    let skin = skin(1);
+    let announced = |dry_run| {
+        let mut commission = Commission::new(&skin, 0, Wish { dry_run, verify: false }, 1_000, Micros(0));
+        let mut times = Vec::new();
+        while let Some(now) = commission.poll_timeout().filter(|now| *now <= Micros(1_000_000)) {
+            assert!(!commission.speaks() || now > Micros(0) + LISTEN);
+            commission.handle_time(now);
+            for message in std::iter::from_fn(|| commission.poll_transmit()) {
+                let is_heartbeat = matches!(
+                    message,
+                    Message::Network { from: Node::Gateway, page: NetworkPage::Heartbeat(_), .. }
+                );
+                times.extend(is_heartbeat.then_some(now.0 / 1_000));
+            }
+        }
+        let speaks = commission.speaks();
+        commission.stop();
+        assert!(!commission.speaks());
+        (times, speaks)
+    };
+    assert_eq!(announced(false), (vec![500, 750, 1_000], true));
+    assert_eq!(announced(true), (vec![], false));
+}
