@@ -354,6 +354,14 @@ mod tests {
     }
 
     #[test]
+    fn a_remote_frame_is_one_with_the_flag_given_or_not() {
+        for id in [0x123, 0x123 | REMOTE] {
+            let frame = Frame::remote(id, 5).unwrap();
+            assert_eq!((frame.is_remote(), frame.id(), frame.len(), frame.data()), (true, 0x123, 5, &[][..]));
+        }
+    }
+
+    #[test]
     fn every_dlc_has_its_length() {
         let lens = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64];
         for (dlc, len) in (0..).zip(lens) {

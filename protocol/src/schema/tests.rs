@@ -79,3 +79,26 @@ fn a_field_gives_its_bits_with_their_sign() {
     assert_eq!(raw("byte = 4\nbit = 5\nformat = { unsigned = 3 }", 0), 1);
     assert_eq!(raw("word = 7", 0), 0, "what is not there");
 }
+
+#[test]
+fn names_are_of_fields_of_labels_and_of_units() {
+    let field = |parameter: &str, place: usize| &parameter_named(parameter).unwrap().fields[place];
+    assert_eq!(field("pose", 0).written_names(), ["x_m", "y_m", "z_m"]);
+    assert_eq!(field("pose", 1).written_names(), ["normal_x", "normal_y", "normal_z"]);
+    assert_eq!(field("timing", 0).written_names(), ["period_us"]);
+    assert_eq!(field("pose", 0).signal_name("", "x"), "pose_x", "it has another name as a signal");
+    assert_eq!(field("timing", 0).signal_name("timing_", ""), "timing_period", "the unit stands elsewhere");
+    assert_eq!(field("mount", 0).signal_name("mount_", ""), "mount_joint");
+    let port = toml::from_str::<Field>("name = \"node\"\nsignal = \"port_{}_leads_to\"").unwrap();
+    assert_eq!(port.signal_name("", "2"), "port_2_leads_to");
+}
+
+#[test]
+fn a_refusal_has_no_tag_and_no_parameter_beside_its_layout() {
+    let schema = |kind| packets().iter().find(|schema| schema.kind == kind).unwrap();
+    let configured = schema(Kind::Configured);
+    let refusal = configured.layouts.iter().find(|layout| layout.number == REFUSED).unwrap();
+    assert_eq!(configured.end(refusal), []);
+    assert_eq!(configured.end(value(5, [0; WORDS])), configured.end);
+    assert_eq!(schema(Kind::Configure).end(refusal), schema(Kind::Configure).end);
+}

@@ -172,6 +172,41 @@ fn a_robot_may_say_where_its_urdf_is() {
 }
 
 #[test]
+fn a_robot_of_joints_and_chains_names_what_is_wrong_with_them() {
+    let (before, rest) = GOOD.split_once("joints = [").unwrap();
+    let (_, after) = rest.split_once("]\n").unwrap();
+    let joint = "[[robot.joint]]\nname = \"lift\"\nkind = \"prismatic\"\nlimits = [-0.5, 1.0]\n";
+    let more = "[[robot.joint]]\nname = \"elbow\"\n";
+    let chain = "[[robot.chain]]\nname = \"arm\"\nrows = [{ joint = \"lift\" }, { joint = \"elbow\" }]\n";
+    let good = format!("{before}{joint}{more}{chain}{after}");
+    let skin = Skin::parse("skin.toml", &good).unwrap();
+    assert_eq!(skin.robot.joints[0].limits, [-0.5, 1.0]);
+    let kinds = skin.robot.joints.iter().map(|joint| joint.kind.name()).collect::<Vec<_>>();
+    assert_eq!(kinds, ["prismatic", "revolute"]);
+    let wrong = |from: &str, to: &str| {
+        assert!(good.contains(from), "{from}");
+        let DocumentError::Wrong { what, .. } =
+            Skin::parse("skin.toml", &good.replacen(from, to, 1)).unwrap_err()
+        else {
+            panic!("{from}")
+        };
+        what.to_string()
+    };
+    let slides =
+        |got: &str| format!("robot.joint[0].limits = {got}: a joint slides within -1.999 to 1.999 m");
+    assert_eq!(wrong("-0.5, 1.0", "-2.1, 1.0"), slides("[-2.1, 1]"));
+    assert_eq!(wrong("-0.5, 1.0", "-0.5, 2.1"), slides("[-0.5, 2.1]"));
+    let own = |got: &str| format!("robot.joint[1].name = {got:?}: each joint has a name of its own");
+    assert_eq!(wrong("name = \"elbow\"\n[[robot.chain]]", "name = \"lift\"\n[[robot.chain]]"), own("lift"));
+    assert_eq!(wrong("name = \"elbow\"\n[[robot.chain]]", "name = \"\"\n[[robot.chain]]"), own(""));
+    let unused = wrong(", { joint = \"elbow\" }", "");
+    assert_eq!(unused, "robot.joint[1].name = \"elbow\": no chain has this joint");
+    assert_eq!(wrong(chain, ""), "robot.chain = []: at least one chain is needed");
+    let both = "robot.joints: either joints, or [[robot.joint]] and [[robot.chain]], not both";
+    assert_eq!(wrong("[robot]\n", "[robot]\njoints = []\n"), both);
+}
+
+#[test]
 fn a_wire_has_two_ends() {
     assert_eq!(
         says("neighbors = [2, 0, 0, 0]", "neighbors = [2, 2, 0, 0]"),
