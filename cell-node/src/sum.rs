@@ -195,7 +195,7 @@ impl Sum {
         child.last = Some(epoch).filter(|_| follows && !words.is_end());
         if !follows || !present {
             self.dropped = self.dropped.wrapping_add(1);
-            child.waiting = (present && !follows).then_some((epoch, words));
+            child.waiting = (!follows).then_some((epoch, words));
             return;
         }
         if child.taken.is_some_and(|before| before.count >= words.count) {

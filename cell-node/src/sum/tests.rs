@@ -15,7 +15,7 @@ fn begin(epoch: u8, depth: u8) -> Begin {
 
 /// In steps of Q7.8 and thousandths of them.
 fn own(thousandths: i64) -> [Acc<30>; MAX_JOINTS] {
-    [Acc::from_steps(thousandths * (1 << SHORTENED) / 1_000); MAX_JOINTS]
+    [Acc::from_steps(thousandths * (1 << 22) / 1_000); MAX_JOINTS]
 }
 
 fn words(word: i16, count: u8) -> Words {
@@ -114,6 +114,22 @@ fn a_sum_is_taken_while_its_lease_runs_and_not_after_a_gap() {
     assert_eq!(sum.taken, 2, "stated for another epoch");
 }
 
+// LEASE-2, NACK-3
+#[test]
+fn a_sum_that_came_before_its_joints_and_without_a_lease_waits_for_its_state() {
+    let mut sum = sum(false);
+    sum.begin(&begin(1, 2), None);
+    sum.take(at(1, 15_900), 1, Epoch(2), words(10, 1));
+    sum.begin(&begin(2, 2), None);
+    assert_eq!((sum.taken, sum.dropped), (0, 1), "no state yet");
+    sum.state(at(2, 100), 1, Epoch(2));
+    assert_eq!((sum.taken, sum.dropped), (1, 0));
+    sum.disown(1);
+    sum.take(at(2, 15_900), 1, Epoch(3), words(10, 1));
+    sum.begin(&begin(3, 2), None);
+    assert_eq!(sum.missing(), Some((Epoch(3), 0b10)), "it does not come");
+}
+
 // LEASE-2
 #[test]
 fn a_sum_that_comes_late_is_not_in_its_epoch_and_keeps_its_lease() {
@@ -159,6 +175,17 @@ fn saturation_passes_upwards_word_by_word() {
     sum.take(at(2, 0), 0, Epoch(2), words(1, 1));
     let (_, said, _) = sum.say(at(2, 1_000)).unwrap();
     assert_eq!(said.torque, [Q7_8::MAX; MAX_JOINTS]);
+}
+
+// SUM-3
+#[test]
+fn a_torque_beyond_the_32_bits_that_are_kept_of_it_saturates_at_its_end() {
+    for (steps, end) in [(i64::MIN / 2, Q7_8::MIN), (i64::MAX / 2, Q7_8::MAX)] {
+        let mut sum = sum(false);
+        sum.begin(&begin(1, 2), Some(&[Acc::from_steps(steps); MAX_JOINTS]));
+        let (_, said, _) = sum.say(at(1, 1_000)).unwrap();
+        assert_eq!(said.torque, [end; MAX_JOINTS]);
+    }
 }
 
 // NACK-2
