@@ -23,9 +23,6 @@ pub(super) fn bound<N: Number>(contact: &Wrenched<N>, rows: &[Row]) -> Option<u1
         }
         moment += ((reach * force) >> 14) + 3;
         (force, moment) = (turned(force), turned(moment));
-        if moment >= (1 << 15) - 1 {
-            return None;
-        }
     }
     u16::try_from(moment).ok().filter(|bound| *bound < MAX_J - 1 && force < 1 << 15)
 }
