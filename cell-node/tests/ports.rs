@@ -7,15 +7,19 @@ use cell_node::node::Node;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};
-use protocol::message::{Answer, From, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::message::{Answer, From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
 use protocol::packet::{Epoch, WORDS, words};
 use protocol::parameters::{Contact, Parameter, Parameters, Pose};
 use protocol::time::{Micros, Span};
-use protocol::wire::{Hello, PortMessage, Rank, UPLINK};
+use protocol::wire::{Hello, PortMessage, Rank, UPLINK, Walk};
 
 const REPLY: u8 = 6;
 
 fn start(wired: u8) -> Node {
+    start_with(wired, CellId::new(12).ok())
+}
+
+fn start_with(wired: u8, cell: Option<CellId>) -> Node {
     let [zero, one] = [Q1_14::ZERO, Q1_14::nearest(1.0)];
     let parameters = Parameters {
         joint: 1,
@@ -25,7 +29,7 @@ fn start(wired: u8) -> Node {
         period_us: 16_000,
         ..Parameters::default()
     };
-    let identity = Identity { cell: Some(CellId::new(12).unwrap()), serial: 1 };
+    let identity = Identity { cell, serial: 1 };
     Node::new(identity, Format::Fd, &Flash::Sound(parameters), true, Micros(0)).with_ports(wired)
 }
 
@@ -85,11 +89,7 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
     let mut node = start(1 << UPLINK);
     let now = Micros(400_000);
     until(&mut node, now);
-    let rank = Rank { round: 1, depth: 0 };
-    let hello =
-        Hello { version: 1, number: 0, port: 0, hears: true, up: false, unnumbered: false, rank: Some(rank) };
-    node.handle_port(now, Span(0), UPLINK, PortMessage::Hello(hello));
-    node.handle_port(now, Span(0), UPLINK, PortMessage::Grant(rank));
+    join_gateway(&mut node, now);
     tell(&mut node, now, &sum_with([1, 1_500, 0, 1, 0, 0]));
     let contact = [Q5_10::nearest(4.0), Q5_10::ZERO, Q5_10::ZERO];
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
@@ -101,4 +101,47 @@ fn a_root_sends_its_sums_to_the_gateways_side_without_a_state() {
     let is_up = |message: &PortMessage| matches!(message, PortMessage::Hello(Hello { up: true, .. }));
     assert!(said.iter().any(|(port, message)| *port == UPLINK && is_up(message)), "{said:?}");
     assert!(!said.iter().any(|(_, message)| matches!(message, PortMessage::State(_))), "{said:?}");
+}
+
+/// The gateway's side takes it as a root.
+fn join_gateway(node: &mut Node, now: Micros) {
+    let rank = Rank { round: 1, depth: 0 };
+    let hello =
+        Hello { version: 1, number: 0, port: 0, hears: true, up: false, unnumbered: false, rank: Some(rank) };
+    node.handle_port(now, Span(0), UPLINK, PortMessage::Hello(hello));
+    node.handle_port(now, Span(0), UPLINK, PortMessage::Grant(rank));
+}
+
+// JOIN-6
+#[test]
+fn the_place_in_the_tree_is_reported_at_most_every_50_ms() {
+    let mut node = start(1 << UPLINK | 0b1);
+    let pages = |node: &mut Node| {
+        core::iter::from_fn(|| node.poll_transmit())
+            .filter_map(|packet| match Message::decode(&packet).unwrap() {
+                Message::Network { page: NetworkPage::Tree(tree), .. } => Some((tree.parent, tree.children)),
+                _ => None,
+            })
+            .collect::<Vec<_>>()
+    };
+    until(&mut node, Micros(400_000));
+    join_gateway(&mut node, Micros(400_000));
+    assert_eq!(pages(&mut node), [(Some(0), 0)]);
+    node.handle_port(Micros(410_000), Span(0), 0, PortMessage::Join);
+    node.handle_timeout(Micros(449_999));
+    assert_eq!(pages(&mut node), []);
+    node.handle_timeout(Micros(450_000));
+    assert_eq!(pages(&mut node), [(Some(0), 0b1)]);
+}
+
+// NODE-2
+#[test]
+fn a_new_node_id_changes_once_what_a_cell_receives() {
+    let mut node = start_with(1 << UPLINK, None);
+    assert!(!node.poll_hears());
+    join_gateway(&mut node, Micros(1_000));
+    assert!(!node.poll_hears(), "the gateway sends no sums");
+    let walk = Walk { walk: 1, first: 3, last: 9 };
+    node.handle_port(Micros(2_000), Span(0), UPLINK, PortMessage::NodeId(walk));
+    assert_eq!([node.poll_hears(), node.poll_hears()], [true, false]);
 }

@@ -382,3 +382,6 @@ impl Network {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
