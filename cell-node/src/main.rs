@@ -106,7 +106,7 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
     if let Some(flash) = arguments.flash.as_deref().filter(|flash| !flash.is_dir()) {
         bail!("--flash {}: there is no such directory; make it first", flash.display());
     }
-    let skin = Skin::read(&arguments.skin)?;
+    let skin = Skin::read_on(&arguments.skin, &arguments.bus)?;
     let bus_index = skin.bus_named(&arguments.bus).with_context(|| {
         let names = skin.buses.iter().map(|bus| bus.name.as_str()).collect::<Vec<_>>().join(", ");
         format!("bus {} is not in {}, which has {names}", arguments.bus, arguments.skin.display())

@@ -1,6 +1,6 @@
 //! From the file's words to checked types.
 
-use super::{Cell, buses, cells};
+use super::{Bus, Cell, buses, cells};
 use super::{Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing, raw, robot, sensing};
 use crate::document::{Fault, Place, span};
 use crate::fixed::Q;
@@ -8,7 +8,23 @@ use crate::parameters::Contact;
 
 pub(super) type Checked<T> = Result<T, Fault>;
 
+/// A whole skin.
 pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
+    checked(raw, |_| true)
+}
+
+/// A skin that has the cells of a bus of this name, and of no other.
+pub(super) fn skin_on(raw: raw::Skin, bus: &str) -> Checked<Skin> {
+    let skin = checked(raw, |of| of.name == bus)?;
+    let is_other = |cell: &Cell| skin.buses.get(cell.bus).is_some_and(|of| of.name != bus);
+    match skin.cells.iter().position(is_other) {
+        None => Ok(skin),
+        Some(index) => Err(Place::named("cell").nth(index).key("bus").fault("", "the cell of another bus")),
+    }
+}
+
+/// Checks everything; `has_cells` says of which buses the cells are there.
+fn checked(raw: raw::Skin, has_cells: impl Fn(&Bus) -> bool) -> Checked<Skin> {
     if raw.version != 1 {
         return Err(Place::named("version").fault(raw.version, "this program reads version 1"));
     }
@@ -31,8 +47,8 @@ pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
     };
     for (index, bus) in skin.buses.iter().enumerate() {
         match bus.reply {
-            Reply::Torque => {}
-            Reply::Sum { slot_us, .. } => tree(&skin, index, slot_us, period_us)?,
+            Reply::Sum { slot_us, .. } if has_cells(bus) => tree(&skin, index, slot_us, period_us)?,
+            Reply::Torque | Reply::Sum { .. } => {}
         }
     }
     Ok(skin)

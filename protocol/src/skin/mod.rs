@@ -6,6 +6,7 @@
 mod buses;
 mod cells;
 mod check;
+mod part;
 mod raw;
 mod reach;
 mod robot;
@@ -205,10 +206,24 @@ impl Skin {
     pub fn on_buses(&self, kept: &[usize]) -> Self {
         let place = |bus: usize| kept.iter().position(|&it| it == bus);
         let cells = self.cells.iter();
+        let cells = cells.filter_map(|cell| Some(Cell { bus: place(cell.bus)?, ..cell.clone() }));
+        let buses = kept.iter().filter_map(|&bus| self.buses.get(bus)).cloned();
+        Self { buses: buses.collect(), ..self.with_cells(cells.collect()) }
+    }
+
+    /// The same with other cells; its own are not copied.
+    #[must_use]
+    pub fn with_cells(&self, cells: Vec<Cell>) -> Self {
+        let Self { name, robot, timing, events, buses, controller, safety, cells: _ } = self;
         Self {
-            buses: kept.iter().filter_map(|&bus| self.buses.get(bus)).cloned().collect(),
-            cells: cells.filter_map(|cell| Some(Cell { bus: place(cell.bus)?, ..cell.clone() })).collect(),
-            ..self.clone()
+            name: name.clone(),
+            robot: robot.clone(),
+            timing: *timing,
+            events: *events,
+            buses: buses.clone(),
+            controller: controller.clone(),
+            safety: *safety,
+            cells,
         }
     }
 
@@ -308,7 +323,7 @@ impl Skin {
     /// The same skin with the cells of one bus only.
     #[must_use]
     pub fn part_on(&self, bus: usize) -> Self {
-        Self { cells: self.cells_of(bus).cloned().collect(), ..self.clone() }
+        self.with_cells(self.cells_of(bus).cloned().collect())
     }
 
     /// The bus of this name, as an index into [`Skin::buses`].

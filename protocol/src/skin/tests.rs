@@ -1,6 +1,6 @@
 use super::*;
 
-const GOOD: &str = r#"version = 1
+pub(super) const GOOD: &str = r#"version = 1
 name = "two"
 
 [robot]

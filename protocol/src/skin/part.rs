@@ -1,0 +1,139 @@
+//! A skin's text without the cells of other buses: whoever has the cells of one bus of many need not read the others,
+//! which are most of the file.
+
+use std::path::Path;
+
+use super::{DocumentError, Skin, check};
+use crate::document;
+
+impl Skin {
+    /// Reads a file's part on a bus, as [`Skin::parse_on`].
+    ///
+    /// # Errors
+    /// When it cannot be read, or the first thing that is wrong with it.
+    pub fn read_on(path: &Path, bus: &str) -> Result<Self, DocumentError> {
+        Self::parse_on(&path.display().to_string(), &document::text(path)?, bus)
+    }
+
+    /// As [`Skin::parse`], with the cells of one bus only, as [`Skin::part_on`] has them; with all of them when there is
+    /// no such bus. The cells of other buses are not looked at, unless something is wrong with the rest: then the whole
+    /// text is read, for its first error.
+    ///
+    /// # Errors
+    /// The first thing that is wrong with it.
+    pub fn parse_on(path: &str, text: &str, bus: &str) -> Result<Self, DocumentError> {
+        if let Some(part) = without_others(text, bus)
+            && let Ok(skin) = document::parse(path, &part, |raw| check::skin_on(raw, bus))
+        {
+            return Ok(skin);
+        }
+        let skin = Self::parse(path, text)?;
+        let index = skin.bus_named(bus);
+        Ok(index.map(|index| skin.part_on(index)).unwrap_or(skin))
+    }
+}
+
+/// The text without each `[[cell]]` that names another bus; none where a line may stand within a string.
+fn without_others(text: &str, bus: &str) -> Option<String> {
+    if text.contains("\"\"\"") || text.contains("'''") {
+        return None;
+    }
+    let mut part = String::new();
+    // Where the section begins that is being read, whether it is a cell, and whether that is another bus'.
+    let (mut begun, mut is_cell, mut is_other, mut at) = (0, false, false, 0);
+    for line in text.split_inclusive('\n') {
+        let word = line.trim_start();
+        // A line within an array ends a section too early at worst, and what is left of it then is no skin.
+        if word.starts_with('[') {
+            part.push_str(text.get(begun..at).filter(|_| !is_other).unwrap_or_default());
+            (begun, is_cell, is_other) = (at, word.starts_with("[[cell]]"), false);
+        } else if is_cell && !is_other {
+            is_other = named_bus(word).is_some_and(|named| named != bus);
+        }
+        at += line.len();
+    }
+    part.push_str(text.get(begun..).filter(|_| !is_other).unwrap_or_default());
+    Some(part)
+}
+
+/// The bus that a line of a cell names in the usual way.
+fn named_bus(line: &str) -> Option<&str> {
+    let value = line.strip_prefix("bus")?.trim_start().strip_prefix('=')?.trim_start().strip_prefix('"')?;
+    let (name, _) = value.split_once('"')?;
+    (!name.contains('\\')).then_some(name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::GOOD;
+    use super::*;
+
+    /// The cells of [`GOOD`] on each of two buses, in turn.
+    fn two_buses(reply: &str) -> String {
+        let bus = "[[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n\n";
+        let other = bus.replace("vcan0", "vcan1").replace("\"torque\"", reply);
+        let text = GOOD.replace(bus, &(bus.replace("\"torque\"", reply) + &other));
+        let (head, cells) = text.split_at(text.find("[[cell]]").unwrap());
+        let cells = cells.replace("node = 1\n", "node = 1\nroot = true\n");
+        format!("{head}{cells}\n# The other half.\n{}", cells.replace("bus = \"vcan0\"", "bus = \"vcan1\""))
+    }
+
+    #[test]
+    fn a_part_is_that_of_the_whole_and_leaves_the_rest_unread() {
+        for reply in ["\"torque\"", "\"sum\"\nslot_us = 100"] {
+            let text = two_buses(reply);
+            let whole = Skin::parse("skin.toml", &text).unwrap();
+            for (index, bus) in ["vcan0", "vcan1"].into_iter().enumerate() {
+                assert_eq!(Skin::parse_on("skin.toml", &text, bus).unwrap(), whole.part_on(index), "{bus}");
+                let part = without_others(&text, bus).unwrap();
+                assert_eq!((part.matches("[[cell]]").count(), part.matches("[[bus]]").count()), (2, 2));
+            }
+            assert_eq!(Skin::parse_on("skin.toml", &text, "vcan2").unwrap(), whole, "of no bus, all");
+        }
+        assert_eq!(Skin::parse_on("skin.toml", GOOD, "vcan0"), Skin::parse("skin.toml", GOOD));
+    }
+
+    #[test]
+    fn cells_that_name_their_bus_in_another_way_are_read_too() {
+        let text = two_buses("\"torque\"");
+        let whole = Skin::parse("skin.toml", &text).unwrap();
+        for (from, to) in [
+            ("bus = \"vcan1\"", "bus='vcan1'"),
+            ("bus = \"vcan1\"", "\"bus\" = \"vcan1\""),
+            ("bus = \"vcan1\"", "bus = \"vcan\\u0031\""),
+            ("[[cell]]", "[[ cell ]] # one"),
+            ("[[cell]]", "  [[cell]]# one"),
+            ("name = \"two\"", "name = \"\"\"two\"\"\""),
+            ("position = [0.1, 0.0, 0.06]", "position = [\n  0.1,\n  0.0, 0.06\n]"),
+        ] {
+            let text = text.replace(from, to);
+            for (index, bus) in ["vcan0", "vcan1"].into_iter().enumerate() {
+                assert_eq!(Skin::parse_on("skin.toml", &text, bus).unwrap(), whole.part_on(index), "{to}");
+            }
+        }
+    }
+
+    #[test]
+    fn an_error_is_that_of_the_whole() {
+        let text = two_buses("\"torque\"");
+        for (from, to) in [
+            ("joint = 2", "joint = 9"),
+            ("neighbors = [2, 0, 0, 0]", "neighbors = [[2], 0, 0, 0]"),
+            ("version = 1", "version = 2"),
+            ("bus = \"vcan1\"", "bus = \"vcan7\""),
+        ] {
+            let text = text.replace(from, to);
+            let whole = Skin::parse("skin.toml", &text);
+            let part = Skin::parse_on("skin.toml", &text, "vcan0");
+            assert!(whole.is_err());
+            assert!(part == whole || to.contains("vcan7"), "{to}: {part:?}");
+        }
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn no_text_panics(text in "(\\[\\[cell\\]\\]|\\[bus|bus = \"a|\"|\n|=|'| |é){0,40}") {
+            let _ = (without_others(&text, "a"), Skin::parse_on("skin.toml", &text, "a"));
+        }
+    }
+}
