@@ -57,6 +57,10 @@ pub struct Summary {
     pub processor: Processor,
     /// Private memory of the largest cell process in KiB, if cells were started.
     pub cell_private_kib: Option<u64>,
+    /// Private memory of this program in KiB, at the end of the loop.
+    pub gateway_private_kib: Option<u64>,
+    /// Private memory of all processes that were started to serve buses, in KiB; none without any.
+    pub buses_private_kib: Option<u64>,
     /// What was recorded, and what was lost.
     pub recording: Option<Recording>,
 }

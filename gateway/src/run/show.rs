@@ -241,6 +241,10 @@ fn costs(rows: &mut Rows, summary: &Summary) {
     if let Some(kib) = summary.cell_private_kib {
         rows.row("private memory of a cell process", format!("{kib} KiB"), "the largest");
     }
+    if let Some(kib) = summary.gateway_private_kib {
+        let buses = summary.buses_private_kib.map(|kib| format!("its servers of buses {kib} KiB"));
+        rows.row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
+    }
     rows.row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");
     if let Some(recording) = &summary.recording {
         for file in &recording.files {

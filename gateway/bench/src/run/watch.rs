@@ -22,7 +22,7 @@ use super::measured::Measured;
 use super::progress::Progress;
 use super::realtime::{self, Granted};
 use super::receiver::BusEvent;
-use super::usage::Spent;
+use super::usage::{Spent, private_kib};
 use crate::record::Recorder;
 use crate::setup::spawn;
 use crate::summary::Summary;
@@ -89,7 +89,10 @@ impl Bench<'_> {
         progress.clear();
         measured.take(&mut inlet, self.began);
         summary.processor = Spent::by(&self.processes, &self.served).since(&before, summary.duration_s);
-        summary.cell_private_kib = self.processes.pids().filter_map(super::usage::private_kib).max();
+        summary.cell_private_kib = self.processes.pids().filter_map(private_kib).max();
+        summary.gateway_private_kib = private_kib(std::process::id());
+        let of_buses = self.served.iter().filter_map(|bus| private_kib(bus.pid()));
+        summary.buses_private_kib = of_buses.reduce(|all, one| all + one);
         if failure.is_some() || ended.is_err() {
             // The cells get no more commands.
             let _ = self.say(&Message::Halt);
