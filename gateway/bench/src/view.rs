@@ -12,6 +12,8 @@ use model::table::{Cell, SWITCHES, Said, Status, Switch};
 pub struct View {
     /// Each cell, in the bus' order.
     pub cells: Vec<CellView>,
+    /// Whether any of them is to be switched to something and has not confirmed it.
+    pub lacking: bool,
     /// Commands of our own that were read back from the bus, or were lost with it.
     pub commands: u64,
     /// What is known of the network's cells, those that are not described among them; none if cells
@@ -50,7 +52,22 @@ pub struct CellView {
     pub lacks: [Option<Switch>; SWITCHES],
 }
 
+impl View {
+    /// The cells of a bus, with what else is known of it.
+    #[must_use]
+    pub fn new(cells: Vec<CellView>, commands: u64, network: Vec<Seen>) -> Self {
+        let lacking = cells.iter().any(CellView::is_lacking);
+        Self { cells, lacking, commands, network }
+    }
+}
+
 impl CellView {
+    /// Whether it can receive, and is to be switched to something that it has not confirmed.
+    #[must_use]
+    pub fn is_lacking(&self) -> bool {
+        (self.ready || self.unconfigured) && self.lacks.iter().any(Option::is_some)
+    }
+
     /// What a table knows of a cell.
     #[must_use]
     pub fn of(cell: &Cell, status: Status) -> Self {

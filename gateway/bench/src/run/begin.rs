@@ -251,11 +251,9 @@ impl Bench<'_> {
             self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_there())
         {
             let Ok(view) = bus_link.view.lock() else { continue };
-            for cell in view.cells.iter().filter(|cell| cell.ready || cell.unconfigured) {
-                let switches: Vec<_> = cell.lacks.into_iter().flatten().collect();
-                if !switches.is_empty() {
-                    lacking.push(((bus, cell.node), switches));
-                }
+            // Next to never, and thousands of cells would be looked at a hundred times a second.
+            for cell in view.cells.iter().filter(|cell| view.lacking && cell.is_lacking()) {
+                lacking.push(((bus, cell.node), cell.lacks.into_iter().flatten().collect()));
             }
         }
         lacking

@@ -319,7 +319,7 @@ mod tests {
             }),
             ports: None,
         });
-        View { cells: cells.collect(), commands: 0, network: network.collect() }
+        View::new(cells.collect(), 0, network.collect())
     }
 
     #[test]

@@ -24,6 +24,17 @@ use trace::capture::BusNote;
 
 /// How often timeouts are checked if nothing comes, and the view is renewed.
 const LOOK: Duration = Duration::from_millis(20);
+/// The same of so many cells on all buses together; of more it is proportionally longer, but at most [`LONGEST_LOOK`].
+const CELLS_A_LOOK: usize = 1_000;
+/// See [`CELLS_A_LOOK`]; a cell is dead after 600 ms.
+const LONGEST_LOOK: Duration = Duration::from_millis(100);
+
+/// How often the timeouts of a skin of so many cells are checked while the loop runs: all of them cost the same.
+#[must_use]
+pub fn look_at(cells: usize) -> Duration {
+    let times = u32::try_from(cells / CELLS_A_LOOK).unwrap_or(u32::MAX);
+    LOOK.saturating_mul(times.max(1)).min(LONGEST_LOOK)
+}
 /// The pause while an interface is down.
 const DOWN: Duration = Duration::from_millis(50);
 /// From one try to open a bus that is gone to the next.
@@ -53,6 +64,8 @@ pub struct Receiver {
     pub receive_end: ReceiveEnd,
     /// How long frames gather, so that one wake-up takes many: a tick, as the loop reads no more often.
     pub gather: Duration,
+    /// How often timeouts are checked and the view is renewed while the loop runs.
+    pub look: Duration,
     /// What is known of it.
     pub table: Table,
     /// The wires to its roots, where cells answer with sums.
@@ -131,7 +144,7 @@ impl Receiver {
                 roots.speak(&self.receive_end.bus);
             }
             self.record(&inbox, &mut account);
-            if count == 0 || looked.elapsed() >= LOOK {
+            if looked.elapsed() >= self.look_now() {
                 looked = Instant::now();
                 self.look(&mut account);
             }
@@ -147,11 +160,17 @@ impl Receiver {
         ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages }
     }
 
+    /// How often to look now: until the loop begins the main thread waits for what cells say.
+    fn look_now(&self) -> Duration {
+        if self.shared.broadcasts.load(Ordering::Relaxed) == 0 { LOOK } else { self.look }
+    }
+
     /// Waits for frames and takes them; how many.
     fn take(&mut self, inbox: &mut Inbox, account: &mut Account) -> usize {
         let bus = &self.receive_end.bus;
         inbox.clear();
-        let timeout = self.roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.timeout()));
+        let look = self.look_now();
+        let timeout = self.roots.as_ref().map_or(look, |roots| look.min(roots.timeout()));
         let came = bus.wait(Some(timeout)).and_then(|ready| if ready { bus.receive(inbox) } else { Ok(0) });
         came.unwrap_or_else(|error| {
             self.lose(inbox, account, error);
@@ -284,7 +303,7 @@ impl Receiver {
         let commands = read + account.unread;
         let network = if self.roots.is_some() { self.table.network(now).collect() } else { Vec::new() };
         if let Ok(mut view) = self.view.lock() {
-            *view = View { cells, commands, network };
+            *view = View::new(cells, commands, network);
         }
     }
 

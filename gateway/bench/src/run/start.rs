@@ -18,7 +18,7 @@ use super::bench::{Bench, BusLink};
 use super::launch::{Processes, ServedBus, allow_files, open_or_serve, program};
 use super::link::{Link, ReceiveEnd, Slot};
 use super::network::Network;
-use super::receiver::{BusEvent, Receiver};
+use super::receiver::{BusEvent, Receiver, look_at};
 use super::roots::{ReceiveFilter, Roots};
 use super::{Options, RunError, realtime};
 use crate::emulate::{self, Emulation, Emulator};
@@ -249,6 +249,7 @@ fn listen(
         index,
         receive_end,
         gather: Duration::from_nanos(skin.timing.tick_nanos()).min(GATHER),
+        look: look_at(skin.cells.len()),
         table,
         roots: Roots::of(skin, index),
         snapshots,

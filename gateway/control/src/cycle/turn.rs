@@ -212,7 +212,9 @@ impl Turn {
     fn owe_to_returned_buses(&mut self, halted: bool) {
         for ((line, owed), worked) in self.lines.iter().zip(&mut self.owed).zip(&mut self.worked) {
             let works = line.state.is_there();
-            let returned = line.state.returned.swap(false, Ordering::Relaxed);
+            // Looked at first: to exchange it takes the processor's time in every tick, and it is set next to never.
+            let returned = &line.state.returned;
+            let returned = returned.load(Ordering::Relaxed) && returned.swap(false, Ordering::Relaxed);
             if (works && !*worked) || returned {
                 *owed = Some(if halted { Message::Halt } else { Message::Resume });
             }
