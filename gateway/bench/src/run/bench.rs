@@ -16,10 +16,11 @@ use protocol::time::Micros;
 
 use super::Options;
 use super::commanded::Remote;
-use super::launch::{Processes, ServedBus};
+use super::launch::Processes;
 use super::link::{Link, Slot, may_return};
 use super::network::Network;
 use super::receiver::{BusEvent, ReceiverResult};
+use super::served::ServedBus;
 use crate::emulate::Emulation;
 use crate::record::Recorder;
 use crate::setup::{names, since};

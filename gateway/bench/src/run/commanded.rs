@@ -12,9 +12,10 @@ use vcan_setup::netlink::Netlink;
 
 use super::Options;
 use super::bench::Bench;
-use super::launch::{LaunchError, ServedBus, program};
+use super::launch::{LaunchError, program};
 use super::measured::Measured;
 use super::progress::Progress;
+use super::served::ServedBus;
 use crate::remote::{Answer, BusState, Command, Lines, LinkDown, Phase, ProcessState, State};
 use model::scenario::ProcessAction;
 

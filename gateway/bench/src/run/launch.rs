@@ -1,9 +1,9 @@
-//! The processes of a bench: embedded buses and cells. All of them end with the gateway, however it
+//! The processes of a bench: cells here, embedded buses in [`super::served`]. All of them end with the gateway, however it
 //! ends: each ends at its parent's death by itself, and a [`Processes`] that is dropped ends them.
 
 use std::fmt::{self, Display, Formatter};
 use std::fs::File;
-use std::io::{BufRead, BufReader, Write};
+use std::io::Write;
 use std::os::fd::AsRawFd;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, Choice, Kinds, Options};
+use protocol::bus::Kinds;
 use protocol::skin::{Cell, Skin};
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, setrlimit};
@@ -114,87 +114,6 @@ pub fn in_memory(bytes: &[u8]) -> Result<(File, PathBuf), RunError> {
     let file = memory().map_err(RunError::Memory)?;
     let path = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()));
     Ok((file, path))
-}
-
-/// An embedded bus in a process of its own, so that it takes its socket away even when the gateway is
-/// killed.
-#[derive(Debug)]
-pub struct ServedBus {
-    bus: String,
-    child: Child,
-}
-
-impl ServedBus {
-    /// Serves a bus and waits until clients can connect; in a directory, if not in the usual one.
-    ///
-    /// # Errors
-    /// When the program does not start or does not say that it serves.
-    pub fn start(program: &Path, bus: &str, directory: Option<&Path>) -> Result<Self, LaunchError> {
-        let mut command = Command::new(program);
-        command.args(["serve", bus, "--until-eof"]).stdin(Stdio::piped()).stdout(Stdio::piped());
-        apart(&mut command, directory);
-        let start = |source| LaunchError::Start { path: program.to_owned(), source };
-        let mut served = Self { bus: bus.to_owned(), child: spawn(&mut command)? };
-        let mut line = String::new();
-        if let Some(out) = served.child.stdout.take() {
-            BufReader::new(out).read_line(&mut line).map_err(start)?;
-        }
-        if line.starts_with("serving ") {
-            Ok(served)
-        } else {
-            Err(LaunchError::Serve { path: program.to_owned(), bus: bus.to_owned() })
-        }
-    }
-
-    /// Its process.
-    #[must_use]
-    pub fn pid(&self) -> u32 {
-        self.child.id()
-    }
-
-    /// The bus.
-    #[must_use]
-    pub fn bus(&self) -> &str {
-        &self.bus
-    }
-
-    /// Ends its process, which takes its socket away; clients find a closed connection.
-    pub fn end(&mut self) {
-        // Its standard input ends, and so does it.
-        drop(self.child.stdin.take());
-        end(&mut [&mut self.child]);
-    }
-
-    /// How its process ended, if it did.
-    pub fn ended(&mut self) -> Option<ExitStatus> {
-        self.child.try_wait().ok().flatten()
-    }
-}
-
-/// Opens a bus; an embedded one without a server is served, by `vcan_setup` if that is named.
-///
-/// # Errors
-/// When it does not open, or is not served.
-pub fn open_or_serve(
-    name: &str,
-    kind: Choice,
-    target: &Options,
-    vcan_setup: Option<&Path>,
-) -> Result<(Bus, Option<ServedBus>), RunError> {
-    match Bus::open(name, kind, target) {
-        Err(BusError::NotServed { .. }) => {
-            let served =
-                ServedBus::start(&program("vcan-setup", vcan_setup)?, name, target.directory.as_deref())?;
-            Ok((Bus::open(name, kind, target)?, Some(served)))
-        }
-        opened => Ok((opened?, None)),
-    }
-}
-
-impl Drop for ServedBus {
-    fn drop(&mut self) {
-        self.end();
-    }
 }
 
 /// The process of one cell or of several.
@@ -420,7 +339,7 @@ impl Plan<'_> {
     }
 }
 
-fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
+pub(super) fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
     command.spawn().map_err(|source| LaunchError::Start { path: command.get_program().into(), source })
 }
 
@@ -434,7 +353,7 @@ fn last_line(log: &Path) -> Option<String> {
 
 /// Ctrl-C on a terminal signals the whole process group, and is meant for the gateway alone: cells and buses
 /// have to outlive it until the final reports. They find embedded buses where it does.
-fn apart(command: &mut Command, directory: Option<&Path>) {
+pub(super) fn apart(command: &mut Command, directory: Option<&Path>) {
     command.process_group(0);
     if let Some(directory) = directory {
         command.env("SKINBUS_DIR", directory);
@@ -455,7 +374,7 @@ pub fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
 }
 
 /// Waits for processes that were asked to end, and kills those that do not.
-fn end(children: &mut [&mut Child]) {
+pub(super) fn end(children: &mut [&mut Child]) {
     let give_up = Instant::now() + TIMEOUT;
     loop {
         let running = children

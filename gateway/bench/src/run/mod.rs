@@ -28,6 +28,7 @@ pub mod progress;
 pub mod realtime;
 pub mod receiver;
 pub mod roots;
+pub mod served;
 mod start;
 mod usage;
 mod watch;

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
-use protocol::bus::{BusKind, Filter, Options as BusOptions};
+use protocol::bus::{Bus, BusKind, Filter, Options as BusOptions};
 use protocol::can::Format;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
@@ -15,11 +15,12 @@ use protocol::usage::say;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::bench::{Bench, BusLink};
-use super::launch::{Processes, ServedBus, allow_files, open_or_serve, program};
+use super::launch::{Processes, allow_files, program};
 use super::link::{Link, ReceiveEnd, Slot};
 use super::network::Network;
 use super::receiver::{BusEvent, Receiver, look_at};
 use super::roots::{ReceiveFilter, Roots};
+use super::served::{ServedBus, Wanted, open_or_serve, open_or_serve_all};
 use super::{Options, RunError, realtime};
 use crate::emulate::{self, Emulation, Emulator};
 use crate::record::feed::{self, Feed, Outlet};
@@ -70,10 +71,15 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let emulation =
         emulator.map(|emulator| emulate(options, &emulator, &mut served, &mut processes, &signalled));
     let emulation = emulation.transpose()?;
-    let opened = skin.buses.iter().enumerate().map(|(index, bus)| {
+    let wanted = skin.buses.iter().enumerate().map(|(index, bus)| {
         let receive_filter = ReceiveFilter::of(skin, index, !outputs.is_empty());
-        open(options, bus, receive_filter.filters, &mut served)
+        wanted(options, bus, receive_filter.filters)
     });
+    let wanted: Vec<_> = wanted.collect();
+    let (opened, own) = open_or_serve_all(&wanted, options.vcan_setup.as_deref())?;
+    served.extend(own);
+    let opened = skin.buses.iter().zip(wanted).zip(opened);
+    let opened = opened.map(|((bus, (.., target)), opened)| linked(options, bus, target, opened));
     let opened = opened.collect::<Result<Vec<_>, _>>()?;
     let shared = Arc::new(Shared::default());
     let (tell, bus_event) = mpsc::channel();
@@ -150,13 +156,8 @@ fn emulate(
     Ok(emulation)
 }
 
-/// Opens a bus; an embedded one without a server is served.
-fn open(
-    options: &Options,
-    described: &skin::Bus,
-    filters: Vec<Filter>,
-    served: &mut Vec<ServedBus>,
-) -> Result<(ReceiveEnd, Slot), RunError> {
+/// How a bus is to be opened.
+fn wanted<'a>(options: &Options, described: &'a skin::Bus, filters: Vec<Filter>) -> Wanted<'a> {
     let name = &described.name;
     let target = BusOptions {
         fd: described.format == Format::Fd,
@@ -167,8 +168,17 @@ fn open(
         send_timeout: SEND_TIMEOUT,
         directory: options.directory.clone(),
     };
-    let (bus, own) = open_or_serve(name, options.kinds.of(name), &target, options.vcan_setup.as_deref())?;
-    served.extend(own);
+    (name, options.kinds.of(name), target)
+}
+
+/// The link of a bus that was opened.
+fn linked(
+    options: &Options,
+    described: &skin::Bus,
+    target: BusOptions,
+    bus: Bus,
+) -> Result<(ReceiveEnd, Slot), RunError> {
+    let name = &described.name;
     if described.reply != Reply::Torque && bus.kind() == BusKind::SocketCan && !bus.is_virtual()? {
         return Err(RunError::RealWires(name.clone()));
     }

@@ -5,7 +5,8 @@ use std::fs;
 
 use rustix::time::{ClockId, clock_gettime};
 
-use super::launch::{Processes, ServedBus};
+use super::launch::Processes;
+use super::served::ServedBus;
 use crate::summary::Processor;
 
 /// Processor time of this process so far, in s.
