@@ -19,8 +19,10 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use model::quantiles::Quantiles;
 use paper::arm::Reply;
 use paper::moving::Run;
+use paper::scale::Bench;
 use paper::{Effort, Experiment as Named, Lab, Session, files};
 use protocol::usage::{Failure, print, quoted};
+use serde_json::Value;
 
 use super::arguments::Programs;
 use super::input::stopped;
@@ -35,7 +37,8 @@ use folder::Folder;
 /// its verdict, and the recordings of the benches, all at once when everything is done; nothing is written when it fails
 /// or is interrupted. A folder that is not empty needs --force. `gateway experiment list` lists the experiments.
 ///
-/// The moving arm's benches are 253 processes on an embedded bus of their own. All of it takes about two minutes.
+/// The moving arm's benches are 253 processes on an embedded bus of their own; those of scale have up to 10 000 cells, a
+/// process a bus. All of it takes about five minutes, half of that scale.
 /// Exit code 0: done, whatever the verdicts; 1: something failed, or was ended; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -176,6 +179,12 @@ impl Lab for Here {
             format!("median {:.0}, 99 % {:.0}, max {:.0} µs", late("p50"), late("p99"), late("max"))
         });
         Ok(run)
+    }
+
+    fn scaled(&mut self, bench: &Bench) -> Result<Value, Failure> {
+        let summary = self.benches.scaled(bench);
+        self.go_on()?;
+        summary
     }
 
     fn go_on(&mut self) -> Result<(), Failure> {

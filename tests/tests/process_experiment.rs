@@ -1,4 +1,4 @@
-//! The moving arm's experiments with real processes, in their quick form, and what may go wrong around them.
+//! The experiments with real processes, in their quick form, and what may go wrong around them.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
@@ -50,6 +50,45 @@ fn the_moving_arm_is_run_recorded_drawn_and_rated() {
         assert!(names(&place.path("results")).contains(&name.to_owned()), "{name}");
     }
     assert_eq!(names(&place.path("results")).iter().filter(|name| name.starts_with('.')).count(), 0);
+}
+
+#[test]
+fn benches_over_their_cells_are_run_drawn_and_rated() {
+    let place = Place::new();
+    let ended = place.start("gateway", "experiment scale --quick -o results").end();
+    assert!(ended.status.success(), "{}", ended.stderr);
+    let results: Value = serde_json::from_str(&place.read("results/results.json")).unwrap();
+    let findings = results["experiments"][0]["findings"].as_array().unwrap();
+    let value = |what: &str| {
+        let found = findings.iter().find(|finding| finding["what"].as_str().unwrap().contains(what));
+        found.unwrap_or_else(|| panic!("{what} in {findings:?}"))["ours"]["value"].as_f64().unwrap()
+    };
+    assert!(value("missing for no known reason, 300 cells") <= 0.0);
+    assert!(value("to the first joints") > 0.0 && value("private memory of the gateway") > 0.0);
+    let rows = place.read("results/scale-processor.csv");
+    let rows: Vec<&str> = rows.lines().collect();
+    assert!(
+        rows[0].starts_with("cells,\"all, none active (cores)\",all (cores),gateway (cores)"),
+        "{rows:?}"
+    );
+    assert!(rows.len() == 3 && rows[1].starts_with("24,") && rows[2].starts_with("300,"), "{rows:?}");
+    let summary =
+        |name: &str| -> Value { serde_json::from_str(&place.read(&format!("results/{name}"))).unwrap() };
+    let active = summary("scale-300-on-2-62.5-hz-active.json");
+    assert_eq!(
+        (active["cells"].as_array().unwrap().len(), active["buses"].as_array().unwrap().len()),
+        (300, 2)
+    );
+    // The first cells of each bus, 15 in all.
+    let due = |cell: &&Value| cell["due"].as_u64().unwrap() > 0;
+    assert_eq!(active["cells"].as_array().unwrap().iter().filter(due).count(), 15);
+    assert!(
+        active["gateway_private_kib"].as_u64().unwrap() > 0
+            && active["buses_private_kib"].as_u64().unwrap() > 0
+    );
+    let quiet = summary("scale-300-on-2-62.5-hz-quiet.json");
+    assert_eq!(quiet["cells"].as_array().unwrap().iter().filter(due).count(), 0);
+    assert!(names(&place.path("results")).iter().all(|name| !name.ends_with(".toml")), "skins are not kept");
 }
 
 #[test]

@@ -73,29 +73,10 @@ pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Opt
     let cells: Vec<usize> = (0..=extent.steps).map(|place| step(place).max(min)).collect();
     let active: Vec<usize> = (0..=extent.steps).map(step).collect();
     let parts: Vec<Skin> = cells.iter().map(|&cells| spread(skin, cells)).collect();
-    let over = |numbers: &[usize], ticks: &dyn Fn(usize, Mode) -> Ticks, seed| {
-        let (distributed, central) = (Mode::Distributed, Mode::Compare);
-        let things = (0..numbers.len()).flat_map(|place| [(place, distributed), (place, central)]);
-        let mut loops: Vec<_> = things.map(|(place, mode)| (ticks(place, mode), mode)).collect();
-        let measured = samples::interleaved(loops.len(), extent.rounds, seed, |thing| {
-            let Some((ticks, mode)) = loops.get_mut(thing) else { return f64::NAN };
-            // Once to find code and data in the caches, as after the loop before it.
-            ticks.epoch(now);
-            let took = ticks.epoch(now);
-            if *mode == distributed { took.tick } else { took.central }
-        });
-        let medians = samples::medians(&measured);
-        let pairs = numbers.iter().zip(medians.as_chunks().0);
-        let points: Vec<_> =
-            pairs.map(|(&number, &[tick, central])| [count(number), tick, central]).collect();
-        let line = |place: fn(&[f64; 3]) -> f64| {
-            Line::through_equals(&points.iter().map(|point| (point[0], place(point))).collect::<Vec<_>>())
-        };
-        Some(Over { distributed: line(|point| point[1])?, central: line(|point| point[2])?, points })
-    };
     let of_part = |place: usize, mode| Ticks::new(parts.get(place).unwrap_or(skin), 0, mode);
     let of_touch = |place: usize, mode| Ticks::new(skin, active.get(place).copied().unwrap_or(0), mode);
-    let (cells, active) = (over(&cells, &of_part, 11)?, over(&active, &of_touch, 12)?);
+    let (cells, active) =
+        (over(&cells, extent.rounds, 11, of_part, now)?, over(&active, extent.rounds, 12, of_touch, now)?);
     Some(Distributed {
         cells,
         active,
@@ -103,6 +84,33 @@ pub fn measure(skin: &Skin, extent: Extent, now: impl Fn() -> u64 + Copy) -> Opt
         of: most,
         receiving: receiving(&skin.part_on(0), extent.rounds, now),
     })
+}
+
+/// Ticks of both ways over some numbers; `ticks` makes the loop of one of them, by its place, and of a way.
+pub(super) fn over(
+    numbers: &[usize],
+    rounds: usize,
+    seed: u64,
+    ticks: impl Fn(usize, Mode) -> Ticks,
+    now: impl Fn() -> u64 + Copy,
+) -> Option<Over> {
+    let (distributed, central) = (Mode::Distributed, Mode::Compare);
+    let things = (0..numbers.len()).flat_map(|place| [(place, distributed), (place, central)]);
+    let mut loops: Vec<_> = things.map(|(place, mode)| (ticks(place, mode), mode)).collect();
+    let measured = samples::interleaved(loops.len(), rounds, seed, |thing| {
+        let Some((ticks, mode)) = loops.get_mut(thing) else { return f64::NAN };
+        // Once to find code and data in the caches, as after the loop before it.
+        ticks.epoch(now);
+        let took = ticks.epoch(now);
+        if *mode == distributed { took.tick } else { took.central }
+    });
+    let medians = samples::medians(&measured);
+    let pairs = numbers.iter().zip(medians.as_chunks().0);
+    let points: Vec<_> = pairs.map(|(&number, &[tick, central])| [count(number), tick, central]).collect();
+    let line = |place: fn(&[f64; 3]) -> f64| {
+        Line::through_equals(&points.iter().map(|point| (point[0], place(point))).collect::<Vec<_>>())
+    };
+    Some(Over { distributed: line(|point| point[1])?, central: line(|point| point[2])?, points })
 }
 
 /// Distributed ticks over the first buses of a skin without cells.
@@ -159,7 +167,7 @@ fn receiving(skin: &Skin, rounds: usize, now: impl Fn() -> u64) -> f64 {
 /// The bar: the distributed slope at most so much of the central one.
 const SHARE: f64 = 0.01;
 
-fn of_share(what: &str, over: &Over) -> [Finding; 3] {
+pub(super) fn of_share(what: &str, over: &Over) -> [Finding; 3] {
     let Over { distributed, central, .. } = over;
     [
         Finding::stated(format!("central T_skin for each {what}"), central.slope_in("ns")),

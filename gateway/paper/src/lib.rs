@@ -22,6 +22,7 @@ pub mod load;
 pub mod moving;
 pub mod recorded;
 pub mod samples;
+pub mod scale;
 pub mod sums;
 pub mod ticks;
 pub mod tree;
@@ -30,6 +31,7 @@ use std::fmt;
 use std::str::FromStr;
 
 use protocol::skin::Skin;
+use serde_json::Value;
 
 use analysis::report::figure::Section;
 use arm::Reply;
@@ -58,11 +60,13 @@ pub enum Experiment {
     Kernels,
     /// Bus load.
     Load,
+    /// Whole benches over their cells.
+    Scale,
 }
 
 impl Experiment {
     /// All of them, in the order of a page.
-    pub const ALL: [Self; 10] = [
+    pub const ALL: [Self; 11] = [
         Self::Fig6,
         Self::Fig7,
         Self::Fig8,
@@ -73,6 +77,7 @@ impl Experiment {
         Self::Sine,
         Self::Kernels,
         Self::Load,
+        Self::Scale,
     ];
 
     /// Its name, what it does, and how long it takes about, in s: quick and in full.
@@ -106,6 +111,11 @@ impl Experiment {
             Self::Sine => ("sine", "error of the 16-bit sines over the whole circle", [1, 1]),
             Self::Kernels => ("kernels", "operations of one cell's Jacobian, by both kernels", [1, 1]),
             Self::Load => ("load", "bus load over cells for common bit rates", [1, 1]),
+            Self::Scale => (
+                "scale",
+                "whole benches of 253 to 10 000 cells: start, processor, memory, ticks, lateness, replies in time",
+                [8, 150],
+            ),
         }
     }
 
@@ -172,6 +182,12 @@ pub trait Lab {
     /// # Errors
     /// When it did not come to its end, or was not recorded whole.
     fn bench(&mut self, reply: Reply, effort: Effort) -> Result<Run, Self::Error>;
+
+    /// Runs a bench of so many cells; its summary as JSON, whatever came of it.
+    ///
+    /// # Errors
+    /// When it did not begin.
+    fn scaled(&mut self, bench: &scale::Bench) -> Result<Value, Self::Error>;
 
     /// Whether to go on; asked between two measurements.
     ///
@@ -244,6 +260,7 @@ impl Session {
                 arithmetic::kernels_section(&arm.robot.name, &arithmetic::Costs::of(&arm))
             }
             Experiment::Load => load::section(),
+            Experiment::Scale => scale::section(&scale::measure(lab, self.effort)?),
         })
     }
 

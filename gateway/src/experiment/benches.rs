@@ -1,4 +1,4 @@
-//! The moving arm's benches: this program again, as from a shell.
+//! The benches of experiments: this program again, as from a shell.
 
 use std::fs;
 use std::io;
@@ -10,10 +10,13 @@ use std::time::Duration;
 
 use paper::arm::{self, Reply};
 use paper::moving::Run;
+use paper::scale::Bench;
 use paper::{Effort, recorded};
+use protocol::id::CellId;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use rustix::process::{Pid, Signal, kill_process};
+use serde_json::Value;
 use trace::files::write_whole;
 
 use crate::arguments::Programs;
@@ -32,60 +35,96 @@ pub(super) struct Benches {
 /// How often it is looked whether a bench has ended.
 const LOOK: Duration = Duration::from_millis(50);
 
+/// What one run takes and gives.
+struct Files {
+    skin: PathBuf,
+    scenario: PathBuf,
+    summary: PathBuf,
+    recording: Option<PathBuf>,
+}
+
 impl Benches {
     /// Runs `gateway run` on the arm and reads what it recorded.
     pub(super) fn run(&self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
         let name = arm::name(reply);
+        let what = format!("the bench of the moving arm ({name})");
         let file = |end: &str| self.folder.join(format!("arm-{name}{end}"));
-        let failed = |path: &Path, error: &dyn std::fmt::Display| {
-            Failure::run(format!("the bench of the moving arm ({name}): {}: {error}", path.display()))
+        let recording = file(".mcap");
+        let files = Files {
+            skin: file(".toml"),
+            scenario: self.folder.join("arm-touches.toml"),
+            summary: file(".json"),
+            recording: Some(recording.clone()),
         };
         let text = arm::skin(reply, effort);
-        let [skin, scenario, recording, summary] =
-            [file(".toml"), self.folder.join("arm-touches.toml"), file(".mcap"), file(".json")];
-        for (path, text) in [(&skin, text.as_str()), (&scenario, arm::scenario(effort))] {
-            write_whole(path, text, true).map_err(|error| failed(path, &error))?;
-        }
-        let own = std::env::current_exe().map_err(|error| failed(Path::new("gateway"), &error))?;
+        let texts = [text.as_str(), arm::scenario(effort)];
         let buses = buses::directory("experiment")?;
+        let ended = self.perform(&what, &files, texts, self.programs.cells_per_process, buses.path())?;
+        if !ended.status.success() {
+            return Err(failed(&what, &last_words(&ended)));
+        }
+        let rows = recorded::read(&recording).map_err(|error| at(&what, &recording, &error))?;
+        let summary = read_summary(&what, &files.summary)?;
+        let joints = Skin::parse("the arm's skin", &text).map_err(Failure::run)?.robot.joints.len();
+        if rows.is_empty() {
+            return Err(at(&what, &recording, &"it has no ticks"));
+        }
+        Ok(Run { rows, summary, joints })
+    }
+
+    /// Runs `gateway run` on a bench of so many cells, each bus' cells in one process, and reads its summary; one that
+    /// failed or was halted has a summary too.
+    pub(super) fn scaled(&self, bench: &Bench) -> Result<Value, Failure> {
+        let what = format!("the bench of {} cells ({})", bench.cells, bench.name());
+        let buses = buses::directory("experiment")?;
+        // What can be generated again is not kept.
+        let files = Files {
+            skin: buses.path().join("skin.toml"),
+            scenario: buses.path().join("scenario.toml"),
+            summary: self.folder.join(format!("{}.json", bench.name())),
+            recording: None,
+        };
+        let texts = [bench.skin(), bench.scenario()];
+        let texts = texts.each_ref().map(String::as_str);
+        let ended = self.perform(&what, &files, texts, CellId::MAX.get(), buses.path())?;
+        if files.summary.exists() {
+            read_summary(&what, &files.summary)
+        } else {
+            Err(failed(&what, &last_words(&ended)))
+        }
+    }
+
+    /// Writes the files of a run, and runs it to its end on embedded buses in a directory.
+    fn perform(
+        &self,
+        what: &str,
+        files: &Files,
+        texts: [&str; 2],
+        cells_per_process: u8,
+        buses: &Path,
+    ) -> Result<Output, Failure> {
+        for (path, text) in [&files.skin, &files.scenario].into_iter().zip(texts) {
+            write_whole(path, text, true).map_err(|error| at(what, path, &error))?;
+        }
+        let own = std::env::current_exe().map_err(|error| at(what, Path::new("gateway"), &error))?;
         let mut command = Command::new(&own);
-        command.arg("run").arg(&skin).arg("--scenario").arg(&scenario).arg("--record").arg(&recording);
-        command.arg("--summary").arg(&summary).args(["--bus-kind", "embedded", "--quiet"]);
-        let Programs { cells_per_process, cell_node, vcan_setup } = &self.programs;
+        command.arg("run").arg(&files.skin).arg("--scenario").arg(&files.scenario);
+        command.arg("--summary").arg(&files.summary).args(["--bus-kind", "embedded", "--quiet"]);
         command.arg("--cells-per-process").arg(cells_per_process.to_string());
-        for (option, path) in [("--cell-node", cell_node), ("--vcan-setup", vcan_setup)] {
+        let Programs { cells_per_process: _, cell_node, vcan_setup } = &self.programs;
+        for (option, path) in [
+            ("--record", files.recording.as_ref()),
+            ("--cell-node", cell_node.as_ref()),
+            ("--vcan-setup", vcan_setup.as_ref()),
+        ] {
             if let Some(path) = path {
                 command.arg(option).arg(path);
             }
         }
-        command
-            .env("SKINBUS_DIR", buses.path())
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(Stdio::piped());
-        let ended = self.wait(command).map_err(|error| failed(&own, &error))?;
-        if !ended.status.success() {
-            let said = String::from_utf8_lossy(&ended.stderr);
-            let last = said.trim_end().lines().last().unwrap_or("it printed nothing").to_owned();
-            let last = last.strip_prefix("gateway: ").unwrap_or(&last);
-            return Err(Failure::run(format!("the bench of the moving arm ({name}): {last}")));
-        }
-        let rows = recorded::read(&recording).map_err(|error| failed(&recording, &error))?;
-        let text = fs::read_to_string(&summary).map_err(|error| failed(&summary, &error))?;
-        let summary = serde_json::from_str(&text).map_err(|error| failed(&summary, &error))?;
-        let joints = Skin::parse("the arm's skin", &arm::skin(reply, effort))
-            .map_err(Failure::run)?
-            .robot
-            .joints
-            .len();
-        if rows.is_empty() {
-            return Err(failed(&recording, &"it has no ticks"));
-        }
-        Ok(Run { rows, summary, joints })
+        command.env("SKINBUS_DIR", buses).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
+        self.wait(command).map_err(|error| at(what, &own, &error))
     }
-}
 
-impl Benches {
     /// Waits for the bench's end, which a signal makes early.
     fn wait(&self, mut command: Command) -> io::Result<Output> {
         let mut child = command.spawn()?;
@@ -100,4 +139,24 @@ impl Benches {
         }
         child.wait_with_output()
     }
+}
+
+fn failed(what: &str, error: &dyn std::fmt::Display) -> Failure {
+    Failure::run(format!("{what}: {error}"))
+}
+
+fn at(what: &str, path: &Path, error: &dyn std::fmt::Display) -> Failure {
+    failed(what, &format_args!("{}: {error}", path.display()))
+}
+
+/// The last that a run said.
+fn last_words(ended: &Output) -> String {
+    let said = String::from_utf8_lossy(&ended.stderr);
+    let last = said.trim_end().lines().last().unwrap_or("it printed nothing").to_owned();
+    last.strip_prefix("gateway: ").map(str::to_owned).unwrap_or(last)
+}
+
+fn read_summary(what: &str, path: &Path) -> Result<Value, Failure> {
+    let text = fs::read_to_string(path).map_err(|error| at(what, path, &error))?;
+    serde_json::from_str(&text).map_err(|error| at(what, path, &error))
 }

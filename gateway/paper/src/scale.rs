@@ -1,0 +1,284 @@
+//! A bench over its cells, up to ten thousand: how long it takes to start, what it costs, how late its loop is, and which
+//! replies come in time at the highest rate that holds.
+//!
+//! Each number of cells lies on as few buses as have node ids for it, and each bus' cells are one process. A rate holds
+//! when [`HOLDS`] of the replies of [`ACTIVE`] of the cells come in time and nothing is lost without a reason.
+
+mod section;
+
+use std::fmt::Write;
+
+use protocol::id::CellId;
+use serde_json::Value;
+
+use super::distributed::{Over, over};
+use super::line::count;
+use super::ticks::{self, Ticks, spread};
+use super::{Effort, Lab};
+use model::generate::{Target, generate};
+use model::scenario::Mode;
+
+pub use section::section;
+
+/// The share of cells that are touched.
+const ACTIVE: f64 = 0.05;
+/// The share of replies that has to be in time.
+const HOLDS: f64 = 0.99;
+/// The force on a touched cell, in N.
+const TOUCH_N: f64 = 0.5;
+/// Cells of the smallest bench of a full measurement: those of the paper's arm.
+const PAPER: usize = 253;
+
+/// One bench.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Bench {
+    /// Its cells.
+    pub cells: usize,
+    /// Its buses.
+    pub buses: usize,
+    /// Joint broadcasts in a second.
+    pub hz: f64,
+    /// Whether [`ACTIVE`] of its cells are touched.
+    pub active: bool,
+    /// How long it runs.
+    pub seconds: f64,
+}
+
+impl Bench {
+    /// What its files are called.
+    #[must_use]
+    pub fn name(&self) -> String {
+        let Self { cells, buses, hz, active, seconds: _ } = self;
+        format!("scale-{cells}-on-{buses}-{hz}-hz-{}", if *active { "active" } else { "quiet" })
+    }
+
+    /// Its `skin.toml`.
+    ///
+    /// # Panics
+    /// Never: so many cells fit.
+    #[must_use]
+    pub fn skin(&self) -> String {
+        let Self { cells, buses, hz, .. } = *self;
+        let target = Target { cells, buses, broadcast_hz: hz, ..Target::default() };
+        generate(&target).expect("so many cells fit on the arm")
+    }
+
+    /// Its `scenario.toml`: the touched cells are the first ones of each bus, the same number on all (to one).
+    #[must_use]
+    pub fn scenario(&self) -> String {
+        let mut text = format!(
+            "duration_s = {:?}\n\n[motion]\nkind = \"kinesthetic\"\n\n[[mode]]\nat_s = 0.0\nkind = \"distributed\"\n",
+            self.seconds
+        );
+        let touched = if self.active { share(self.cells) } else { 0 };
+        for bus in 0..self.buses {
+            let here = touched / self.buses + usize::from(bus < touched % self.buses);
+            if here > 0 {
+                let nodes: Vec<_> = (1..=here).map(|node| node.to_string()).collect();
+                let nodes = nodes.join(", ");
+                let _ = write!(
+                    text,
+                    "\n[[touch]]\nbus = \"vcan{bus}\"\ncells = [{nodes}]\nforce_n = {TOUCH_N:?}\n"
+                );
+            }
+        }
+        text
+    }
+}
+
+/// How many of so many cells are touched.
+const fn share(cells: usize) -> usize {
+    cells.div_ceil(20)
+}
+
+/// What a bench's summary says.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Figures {
+    /// From its start to the first joints, in s.
+    pub start_s: f64,
+    /// Processor of the gateway, the buses and the cells, in cores.
+    pub cores: [f64; 3],
+    /// Memory of the gateway, of all that serves buses, and of the largest process of cells, in MB.
+    pub memory_mb: [f64; 3],
+    /// The median of a tick that computes nothing centrally, in µs.
+    pub tick_us: f64,
+    /// How late 99 % of the ticks begin at most, in µs, and an idle thread's.
+    pub late_us: [f64; 2],
+    /// Replies that were due.
+    pub due: f64,
+    /// Those that came before the next joints.
+    pub in_time: f64,
+    /// Replies and packets that are missing for no known reason.
+    pub unknown: f64,
+    /// Whether the run came to its end with the robot moving.
+    pub done: bool,
+}
+
+impl Figures {
+    /// Reads a summary (`bench::summary::Summary` as JSON).
+    #[must_use]
+    pub fn of(summary: &Value) -> Self {
+        let figure = |keys: &[&str]| {
+            let value = keys.iter().try_fold(summary, |value, key| value.get(key));
+            value.and_then(Value::as_f64).unwrap_or(f64::NAN)
+        };
+        let buses = summary.get("buses").and_then(Value::as_array);
+        let over_buses = |key: &str, what: &str| {
+            let of_bus = |bus: &Value| bus.get(key)?.get(what)?.as_f64();
+            buses.into_iter().flatten().filter_map(of_bus).sum::<f64>()
+        };
+        let megabytes = |key| figure(&[key]) * 1_024.0 * 1e-6;
+        Self {
+            start_s: figure(&["first_broadcast_s"]),
+            cores: ["gateway", "buses", "cells"].map(|part| figure(&["processor", part])),
+            memory_mb: ["gateway_private_kib", "buses_private_kib", "cell_private_kib"].map(megabytes),
+            tick_us: figure(&["loop", "took_distributed_us", "p50"]),
+            late_us: ["late_us", "idle_late_us"].map(|late| figure(&["loop", late, "p99"])),
+            due: over_buses("replies", "due"),
+            in_time: over_buses("replies", "in_time"),
+            unknown: over_buses("replies", "unknown") + over_buses("uplink", "unknown"),
+            done: summary.get("outcome").and_then(Value::as_str) == Some("done"),
+        }
+    }
+
+    /// The share of due replies that came in time.
+    #[must_use]
+    pub fn share(&self) -> f64 {
+        if self.due > 0.0 { self.in_time / self.due } else { f64::NAN }
+    }
+
+    /// Whether its rate holds.
+    fn holds(&self) -> bool {
+        self.done && self.share() >= HOLDS && self.unknown <= 0.0
+    }
+}
+
+/// One number of cells, at the highest rate that holds, or else at the lowest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Size {
+    /// Cells.
+    pub cells: usize,
+    /// Buses.
+    pub buses: usize,
+    /// Joint broadcasts in a second.
+    pub hz: f64,
+    /// Whether that rate holds.
+    pub holds: bool,
+    /// With no cell touched.
+    pub quiet: Figures,
+    /// With [`ACTIVE`] of them touched.
+    pub active: Figures,
+}
+
+/// Ticks without threads, in ns: of the fewest cells, of them on as many buses as the most, and of the most.
+pub type Beside = [f64; 3];
+
+/// All that is measured.
+#[derive(Clone, Debug)]
+pub struct Scale {
+    /// By number of cells.
+    pub sizes: Vec<Size>,
+    /// Ticks over cells, all active, on as many buses as the most of them need.
+    pub ticks: Over,
+    /// Ticks beside each other, all cells active.
+    pub beside: Beside,
+}
+
+/// How much is measured.
+#[derive(Clone, Copy, Debug)]
+struct Extent {
+    /// Numbers of cells, from the fewest to the most.
+    cells: &'static [usize],
+    /// Rates, the highest first.
+    rates: &'static [f64],
+    /// How long a bench runs, in s.
+    seconds: f64,
+    /// Numbers of cells in ticks without threads, beside one on each bus.
+    steps: usize,
+    /// How often their ticks are measured.
+    rounds: usize,
+}
+
+const FULL: Extent = Extent {
+    cells: &[PAPER, 2 * PAPER, 4 * PAPER, 10 * PAPER, 20 * PAPER, 10_000],
+    rates: &[62.5, 31.25, 15.625],
+    seconds: 5.0,
+    steps: 10,
+    rounds: 100,
+};
+
+const QUICK: Extent = Extent { cells: &[24, 300], rates: &[62.5], seconds: 1.0, steps: 4, rounds: 5 };
+
+/// Measures everything.
+///
+/// # Errors
+/// Those of the lab.
+///
+/// # Panics
+/// Never: skins that are generated here fit, and laws have points enough.
+pub fn measure<L: Lab>(lab: &mut L, effort: Effort) -> Result<Scale, L::Error> {
+    let extent = match effort {
+        Effort::Quick => QUICK,
+        Effort::Full => FULL,
+    };
+    let mut sizes = Vec::new();
+    for &cells in extent.cells {
+        sizes.push(size(lab, cells, extent)?);
+    }
+    lab.go_on()?;
+    let (fewest, most) = (extent.cells.first().copied(), extent.cells.last().copied());
+    let (ticks, beside) = loops(fewest.unwrap_or(1), most.unwrap_or(1), extent, || lab.now());
+    Ok(Scale { sizes, ticks, beside })
+}
+
+/// Finds the highest rate at which so many cells hold, and measures them at it.
+fn size<L: Lab>(lab: &mut L, cells: usize, extent: Extent) -> Result<Size, L::Error> {
+    let buses = cells.div_ceil(CellId::COUNT);
+    let of = |hz, active| Bench { cells, buses, hz, active, seconds: extent.seconds };
+    let (mut hz, mut active) = (f64::NAN, Figures::default());
+    for &rate in extent.rates {
+        lab.go_on()?;
+        hz = rate;
+        active = Figures::of(&lab.scaled(&of(hz, true))?);
+        if active.holds() {
+            break;
+        }
+    }
+    lab.go_on()?;
+    let quiet = Figures::of(&lab.scaled(&of(hz, false))?);
+    Ok(Size { cells, buses, hz, holds: active.holds(), quiet, active })
+}
+
+/// Ticks without threads: over cells, and three of them beside each other.
+fn loops(fewest: usize, most: usize, extent: Extent, now: impl Fn() -> u64 + Copy) -> (Over, Beside) {
+    let skin = |cells, buses| ticks::skin(cells, buses).expect("so many cells fit on the arm");
+    let buses = most.div_ceil(CellId::COUNT);
+    let large = skin(most, buses);
+    // A bus without cells has no robot to compute, so that there is one cell at least on each.
+    let numbers: Vec<usize> =
+        (0..=extent.steps).map(|step| (most * step / extent.steps).max(buses)).collect();
+    let parts: Vec<_> = numbers.iter().map(|&cells| spread(&large, cells)).collect();
+    let all_active = |place: usize, mode| {
+        let part = parts.get(place).unwrap_or(&large);
+        Ticks::new(part, part.cells.len(), mode)
+    };
+    let over = over(&numbers, extent.rounds, 14, all_active, now).expect("more than two numbers of cells");
+    let few = skin(fewest, fewest.div_ceil(CellId::COUNT));
+    let skins = [&few, &spread(&large, fewest.max(buses)), &large];
+    let mut loops = skins.map(|skin| Ticks::new(skin, skin.cells.len(), Mode::Distributed));
+    let measured = super::samples::interleaved(loops.len(), extent.rounds, 15, |thing| {
+        let Some(ticks) = loops.get_mut(thing) else { return f64::NAN };
+        ticks.epoch(now);
+        ticks.epoch(now).tick
+    });
+    let medians = super::samples::medians(&measured);
+    (over, std::array::from_fn(|place| medians.get(place).copied().unwrap_or(f64::NAN)))
+}
+
+/// A count of cells on an axis.
+fn cells_of(size: &Size) -> f64 {
+    count(size.cells)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,192 @@
+//! The section of a page about benches over their cells.
+
+use super::{ACTIVE, Figures, HOLDS, Scale, Size, cells_of};
+use crate::distributed::{self, Over};
+use analysis::report::figure::{Axis, Figure, Finding, Section, Shape, Table, number};
+
+/// The bars: of the start in s, of the gateway's memory in MB, and of the distributed tick beside that of the fewest
+/// cells, on their own buses and on as many as the most have.
+const START_S: f64 = 10.0;
+const MEMORY_MB: f64 = 200.0;
+const TICK: f64 = 4.0;
+const TICK_ON_AS_MANY: f64 = 1.2;
+
+/// What was measured, drawn and rated.
+#[must_use]
+pub fn section(measured: &Scale) -> Section {
+    let Scale { sizes, ticks, beside } = measured;
+    let most = sizes.last();
+    Section::new("scale", "A bench over its cells")
+        .text(format!(
+            "Whole benches on embedded buses, as few as have node ids for the cells, the cells of a bus in one process: first \
+             with {} % of the cells touched, at half the rate where fewer than {} % of the replies come in time, and once more \
+             at half of that; then with none touched, at the same rate.",
+            ACTIVE * 100.0,
+            HOLDS * 100.0
+        ))
+        .text(
+            "A tick of a bench is the median of those that computed nothing centrally. Ticks over cells are those of a loop \
+             without threads, with every cell active, on as many buses for all numbers of cells; the central computation is \
+             timed in the same rounds.",
+        )
+        .figures(of_benches(sizes))
+        .figures([over_cells(ticks)])
+        .findings(most.map(of_most).into_iter().flatten())
+        .findings(of_ticks(sizes, beside))
+        .findings(distributed::of_share("active cell", ticks))
+        .tables([table(sizes)])
+}
+
+/// A figure of benches over their cells, in a series for each pair of a caption and a value.
+fn drawn<const N: usize>(
+    (name, title): (&str, &str),
+    y: Axis,
+    sizes: &[Size],
+    series: [(&str, fn(&Size) -> f64); N],
+) -> Figure {
+    let figure = Figure::new(format!("scale-{name}"), title, Axis::new("cells", ""), y).half();
+    series.into_iter().fold(figure, |figure, (caption, value)| {
+        let points = sizes.iter().map(|size| (cells_of(size), value(size)));
+        figure.draw(caption, Shape::Line, points.collect())
+    })
+}
+
+fn of_benches(sizes: &[Size]) -> [Figure; 7] {
+    [
+        drawn(
+            ("start", "From the start to the first joints"),
+            Axis::new("time", "s"),
+            sizes,
+            [("none active", |size| size.quiet.start_s), ("5 % active", |size| size.active.start_s)],
+        ),
+        drawn(
+            ("processor", "Processor, 5 % active"),
+            Axis::new("processor", "cores"),
+            sizes,
+            [
+                ("all, none active", |size| size.quiet.cores.iter().sum()),
+                ("all", |size| size.active.cores.iter().sum()),
+                ("gateway", |size| size.active.cores[0]),
+                ("buses", |size| size.active.cores[1]),
+                ("cells", |size| size.active.cores[2]),
+            ],
+        ),
+        drawn(
+            ("memory", "Private memory, 5 % active"),
+            Axis::new("memory", "MB"),
+            sizes,
+            [
+                ("gateway", |size| size.active.memory_mb[0]),
+                ("all that serves buses", |size| size.active.memory_mb[1]),
+                ("the largest process of cells", |size| size.active.memory_mb[2]),
+            ],
+        ),
+        drawn(
+            ("tick", "Median of the distributed tick"),
+            Axis::new("time in a tick", "µs"),
+            sizes,
+            [("none active", |size| size.quiet.tick_us), ("5 % active", |size| size.active.tick_us)],
+        ),
+        drawn(
+            ("late", "Lateness of 99 % of the ticks"),
+            Axis::new("late by at most", "µs"),
+            sizes,
+            [
+                ("none active", |size| size.quiet.late_us[0]),
+                ("5 % active", |size| size.active.late_us[0]),
+                ("an idle thread", |size| size.quiet.late_us[1]),
+            ],
+        ),
+        drawn(
+            ("replies", "Replies in time, 5 % active, at the highest rate that holds"),
+            Axis::new("replies in time", "%").between(0.0, 100.0),
+            sizes,
+            [("", |size| size.active.share() * 100.0)],
+        ),
+        drawn(
+            ("rate", "The highest rate that holds, or the lowest tried"),
+            Axis::new("rate", "Hz"),
+            sizes,
+            [("", |size| size.hz)],
+        ),
+    ]
+}
+
+fn over_cells(over: &Over) -> Figure {
+    let micros = |place: fn(&[f64; 3]) -> f64| {
+        over.points.iter().map(|point| (point[0], place(point) * 1e-3)).collect::<Vec<_>>()
+    };
+    let title = "Ticks over cells, all active, on as many buses";
+    Figure::new("scale-loop", title, Axis::new("cells", ""), Axis::new("time in a tick", "µs").log())
+        .draw("central T_skin", Shape::Points, micros(|point| point[2]))
+        .draw("distributed: the whole tick", Shape::Points, micros(|point| point[1]))
+}
+
+/// What is asked of the bench with the most cells.
+fn of_most(size: &Size) -> Vec<Finding> {
+    let Size { cells, hz, holds, quiet, active, .. } = size;
+    let of = |what: &str| format!("{what}, {cells} cells");
+    let Figures { start_s, memory_mb, .. } = active;
+    let at = format!("replies in time at {} Hz, 5 % active", number(*hz));
+    let bar = format!("at least {} %, none unknown", HOLDS * 100.0);
+    vec![
+        Finding::stated(of("from the start to the first joints"), (*start_s, "s")).at_most(START_S),
+        Finding::stated(of(&at), (active.share() * 100.0, "%")).must(bar, *holds),
+        Finding::stated(
+            of("replies and packets missing for no known reason"),
+            active.unknown + quiet.unknown,
+        )
+        .at_most(0.0),
+        Finding::stated(of("private memory of the gateway"), (memory_mb[0], "MB")).at_most(MEMORY_MB),
+        Finding::stated(of("processor, none active"), (quiet.cores.iter().sum::<f64>(), "cores")),
+        Finding::stated(of("processor, 5 % active"), (active.cores.iter().sum::<f64>(), "cores")),
+    ]
+}
+
+/// The tick of the most cells beside that of the fewest.
+fn of_ticks(sizes: &[Size], [few, few_on_as_many, most]: &[f64; 3]) -> Vec<Finding> {
+    let (Some(fewest), Some(largest)) = (sizes.first(), sizes.last()) else { return Vec::new() };
+    let (cells, buses, fewest_cells) = (largest.cells, largest.buses, fewest.cells);
+    let beside = |what: &str| format!("distributed tick of {cells} cells by that of {fewest_cells}{what}");
+    vec![
+        Finding::stated(beside(", without threads, all active"), most / few).at_most(TICK),
+        Finding::stated(beside(&format!(" on {buses} buses too, the same way")), most / few_on_as_many)
+            .at_most(TICK_ON_AS_MANY),
+        Finding::stated(
+            beside(", medians of benches, 5 % active"),
+            largest.active.tick_us / fewest.active.tick_us,
+        ),
+    ]
+}
+
+fn table(sizes: &[Size]) -> Table {
+    let row = |size: &Size| {
+        let Size { cells, buses, hz, holds, quiet, active } = size;
+        let both =
+            |value: fn(&Figures) -> f64| format!("{}; {}", number(value(quiet)), number(value(active)));
+        [
+            cells.to_string(),
+            buses.to_string(),
+            format!("{}{}", number(*hz), if *holds { "" } else { " (does not hold)" }),
+            both(|figures| figures.start_s),
+            both(|figures| figures.cores.iter().sum()),
+            both(|figures| figures.memory_mb[0]),
+            both(|figures| figures.tick_us),
+            both(|figures| figures.late_us[0]),
+            format!("{} of {}", active.in_time, active.due),
+        ]
+    };
+    let head = [
+        "cells",
+        "buses",
+        "rate, Hz",
+        "start, s",
+        "processor, cores",
+        "gateway, MB",
+        "tick, µs",
+        "99 % of ticks late by, µs",
+        "replies in time, 5 % active",
+    ];
+    let title = "Benches over their cells; of two numbers the first with none active, the second with 5 %";
+    Table::new(title, head, sizes.iter().map(row))
+}
