@@ -2,6 +2,7 @@
 
 pub mod doctor;
 pub mod embedded;
+pub mod hosts;
 pub mod kernel;
 pub mod link;
 pub mod look;

@@ -174,7 +174,8 @@ pub struct Processor {
     pub buses: f64,
 }
 
-/// Packets from the cells: sent = delivered + rejected + unheard + lost, and lost = dropped + backlog + outage + unknown.
+/// Packets from the cells: sent = delivered + rejected + unheard + lost, and lost = dropped + backlog + outage + hosts
+/// + unknown.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct UplinkSummary {
     /// Sent, by the cells' own count, as of their last heartbeats.
@@ -191,6 +192,8 @@ pub struct UplinkSummary {
     pub backlog: u64,
     /// Sent and not arrived, while the bus was lost.
     pub outage: u64,
+    /// Sent and not arrived, explained by frames that were lost between hosts.
+    pub hosts: u64,
     /// Sent and not arrived, for an unknown reason.
     pub unknown: u64,
     /// Arrived more often than sent.
@@ -207,6 +210,13 @@ pub struct UplinkSummary {
 }
 
 impl UplinkSummary {
+    /// Attributes unknown losses to links between hosts, at most so many.
+    pub fn explain_by_hosts(&mut self, at_most: u64) {
+        let explained = self.unknown.min(at_most);
+        self.unknown -= explained;
+        self.hosts += explained;
+    }
+
     /// Attributes unknown losses to the kernel's backlog, at most so many; how many.
     pub fn explain_by_backlog(&mut self, at_most: u64) -> u64 {
         let explained = self.unknown.min(at_most);
@@ -239,6 +249,23 @@ pub struct OutagesSummary {
     pub at_end: bool,
     /// Ticks without it.
     pub ticks: u64,
+}
+
+/// Another host that has the bus too.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct HostSummary {
+    /// Cells that sent from there.
+    pub cells: usize,
+    /// How often it was gone, or not reached.
+    pub gone: u64,
+    /// For how long in total, in s.
+    pub gone_s: f64,
+    /// Whether it was reached at the end.
+    pub at_end: bool,
+    /// Frames from there that did not get here.
+    pub lost_from: u64,
+    /// Frames from here that did not get there, as it reports.
+    pub lost_to: u64,
 }
 
 /// The network of a bus' cells.
@@ -286,6 +313,8 @@ pub struct BusSummary {
     pub receive_buffer: usize,
     /// How often it was lost.
     pub outages: OutagesSummary,
+    /// Other hosts, by name, that `vcan-setup link` joins it with.
+    pub hosts: BTreeMap<String, HostSummary>,
     /// Cells by status at the end.
     pub cells: BTreeMap<&'static str, usize>,
     /// Cells that were dead or were never received at the end.
@@ -353,6 +382,7 @@ impl BusSummary {
             kind: kind.to_owned(),
             receive_buffer,
             outages: OutagesSummary::default(),
+            hosts: BTreeMap::new(),
             cells,
             silent_cells,
             uplink: uplink(table, dropped),
@@ -399,6 +429,7 @@ fn uplink(table: &Table, dropped_by_bus: u64) -> UplinkSummary {
         dropped,
         backlog: 0,
         outage: total.outage,
+        hosts: 0,
         unknown: unexplained - dropped,
         surplus: total.surplus,
         outsiders: total.outsiders,

@@ -111,6 +111,17 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
         let ticks = format!("{} ticks without it", bus.outages.ticks);
         rows.row("lost", format!("{} times, {:.1} s{end}", bus.outages.times, bus.outages.lost_s), ticks);
     }
+    for (host, it) in &bus.hosts {
+        let gone =
+            (it.gone > 0).then(|| format!("gone {}, {:.1} s", count(it.gone as usize, "time"), it.gone_s));
+        let end = (!it.at_end).then(|| "not reached at the end".to_owned());
+        let lost = list(
+            [(it.lost_from, "from there"), (it.lost_to, "to there")]
+                .map(|(n, way)| format!("{n} frames lost {way}")),
+        );
+        let cells = count(it.cells, "cell");
+        rows.row(format!("host {host}"), list([cells].into_iter().chain(gone).chain(end)), lost);
+    }
     if !bus.silent_cells.is_empty() {
         rows.row("silent cells", words(&bus.silent_cells), "");
     }
@@ -205,7 +216,7 @@ fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
 
 fn frames(rows: &mut Rows, bus: &BusSummary) {
     let up = &bus.uplink;
-    let lost = up.dropped + up.backlog + up.outage + up.unknown;
+    let lost = up.dropped + up.backlog + up.outage + up.hosts + up.unknown;
     rows.row("packets sent by cells", up.sent, "by their own count");
     rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
     rows.any("  for other cells", up.unheard, "sums that the gateway does not take");
@@ -213,6 +224,7 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
         (up.dropped, "dropped by the bus"),
         (up.backlog, "by the kernel's backlog"),
         (up.outage, "with the bus"),
+        (up.hosts, "between hosts"),
     ];
     rows.row("  lost", lost, explained(&reasons, up.unknown));
     rows.any("  surplus", up.surplus, "");

@@ -17,6 +17,9 @@ use protocol::slcan::{self, Decoder, Line};
 use protocol::time::Micros;
 use protocol::wire_time::BitRates;
 
+use vcan_setup::hosts::incoming::{self, Incoming};
+use vcan_setup::hosts::message;
+
 use super::{frame, packet as any_packet};
 
 /// What is read as a packet is written as the same bytes, and what is read as a message as the same packet.
@@ -97,6 +100,38 @@ pub(super) fn slcan(data: &[u8]) {
     }
     if let Ok(frame) = frame(&mut Unstructured::new(data)) {
         again(&frame);
+    }
+}
+
+/// Messages of two hosts: all their frames are accounted for, whatever they say of themselves.
+pub(super) fn hosts(data: &[u8]) {
+    let mut from = Unstructured::new(data);
+    let (mut incoming, mut frames, mut bytes) = (Incoming::default(), Vec::new(), Vec::new());
+    let mut waiting = 0;
+    while let Ok(length @ 1..) = from.int_in_range(0..=600_usize).map(|length| length.min(from.len())) {
+        let Ok(message) = from.bytes(length) else { break };
+        let host = if length % 2 == 0 { "b" } else { "c" };
+        frames.clear();
+        if let Ok(head) = message::decode(message, &mut frames) {
+            message::encode(&head, &frames, &mut bytes);
+            let mut again = Vec::new();
+            assert_eq!(message::decode(&bytes, &mut again), Ok(head));
+            assert_eq!(again, frames);
+        }
+        assert_eq!(incoming.take(host, message).is_ok(), message::decode(message, &mut frames).is_ok());
+        waiting = waiting.max(incoming.waiting().len());
+        if from.arbitrary().unwrap_or(false) {
+            incoming.sent(from.int_in_range(0..=9).unwrap_or(0));
+        } else {
+            incoming.refused(from.int_in_range(0..=9).unwrap_or(0));
+        }
+    }
+    assert!(waiting <= incoming::QUEUE);
+    let left = incoming.waiting().len();
+    incoming.sent(left);
+    for (_, it, _) in incoming.accounts() {
+        assert_eq!(it.numbered, it.before + it.dropped_there + it.lost + it.taken);
+        assert!(it.taken >= it.sent + it.dropped_here + it.refused);
     }
 }
 

@@ -25,6 +25,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("packet", frames::packet),
     ("reassembly", frames::reassembly),
     ("slcan", frames::slcan),
+    ("hosts", frames::hosts),
     ("decoder", frames::decoder),
     ("shadow", frames::shadow),
     ("candump", files::candump),

@@ -75,7 +75,7 @@ impl Summary {
             let missing: u64 = missing.map(|count| count.as_u64().unwrap()).sum();
             assert_eq!(missing, replies - of("/replies/in_time") - of("/replies/late"), "{:#}", self.0);
             let arrived = of("/uplink/delivered") + of("/uplink/rejected") + of("/uplink/unheard");
-            let reasons = ["dropped", "backlog", "outage", "unknown"];
+            let reasons = ["dropped", "backlog", "outage", "hosts", "unknown"];
             let lost: u64 = reasons.map(|reason| of(&format!("/uplink/{reason}"))).iter().sum();
             assert_eq!(of("/uplink/sent") + of("/uplink/surplus"), arrived + lost, "{:#}", self.0);
             assert_eq!((of("/replies/unknown"), of("/uplink/unknown")), (0, 0), "{:#}", self.0);

@@ -2,6 +2,8 @@
 //! 1 (it failed, or this machine does not allow it) and 2 (wrong use or configuration).
 
 mod doctor;
+#[cfg(feature = "link")]
+mod link;
 mod serve;
 mod slcan;
 mod status;
@@ -46,6 +48,8 @@ enum Command {
     Doctor(doctor::Doctor),
     Serve(serve::Serve),
     Slcan(slcan::Slcan),
+    #[cfg(feature = "link")]
+    Link(link::Link),
 }
 
 impl Command {
@@ -57,6 +61,8 @@ impl Command {
             Self::Doctor(command) => command.run(),
             Self::Serve(command) => command.run(),
             Self::Slcan(command) => command.run(),
+            #[cfg(feature = "link")]
+            Self::Link(command) => command.run(),
         }
     }
 }

@@ -1,13 +1,21 @@
 //! `vcan-setup status`.
 
+use std::collections::BTreeMap;
+use std::time::Duration;
+
 use clap::Args;
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use protocol::bus::BusKind;
 use protocol::usage::{Failure, print};
 use serde::Serialize;
+use vcan_setup::hosts::report as hosts;
 use vcan_setup::link::{CLASSIC_MTU, Counters, FD_MTU, Hardware, Interface, Kind, Peer, Rates};
 use vcan_setup::look::{Embedded, embedded_buses};
 
 use super::{json, query, target};
+
+/// How long a link may take to answer.
+const ANSWER: Duration = Duration::from_millis(500);
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
 ///
@@ -35,12 +43,15 @@ impl Status {
         };
         let interfaces: Vec<_> = present.iter().filter(named).collect();
         let embedded: Vec<_> = embedded_buses().into_iter().filter(|bus| is_requested(&bus.name)).collect();
+        let kernel = interfaces.iter().map(|interface| (interface.name.as_str(), BusKind::SocketCan));
+        let user = embedded.iter().filter(|bus| bus.served).map(|bus| (bus.name.as_str(), BusKind::Embedded));
+        let links = links(kernel.chain(user));
         let text = match (self.json, interfaces.is_empty() && embedded.is_empty()) {
             (true, _) => {
                 let interfaces = interfaces.iter().map(|interface| report(interface)).collect();
-                json(&Report { interfaces, embedded: &embedded })?
+                json(&Report { interfaces, embedded: &embedded, links: &links })?
             }
-            (false, false) => table(&interfaces, &embedded),
+            (false, false) => table(&interfaces, &embedded) + &joined(&links),
             (false, true) if target.is_empty() => "no CAN interface, no embedded bus\n".to_owned(),
             // What was named and is not there is reported below.
             (false, true) => String::new(),
@@ -57,6 +68,29 @@ impl Status {
         let (names, words) = (absent.join(", "), absent.join(" "));
         Err(Failure::run(format!("not there: {names}; `vcan-setup doctor {words}` says how to get it")))
     }
+}
+
+/// What the links of these buses report; a link that is stopped does not answer.
+fn links<'a>(buses: impl Iterator<Item = (&'a str, BusKind)>) -> BTreeMap<&'a str, hosts::Report> {
+    let report = |(bus, kind)| {
+        let report = hosts::Reports::connect(bus, kind, None).and_then(|mut it| it.wait(ANSWER));
+        Some((bus, report.ok()?))
+    };
+    buses.filter_map(report).collect()
+}
+
+fn joined(links: &BTreeMap<&str, hosts::Report>) -> String {
+    let host = |(name, host): (&String, &hosts::Host)| {
+        let cells = host.nodes.len();
+        let gone = if host.is_there { "" } else { ", not reached" };
+        format!("'{name}' ({cells} cell{}{gone})", if cells == 1 { "" } else { "s" })
+    };
+    let line = |(bus, report): (&&str, &hosts::Report)| {
+        let hosts: Vec<_> = report.hosts.iter().map(host).collect();
+        let with = if hosts.is_empty() { "nobody yet".to_owned() } else { hosts.join(", ") };
+        format!("{bus} is linked as '{}' with {with}\n", report.host)
+    };
+    links.iter().map(line).collect()
 }
 
 fn table(interfaces: &[&Interface], embedded: &[Embedded]) -> String {
@@ -144,6 +178,8 @@ fn rates(interface: &Interface) -> String {
 struct Report<'a> {
     interfaces: Vec<InterfaceReport<'a>>,
     embedded: &'a [Embedded],
+    /// Of buses that are joined with those of other hosts.
+    links: &'a BTreeMap<&'a str, hosts::Report>,
 }
 
 #[derive(Serialize)]

@@ -1,7 +1,8 @@
 //! A bench: its buses, its cells' processes, and what all of its threads share.
 
+use std::collections::BTreeSet;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::Receiver as Inlet;
+use std::sync::mpsc::{Receiver as Inlet, Sender};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -9,13 +10,14 @@ use std::time::{Duration, Instant};
 use hdrhistogram::Histogram;
 use protocol::bus::BusError;
 use protocol::can::{Format, Frame};
-use protocol::id::Node;
+use protocol::id::{CellId, Node};
 use protocol::message::{Message, Request};
 use protocol::packet::Epoch;
 use protocol::time::Micros;
 
 use super::Options;
 use super::commanded::Remote;
+use super::hosts::Hosts;
 use super::launch::Processes;
 use super::link::{Link, Slot, may_return};
 use super::network::Network;
@@ -44,6 +46,10 @@ pub(super) struct BusLink {
     pub(super) line: Option<(Line, Slot)>,
     pub(super) view: Arc<Mutex<View>>,
     pub(super) receiver: Option<JoinHandle<ReceiverResult>>,
+    /// Where the receiver learns which cells were not reached.
+    pub(super) in_doubt: Sender<BTreeSet<CellId>>,
+    /// Other hosts that have the bus.
+    pub(super) hosts: Hosts,
     /// Its cells' network, where they answer with sums.
     pub(super) network: Option<Network>,
     pub(super) shared: Arc<Shared>,

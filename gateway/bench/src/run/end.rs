@@ -200,7 +200,9 @@ impl Bench<'_> {
             };
             let kind = link.kind.to_string();
             let summary = BusSummary::new(&link.name, &kind, link.receive_buffer, table, *dropped, now);
-            Some(BusSummary { outages, network, ..summary })
+            let mut summary = BusSummary { outages, network, hosts: bus_link.hosts.summary(), ..summary };
+            summary.uplink.explain_by_hosts(bus_link.hosts.lost());
+            Some(summary)
         };
         let mut summaries: Vec<_> =
             self.bus_links.iter().zip(received).enumerate().filter_map(summary).collect();

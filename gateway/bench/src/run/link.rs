@@ -3,12 +3,14 @@
 //! The receiver reopens a bus that is gone. The loop finds the new one in a triple buffer, where it neither waits nor
 //! frees anything; threads that may wait use [`Link::send`].
 
+use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, BusError, BusKind, Choice, Options, SendError};
 use protocol::can::Frame;
+use vcan_setup::hosts::report::Reports;
 
 use control::cycle::turn::BusState;
 
@@ -64,6 +66,14 @@ impl Link {
     #[must_use]
     pub fn is_gone(&self) -> bool {
         self.gone.load(Ordering::Relaxed)
+    }
+
+    /// Connects to the program that joins it with buses of other hosts.
+    ///
+    /// # Errors
+    /// When there is none.
+    pub fn reports(&self) -> io::Result<Reports> {
+        Reports::connect(&self.name, self.kind, self.target.directory.as_deref())
     }
 
     /// Sends frames; not for the loop, for a bus that is being exchanged is waited for.

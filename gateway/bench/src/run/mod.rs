@@ -17,6 +17,7 @@ mod commanded;
 mod end;
 mod error;
 mod halts;
+mod hosts;
 #[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
 mod io;
 pub mod launch;

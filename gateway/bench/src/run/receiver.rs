@@ -1,13 +1,14 @@
 //! The thread that receives on one bus: it keeps the table, and leaves snapshots for the tick.
 
+use std::collections::BTreeSet;
 use std::sync::atomic::Ordering;
-use std::sync::mpsc::Sender;
+use std::sync::mpsc::{self, Sender};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use protocol::bus::batch::BATCH;
 use protocol::bus::{BusError, Inbox, Received};
-use protocol::id::Kind;
+use protocol::id::{CellId, Kind};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
@@ -82,6 +83,8 @@ pub struct Receiver {
     pub view: Arc<Mutex<View>>,
     /// What is reported to it at once.
     pub bus_event: Sender<(usize, BusEvent)>,
+    /// Cells that it says were not reached, before it sends them anything again.
+    pub in_doubt: mpsc::Receiver<BTreeSet<CellId>>,
 }
 
 /// The result of a receiver.
@@ -135,6 +138,9 @@ impl Receiver {
                 account.outages.end(Instant::now());
                 self.note(BusNote::Back);
                 self.tell(BusEvent::Up);
+            }
+            for cells in self.in_doubt.try_iter() {
+                self.table.interrupt_cells(|cell| cells.contains(&cell));
             }
             self.hear(&inbox);
             if let Some(roots) = &mut self.roots {

@@ -15,6 +15,7 @@ use protocol::usage::say;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::bench::{Bench, BusLink};
+use super::hosts::Hosts;
 use super::launch::{Processes, allow_files, program};
 use super::link::{Link, ReceiveEnd, Slot};
 use super::network::Network;
@@ -255,6 +256,7 @@ fn listen(
     let (positions, of_broadcasts) = rtrb::RingBuffer::<(Epoch, [f64; MAX_JOINTS])>::new(64);
     let format = skin.buses.get(index).map_or(Format::Fd, |bus| bus.format);
     let line = Line { format, snapshot, positions, state: Arc::clone(&link.state) };
+    let (in_doubt, not_reached) = mpsc::channel();
     let receiver = Receiver {
         index,
         receive_end,
@@ -268,8 +270,10 @@ fn listen(
         shared: Arc::clone(&shared),
         view: Arc::clone(&view),
         bus_event,
+        in_doubt: not_reached,
     };
     let receiver = Some(spawn(&format!("rx {}", link.name), move || receiver.run())?);
     let network = Network::of(skin, index);
-    Ok(BusLink { link, format, line: Some((line, slot)), view, receiver, network, shared })
+    let line = Some((line, slot));
+    Ok(BusLink { link, format, line, view, receiver, in_doubt, hosts: Hosts::new(), network, shared })
 }

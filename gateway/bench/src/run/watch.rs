@@ -147,6 +147,7 @@ impl Bench<'_> {
         self.obey(measured, progress);
         self.hear(script, progress)?;
         self.serve_again(progress);
+        self.look_at_hosts(script, progress)?;
         for note in self.watch_networks()? {
             progress.note(&note);
         }
@@ -331,6 +332,24 @@ impl Bench<'_> {
             progress.note(&format!("the process of {} ended ({})", self.cells_of(&ended), ended.how()));
         }
         Ok(())
+    }
+
+    /// Takes what links to other hosts report.
+    fn look_at_hosts(&mut self, script: &Script, progress: &Progress) -> Result<(), RunError> {
+        let mut reached = BTreeSet::new();
+        for (bus, bus_link) in self.bus_links.iter_mut().enumerate() {
+            let changes = bus_link.hosts.look(&bus_link.link);
+            changes.notes.iter().for_each(|note| progress.note(note));
+            reached.extend(changes.reached.into_iter().map(|cell| (bus, cell)));
+            if !changes.in_doubt.is_empty() {
+                // Before its cells are told anything again.
+                let _ = bus_link.in_doubt.send(changes.in_doubt);
+            }
+        }
+        if reached.is_empty() {
+            return Ok(());
+        }
+        self.remind(script, |it| reached.contains(&(it.bus, it.node)))
     }
 
     /// Serves embedded buses again that were ours and whose processes have ended, unless a command has taken them down.

@@ -1,5 +1,6 @@
 //! The epoch that cells are answering: which replies are due, and how it ends when the next one begins.
 
+use protocol::id::CellId;
 use protocol::message::Joints;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
@@ -153,6 +154,17 @@ impl Table {
     #[must_use]
     pub fn difference(&self) -> Option<[f64; MAX_JOINTS]> {
         self.root_totals.as_ref().map_or(self.difference, |root_totals| root_totals.error.last)
+    }
+
+    /// The bus is lost: packets on their way are in doubt. The torques stay as they are, and decay in the loop.
+    pub fn interrupt(&mut self) {
+        self.interrupted = true;
+        self.interrupt_cells(|_| true);
+    }
+
+    /// These cells were not reached, or are not any more, while the bus works: packets of theirs, and to them, may be lost.
+    pub fn interrupt_cells(&mut self, is_in_doubt: impl Fn(CellId) -> bool) {
+        self.cells.iter_mut().filter(|cell| is_in_doubt(cell.node)).for_each(Cell::interrupt);
     }
 
     /// Releases torques that have decayed in the loop while no joints were on the bus, so that they do not come back.

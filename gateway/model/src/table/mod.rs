@@ -401,12 +401,6 @@ impl Table {
         self.notices.clear();
     }
 
-    /// The bus is lost: packets on their way are in doubt. The torques stay as they are, and decay in the loop.
-    pub fn interrupt(&mut self) {
-        self.interrupted = true;
-        self.cells.iter_mut().for_each(Cell::interrupt);
-    }
-
     /// Handles timeouts: cells that were silent for too long are dead.
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.cells.len() {

@@ -1,0 +1,227 @@
+//! A bus that `vcan-setup link` joins with those of other hosts: what is lost between the hosts, and which of them are gone.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use protocol::id::CellId;
+use vcan_setup::hosts::report::{Host, Report, Reports};
+
+use super::link::{Link, Outages};
+use crate::setup::names;
+use crate::summary::HostSummary;
+
+/// From one look for a link to the next, where there is none.
+const LOOK_AGAIN: Duration = Duration::from_millis(500);
+
+/// The other hosts of a bus, and the connection to its link.
+#[derive(Debug)]
+pub(super) struct Hosts {
+    reports: Option<Reports>,
+    look_at: Instant,
+    known: Known,
+}
+
+/// What is to be done after a change.
+#[derive(Debug, Default, Eq, PartialEq)]
+pub(super) struct Changes {
+    /// For the user.
+    pub(super) notes: Vec<String>,
+    /// Cells whose packets, or whose stimuli, may be lost.
+    pub(super) in_doubt: BTreeSet<CellId>,
+    /// Of these, the cells of hosts that are reached.
+    pub(super) reached: BTreeSet<CellId>,
+}
+
+/// What the reports say, over all of a run.
+#[derive(Debug, Default)]
+struct Known {
+    hosts: BTreeMap<String, Of>,
+    /// Whether a link has reported since the run began.
+    is_linked: bool,
+}
+
+/// What is known of a host.
+#[derive(Debug, Default)]
+struct Of {
+    newest: Host,
+    outages: Outages,
+    /// Frames that did not get through, from there and to there.
+    lost: [u64; 2],
+}
+
+impl Hosts {
+    pub(super) fn new() -> Self {
+        Self { reports: None, look_at: Instant::now(), known: Known::default() }
+    }
+
+    /// Takes what the bus' link has reported. Does not wait.
+    pub(super) fn look(&mut self, link: &Link) -> Changes {
+        let (now, mut changes) = (Instant::now(), Changes::default());
+        if self.reports.is_none() && self.look_at <= now {
+            self.look_at = now + LOOK_AGAIN;
+            self.reports = link.reports().ok();
+        }
+        match self.reports.as_mut().map(Reports::take) {
+            Some(Ok(reports)) => {
+                for report in reports {
+                    self.known.take(&link.name, report, now, &mut changes);
+                }
+            }
+            Some(Err(error)) => {
+                self.reports = None;
+                self.known.end(&link.name, &error.to_string(), now, &mut changes);
+            }
+            None => {}
+        }
+        changes
+    }
+
+    /// Frames that did not get through between the hosts.
+    pub(super) fn lost(&self) -> u64 {
+        self.known.hosts.values().map(|of| of.lost.iter().sum::<u64>()).sum()
+    }
+
+    /// What was known of each host; none where nothing linked the bus.
+    pub(super) fn summary(&self) -> BTreeMap<String, HostSummary> {
+        let summary = |of: &Of| HostSummary {
+            cells: of.newest.nodes.len(),
+            gone: of.outages.times,
+            gone_s: of.outages.lost(Instant::now()).as_secs_f64(),
+            at_end: of.newest.is_there,
+            lost_from: of.lost[0],
+            lost_to: of.lost[1],
+        };
+        self.known.hosts.iter().map(|(host, of)| (host.clone(), summary(of))).collect()
+    }
+}
+
+impl Known {
+    fn take(&mut self, bus: &str, report: Report, now: Instant, changes: &mut Changes) {
+        let is_first = !std::mem::replace(&mut self.is_linked, true);
+        for (host, newest) in report.hosts {
+            let known = self.hosts.entry(host.clone()).or_default();
+            let before = std::mem::replace(&mut known.newest, newest);
+            let newest = &known.newest;
+            let missing = |host: &Host| [host.heard.missing(), host.ours.map_or(0, |ours| ours.missing())];
+            let (was, is) = (missing(&before), missing(newest));
+            if is_first {
+                // What it lost before the run began is not the run's.
+                known.outages = Outages::default();
+            } else {
+                for (lost, (was, is)) in known.lost.iter_mut().zip(was.into_iter().zip(is)) {
+                    *lost += is.saturating_sub(was);
+                }
+            }
+            let cells: Vec<_> =
+                newest.nodes.iter().filter_map(|&node| CellId::new(node.into()).ok()).collect();
+            if before.is_there != newest.is_there {
+                let how = if newest.is_there {
+                    known.outages.end(now);
+                    if is_first || known.outages.times == 0 { "is linked" } else { "is reached again" }
+                } else {
+                    known.outages.begin(now);
+                    "is gone, or not reached"
+                };
+                let of_it = names(&cells, "");
+                let of_it = if cells.is_empty() { String::new() } else { format!(" (cells {of_it})") };
+                changes.notes.push(format!("host '{host}' of {bus} {how}{of_it}"));
+            }
+            let is_disturbed = !is_first
+                && (before.is_there != newest.is_there
+                    || before.heard.lives != newest.heard.lives
+                    || was[1] != is[1]);
+            if is_disturbed {
+                changes.in_doubt.extend(&cells);
+                if newest.is_there {
+                    changes.reached.extend(&cells);
+                }
+            }
+        }
+    }
+
+    /// The link here has ended. A next one counts anew.
+    fn end(&mut self, bus: &str, why: &str, now: Instant, changes: &mut Changes) {
+        changes.notes.push(format!("the link of {bus} to other hosts has ended ({why})"));
+        for known in self.hosts.values_mut() {
+            let nodes = std::mem::take(&mut known.newest).nodes;
+            changes.in_doubt.extend(nodes.iter().filter_map(|&node| CellId::new(node.into()).ok()));
+            known.newest.nodes = nodes;
+            known.outages.begin(now);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use vcan_setup::hosts::incoming::Heard;
+
+    use super::*;
+
+    fn report(hosts: &[(&str, bool, u64, u64, u64)]) -> Report {
+        let host = |&(name, is_there, lives, from, to): &(&str, bool, u64, u64, u64)| {
+            let heard = Heard { lives, lost: from, ..Heard::default() };
+            let ours = Some(Heard { dropped_here: to, ..Heard::default() });
+            (name.to_owned(), Host { is_there, nodes: vec![7, 9], heard, ours })
+        };
+        Report { host: "a".to_owned(), hosts: hosts.iter().map(host).collect(), ..Report::default() }
+    }
+
+    struct Fixture(Hosts, Instant, u64);
+
+    impl Fixture {
+        fn new() -> Self {
+            Self(Hosts::new(), Instant::now(), 0)
+        }
+
+        /// A report one second after the last one: the notes, and how many cells are in doubt and reached.
+        fn take(&mut self, hosts: &[(&str, bool, u64, u64, u64)]) -> (Vec<String>, usize, usize) {
+            self.2 += 1;
+            let mut changes = Changes::default();
+            self.0.known.take("vcan0", report(hosts), self.1 + Duration::from_secs(self.2), &mut changes);
+            (changes.notes, changes.in_doubt.len(), changes.reached.len())
+        }
+    }
+
+    #[test]
+    fn what_was_lost_before_the_run_is_not_the_runs() {
+        let mut of = Fixture::new();
+        let (notes, in_doubt, _) = of.take(&[("b", true, 1, 50, 60)]);
+        assert_eq!((notes, in_doubt), (vec!["host 'b' of vcan0 is linked (cells 7, 9)".to_owned()], 0));
+        assert_eq!(of.0.lost(), 0);
+        assert_eq!(of.take(&[("b", true, 1, 53, 60)]), (vec![], 0, 0), "their own counts show it");
+        assert_eq!(of.take(&[("b", true, 1, 53, 64)]), (vec![], 2, 2), "stimuli may be among them");
+        assert_eq!((of.0.lost(), of.0.summary()["b"].lost_from, of.0.summary()["b"].lost_to), (7, 3, 4));
+    }
+
+    #[test]
+    fn cells_of_a_host_that_is_gone_are_in_doubt_and_told_again_when_it_is_reached() {
+        let mut of = Fixture::new();
+        of.take(&[("b", true, 1, 0, 0), ("c", true, 1, 0, 0)]);
+        let (notes, in_doubt, reached) = of.take(&[("b", false, 1, 0, 0), ("c", true, 1, 0, 0)]);
+        assert_eq!(notes, ["host 'b' of vcan0 is gone, or not reached (cells 7, 9)"]);
+        assert_eq!((in_doubt, reached), (2, 0));
+        let (notes, in_doubt, reached) = of.take(&[("b", true, 2, 0, 0), ("c", true, 1, 0, 0)]);
+        assert_eq!(notes, ["host 'b' of vcan0 is reached again (cells 7, 9)"]);
+        assert_eq!((in_doubt, reached), (2, 2));
+        assert_eq!(
+            of.take(&[("b", true, 3, 0, 0), ("c", true, 1, 0, 0)]).1,
+            2,
+            "its link was killed and is back"
+        );
+        let b = of.0.summary()["b"];
+        assert_eq!((b.gone, b.gone_s, b.at_end, b.cells), (1, 1.0, true, 2));
+    }
+
+    #[test]
+    fn a_link_that_ends_here_and_counts_anew_loses_no_account() {
+        let mut of = Fixture::new();
+        of.take(&[("b", true, 1, 10, 0)]);
+        of.take(&[("b", true, 1, 15, 0)]);
+        let mut changes = Changes::default();
+        of.0.known.end("vcan0", "end of file", of.1 + Duration::from_secs(3), &mut changes);
+        assert_eq!((changes.in_doubt.len(), changes.reached.len()), (2, 0));
+        let (notes, _, reached) = of.take(&[("b", true, 1, 2, 0)]);
+        assert_eq!((notes.len(), reached), (1, 2));
+        assert_eq!(of.0.lost(), 7);
+    }
+}

@@ -1,0 +1,149 @@
+//! Mutual TLS and access control, with the commands and files of `docs/how-to/several-hosts.md`.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use super::process::{Place, Running};
+use super::{Host, ended_link, link_program, port};
+
+const GUIDE: &str = include_str!("../../../docs/how-to/several-hosts.md");
+
+/// The text of the code block that contains this.
+fn block(mark: &str) -> String {
+    let blocks = GUIDE.split("\n```").skip(1).step_by(2);
+    let block = blocks
+        .into_iter()
+        .find(|block| block.contains(mark))
+        .unwrap_or_else(|| panic!("no block with {mark}"));
+    block.split_once('\n').unwrap().1.replace("robot.local", "localhost")
+}
+
+fn shell(folder: &Path, script: &str) {
+    let done = Command::new("bash").args(["-euc", script]).current_dir(folder).output().unwrap();
+    assert!(done.status.success(), "{script}: {}", String::from_utf8_lossy(&done.stderr));
+}
+
+/// The certificates of the guide, and its two configurations at a port of this machine.
+fn secured(port: u16) -> Place {
+    let place = Place::new();
+    let certificates = block("openssl req -x509").replace("DNS:$host.local", "DNS:localhost");
+    shell(&place.path(""), &certificates);
+    for (name, mark) in [("robot.json5", "listen: {"), ("cells.json5", "connect: {")] {
+        let text = block(mark).replace("localhost:7447", &format!("localhost:{port}"));
+        let folder = place.path("").display().to_string();
+        let text = ["ca.pem", "robot.key", "robot.pem", "cells.key", "cells.pem"]
+            .iter()
+            .fold(text, |text, file| text.replace(&format!("\"{file}\""), &format!("\"{folder}{file}\"")));
+        place.write(name, &text);
+    }
+    place
+}
+
+fn link(host: &Host, config: &Path) -> Running {
+    host.link(&format!("--config {}", config.display()))
+}
+
+/// A robot with the guide's configuration, and somebody with a changed one of the guide's: both links.
+fn robot_and(change: impl FnOnce(&Place, String) -> String) -> [Running; 2] {
+    let place = secured(port());
+    let (robot, other) = (Host::new("robot", None), Host::new("cells", None));
+    let robot_link = link(&robot, &place.path("robot.json5"));
+    let text = change(&place, place.read("cells.json5"));
+    let path = place.write("other.json5", &text);
+    let other_link = link(&other, &path);
+    // They need it as long as they run.
+    std::mem::forget((place, robot, other));
+    [robot_link, other_link]
+}
+
+/// Neither has the other.
+fn is_refused(links: [Running; 2]) {
+    for link in links {
+        assert!(!link.stderr().contains("has joined"), "{}", link.stderr());
+        let report = ended_link(link);
+        assert_eq!(report["hosts"], serde_json::json!({}), "{report:#}");
+    }
+}
+
+#[test]
+#[ignore = "tests/hosts runs it"]
+fn the_certificates_of_the_guide_are_taken() {
+    let links = robot_and(|_, text| text);
+    links[0].hears("host 'cells' has joined");
+    links[1].hears("host 'robot' has joined");
+    links.into_iter().for_each(|link| _ = ended_link(link));
+}
+
+#[test]
+#[ignore = "tests/hosts runs it"]
+fn a_certificate_of_another_authority_is_refused_and_said_on_both_sides() {
+    let links = robot_and(|place, text| {
+        let folder = place.path("").join("others");
+        fs::create_dir(&folder).unwrap();
+        shell(&folder, &block("openssl req -x509"));
+        let (mine, others) = (place.path("cells."), folder.join("cells."));
+        text.replace(&mine.display().to_string(), &others.display().to_string())
+    });
+    links[0].hears("vcan0: ");
+    links[1].hears("cannot connect to tls/localhost");
+    is_refused(links);
+}
+
+#[test]
+#[ignore = "tests/hosts runs it"]
+fn no_certificate_is_refused_and_said_on_both_sides() {
+    let links = robot_and(|_, text| {
+        let without =
+            |line: &&str| !line.contains("connect_private_key") && !line.contains("connect_certificate");
+        let text: Vec<_> = text.lines().filter(without).collect();
+        text.join("\n").replace("enable_mtls: true", "enable_mtls: false")
+    });
+    links[0].hears("vcan0: ");
+    links[1].hears("cannot connect to tls/localhost");
+    is_refused(links);
+}
+
+#[test]
+#[ignore = "tests/hosts runs it"]
+fn an_endpoint_that_is_not_in_the_certificate_is_refused_and_said_on_both_sides() {
+    let links = robot_and(|_, text| text.replace("tls/localhost", "tls/127.0.0.1"));
+    links[0].hears("vcan0: ");
+    links[1].hears("cannot connect to tls/127.0.0.1");
+    is_refused(links);
+}
+
+#[test]
+#[ignore = "tests/hosts runs it"]
+fn a_host_that_access_control_does_not_name_is_not_heard() {
+    let links = robot_and(|place, text| {
+        shell(
+            &place.path(""),
+            &block("openssl req -x509")
+                .lines()
+                .filter(|line| !line.contains("-x509 "))
+                .collect::<Vec<_>>()
+                .join("\n")
+                .replace("robot cells", "intruder")
+                .replace("DNS:$host.local", "DNS:localhost"),
+        );
+        text.replace("cells.key", "intruder.key").replace("cells.pem", "intruder.pem")
+    });
+    links[1].hears("vcan0: ");
+    is_refused(links);
+}
+
+#[test]
+#[ignore = "tests/hosts runs it"]
+fn a_configuration_that_is_none_is_one_line() {
+    let host = Host::new("robot", None);
+    for (text, says) in [
+        ("{", "other.json5: "),
+        ("{ listen: { endpoints: [\"tls/localhost:1\"] } }", "other.json5: Cannot create"),
+    ] {
+        let path = host.place.write("other.json5", text);
+        let words = format!("link vcan0 --bus-kind embedded --config {}", path.display());
+        let ended = host.start(&link_program(), &words).end();
+        assert!(ended.refusal(1).contains(says), "{ended:#?}");
+    }
+}

@@ -1,0 +1,335 @@
+//! From other hosts to a bus: what is missing of each source, and frames that wait for the bus.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use protocol::can::Frame;
+use protocol::id::{CellId, Id};
+use serde::{Deserialize, Serialize};
+
+use super::message::{Head, MessageError, Stamped, decode};
+
+/// Frames that wait for the bus at most.
+pub const QUEUE: usize = 8_192;
+/// Sources that are told apart; a host that is named anew each time would fill the memory.
+pub const SOURCES: usize = 256;
+
+/// What has become of the frames of one source. `numbered` is always `before`, `dropped_there`, `lost` and `taken`; `taken`
+/// is always `sent`, `dropped_here`, `refused` and those that wait.
+#[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
+pub struct Heard {
+    /// Numbers that the source has given, of all its lives.
+    pub numbered: u64,
+    /// Of these, from before this link heard the source first, or after it started anew.
+    pub before: u64,
+    /// Dropped by the source: its queue was full.
+    pub dropped_there: u64,
+    /// Lost between the hosts.
+    pub lost: u64,
+    /// Taken here.
+    pub taken: u64,
+    /// Handed to the bus.
+    pub sent: u64,
+    /// Dropped here: the queue to the bus was full.
+    pub dropped_here: u64,
+    /// Refused by the bus.
+    pub refused: u64,
+    /// Came again; not taken again.
+    pub repeated: u64,
+    /// Dropped by the source's bus before the source took them; they have no numbers.
+    pub missed_there: u64,
+    /// Messages that were none.
+    pub garbage: u64,
+    /// Starts of the source.
+    pub lives: u64,
+    /// Of these, returns of the life before: two hosts have the same name.
+    pub shared: u64,
+}
+
+impl Heard {
+    /// Frames that did not get through, wherever they were lost.
+    #[must_use]
+    pub const fn missing(&self) -> u64 {
+        self.dropped_there + self.lost + self.missed_there + self.dropped_here + self.refused
+    }
+}
+
+/// The node ids under which cells of a host have sent.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Nodes([u64; 4]);
+
+impl Nodes {
+    fn take(&mut self, frame: &Frame) {
+        let id = u16::try_from(frame.id()).ok().filter(|_| !frame.is_extended() && !frame.is_error());
+        let Some(cell) = id.and_then(|id| Id::from_bits(id).sender()) else { return };
+        let (word, bit) = (cell.get() / 64, cell.get() % 64);
+        if let Some(word) = self.0.get_mut(usize::from(word)) {
+            *word |= 1 << bit;
+        }
+    }
+
+    /// In order.
+    pub fn iter(&self) -> impl Iterator<Item = CellId> {
+        let is_in = |cell: &CellId| {
+            self.0.get(usize::from(cell.get() / 64)).is_some_and(|word| word >> (cell.get() % 64) & 1 == 1)
+        };
+        CellId::all().filter(is_in)
+    }
+}
+
+#[derive(Debug, Default)]
+struct Source {
+    head: Head,
+    /// The number of its next frame.
+    next: u64,
+    /// The life before this one.
+    before: Option<u64>,
+    account: Heard,
+    nodes: Nodes,
+}
+
+impl Source {
+    /// Takes what a message says of the numbers; how many of its frames were heard before.
+    fn take(&mut self, head: &Head, count: u64) -> u64 {
+        let account = &mut self.account;
+        if account.lives == 0 || self.head.life != head.life {
+            account.lives += 1;
+            account.numbered += head.first;
+            account.before += head.first;
+            account.shared += u64::from(self.before == Some(head.life));
+            self.before = (account.lives > 1).then_some(self.head.life);
+            (self.head, self.next) = (*head, head.first);
+        }
+        let end = head.first + count;
+        let again = self.next.saturating_sub(head.first).min(count);
+        account.repeated += again;
+        if end <= self.next {
+            return again;
+        }
+        let missing = head.first.saturating_sub(self.next);
+        let there = head.dropped.saturating_sub(self.head.dropped).min(missing);
+        account.dropped_there += there;
+        account.lost += missing - there;
+        account.missed_there += head.missed.saturating_sub(self.head.missed);
+        account.taken += count - again;
+        account.numbered += end - self.next;
+        (self.head, self.next) = (*head, end);
+        again
+    }
+}
+
+/// The frames of all other hosts.
+#[derive(Debug, Default)]
+pub struct Incoming {
+    /// By host.
+    sources: BTreeMap<String, Source>,
+    waiting: VecDeque<Frame>,
+    /// Whose they are, in runs.
+    of: VecDeque<(String, usize)>,
+    /// Messages of hosts beyond [`SOURCES`].
+    strangers: u64,
+    frames: Vec<Stamped>,
+}
+
+impl Incoming {
+    /// Takes a message of a host.
+    ///
+    /// # Errors
+    /// When it is none; it is counted.
+    pub fn take(&mut self, host: &str, bytes: &[u8]) -> Result<(), MessageError> {
+        if !self.sources.contains_key(host) {
+            if self.sources.len() >= SOURCES {
+                self.strangers += 1;
+                return Ok(());
+            }
+            self.sources.insert(host.to_owned(), Source::default());
+        }
+        let Some(source) = self.sources.get_mut(host) else { return Ok(()) };
+        self.frames.clear();
+        let head = decode(bytes, &mut self.frames).inspect_err(|_| source.account.garbage += 1)?;
+        let again = source.take(&head, self.frames.len() as u64);
+        let new = self.frames.iter().skip(usize::try_from(again).unwrap_or(usize::MAX));
+        new.clone().for_each(|stamped| source.nodes.take(&stamped.frame));
+        let room = QUEUE.saturating_sub(self.waiting.len());
+        let before = self.waiting.len();
+        self.waiting.extend(new.clone().take(room).map(|stamped| stamped.frame));
+        let added = self.waiting.len() - before;
+        source.account.dropped_here += (new.len() - added) as u64;
+        match self.of.back_mut() {
+            Some((last, count)) if last == host => *count += added,
+            _ if added > 0 => self.of.push_back((host.to_owned(), added)),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Frames for the bus, the oldest first; not all of them where the buffer wraps.
+    #[must_use]
+    pub fn waiting(&self) -> &[Frame] {
+        self.waiting.as_slices().0
+    }
+
+    /// The bus has taken so many of the first ones.
+    pub fn sent(&mut self, count: usize) {
+        self.gone(count, |account, count| account.sent += count);
+    }
+
+    /// The bus has refused so many of the first ones.
+    pub fn refused(&mut self, count: usize) {
+        self.gone(count, |account, count| account.refused += count);
+    }
+
+    fn gone(&mut self, count: usize, note: impl Fn(&mut Heard, u64)) {
+        let mut left = count.min(self.waiting.len());
+        self.waiting.drain(..left);
+        while left > 0 {
+            let Some((host, waiting)) = self.of.front_mut() else { return };
+            let of_it = left.min(*waiting);
+            (*waiting, left) = (*waiting - of_it, left - of_it);
+            if let Some(source) = self.sources.get_mut(host.as_str()) {
+                note(&mut source.account, of_it as u64);
+            }
+            if *waiting == 0 {
+                self.of.pop_front();
+            }
+        }
+    }
+
+    /// What has become of the frames of each host, and the cells that sent them.
+    pub fn accounts(&self) -> impl Iterator<Item = (&str, Heard, Nodes)> {
+        self.sources.iter().map(|(host, source)| (host.as_str(), source.account, source.nodes))
+    }
+
+    /// The names that more than one host has.
+    pub fn shared(&self) -> impl Iterator<Item = &str> {
+        self.sources.iter().filter(|(_, source)| source.account.shared > 0).map(|(host, _)| host.as_str())
+    }
+
+    /// Messages of hosts that were too many.
+    #[must_use]
+    pub const fn strangers(&self) -> u64 {
+        self.strangers
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::message::encode;
+    use super::*;
+    use proptest::prelude::*;
+    use protocol::id::{Kind, Node};
+
+    fn message(head: Head, count: u64) -> Vec<u8> {
+        let frame = |at: u64| Frame::classic(0x201, &(head.first + at).to_le_bytes()).unwrap();
+        let frames: Vec<_> = (0..count).map(|at| Stamped { at_nanos: at, frame: frame(at) }).collect();
+        let mut bytes = Vec::new();
+        encode(&head, &frames, &mut bytes);
+        bytes
+    }
+
+    fn heard(incoming: &Incoming) -> Heard {
+        incoming.accounts().next().unwrap().1
+    }
+
+    #[test]
+    fn each_missing_frame_has_its_place() {
+        let mut incoming = Incoming::default();
+        let mut take = |life, first, dropped, missed, count| {
+            incoming.take("b", &message(Head { life, first, dropped, missed }, count)).unwrap();
+        };
+        take(1, 100, 3, 9, 10); // 100 were before
+        take(1, 110, 3, 9, 10);
+        take(1, 125, 5, 11, 10); // two dropped there, three lost
+        take(1, 125, 5, 11, 10); // again
+        take(1, 130, 5, 11, 10); // half of it again
+        take(2, 4, 0, 0, 1); // it has started anew
+        let account = heard(&incoming);
+        let expected = Heard {
+            numbered: 145,
+            before: 104,
+            dropped_there: 2,
+            lost: 3,
+            taken: 36,
+            repeated: 15,
+            missed_there: 2,
+            lives: 2,
+            ..Heard::default()
+        };
+        assert_eq!(account, expected);
+        assert_eq!(incoming.waiting().len(), 36);
+        incoming.sent(30);
+        incoming.refused(4);
+        let account = heard(&incoming);
+        assert_eq!((account.sent, account.refused, incoming.waiting().len()), (30, 4, 2));
+    }
+
+    #[test]
+    fn two_hosts_of_one_name_are_noticed() {
+        let mut incoming = Incoming::default();
+        for life in [1, 2, 3, 2, 3] {
+            incoming.take("b", &message(Head { life, ..Head::default() }, 1)).unwrap();
+        }
+        assert_eq!((heard(&incoming).lives, heard(&incoming).shared), (5, 2));
+    }
+
+    #[test]
+    fn what_the_bus_does_not_take_is_counted_for_its_host() {
+        let mut incoming = Incoming::default();
+        let head = |first| Head { life: 1, first, ..Head::default() };
+        for first in (0..QUEUE as u64).step_by(256) {
+            incoming.take(if first % 512 == 0 { "b" } else { "c" }, &message(head(first), 256)).unwrap();
+        }
+        incoming.take("d", &message(head(0), 5)).unwrap();
+        let of: Vec<_> = incoming.accounts().map(|(host, it, _)| (host, it.taken, it.dropped_here)).collect();
+        let half = QUEUE as u64 / 2;
+        assert_eq!(of, [("b", half, 0), ("c", half, 0), ("d", 5, 5)]);
+        incoming.sent(300);
+        let sent: Vec<_> = incoming.accounts().map(|(_, it, _)| it.sent).collect();
+        assert_eq!(sent, [256, 44, 0]);
+        assert!(incoming.take("b", &[9]).is_err());
+        assert_eq!(heard(&incoming).garbage, 1);
+    }
+
+    #[test]
+    fn it_is_known_which_cells_are_behind_a_host() {
+        let mut incoming = Incoming::default();
+        let sent = |id| Stamped { at_nanos: 0, frame: Frame::classic(id, &[]).unwrap() };
+        let mut bytes = Vec::new();
+        let of = |kind, node| u32::from(Id::new(kind, Node::Cell(CellId::new(node).unwrap())).to_bits());
+        let frames = [
+            sent(of(Kind::Torque, 7)),
+            sent(of(Kind::Network, 126)),
+            sent(of(Kind::Stimulus, 9)),
+            sent(of(Kind::Torque, 7) | protocol::can::EXTENDED),
+        ];
+        encode(&Head::default(), &frames, &mut bytes);
+        incoming.take("b", &bytes).unwrap();
+        let nodes: Vec<_> = incoming.accounts().next().unwrap().2.iter().map(CellId::get).collect();
+        assert_eq!(nodes, [7, 126]);
+    }
+
+    #[test]
+    fn hosts_without_end_fill_nothing() {
+        let mut incoming = Incoming::default();
+        for host in 0..SOURCES + 3 {
+            incoming.take(&host.to_string(), &message(Head::default(), 1)).unwrap();
+        }
+        assert_eq!((incoming.accounts().count(), incoming.strangers()), (SOURCES, 3));
+    }
+
+    proptest! {
+        #[test]
+        fn accounts_add_up_whatever_comes(messages in proptest::collection::vec((0..3_u64, 0..400_u64, 0..30_u64, 0..9_u64, 0..20_u64, 0..30_usize), 0..60)) {
+            let mut incoming = Incoming::default();
+            for (life, first, dropped, missed, count, gone) in messages {
+                let head = Head { life, first, dropped: dropped.min(first), missed };
+                incoming.take("b", &message(head, count)).unwrap();
+                if gone % 2 == 0 { incoming.sent(gone) } else { incoming.refused(gone) }
+            }
+            for (_, it, _) in incoming.accounts() {
+                prop_assert_eq!(it.numbered, it.before + it.dropped_there + it.lost + it.taken);
+                let waiting = incoming.waiting.len() as u64;
+                prop_assert_eq!(it.taken, it.sent + it.dropped_here + it.refused + waiting);
+            }
+        }
+    }
+}

@@ -1,0 +1,444 @@
+//! The shell around the core: a bus, a session of Zenoh, and one thread between them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
+use std::io;
+use std::os::fd::{AsFd, OwnedFd};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use protocol::bus::{Bus, BusError, BusKind, Inbox, Options};
+use protocol::id::CellId;
+use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
+use rustix::io::Errno;
+use zenoh::bytes::ZBytes;
+use zenoh::key_expr::KeyExpr;
+use zenoh::pubsub::Publisher;
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::sample::{Locality, Sample, SampleKind};
+use zenoh::{Session, Wait};
+
+pub use super::event::Event;
+use super::incoming::{Heard, Incoming, SOURCES};
+use super::log;
+use super::message::Stamped;
+use super::outgoing::{Outgoing, Sent};
+use super::report::{Host, Report, listen};
+use super::returned::Returned;
+use super::session::{FRAMES, HEARD, config, host_of, key, life};
+pub use super::session::{LinkError, Settings};
+use super::watchers::Watchers;
+
+/// Frames that may wait unread in the socket of the bus.
+const RECEIVE_BUFFER: usize = 8 << 20;
+/// How soon a bus that is full is tried again.
+const RETRY: Duration = Duration::from_millis(1);
+/// From one attempt to open a bus that is away to the next.
+const AGAIN: Duration = Duration::from_millis(100);
+/// Between two reports of losses on standard error.
+const SAY: Duration = Duration::from_secs(1);
+/// Between two reports to other hosts, and to programs here.
+const TELL: Duration = Duration::from_millis(200);
+/// Batches taken from the bus before anything else has its turn.
+const TURNS: usize = 4;
+
+/// What threads of Zenoh hand to the link's.
+struct Shared {
+    incoming: Mutex<Incoming>,
+    /// What each other host says has become of this host's frames.
+    ours: Mutex<BTreeMap<String, Heard>>,
+    wake: OwnedFd,
+}
+
+impl Shared {
+    fn incoming(&self) -> MutexGuard<'_, Incoming> {
+        self.incoming.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn ours(&self) -> MutexGuard<'_, BTreeMap<String, Heard>> {
+        self.ours.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn wake(&self) {
+        // It can only be full, and then it can be read.
+        let _ = rustix::io::write(&self.wake, &1_u64.to_ne_bytes());
+    }
+}
+
+/// A bus that is linked.
+pub struct Link {
+    settings: Settings,
+    kind: BusKind,
+    session: Session,
+    publisher: Publisher<'static>,
+    /// For what was heard of the other hosts.
+    teller: Publisher<'static>,
+    shared: Arc<Shared>,
+    events: Receiver<Event>,
+    /// Dropped at the end.
+    declared: Vec<Box<dyn Send>>,
+    bus: Option<Bus>,
+    outgoing: Outgoing,
+    returned: Returned,
+    began: Instant,
+    missed_before: u64,
+    there: BTreeSet<String>,
+    /// As long as it listens, no other link of this bus here can.
+    watchers: Watchers,
+    tell_at: Instant,
+}
+
+impl fmt::Debug for Link {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Link").field("settings", &self.settings).finish_non_exhaustive()
+    }
+}
+
+impl Link {
+    /// Opens the bus and a session. Others may be away.
+    ///
+    /// # Errors
+    /// When the bus cannot be opened, the configuration is wrong, or another link has the same name.
+    pub fn open(settings: Settings) -> Result<Self, LinkError> {
+        let own = key(FRAMES, &settings.bus, &settings.host)?;
+        let config = config(&settings)?;
+        let kind = settings.choice.resolve();
+        let listener = listen(&settings.bus, kind, settings.directory.as_deref()).map_err(|error| {
+            if error.kind() == io::ErrorKind::AddrInUse {
+                LinkError::Twice(settings.bus.clone())
+            } else {
+                LinkError::Wait(error)
+            }
+        })?;
+        let bus = open(&settings)?;
+        let (tell, events) = channel();
+        log::listen(tell.clone());
+        let session = zenoh::open(config).wait().map_err(|error| settings.blame(&error.to_string()))?;
+        let publisher = session
+            .declare_publisher(own)
+            .congestion_control(CongestionControl::Drop)
+            .priority(Priority::RealTime)
+            .express(true)
+            .allowed_destination(Locality::Remote)
+            .wait()
+            .map_err(LinkError::zenoh)?;
+        let teller = session
+            .declare_publisher(key(HEARD, &settings.bus, &settings.host)?)
+            .allowed_destination(Locality::Remote)
+            .wait()
+            .map_err(LinkError::zenoh)?;
+        let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK);
+        let wake = wake.map_err(|errno| LinkError::Wait(errno.into()))?;
+        let shared = Arc::new(Shared { incoming: Mutex::default(), ours: Mutex::default(), wake });
+        let mut link = Self {
+            settings,
+            kind,
+            session,
+            publisher,
+            teller,
+            shared,
+            events,
+            declared: Vec::new(),
+            bus: Some(bus),
+            outgoing: Outgoing::new(life()),
+            returned: Returned::default(),
+            began: Instant::now(),
+            missed_before: 0,
+            there: BTreeSet::new(),
+            watchers: Watchers::new(listener),
+            tell_at: Instant::now(),
+        };
+        link.declare(&tell)?;
+        Ok(link)
+    }
+
+    /// Listens to the other hosts: their frames, what they heard of this one, and who is there.
+    fn declare(&mut self, tell: &Sender<Event>) -> Result<(), LinkError> {
+        let Settings { bus, host, .. } = self.settings.clone();
+        let shared = Arc::clone(&self.shared);
+        self.subscribe(FRAMES, tell.clone(), move |from, bytes| {
+            shared.incoming().take(from, bytes).map_err(|error| error.to_string())
+        })?;
+        let (shared, this) = (Arc::clone(&self.shared), host.clone());
+        self.subscribe(HEARD, tell.clone(), move |from, bytes| {
+            let heard: BTreeMap<String, Heard> = serde_json::from_slice(bytes)
+                .map_err(|error| format!("no account of what it heard: {error}"))?;
+            let mut ours = shared.ours();
+            if let Some(heard) = heard.get(&this).filter(|_| ours.len() < SOURCES || ours.contains_key(from))
+            {
+                ours.insert(from.to_owned(), *heard);
+            }
+            Ok(())
+        })?;
+        let (shared, tell, this) = (Arc::clone(&self.shared), tell.clone(), host.clone());
+        let seen = move |sample: Sample| {
+            let from = host_of(sample.key_expr().as_str()).to_owned();
+            if from != this {
+                let is_there = sample.kind() == SampleKind::Put;
+                let _ = tell.send(if is_there { Event::Joined(from) } else { Event::Gone(from) });
+                shared.wake();
+            }
+        };
+        let liveliness = self.session.liveliness();
+        let watch = liveliness.declare_subscriber(key(FRAMES, &bus, "*")?).history(true).callback(seen);
+        self.declared.push(Box::new(watch.wait().map_err(LinkError::zenoh)?));
+        let token = liveliness.declare_token(key(FRAMES, &bus, &host)?).wait().map_err(LinkError::zenoh)?;
+        self.declared.push(Box::new(token));
+        Ok(())
+    }
+
+    /// Hands what other hosts publish to `take`, and says what was wrong with it.
+    fn subscribe(
+        &mut self,
+        what: &str,
+        tell: Sender<Event>,
+        take: impl Fn(&str, &[u8]) -> Result<(), String> + Send + Sync + 'static,
+    ) -> Result<(), LinkError> {
+        let Settings { bus, host, .. } = self.settings.clone();
+        let shared = Arc::clone(&self.shared);
+        let taken = move |sample: Sample| {
+            let from = host_of(sample.key_expr().as_str());
+            if from == host {
+                return;
+            }
+            if let Err(why) = take(from, &sample.payload().to_bytes()) {
+                let _ = tell.send(Event::Garbage(from.to_owned(), why));
+            }
+            shared.wake();
+        };
+        let all: KeyExpr<'static> = key(what, &bus, "*")?;
+        let subscriber =
+            self.session.declare_subscriber(all).allowed_origin(Locality::Remote).callback(taken);
+        self.declared.push(Box::new(subscriber.wait().map_err(LinkError::zenoh)?));
+        Ok(())
+    }
+
+    /// What carries the bus here.
+    #[must_use]
+    pub const fn kind(&self) -> BusKind {
+        self.kind
+    }
+
+    /// Passes frames until `stop` can be read or is hung up; what has become of them.
+    ///
+    /// # Errors
+    /// When the system cannot wait.
+    pub fn run(mut self, stop: impl AsFd, mut report: impl FnMut(Event)) -> Result<Report, LinkError> {
+        let (mut inbox, mut bytes) = (Inbox::new(), Vec::new());
+        let (mut said, mut say_at, mut open_at) = ((0, 0), Instant::now(), Instant::now());
+        let mut warned = BTreeSet::new();
+        loop {
+            if !self.wait(&stop).map_err(LinkError::Wait)? {
+                break;
+            }
+            if self.bus.is_none() && open_at <= Instant::now() {
+                open_at = Instant::now() + AGAIN;
+                self.bus = open(&self.settings).ok();
+                if self.bus.is_some() {
+                    report(Event::BusBack);
+                }
+            }
+            let lost = self.read(&mut inbox).and_then(|()| self.write());
+            if let Err(error) = lost {
+                self.bus = None;
+                self.missed_before += u64::from(inbox.dropped());
+                inbox = Inbox::new();
+                report(Event::BusAway(error.to_string()));
+            }
+            self.publish(&mut bytes);
+            self.note_events(&mut report);
+            if self.returned.count() > 0 && warned.insert(None) {
+                report(Event::Circle);
+            }
+            let shared: Vec<_> = self.shared.incoming().shared().map(str::to_owned).collect();
+            for host in shared {
+                if warned.insert(Some(host.clone())) {
+                    report(Event::SameName(host));
+                }
+            }
+            let losses = self.losses();
+            if losses != said && say_at <= Instant::now() {
+                report(Event::Lost { from_here: losses.0 - said.0, from_others: losses.1 - said.1 });
+                (said, say_at) = (losses, Instant::now() + SAY);
+            }
+            self.watchers.accept();
+            if self.tell_at <= Instant::now() {
+                self.tell();
+            }
+        }
+        let report = self.report();
+        self.declared.clear();
+        let _ = self.session.close().wait();
+        Ok(report)
+    }
+
+    /// Takes note of who is there, and says so.
+    fn note_events(&mut self, report: &mut impl FnMut(Event)) {
+        for event in self.events.try_iter() {
+            if let Event::Joined(host) = &event
+                && self.there.len() < SOURCES
+            {
+                self.there.insert(host.clone());
+            } else if let Event::Gone(host) = &event {
+                self.there.remove(host);
+            }
+            // Programs here learn it at once.
+            self.tell_at = self.began;
+            report(event);
+        }
+    }
+
+    /// Tells the other hosts what was heard of them, and programs here everything.
+    fn tell(&mut self) {
+        self.tell_at = Instant::now() + TELL;
+        let report = self.report();
+        let heard: BTreeMap<_, _> = report.hosts.iter().map(|(host, it)| (host, it.heard)).collect();
+        if let Ok(bytes) = serde_json::to_vec(&heard)
+            && !heard.is_empty()
+        {
+            // Five times a second the newest; one that is lost is not missed.
+            let _ = self.teller.put(bytes).wait();
+        }
+        self.watchers.tell(&report);
+    }
+
+    /// Takes what the bus has.
+    fn read(&mut self, inbox: &mut Inbox) -> Result<(), BusError> {
+        let Some(bus) = &self.bus else { return Ok(()) };
+        let now = nanos(self.began.elapsed());
+        for _ in 0..TURNS {
+            let count = bus.receive(inbox)?;
+            for received in inbox.frames() {
+                if self.returned.is_returned(now, &received.frame) {
+                    continue;
+                }
+                let at_nanos = if received.at_nanos == 0 { wall() } else { received.at_nanos };
+                self.outgoing.take(Stamped { at_nanos, frame: received.frame });
+            }
+            self.outgoing.miss(self.missed_before + u64::from(inbox.dropped()));
+            if count == 0 {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// Hands what waits to the bus.
+    fn write(&mut self) -> Result<(), BusError> {
+        let Some(bus) = &self.bus else { return Ok(()) };
+        let now = nanos(self.began.elapsed());
+        let mut incoming = self.shared.incoming();
+        while !incoming.waiting().is_empty() {
+            let sent = bus.send(incoming.waiting());
+            let count = sent.as_ref().map_or_else(|error| error.sent, |()| incoming.waiting().len());
+            for frame in incoming.waiting().iter().take(count) {
+                self.returned.put(now, frame);
+            }
+            incoming.sent(count);
+            match sent {
+                Ok(()) => {}
+                Err(error) => {
+                    if matches!(error.cause, BusError::Full { .. }) {
+                        return Ok(());
+                    }
+                    let count = incoming.waiting().len();
+                    incoming.refused(count);
+                    return Err(error.cause);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Hands what waits to Zenoh, which never waits: what it has no room for it drops, and others count it as lost.
+    fn publish(&mut self, bytes: &mut Vec<u8>) {
+        loop {
+            let count = self.outgoing.message(bytes);
+            if count == 0 {
+                return;
+            }
+            match self.publisher.put(ZBytes::from(bytes.as_slice())).wait() {
+                Ok(()) => self.outgoing.sent(count),
+                Err(_) => self.outgoing.refused(count),
+            }
+        }
+    }
+
+    /// Waits until there is something to do; whether it goes on.
+    fn wait(&self, stop: &impl AsFd) -> io::Result<bool> {
+        let listener = self.watchers.listener();
+        let mut polled = vec![
+            PollFd::new(stop, PollFlags::IN),
+            PollFd::new(&self.shared.wake, PollFlags::IN),
+            PollFd::new(&listener, PollFlags::IN),
+        ];
+        polled.extend(self.bus.as_ref().map(|bus| PollFd::from_borrowed_fd(bus.as_fd(), PollFlags::IN)));
+        let is_full = !self.shared.incoming().waiting().is_empty();
+        let until_told = self.tell_at.saturating_duration_since(Instant::now());
+        let timeout = match &self.bus {
+            None => AGAIN.min(until_told),
+            Some(_) if is_full => RETRY.min(until_told),
+            Some(_) => until_told,
+        };
+        match poll(&mut polled, Timespec::try_from(timeout).ok().as_ref()) {
+            Ok(_) | Err(Errno::INTR) => {}
+            Err(errno) => return Err(errno.into()),
+        }
+        let came = |at: usize| polled.get(at).is_some_and(|polled| !polled.revents().is_empty());
+        if came(1) {
+            // Whatever stood there: everything is looked at.
+            let _ = rustix::io::read(&self.shared.wake, &mut [0; 8]);
+        }
+        Ok(!came(0))
+    }
+
+    /// Frames lost: from here, and of others.
+    fn losses(&self) -> (u64, u64) {
+        let Sent { dropped, missed, .. } = self.outgoing.account();
+        (dropped + missed, self.shared.incoming().accounts().map(|(_, heard, _)| heard.missing()).sum())
+    }
+
+    fn report(&self) -> Report {
+        let incoming = self.shared.incoming();
+        let ours = self.shared.ours();
+        let mut hosts: BTreeMap<String, Host> = incoming
+            .accounts()
+            .map(|(host, heard, nodes)| {
+                let nodes = nodes.iter().map(CellId::get).collect();
+                (host.to_owned(), Host { heard, nodes, ..Host::default() })
+            })
+            .collect();
+        for (host, heard) in ours.iter() {
+            hosts.entry(host.clone()).or_default().ours = Some(*heard);
+        }
+        for host in &self.there {
+            hosts.entry(host.clone()).or_default().is_there = true;
+        }
+        Report {
+            host: self.settings.host.clone(),
+            sent: self.outgoing.account(),
+            hosts,
+            returned: self.returned.count(),
+            strangers: incoming.strangers(),
+        }
+    }
+}
+
+fn open(settings: &Settings) -> Result<Bus, BusError> {
+    let options = Options {
+        receive_buffer: RECEIVE_BUFFER,
+        send_timeout: Duration::ZERO,
+        directory: settings.directory.clone(),
+        ..Options::default()
+    };
+    Bus::open(&settings.bus, settings.choice, &options)
+}
+
+fn wall() -> u64 {
+    nanos(SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default())
+}
+
+fn nanos(span: Duration) -> u64 {
+    u64::try_from(span.as_nanos()).unwrap_or(u64::MAX)
+}

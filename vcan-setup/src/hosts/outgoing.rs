@@ -1,0 +1,150 @@
+//! From a bus to the other hosts: frames that wait, numbered, and dropped where there is no room.
+
+use std::collections::VecDeque;
+
+use serde::{Deserialize, Serialize};
+
+use super::message::{FRAMES, Head, Stamped, encode};
+
+/// Frames that wait at most: 100 ms of a full bus.
+pub const QUEUE: usize = 4_096;
+
+/// What has become of the frames of a bus. `taken` is always `sent`, `dropped` and those that wait.
+#[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
+pub struct Sent {
+    /// Frames that the bus gave this link.
+    pub taken: u64,
+    /// Frames that were handed to the transport.
+    pub sent: u64,
+    /// Messages in which they were.
+    pub messages: u64,
+    /// Frames that found no room in the queue here, or that the transport refused.
+    pub dropped: u64,
+    /// Frames that the bus dropped, because this process did not read in time; not in `taken`.
+    pub missed: u64,
+}
+
+/// The frames of a bus that wait for the transport.
+#[derive(Debug)]
+pub struct Outgoing {
+    life: u64,
+    /// Frames that wait, in runs without a gap in their numbers.
+    waiting: VecDeque<(u64, Stamped)>,
+    /// The number of the next frame.
+    next: u64,
+    account: Sent,
+}
+
+impl Outgoing {
+    /// None so far; `life` is a random number.
+    #[must_use]
+    pub fn new(life: u64) -> Self {
+        Self { life, waiting: VecDeque::with_capacity(QUEUE), next: 0, account: Sent::default() }
+    }
+
+    /// Takes a frame of the bus; drops it when there is no room.
+    pub fn take(&mut self, stamped: Stamped) {
+        let number = self.next;
+        self.next += 1;
+        self.account.taken += 1;
+        if self.waiting.len() < QUEUE {
+            self.waiting.push_back((number, stamped));
+        } else {
+            self.account.dropped += 1;
+        }
+    }
+
+    /// Frames that the bus has dropped so far.
+    pub const fn miss(&mut self, so_far: u64) {
+        self.account.missed = so_far;
+    }
+
+    /// Writes the next message; how many frames are in it. They wait until [`Outgoing::sent`] or [`Outgoing::refused`].
+    pub fn message(&self, bytes: &mut Vec<u8>) -> usize {
+        let Some(&(first, _)) = self.waiting.front() else { return 0 };
+        let run = self.waiting.iter().zip(first..).take(FRAMES);
+        let count = run.take_while(|((number, _), expected)| number == expected).count();
+        // All before it were sent or dropped.
+        let dropped = first - self.account.sent;
+        let head = Head { life: self.life, first, dropped, missed: self.account.missed };
+        encode(&head, self.waiting.iter().take(count).map(|(_, stamped)| stamped), bytes);
+        count
+    }
+
+    /// The transport has taken a message of so many frames.
+    pub fn sent(&mut self, count: usize) {
+        let gone = self.waiting.drain(..count.min(self.waiting.len())).count() as u64;
+        self.account.sent += gone;
+        self.account.messages += 1;
+    }
+
+    /// The transport has refused it.
+    pub fn refused(&mut self, count: usize) {
+        self.account.dropped += self.waiting.drain(..count.min(self.waiting.len())).count() as u64;
+    }
+
+    /// What has become of the frames so far.
+    #[must_use]
+    pub const fn account(&self) -> Sent {
+        self.account
+    }
+
+    /// Frames that wait.
+    #[must_use]
+    pub fn waiting(&self) -> usize {
+        self.waiting.len()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::message::decode;
+    use super::*;
+    use protocol::can::Frame;
+
+    fn frame(at_nanos: u64) -> Stamped {
+        Stamped { at_nanos, frame: Frame::classic(0x201, &at_nanos.to_le_bytes()).unwrap() }
+    }
+
+    /// The next message: its first number, what was dropped before, and the times of its frames.
+    fn next(outgoing: &mut Outgoing) -> Option<(u64, u64, Vec<u64>)> {
+        let (mut bytes, mut frames) = (Vec::new(), Vec::new());
+        let count = outgoing.message(&mut bytes);
+        if count == 0 {
+            return None;
+        }
+        let head = decode(&bytes, &mut frames).unwrap();
+        assert_eq!(frames.len(), count);
+        outgoing.sent(count);
+        Some((head.first, head.dropped, frames.iter().map(|it| it.at_nanos).collect()))
+    }
+
+    #[test]
+    fn frames_go_out_in_order_and_in_batches() {
+        let mut outgoing = Outgoing::new(1);
+        assert_eq!(next(&mut outgoing), None);
+        (0..300).for_each(|at| outgoing.take(frame(at)));
+        assert_eq!(next(&mut outgoing), Some((0, 0, (0..256).collect())));
+        assert_eq!(next(&mut outgoing), Some((256, 0, (256..300).collect())));
+        assert_eq!((outgoing.account().sent, outgoing.account().messages, outgoing.waiting()), (300, 2, 0));
+    }
+
+    #[test]
+    fn what_is_dropped_has_a_number_and_is_told() {
+        let mut outgoing = Outgoing::new(1);
+        let all = QUEUE as u64;
+        (0..all + 7).for_each(|at| outgoing.take(frame(at)));
+        assert_eq!((outgoing.account().dropped, outgoing.waiting()), (7, QUEUE));
+        assert_eq!(next(&mut outgoing).unwrap().0, 0);
+        outgoing.take(frame(9_000));
+        outgoing.refused(256); // frames 256 to 511
+        let mut last = None;
+        while let Some(message) = next(&mut outgoing) {
+            // A gap ends a message.
+            last = Some(message);
+        }
+        assert_eq!(last, Some((all + 7, 7 + 256, vec![9_000])));
+        let Sent { taken, sent, dropped, .. } = outgoing.account();
+        assert_eq!((taken, sent, dropped), (all + 8, all + 8 - 263, 263));
+    }
+}

@@ -1,0 +1,195 @@
+//! What a link tells of itself to programs of its machine, and where they find it.
+//!
+//! A link listens at an abstract address, of which there is one for each bus in a network namespace. Whoever connects receives
+//! a [`Report`] at once and after each change, as a line of JSON, and sends nothing.
+
+use std::collections::BTreeMap;
+use std::io::{self, ErrorKind, Read};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixListener, UnixStream};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use protocol::bus::BusKind;
+use protocol::bus::embedded::usual_directory;
+use serde::{Deserialize, Serialize};
+
+use super::incoming::Heard;
+use super::outgoing::Sent;
+
+/// The longest line in bytes: 256 hosts are shorter.
+const LONGEST: usize = 1 << 20;
+/// Bytes of an abstract address.
+const NAME: usize = 107;
+
+/// What a link knows.
+#[derive(Clone, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
+pub struct Report {
+    /// This host's name.
+    pub host: String,
+    /// From this bus to the other hosts.
+    pub sent: Sent,
+    /// Each other host.
+    pub hosts: BTreeMap<String, Host>,
+    /// Frames of other hosts that came back from this bus, and were not sent once more.
+    pub returned: u64,
+    /// Messages of hosts that were too many.
+    pub strangers: u64,
+}
+
+/// What a link knows of another host.
+#[derive(Clone, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
+pub struct Host {
+    /// It is reached.
+    pub is_there: bool,
+    /// The cells whose frames came from there, by node id.
+    pub nodes: Vec<u8>,
+    /// What has become of its frames.
+    pub heard: Heard,
+    /// What it says has become of this host's frames; null until it says so.
+    pub ours: Option<Heard>,
+}
+
+/// Where the link of a bus is found; `directory` is where embedded buses live, `None` the usual one.
+fn address(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<SocketAddr> {
+    let place = match kind {
+        BusKind::Embedded => directory.map_or_else(usual_directory, Path::to_owned),
+        _ => PathBuf::new(),
+    };
+    let mut name = format!("skinbus-link {bus} {}", place.display()).into_bytes();
+    if name.len() > NAME {
+        name.drain(..name.len() - NAME);
+    }
+    SocketAddr::from_abstract_name(name)
+}
+
+/// Claims the place of the link of a bus.
+///
+/// # Errors
+/// [`ErrorKind::AddrInUse`] when there is one.
+pub fn listen(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<UnixListener> {
+    let listener = UnixListener::bind_addr(&address(bus, kind, directory)?)?;
+    listener.set_nonblocking(true)?;
+    Ok(listener)
+}
+
+/// A program's connection to the link of a bus.
+#[derive(Debug)]
+pub struct Reports {
+    stream: UnixStream,
+    buffer: Vec<u8>,
+}
+
+impl Reports {
+    /// Connects to the link of a bus.
+    ///
+    /// # Errors
+    /// [`ErrorKind::ConnectionRefused`] when nothing links it.
+    pub fn connect(bus: &str, kind: BusKind, directory: Option<&Path>) -> io::Result<Self> {
+        let stream = UnixStream::connect_addr(&address(bus, kind, directory)?)?;
+        stream.set_nonblocking(true)?;
+        Ok(Self { stream, buffer: Vec::new() })
+    }
+
+    /// Waits for a report.
+    ///
+    /// # Errors
+    /// When none comes in that time, or the link has ended.
+    pub fn wait(&mut self, timeout: Duration) -> io::Result<Report> {
+        let until = Instant::now() + timeout;
+        loop {
+            if let Some(report) = self.take()?.pop() {
+                return Ok(report);
+            }
+            if Instant::now() >= until {
+                return Err(ErrorKind::TimedOut.into());
+            }
+            std::thread::sleep(Duration::from_millis(2));
+        }
+    }
+
+    /// The reports that have come, in order. Does not wait.
+    ///
+    /// # Errors
+    /// When the link has ended, or sends no reports.
+    pub fn take(&mut self) -> io::Result<Vec<Report>> {
+        let mut piece = [0; 4_096];
+        loop {
+            match self.stream.read(&mut piece) {
+                Ok(0) => return Err(ErrorKind::UnexpectedEof.into()),
+                Ok(count) => self.buffer.extend(piece.iter().take(count)),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) => return Err(error),
+            }
+            if self.buffer.len() > LONGEST {
+                break;
+            }
+        }
+        let Some(end) = self.buffer.iter().rposition(|&byte| byte == b'\n') else {
+            let is_endless = self.buffer.len() > LONGEST;
+            return if is_endless { Err(ErrorKind::InvalidData.into()) } else { Ok(Vec::new()) };
+        };
+        let rest = self.buffer.split_off(end + 1);
+        let lines = std::mem::replace(&mut self.buffer, rest);
+        let reports = lines.split(|&byte| byte == b'\n').filter(|line| !line.is_empty());
+        reports.map(|line| serde_json::from_slice(line).map_err(io::Error::from)).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::io::Write;
+
+    use super::*;
+
+    #[test]
+    fn a_bus_has_one_place_and_reports_come_in_order_and_in_pieces() {
+        let bus = format!("r{}", std::process::id());
+        let of = |directory| listen(&bus, BusKind::Embedded, Some(Path::new(directory)));
+        let listener = of("/one").unwrap();
+        assert_eq!(of("/one").unwrap_err().kind(), ErrorKind::AddrInUse);
+        assert!(of("/two").is_ok(), "another directory, another bus");
+        let connect = |directory| Reports::connect(&bus, BusKind::Embedded, Some(Path::new(directory)));
+        assert_eq!(connect("/two").unwrap_err().kind(), ErrorKind::ConnectionRefused);
+        let mut reports = connect("/one").unwrap();
+        let (mut stream, _) = listener.accept().unwrap();
+        assert!(reports.take().unwrap().is_empty());
+        let report = |host: &str| {
+            let hosts = [("b".to_owned(), Host { nodes: vec![1, 9], ..Host::default() })].into();
+            Report { host: host.to_owned(), hosts, ..Report::default() }
+        };
+        let line = |host| format!("{}\n", serde_json::to_string(&report(host)).unwrap());
+        let (whole, cut) = (line("x"), line("y"));
+        stream.write_all(whole.as_bytes()).unwrap();
+        stream.write_all(&cut.as_bytes()[..40]).unwrap();
+        assert_eq!(reports.take().unwrap(), [report("x")]);
+        stream.write_all(&cut.as_bytes()[40..]).unwrap();
+        stream.write_all(whole.as_bytes()).unwrap();
+        assert_eq!(reports.take().unwrap(), [report("y"), report("x")]);
+        stream.write_all(b"{}\n").unwrap();
+        assert!(reports.take().is_err(), "not a report");
+        drop(stream);
+        assert_eq!(reports.take().unwrap_err().kind(), ErrorKind::UnexpectedEof);
+    }
+
+    #[test]
+    fn a_line_without_end_fills_nothing() {
+        let (mut stream, other) = UnixStream::pair().unwrap();
+        other.set_nonblocking(true).unwrap();
+        stream.set_nonblocking(true).unwrap();
+        let mut reports = Reports { stream: other, buffer: Vec::new() };
+        let ended = (0..1_000).find_map(|_| {
+            let _ = stream.write(&[b'x'; 65_536]);
+            reports.take().err()
+        });
+        assert_eq!(ended.unwrap().kind(), ErrorKind::InvalidData);
+    }
+
+    #[test]
+    fn a_long_path_is_shortened_from_its_beginning() {
+        let directory = format!("/{}/end", "x".repeat(200));
+        let address = address("vcan0", BusKind::Embedded, Some(Path::new(&directory))).unwrap();
+        assert!(address.as_abstract_name().unwrap().ends_with(b"x/end"));
+    }
+}

@@ -1,0 +1,84 @@
+//! Programs of this machine that want to know what a link knows.
+
+use std::io::Write;
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::net::{UnixListener, UnixStream};
+
+use super::report::Report;
+
+/// Programs at most; further ones are hung up on.
+const WATCHERS: usize = 64;
+
+/// Those that are connected, and where others connect.
+#[derive(Debug)]
+pub(super) struct Watchers {
+    listener: UnixListener,
+    streams: Vec<UnixStream>,
+    /// The newest report that all of them have, as a line.
+    line: Vec<u8>,
+}
+
+impl Watchers {
+    pub(super) const fn new(listener: UnixListener) -> Self {
+        Self { listener, streams: Vec::new(), line: Vec::new() }
+    }
+
+    /// Readable when somebody connects.
+    pub(super) fn listener(&self) -> BorrowedFd<'_> {
+        self.listener.as_fd()
+    }
+
+    /// Takes those that connect, and gives them the newest report.
+    pub(super) fn accept(&mut self) {
+        while let Ok((mut stream, _)) = self.listener.accept() {
+            let is_taken = self.streams.len() < WATCHERS
+                && stream.set_nonblocking(true).is_ok()
+                && stream.write_all(&self.line).is_ok();
+            if is_taken {
+                self.streams.push(stream);
+            }
+        }
+    }
+
+    /// Tells all of them, if it is new. Whoever does not read is hung up on, for half a line would be worse than none.
+    pub(super) fn tell(&mut self, report: &Report) {
+        let Ok(mut line) = serde_json::to_vec(report) else { return };
+        line.push(b'\n');
+        if line != self.line {
+            self.streams.retain_mut(|stream| stream.write_all(&line).is_ok());
+            self.line = line;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use protocol::bus::BusKind;
+
+    use super::super::report::{Reports, listen};
+    use super::*;
+
+    #[test]
+    fn whoever_connects_has_the_newest_report_and_who_does_not_read_is_hung_up_on() {
+        let bus = format!("w{}", std::process::id());
+        let place = (BusKind::Embedded, Some(Path::new("/watchers")));
+        let mut watchers = Watchers::new(listen(&bus, place.0, place.1).unwrap());
+        let report = |returned| Report { host: "x".repeat(100), returned, ..Report::default() };
+        watchers.tell(&report(1));
+        let mut reads = Reports::connect(&bus, place.0, place.1).unwrap();
+        let _sleeps = Reports::connect(&bus, place.0, place.1).unwrap();
+        watchers.accept();
+        watchers.tell(&report(1));
+        assert_eq!(reads.take().unwrap(), [report(1)], "once");
+        for returned in 2..100_000 {
+            watchers.tell(&report(returned));
+            assert_eq!(reads.take().unwrap(), [report(returned)]);
+            if watchers.streams.len() == 1 {
+                return;
+            }
+        }
+        panic!("{} watchers", watchers.streams.len());
+    }
+}
