@@ -43,6 +43,10 @@ const GONE_AFTER: Span = Span::from_millis(10_000);
 /// So many heartbeats whose counter goes on show a start of which no claim was heard, on an id that two senders used.
 const SHOWN_BY: u8 = 3;
 
+/// A cell's heartbeats are a quarter of a second apart. Old ones that are sent again in the order of their counters, by
+/// chance, come much sooner.
+const PACE: Span = Span::from_millis(100);
+
 /// A cell claims its id for 250 ms or longer; less 10 ms, by which a frame may have been late.
 const CLAIM_TAKES: Span = Span::from_millis(240);
 
@@ -157,7 +161,8 @@ impl Claim {
 
     /// Whether an outsider has the id now: the owner is silent, and its claim was heard or its counter goes on.
     fn takes_over(&mut self, at: Micros, heartbeat: &Heartbeat) -> bool {
-        let before = self.candidate.filter(|(life, _)| life.sent(at, heartbeat).is_some());
+        let goes_on = |life: &Life| life.sent(at, heartbeat).is_some() && at.since(life.at) >= PACE;
+        let before = self.candidate.filter(|(life, _)| goes_on(life));
         let shown = before.map_or(1, |(_, shown)| shown.saturating_add(1));
         self.candidate = Some((Life { heartbeat: *heartbeat, at, claimed: None }, shown));
         let is_gone = self.owner.is_none_or(|owner| !owner.is_alive(at));
@@ -284,6 +289,17 @@ mod tests {
         assert_eq!(words(0), [Word::First, known, AGAIN, old, Word::Shared, old, known, outsider, known]);
         // A cell that had started since could not have sent 2883 packets.
         assert_eq!(words(2000), [Word::First, known, outsider, old, known, old, known, outsider, known]);
+    }
+
+    #[test]
+    fn old_heartbeats_in_order_do_not_take_the_id_of_a_cell_that_hangs() {
+        let old = [15_611, 15_860, 15_611, 15_611, 15_727, 15_860, 15_860, 15_611, 15_727, 15_860];
+        let burst = old.iter().zip(1_703..).map(|(&sent, ms)| (ms, sent));
+        let own = [(0, 15_993), (1, 15_860), (2, 15_993 + 3), (227, 16_010), (686, 16_016), (995, 16_059)];
+        let heard = own.into_iter().chain(burst).chain([(1_718, 16_063), (1_975, 16_123)]);
+        let words = words_at(heard.map(|(ms, sent)| (ms, 7, sent, State::default())));
+        let count = |of: Word| words.iter().filter(|word| **word == of).count();
+        assert_eq!((count(Word::First), count(Word::Known), count(Word::Outsider)), (1, 6, 11), "{words:?}");
     }
 
     #[test]
