@@ -118,9 +118,10 @@ fn the_place_in_the_tree_is_reported_at_most_every_50_ms() {
     let mut node = start(1 << UPLINK | 0b1);
     let pages = |node: &mut Node| {
         core::iter::from_fn(|| node.poll_transmit())
-            .filter_map(|packet| match Message::decode(&packet).unwrap() {
-                Message::Network { page: NetworkPage::Tree(tree), .. } => Some((tree.parent, tree.children)),
-                _ => None,
+            .filter_map(|packet| {
+                let message = Message::decode(&packet).unwrap();
+                let Message::Network { page: NetworkPage::Tree(tree), .. } = message else { return None };
+                Some((tree.parent, tree.children))
             })
             .collect::<Vec<_>>()
     };

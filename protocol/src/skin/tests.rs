@@ -180,7 +180,6 @@ fn a_robot_of_joints_and_chains_names_what_is_wrong_with_them() {
     let chain = "[[robot.chain]]\nname = \"arm\"\nrows = [{ joint = \"lift\" }, { joint = \"elbow\" }]\n";
     let good = format!("{before}{joint}{more}{chain}{after}");
     let skin = Skin::parse("skin.toml", &good).unwrap();
-    assert_eq!(skin.robot.joints[0].limits, [-0.5, 1.0]);
     let kinds = skin.robot.joints.iter().map(|joint| joint.kind.name()).collect::<Vec<_>>();
     assert_eq!(kinds, ["prismatic", "revolute"]);
     let wrong = |from: &str, to: &str| {
@@ -190,7 +189,7 @@ fn a_robot_of_joints_and_chains_names_what_is_wrong_with_them() {
         else {
             panic!("{from}")
         };
-        what.to_string()
+        what
     };
     let slides =
         |got: &str| format!("robot.joint[0].limits = {got}: a joint slides within -1.999 to 1.999 m");

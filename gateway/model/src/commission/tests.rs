@@ -31,9 +31,9 @@ fn begun(skin: &Skin) -> (Commission, Micros) {
 /// The requests that it sends now: to whom, with which tag, and what.
 fn requests(commission: &mut Commission) -> Vec<(Node, u8, Request)> {
     std::iter::from_fn(|| commission.poll_transmit())
-        .filter_map(|message| match message {
-            Message::Configure { to, tag, request } => Some((to, tag, request)),
-            _ => None,
+        .filter_map(|message| {
+            let Message::Configure { to, tag, request } = message else { return None };
+            Some((to, tag, request))
         })
         .collect()
 }
