@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use bench::summary::{
-    BusSummary, CellSummary, Halted, Loop, NetworkSummary, Outcome, Processor, Recording, RepliesSummary,
-    Summary, SumsSummary, TickBefore, Written,
+    BusSummary, CellSummary, Halted, HostSummary, Loop, NetworkSummary, Outcome, Processor, Recording,
+    RepliesSummary, Summary, SumsSummary, TickBefore, Written,
 };
 use model::quantiles::{Quantiles, histogram};
 use model::table::{Accuracy, Event, Status, Table};
@@ -90,6 +90,8 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
         buses: vec![bus],
         processor: Processor::default(),
         cell_private_kib: Some(768),
+        gateway_private_kib: Some(9_000),
+        buses_private_kib: Some(500),
         recording: Some(Recording {
             files: vec![Written {
                 path: "run.log".to_owned(),
@@ -168,6 +170,7 @@ fn every_key_is_documented_with_its_type_and_no_other() {
     cells.iter_mut().for_each(|cell| cell.mode = Some("test"));
     let bus = BusSummary::new("vcan0", "embedded", 0, &table, 0, Micros(0));
     let bus = BusSummary {
+        hosts: vec![HostSummary { name: "cells".to_owned(), ..HostSummary::default() }],
         sums: Some(SumsSummary::default()),
         network: Some(NetworkSummary {
             differences: vec!["cell 2 does not speak".to_owned()],

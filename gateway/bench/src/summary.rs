@@ -252,8 +252,10 @@ pub struct OutagesSummary {
 }
 
 /// Another host that has the bus too.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct HostSummary {
+    /// Its name.
+    pub name: String,
     /// Cells that sent from there.
     pub cells: usize,
     /// How often it was gone, or not reached.
@@ -313,8 +315,8 @@ pub struct BusSummary {
     pub receive_buffer: usize,
     /// How often it was lost.
     pub outages: OutagesSummary,
-    /// Other hosts, by name, that `vcan-setup link` joins it with.
-    pub hosts: BTreeMap<String, HostSummary>,
+    /// Other hosts that `vcan-setup link` joins it with.
+    pub hosts: Vec<HostSummary>,
     /// Cells by status at the end.
     pub cells: BTreeMap<&'static str, usize>,
     /// Cells that were dead or were never received at the end.
@@ -382,7 +384,7 @@ impl BusSummary {
             kind: kind.to_owned(),
             receive_buffer,
             outages: OutagesSummary::default(),
-            hosts: BTreeMap::new(),
+            hosts: Vec::new(),
             cells,
             silent_cells,
             uplink: uplink(table, dropped),

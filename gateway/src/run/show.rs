@@ -111,16 +111,15 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
         let ticks = format!("{} ticks without it", bus.outages.ticks);
         rows.row("lost", format!("{} times, {:.1} s{end}", bus.outages.times, bus.outages.lost_s), ticks);
     }
-    for (host, it) in &bus.hosts {
-        let gone =
-            (it.gone > 0).then(|| format!("gone {}, {:.1} s", count(it.gone as usize, "time"), it.gone_s));
+    for it in &bus.hosts {
+        let gone = (it.gone > 0).then(|| format!("gone {}, {:.1} s", count(it.gone, "time"), it.gone_s));
         let end = (!it.at_end).then(|| "not reached at the end".to_owned());
         let lost = list(
             [(it.lost_from, "from there"), (it.lost_to, "to there")]
                 .map(|(n, way)| format!("{n} frames lost {way}")),
         );
         let cells = count(it.cells, "cell");
-        rows.row(format!("host {host}"), list([cells].into_iter().chain(gone).chain(end)), lost);
+        rows.row(format!("host {}", it.name), list([cells].into_iter().chain(gone).chain(end)), lost);
     }
     if !bus.silent_cells.is_empty() {
         rows.row("silent cells", words(&bus.silent_cells), "");

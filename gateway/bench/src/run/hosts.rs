@@ -82,8 +82,9 @@ impl Hosts {
     }
 
     /// What was known of each host; none where nothing linked the bus.
-    pub(super) fn summary(&self) -> BTreeMap<String, HostSummary> {
-        let summary = |of: &Of| HostSummary {
+    pub(super) fn summary(&self) -> Vec<HostSummary> {
+        let summary = |(name, of): (&String, &Of)| HostSummary {
+            name: name.clone(),
             cells: of.newest.nodes.len(),
             gone: of.outages.times,
             gone_s: of.outages.lost(Instant::now()).as_secs_f64(),
@@ -91,7 +92,7 @@ impl Hosts {
             lost_from: of.lost[0],
             lost_to: of.lost[1],
         };
-        self.known.hosts.iter().map(|(host, of)| (host.clone(), summary(of))).collect()
+        self.known.hosts.iter().map(summary).collect()
     }
 }
 
@@ -190,7 +191,7 @@ mod tests {
         assert_eq!(of.0.lost(), 0);
         assert_eq!(of.take(&[("b", true, 1, 53, 60)]), (vec![], 0, 0), "their own counts show it");
         assert_eq!(of.take(&[("b", true, 1, 53, 64)]), (vec![], 2, 2), "stimuli may be among them");
-        assert_eq!((of.0.lost(), of.0.summary()["b"].lost_from, of.0.summary()["b"].lost_to), (7, 3, 4));
+        assert_eq!((of.0.lost(), of.0.summary()[0].lost_from, of.0.summary()[0].lost_to), (7, 3, 4));
     }
 
     #[test]
@@ -208,7 +209,7 @@ mod tests {
             2,
             "its link was killed and is back"
         );
-        let b = of.0.summary()["b"];
+        let b = &of.0.summary()[0];
         assert_eq!((b.gone, b.gone_s, b.at_end, b.cells), (1, 1.0, true, 2));
     }
 

@@ -37,12 +37,15 @@ pub fn section(measured: &Scale) -> Section {
         .tables([table(sizes)])
 }
 
+/// The name of a line of a picture, and its height.
+type Series<'a> = (&'a str, fn(&Size) -> f64);
+
 /// A figure of benches over their cells, in a series for each pair of a caption and a value.
 fn drawn<const N: usize>(
     (name, title): (&str, &str),
     y: Axis,
     sizes: &[Size],
-    series: [(&str, fn(&Size) -> f64); N],
+    series: [Series<'_>; N],
 ) -> Figure {
     let figure = Figure::new(format!("scale-{name}"), title, Axis::new("cells", ""), y).half();
     series.into_iter().fold(figure, |figure, (caption, value)| {
