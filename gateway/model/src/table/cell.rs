@@ -1,7 +1,7 @@
 //! The gateway's state of one cell.
 
 use protocol::id::CellId;
-use protocol::message::{Answer, From, Heard, Heartbeat, SensorPage, SkinSensors, State};
+use protocol::message::{Answer, From, Heartbeat, SensorPage, SkinSensors, State};
 use protocol::packet::{Epoch, WORDS};
 use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
@@ -13,6 +13,7 @@ use super::held::{Change, Held};
 use super::replies::{Outstanding, Replies};
 use super::root_totals::RootSums;
 use super::sensed::Sensed;
+use super::sent::Sent;
 use super::switched::{SWITCHES, Switch, Switched};
 use crate::tracker::{Contact, Pages, Tracked, Update, Uplink, Word};
 
@@ -60,15 +61,6 @@ pub struct Said {
     pub counters: bool,
 }
 
-/// Joints that were sent to a cell, to be compared with the number that it reports as received.
-#[derive(Clone, Copy, Debug, Default)]
-struct Sent {
-    /// Its first page of receive counters since it started or we did.
-    first: Option<Heard>,
-    /// Broadcasts since that page.
-    joints: u64,
-}
-
 /// Whether a cell is halted.
 #[derive(Clone, Copy, Debug, Default)]
 struct Halt {
@@ -110,8 +102,6 @@ pub struct Cell {
     switched: Switched,
     halt: Halt,
     sent: Sent,
-    /// The same before its last start and replies then in doubt, as long as that start may be taken back.
-    before_start: Option<(Sent, u64)>,
     pub(super) outstanding: Outstanding,
     /// The number of the last broadcast that it answered.
     pub(super) answered: Option<u64>,
@@ -144,7 +134,6 @@ impl Cell {
             switched,
             halt: Halt::default(),
             sent: Sent::default(),
-            before_start: None,
             outstanding: Outstanding::default(),
             answered: None,
             held: Held::default(),
@@ -186,15 +175,13 @@ impl Cell {
     pub(super) fn begin_accounts(&mut self) {
         self.tracked.account = Default::default();
         (self.replies, self.sensed, self.outstanding) = Default::default();
-        self.sent.joints = 0;
+        self.sent.begin();
     }
 
     /// Its receive counters came, and so many joints passed the page on its way; later pages are compared with the
     /// first one since a start.
     pub(super) fn report(&mut self, passed: u64) {
-        if self.sent.first.is_none() {
-            self.sent = Sent { first: self.pages().heard, joints: passed };
-        }
+        self.sent.report(self.pages().heard, passed);
     }
 
     /// Takes its heartbeat, with what that means.
@@ -228,7 +215,7 @@ impl Cell {
             self.restart(word, update.taken_back, heartbeat.sent);
             (self.reply, self.deaf) = (None, 0);
         } else if !self.tracked.account.is_in_question() {
-            self.before_start = None;
+            self.sent.confirm();
         }
         // It does not release a sum, which may hold torques of other cells.
         if self.sums.is_some() || !started && heartbeat.state.has(State::ACTIVE) {
@@ -293,7 +280,7 @@ impl Cell {
     /// A new broadcast: a reply that did not come in three epochs is missing, and the held torque decays.
     /// Returns the change of the sum and for how many epochs the held torque was not renewed.
     pub(super) fn open_epoch(&mut self, number: u64, in_contact: bool, safety: &Safety) -> (Change, u32) {
-        self.sent.joints += 1;
+        self.sent.count();
         let due = in_contact && self.is_ready();
         if let Some(sums) = &mut self.sums {
             self.outstanding.open_only(due);
@@ -314,7 +301,7 @@ impl Cell {
 
     /// The last broadcast came again: the cell receives and drops it, and no reply is due.
     pub(super) const fn hear_again(&mut self) {
-        self.sent.joints += 1;
+        self.sent.count();
     }
 
     /// Whether something of its torque is in the running sum.
@@ -385,16 +372,7 @@ impl Cell {
     /// does not report as received; of a cell that has reported.
     #[must_use]
     pub fn unanswered(&self) -> Option<(u64, u64)> {
-        let first = self.sent.first?;
-        let last = self.pages().heard.unwrap_or(first);
-        let since = |count: fn(&Heard) -> u16| count(&last).wrapping_sub(count(&first));
-        let skipped = since(|heard| heard.joints_late);
-        let heard = since(|heard| heard.joints).wrapping_add(since(|heard| heard.joints_repeated));
-        // The cell counts modulo 2^16, so only the difference modulo 2^16 is known. A page may have passed some joints
-        // on the way.
-        let [low, high, ..] = self.sent.joints.to_le_bytes();
-        let unheard = u16::from_le_bytes([low, high]).wrapping_sub(heard.wrapping_add(skipped));
-        Some((skipped.into(), if unheard > u16::MAX - 64 { 0 } else { unheard.into() }))
+        self.sent.unanswered(self.pages().heard)
     }
 
     /// The bus is lost: due replies may have been sent and lost.
@@ -424,28 +402,15 @@ impl Cell {
     /// a restart was none: they go on, and explain all but what was outstanding.
     fn restart(&mut self, word: Word, taken_back: bool, sent: u16) {
         let due = self.outstanding.clear();
-        let (joints, in_doubt) = (self.sent.joints, self.replies.in_doubt);
-        // It counts from zero; without its first heartbeat, we compare from the next page on.
-        let anew = Sent { first: (sent == 0).then(Heard::default), joints: 0 };
-        if let Some((before, _)) = &mut self.before_start {
-            before.joints += joints;
-        } else if word == (Word::Started { again: true }) {
-            self.before_start = Some((self.sent, in_doubt));
-        }
-        let before = self.before_start.as_mut().filter(|_| self.sums.is_none());
-        let in_doubt = before.map_or(0, |(_, in_doubt)| {
-            *in_doubt += u64::from(due);
-            *in_doubt
-        });
-        let before = self.before_start.take_if(|_| taken_back);
-        self.sent = before.map_or(anew, |(sent, _)| sent);
+        let outstanding = if self.sums.is_some() { 0 } else { due };
+        let in_doubt = self.sent.restart(word, taken_back, sent, (outstanding, self.replies.in_doubt));
         if self.sums.is_some() {
             // Its contribution is missing in a sum, and its own held sum decays.
             return;
         }
         self.replies.miss(due, false);
         let unexplained = self.replies.missing.saturating_sub(self.replies.too_late);
-        self.replies.in_doubt = if before.is_some() { in_doubt } else { unexplained };
+        self.replies.in_doubt = in_doubt.unwrap_or(unexplained);
         self.answered = None;
     }
 

@@ -20,6 +20,7 @@ mod outsiders;
 mod replies;
 mod root_totals;
 mod sensed;
+mod sent;
 mod switched;
 
 use std::collections::VecDeque;
