@@ -75,7 +75,10 @@ mod tests {
         let text = GOOD.replace(bus, &(bus.replace("\"torque\"", reply) + &other));
         let (head, cells) = text.split_at(text.find("[[cell]]").unwrap());
         let cells = cells.replace("node = 1\n", "node = 1\nroot = true\n");
-        format!("{head}{cells}\n# The other half.\n{}", cells.replace("bus = \"vcan0\"", "bus = \"vcan1\""))
+        format!(
+            "{head}{cells}\n# The cells of vcan1.\n{}",
+            cells.replace("bus = \"vcan0\"", "bus = \"vcan1\"")
+        )
     }
 
     #[test]

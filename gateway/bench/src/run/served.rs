@@ -74,8 +74,8 @@ impl ServedBus {
     }
 }
 
-/// A bus that is to be opened: its name, its kind, and how.
-pub type Wanted<'a> = (&'a str, Choice, Options);
+/// A bus to be opened: its name, its kind, and how.
+pub type Target<'a> = (&'a str, Choice, Options);
 
 /// Opens a bus; an embedded one without a server is served, by `vcan_setup` if that is named.
 ///
@@ -97,7 +97,7 @@ pub fn open_or_serve(
 /// # Errors
 /// When one does not open, or is not served.
 pub fn open_or_serve_all(
-    buses: &[Wanted<'_>],
+    buses: &[Target<'_>],
     vcan_setup: Option<&Path>,
 ) -> Result<(Vec<Bus>, Vec<ServedBus>), RunError> {
     let mut begun = Vec::with_capacity(buses.len());

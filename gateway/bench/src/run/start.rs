@@ -21,7 +21,7 @@ use super::link::{Link, ReceiveEnd, Slot};
 use super::network::Network;
 use super::receiver::{BusEvent, Receiver, look_at};
 use super::roots::{ReceiveFilter, Roots};
-use super::served::{ServedBus, Wanted, open_or_serve, open_or_serve_all};
+use super::served::{ServedBus, Target, open_or_serve, open_or_serve_all};
 use super::{Options, RunError, realtime};
 use crate::emulate::{self, Emulation, Emulator};
 use crate::record::feed::{self, Feed, Outlet};
@@ -72,14 +72,14 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let emulation =
         emulator.map(|emulator| emulate(options, &emulator, &mut served, &mut processes, &signalled));
     let emulation = emulation.transpose()?;
-    let wanted = skin.buses.iter().enumerate().map(|(index, bus)| {
+    let targets = skin.buses.iter().enumerate().map(|(index, bus)| {
         let receive_filter = ReceiveFilter::of(skin, index, !outputs.is_empty());
-        wanted(options, bus, receive_filter.filters)
+        target_of(options, bus, receive_filter.filters)
     });
-    let wanted: Vec<_> = wanted.collect();
-    let (opened, own) = open_or_serve_all(&wanted, options.vcan_setup.as_deref())?;
+    let targets: Vec<_> = targets.collect();
+    let (opened, own) = open_or_serve_all(&targets, options.vcan_setup.as_deref())?;
     served.extend(own);
-    let opened = skin.buses.iter().zip(wanted).zip(opened);
+    let opened = skin.buses.iter().zip(targets).zip(opened);
     let opened = opened.map(|((bus, (.., target)), opened)| linked(options, bus, target, opened));
     let opened = opened.collect::<Result<Vec<_>, _>>()?;
     let shared = Arc::new(Shared::default());
@@ -158,7 +158,7 @@ fn emulate(
 }
 
 /// How a bus is to be opened.
-fn wanted<'a>(options: &Options, described: &'a skin::Bus, filters: Vec<Filter>) -> Wanted<'a> {
+fn target_of<'a>(options: &Options, described: &'a skin::Bus, filters: Vec<Filter>) -> Target<'a> {
     let name = &described.name;
     let target = BusOptions {
         fd: described.format == Format::Fd,
