@@ -10,7 +10,7 @@ use super::message::{Head, MessageError, Stamped, decode};
 
 /// Frames that wait for the bus at most.
 pub const QUEUE: usize = 8_192;
-/// Sources that are told apart; a host that is named anew each time would fill the memory.
+/// Sources that are told apart; a host with another name each time would fill the memory.
 pub const SOURCES: usize = 256;
 
 /// What has become of the frames of one source. `numbered` is always `before`, `dropped_there`, `lost` and `taken`; `taken`
@@ -19,7 +19,7 @@ pub const SOURCES: usize = 256;
 pub struct Heard {
     /// Numbers that the source has given, of all its lives.
     pub numbered: u64,
-    /// Of these, from before this link heard the source first, or after it started anew.
+    /// Of these, from before this link heard the source first, or after it restarted.
     pub before: u64,
     /// Dropped by the source: its queue was full.
     pub dropped_there: u64,
@@ -126,7 +126,7 @@ pub struct Incoming {
     /// Whose they are, in runs.
     of: VecDeque<(String, usize)>,
     /// Messages of hosts beyond [`SOURCES`].
-    strangers: u64,
+    unknown_hosts: u64,
     frames: Vec<Stamped>,
 }
 
@@ -138,7 +138,7 @@ impl Incoming {
     pub fn take(&mut self, host: &str, bytes: &[u8]) -> Result<(), MessageError> {
         if !self.sources.contains_key(host) {
             if self.sources.len() >= SOURCES {
-                self.strangers += 1;
+                self.unknown_hosts += 1;
                 return Ok(());
             }
             self.sources.insert(host.to_owned(), Source::default());
@@ -206,8 +206,8 @@ impl Incoming {
 
     /// Messages of hosts that were too many.
     #[must_use]
-    pub const fn strangers(&self) -> u64 {
-        self.strangers
+    pub const fn unknown_hosts(&self) -> u64 {
+        self.unknown_hosts
     }
 }
 
@@ -241,7 +241,7 @@ mod tests {
         take(1, 125, 5, 11, 10); // two dropped there, three lost
         take(1, 125, 5, 11, 10); // again
         take(1, 130, 5, 11, 10); // half of it again
-        take(2, 4, 0, 0, 1); // it has started anew
+        take(2, 4, 0, 0, 1); // it has restarted
         let account = heard(&incoming);
         let expected = Heard {
             numbered: 145,
@@ -313,7 +313,7 @@ mod tests {
         for host in 0..SOURCES + 3 {
             incoming.take(&host.to_string(), &message(Head::default(), 1)).unwrap();
         }
-        assert_eq!((incoming.accounts().count(), incoming.strangers()), (SOURCES, 3));
+        assert_eq!((incoming.accounts().count(), incoming.unknown_hosts()), (SOURCES, 3));
     }
 
     proptest! {

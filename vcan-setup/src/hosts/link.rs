@@ -73,7 +73,7 @@ pub struct Link {
     session: Session,
     publisher: Publisher<'static>,
     /// For what was heard of the other hosts.
-    teller: Publisher<'static>,
+    accounts: Publisher<'static>,
     shared: Arc<Shared>,
     events: Receiver<Event>,
     /// Dropped at the end.
@@ -123,7 +123,7 @@ impl Link {
             .allowed_destination(Locality::Remote)
             .wait()
             .map_err(LinkError::zenoh)?;
-        let teller = session
+        let accounts = session
             .declare_publisher(key(HEARD, &settings.bus, &settings.host)?)
             .allowed_destination(Locality::Remote)
             .wait()
@@ -136,7 +136,7 @@ impl Link {
             kind,
             session,
             publisher,
-            teller,
+            accounts,
             shared,
             events,
             declared: Vec::new(),
@@ -298,7 +298,7 @@ impl Link {
             && !heard.is_empty()
         {
             // Five times a second the newest; one that is lost is not missed.
-            let _ = self.teller.put(bytes).wait();
+            let _ = self.accounts.put(bytes).wait();
         }
         self.watchers.tell(&report);
     }
@@ -420,7 +420,7 @@ impl Link {
             sent: self.outgoing.account(),
             hosts,
             returned: self.returned.count(),
-            strangers: incoming.strangers(),
+            unknown_hosts: incoming.unknown_hosts(),
         }
     }
 }

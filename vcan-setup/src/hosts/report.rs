@@ -34,7 +34,7 @@ pub struct Report {
     /// Frames of other hosts that came back from this bus, and were not sent once more.
     pub returned: u64,
     /// Messages of hosts that were too many.
-    pub strangers: u64,
+    pub unknown_hosts: u64,
 }
 
 /// What a link knows of another host.

@@ -140,7 +140,7 @@ impl Known {
         }
     }
 
-    /// The link here has ended. A next one counts anew.
+    /// The link here has ended. A next one counts from zero.
     fn end(&mut self, bus: &str, why: &str, now: Instant, changes: &mut Changes) {
         changes.notes.push(format!("the link of {bus} to other hosts has ended ({why})"));
         for known in self.hosts.values_mut() {

@@ -57,8 +57,8 @@ impl Sent {
         }
         let before = self.before.take_if(|_| taken_back);
         // It counts from zero; without its first heartbeat, we compare from the next page on.
-        let anew = Since { first: (sent == 0).then(Heard::default), joints: 0 };
-        self.since = before.map_or(anew, |(since, _)| since);
+        let restarted = Since { first: (sent == 0).then(Heard::default), joints: 0 };
+        self.since = before.map_or(restarted, |(since, _)| since);
         before.map(|(_, in_doubt)| in_doubt)
     }
 
