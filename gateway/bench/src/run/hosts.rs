@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn a_link_that_ends_here_and_counts_anew_loses_no_account() {
+    fn a_link_that_ends_here_and_counts_from_zero_loses_no_account() {
         let mut of = Fixture::new();
         of.take(&[("b", true, 1, 10, 0)]);
         of.take(&[("b", true, 1, 15, 0)]);
