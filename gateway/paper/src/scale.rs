@@ -21,9 +21,9 @@ use model::scenario::Mode;
 pub use section::section;
 
 /// The share of cells that are touched.
-const ACTIVE: f64 = 0.05;
+pub const ACTIVE: f64 = 0.05;
 /// The share of replies that has to be in time.
-const HOLDS: f64 = 0.99;
+pub const HOLDS: f64 = 0.99;
 /// The force on a touched cell, in N.
 const TOUCH_N: f64 = 0.5;
 /// Cells of the smallest bench of a full measurement: those of the paper's arm.
