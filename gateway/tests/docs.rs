@@ -128,6 +128,10 @@ fn every_key_of_a_scenario_is_documented_and_no_other() {
             "{line}"
         );
     }
+    for line in ["[sensors]", "[sensors.force]"] {
+        let keys = allowed(&format!("{line}\nzzz = 1\n"), read_scenario);
+        assert_eq!(documented(SCENARIO_MD, &format!("### `{line}`")), keys, "{line}");
+    }
 }
 
 #[test]

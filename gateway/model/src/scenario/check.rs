@@ -10,7 +10,7 @@ use protocol::time::{Micros, Span};
 use protocol::wire::PORTS;
 
 use super::touches::MAX_FORCE_N;
-use super::{Mode, ModeChange, Motion, MotionKind, Profile, Scenario, Touch, faults, raw};
+use super::{Mode, ModeChange, Motion, MotionKind, Profile, Scenario, Touch, faults, raw, sensors};
 
 pub(super) type Checked<T> = Result<T, Wrong>;
 
@@ -27,7 +27,8 @@ pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     let names = Names::of(skin);
     let touches = touches(&raw.touch, end, &names)?;
     let faults = faults::faults(&raw.fault, end, &names)?;
-    Ok(Scenario { duration, seed, motion, modes, touches, faults })
+    let sensors = sensors::sensors(&raw.sensors, end)?;
+    Ok(Scenario { duration, seed, motion, modes, touches, faults, sensors })
 }
 
 /// The scenario's duration in s.
@@ -40,6 +41,18 @@ impl EndS {
         if (0.0..self.0).contains(&seconds) {
             return Ok(Micros(span(seconds).0));
         }
+        self.outside(at, seconds)
+    }
+
+    /// A moment within the scenario, or its end.
+    pub(super) fn moment_or_end(self, at: &Place, seconds: f64) -> Checked<Micros> {
+        if (0.0..=self.0).contains(&seconds) {
+            return Ok(Micros(span(seconds).0));
+        }
+        self.outside(at, seconds)
+    }
+
+    fn outside(self, at: &Place, seconds: f64) -> Checked<Micros> {
         let why = format_args!("the scenario goes from 0 to duration_s = {}", self.0);
         Err(at.fault(seconds, why))
     }

@@ -8,6 +8,7 @@ mod check;
 mod faults;
 mod raw;
 mod remarks;
+mod sensors;
 mod touches;
 
 use std::path::Path;
@@ -18,6 +19,7 @@ use protocol::skin::{KEYS, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::{Micros, Span};
 use serde::{Deserialize, Serialize};
 
+pub use sensors::{ForceErrors, REFERENCE_C, Sensors};
 pub use touches::{MAX_FORCE_N, Stimulus, Touches, contact_words};
 
 /// How long a run takes in which nothing happens, unless it is told.
@@ -38,6 +40,8 @@ pub struct Scenario {
     pub touches: Vec<Touch>,
     /// The faults, in the order of time.
     pub faults: Vec<Fault>,
+    /// How the sensors differ from perfect ones.
+    pub sensors: Sensors,
 }
 
 /// The motion of the robot.
@@ -326,7 +330,15 @@ impl Scenario {
     #[must_use]
     pub const fn idle(duration: Span) -> Self {
         let motion = Motion { start: [0.0; MAX_ROBOT_JOINTS], kind: MotionKind::Kinesthetic };
-        Self { duration, seed: 1, motion, modes: Vec::new(), touches: Vec::new(), faults: Vec::new() }
+        Self {
+            duration,
+            seed: 1,
+            motion,
+            modes: Vec::new(),
+            touches: Vec::new(),
+            faults: Vec::new(),
+            sensors: Sensors::PERFECT,
+        }
     }
 
     /// What the gateway computes at a time.

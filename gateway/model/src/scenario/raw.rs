@@ -21,6 +21,8 @@ pub(super) struct Scenario {
     pub(super) touch: Vec<Touch>,
     #[serde(default)]
     pub(super) fault: Vec<Fault>,
+    #[serde(default)]
+    pub(super) sensors: Sensors,
 }
 
 const fn one() -> i64 {
@@ -109,4 +111,27 @@ pub(super) struct Fault {
     pub(super) n_per_s: Option<f64>,
     pub(super) frames_per_s: Option<f64>,
     pub(super) id: Option<i64>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct Sensors {
+    /// Times in s and temperatures in °C.
+    pub(super) temperature_c: Vec<[f64; 2]>,
+    pub(super) force: Option<ForceErrors>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct ForceErrors {
+    pub(super) kind: Option<String>,
+    pub(super) offset_n: Option<f64>,
+    pub(super) gain: Option<f64>,
+    pub(super) hysteresis: Option<f64>,
+    pub(super) creep: Option<f64>,
+    pub(super) drift_n: Option<f64>,
+    pub(super) temperature_n_per_c: Option<f64>,
+    pub(super) temperature_gain_per_c: Option<f64>,
+    pub(super) crosstalk: Option<f64>,
+    pub(super) noise_n: Option<f64>,
 }

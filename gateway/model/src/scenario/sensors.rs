@@ -1,0 +1,205 @@
+//! How the sensors of a run differ from perfect ones: the table `[sensors]`.
+
+use protocol::document::Place;
+use protocol::fixed::Q9_6;
+use protocol::time::Micros;
+
+use super::check::{Checked, EndS};
+use super::raw;
+
+/// Data sheets state errors at this temperature, in °C.
+pub const REFERENCE_C: f64 = 25.0;
+
+/// How sensors differ from perfect ones; the default is perfect sensors. Which cell errs how is drawn from the scenario's
+/// seed.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Sensors {
+    /// The temperature of all cells in °C at some times, in the order of time: linear between them, constant before the
+    /// first and after the last one. Without any it is not simulated.
+    pub temperature: Vec<(Micros, f64)>,
+    /// The errors of force sensors.
+    pub force: ForceErrors,
+}
+
+/// The errors of force sensors; all are zero of perfect ones.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ForceErrors {
+    /// The largest zero error in N, of either sign.
+    pub offset_n: f64,
+    /// The largest error of the gain, a part of it, of either sign.
+    pub gain: f64,
+    /// How much more it reads while the force falls than while it rises, a part of the force.
+    pub hysteresis: f64,
+    /// How much more it reads under a constant force with each tenfold of time, a part of the force.
+    pub creep: f64,
+    /// The standard deviation of the zero's random walk after an hour, in N.
+    pub drift_n: f64,
+    /// The largest shift of the zero in N/°C, of either sign.
+    pub temperature_n_per_c: f64,
+    /// The largest change of the gain for each °C, a part of it, of either sign.
+    pub temperature_gain_per_c: f64,
+    /// Which part of the force on a wired neighbour it reads.
+    pub crosstalk: f64,
+    /// The standard deviation of the noise in N.
+    pub noise_n: f64,
+}
+
+impl Sensors {
+    /// Sensors that read what is there.
+    pub const PERFECT: Self = Self { temperature: Vec::new(), force: ForceErrors::PERFECT };
+
+    /// Whether they read what is there, and no temperature.
+    #[must_use]
+    pub fn are_perfect(&self) -> bool {
+        *self == Self::PERFECT
+    }
+
+    /// The temperature of all cells at a time, if it is simulated.
+    #[must_use]
+    pub fn temperature_at(&self, time: Micros) -> Option<f64> {
+        let after = self.temperature.partition_point(|(at, _)| *at <= time);
+        let before = after.checked_sub(1).and_then(|index| self.temperature.get(index));
+        match (before, self.temperature.get(after)) {
+            (Some(&(from, low)), Some(&(to, high))) => {
+                let part = time.since(from).seconds() / to.since(from).seconds();
+                Some(low + (high - low) * part)
+            }
+            (Some((_, one)), None) | (None, Some((_, one))) => Some(*one),
+            (None, None) => None,
+        }
+    }
+}
+
+impl ForceErrors {
+    /// None.
+    pub const PERFECT: Self = Self {
+        offset_n: 0.0,
+        gain: 0.0,
+        hysteresis: 0.0,
+        creep: 0.0,
+        drift_n: 0.0,
+        temperature_n_per_c: 0.0,
+        temperature_gain_per_c: 0.0,
+        crosstalk: 0.0,
+        noise_n: 0.0,
+    };
+
+    /// Honeywell FSS1500, a piezoresistive bridge of 15 N. Its data sheet has, at 5 V and 0.12 mV/g: null offset up to
+    /// 15 mV, 125 g; sensitivity 0.10 to 0.14 mV/g; null shift 0.5 mV from 25 to 40 °C, 4.2 g; sensitivity shift 5.5 %
+    /// from 25 to 50 °C.
+    pub const PIEZORESISTIVE: Self = Self {
+        offset_n: 1.2,
+        gain: 0.17,
+        temperature_n_per_c: 0.0027,
+        temperature_gain_per_c: 0.0022,
+        ..Self::PERFECT
+    };
+
+    /// Interlink FSR 400, a force sensing resistor. Its data sheet has: 6 % from part to part; hysteresis 10 %; long term
+    /// drift 5 % per log10(time); 15 % less resistance after an hour at 85 °C.
+    pub const RESISTIVE: Self =
+        Self { gain: 0.06, hysteresis: 0.1, creep: 0.05, temperature_gain_per_c: 0.0025, ..Self::PERFECT };
+}
+
+/// Checks the table `[sensors]`.
+pub(super) fn sensors(raw: &raw::Sensors, end: EndS) -> Checked<Sensors> {
+    let at = Place::named("sensors");
+    let temperature = temperature(&at.key("temperature_c"), &raw.temperature_c, end)?;
+    let force = raw.force.as_ref().map_or(Ok(ForceErrors::PERFECT), |raw| force(&at.key("force"), raw))?;
+    Ok(Sensors { temperature, force })
+}
+
+fn temperature(at: &Place, points: &[[f64; 2]], end: EndS) -> Checked<Vec<(Micros, f64)>> {
+    let mut temperature: Vec<(Micros, f64)> = Vec::with_capacity(points.len());
+    for (index, &[seconds, degrees]) in points.iter().enumerate() {
+        let at = at.nth(index);
+        let moment = end.moment_or_end(&at.nth(0), seconds)?;
+        if temperature.last().is_some_and(|(last, _)| *last >= moment) {
+            return Err(at.nth(0).fault(seconds, "times come in their order, each once"));
+        }
+        at.nth(1).fit(degrees, Q9_6::try_nearest)?;
+        temperature.push((moment, degrees));
+    }
+    Ok(temperature)
+}
+
+fn force(at: &Place, raw: &raw::ForceErrors) -> Checked<ForceErrors> {
+    let kinds = [
+        ("perfect", ForceErrors::PERFECT),
+        ("piezoresistive", ForceErrors::PIEZORESISTIVE),
+        ("resistive", ForceErrors::RESISTIVE),
+    ];
+    let mut errors = at.key("kind").word(raw.kind.as_deref().unwrap_or("piezoresistive"), &kinds)?;
+    let keys = [
+        ("offset_n", raw.offset_n, &mut errors.offset_n, 30.0),
+        ("gain", raw.gain, &mut errors.gain, 0.9),
+        ("hysteresis", raw.hysteresis, &mut errors.hysteresis, 1.0),
+        ("creep", raw.creep, &mut errors.creep, 0.5),
+        ("drift_n", raw.drift_n, &mut errors.drift_n, 30.0),
+        ("temperature_n_per_c", raw.temperature_n_per_c, &mut errors.temperature_n_per_c, 1.0),
+        ("temperature_gain_per_c", raw.temperature_gain_per_c, &mut errors.temperature_gain_per_c, 0.1),
+        ("crosstalk", raw.crosstalk, &mut errors.crosstalk, 0.5),
+        ("noise_n", raw.noise_n, &mut errors.noise_n, 1.0),
+    ];
+    for (key, given, error, max) in keys {
+        let Some(given) = given else { continue };
+        if !(0.0..=max).contains(&given) {
+            return Err(at.key(key).fault(given, format_args!("0 to {max} are possible")));
+        }
+        *error = given;
+    }
+    Ok(errors)
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "these are exact")]
+mod tests {
+    use super::*;
+    use crate::scenario::Scenario;
+    use crate::testing::skin;
+
+    fn read(text: &str) -> Result<Sensors, String> {
+        let text = format!("duration_s = 600.0\n{text}");
+        Scenario::parse("s.toml", &text, &skin())
+            .map(|scenario| scenario.sensors)
+            .map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn sensors_are_perfect_unless_the_scenario_says_how_bad_they_are() {
+        for text in ["", "[sensors]\n", "[sensors.force]\nkind = \"perfect\"\n"] {
+            assert!(read(text).unwrap().are_perfect(), "{text}");
+        }
+        assert_eq!(read("[sensors.force]\n").unwrap().force, ForceErrors::PIEZORESISTIVE);
+        let given =
+            read("[sensors.force]\nkind = \"resistive\"\ncreep = 0.0\noffset_n = 0.25\n").unwrap().force;
+        assert_eq!(given, ForceErrors { creep: 0.0, offset_n: 0.25, ..ForceErrors::RESISTIVE });
+    }
+
+    #[test]
+    fn temperature_is_linear_between_its_times() {
+        let sensors = read("[sensors]\ntemperature_c = [[60.0, 25.0], [600.0, 35.0]]\n").unwrap();
+        let at = |seconds: u64| sensors.temperature_at(Micros(seconds * 1_000_000)).unwrap();
+        assert_eq!([0, 60, 330, 600, 700].map(at), [25.0, 25.0, 30.0, 35.0, 35.0]);
+        assert_eq!(Sensors::PERFECT.temperature_at(Micros(0)), None);
+    }
+
+    #[test]
+    fn what_cannot_be_is_refused_in_one_line() {
+        let cases = [
+            (
+                "[sensors]\ntemperature_c = [[0.0, 25.0], [0.0, 26.0]]\n",
+                "sensors.temperature_c[1][0] = 0: times come in their order, each once",
+            ),
+            ("[sensors]\ntemperature_c = [[601.0, 25.0]]\n", "the scenario goes from 0 to duration_s = 600"),
+            ("[sensors.force]\nkind = \"good\"\n", "\"perfect\", \"piezoresistive\" or \"resistive\""),
+            ("[sensors.force]\ngain = 1.0\n", "sensors.force.gain = 1: 0 to 0.9 are possible"),
+            ("[sensors.force]\nnoise_n = nan\n", "sensors.force.noise_n = NaN: 0 to 1 are possible"),
+            ("[sensors]\noffset = 1\n", "unknown field `offset`"),
+        ];
+        for (text, why) in cases {
+            let said = read(text).unwrap_err();
+            assert!(said.contains(why), "{said}");
+        }
+    }
+}
