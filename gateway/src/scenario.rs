@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use bench::run::RunError;
 use bench::run::launch::groups;
 use clap::{Args, Subcommand};
-use model::scenario::{BusFault, FaultKind, MotionKind, Scenario as Description, SensorFault};
+use model::scenario::{BusFault, FaultKind, ForceErrors, MotionKind, Scenario as Description, SensorFault};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 use protocol::usage::{Failure, print, shown};
@@ -73,6 +73,9 @@ struct Plan {
     seed: u64,
     motion: Motion,
     events: Vec<Event>,
+    /// How the sensors differ from perfect ones.
+    #[serde(skip_serializing_if = "Map::is_empty")]
+    sensors: Map<String, Value>,
     /// What has no effect.
     remarks: Vec<String>,
 }
@@ -142,11 +145,18 @@ impl Plan {
             Motion { kind: scenario.motion.kind.name(), start: each(&scenario.motion.start), units, how };
         let (duration_s, seed) = (scenario.duration.seconds(), scenario.seed);
         let remarks = scenario.remarks(skin);
-        Self { skin: skin.name.clone(), duration_s, seed, motion, events, remarks }
+        let errors = errors(&scenario.sensors.force).into_iter().filter(|(_, error)| *error > 0.0);
+        let mut sensors: Map<_, _> = errors.map(|(key, error)| (key.to_owned(), json!(error))).collect();
+        let temperature = scenario.sensors.temperature.iter().map(|(at, degrees)| [seconds(*at), *degrees]);
+        let temperature: Vec<_> = temperature.collect();
+        if !temperature.is_empty() {
+            sensors.insert("temperature_c".to_owned(), json!(temperature));
+        }
+        Self { skin: skin.name.clone(), duration_s, seed, motion, events, sensors, remarks }
     }
 
     fn text(&self, file: &str) -> String {
-        let Self { skin, duration_s, seed, motion, events, remarks } = self;
+        let Self { skin, duration_s, seed, motion, events, sensors, remarks } = self;
         let moves = match motion.kind {
             "hold" => "the robot stays at",
             "sine" => "every joint swings about",
@@ -163,8 +173,9 @@ impl Plan {
         };
         let (file, skin) = (shown(file), shown(skin));
         let head = format!(
-            "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start}{how}\n",
-            count(events.len(), "event")
+            "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start}{how}\n{}",
+            count(events.len(), "event"),
+            if sensors.is_empty() { String::new() } else { format!("sensors: {}\n", described(sensors)) }
         );
         let remarks: String = remarks.iter().map(|remark| format!("remark: {}\n", shown(remark))).collect();
         if events.is_empty() {
@@ -213,6 +224,21 @@ fn on_cells(
         (!cells.is_empty()).then(|| Event { at_s: seconds(at), for_s, what, bus, cells, how: how.clone() })
     };
     skin.buses.iter().enumerate().filter_map(of_bus).collect()
+}
+
+/// The errors of force sensors, by the file's keys.
+const fn errors(errors: &ForceErrors) -> [(&'static str, f64); 9] {
+    [
+        ("offset_n", errors.offset_n),
+        ("gain", errors.gain),
+        ("hysteresis", errors.hysteresis),
+        ("creep", errors.creep),
+        ("drift_n", errors.drift_n),
+        ("temperature_n_per_c", errors.temperature_n_per_c),
+        ("temperature_gain_per_c", errors.temperature_gain_per_c),
+        ("crosstalk", errors.crosstalk),
+        ("noise_n", errors.noise_n),
+    ]
 }
 
 /// What a fault does.

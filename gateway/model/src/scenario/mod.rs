@@ -6,6 +6,7 @@
 
 mod check;
 mod faults;
+mod measured;
 mod raw;
 mod remarks;
 mod sensors;

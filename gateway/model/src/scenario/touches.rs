@@ -1,7 +1,8 @@
 //! The sensor words of every cell in every epoch, from touches and sensor faults.
 //!
 //! A pure function of the scenario and the epoch: epoch 0 is the scenario's beginning, epoch k comes k
-//! broadcast periods later. The words at that moment are those with which the cell answers these joints.
+//! broadcast periods later. The words at that moment are those with which the cell answers these joints. Sensors that
+//! are not perfect are computed epoch by epoch ([`Measured`]).
 
 use core::f64::consts::PI;
 
@@ -11,6 +12,7 @@ use protocol::message::SkinSensors;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
+use super::measured::{Measured, True};
 use super::{FaultKind, Profile, Scenario, SensorFault, Touch};
 
 /// The sensor words of a cell from an epoch on.
@@ -36,6 +38,12 @@ pub struct Touches {
     /// The touches' forces in N before and now: scratch of [`Touches::changes`].
     levels: Vec<[Option<f64>; 2]>,
     cells: Vec<Touched>,
+    /// What sensors measure that are not perfect; then all cells are touched.
+    measured: Option<Measured>,
+    /// Scratch of [`Touches::changes`], as are the next two.
+    changed: Vec<Stimulus>,
+    there: Vec<True>,
+    before: Vec<SkinSensors>,
 }
 
 /// Something that happens to a cell at some time.
@@ -83,12 +91,20 @@ impl Touches {
                 }
             }
         }
-        cells.retain(|touched| !touched.touches.is_empty() || !touched.faults.is_empty());
+        let measured =
+            (!scenario.sensors.are_perfect()).then(|| Measured::new(&scenario.sensors, scenario.seed, skin));
+        if measured.is_none() {
+            cells.retain(|touched| !touched.touches.is_empty() || !touched.faults.is_empty());
+        }
         Self {
             period_us: 1e6 / skin.timing.broadcast_hz(),
             levels: vec![[None; 2]; scenario.touches.len()],
             touches: scenario.touches.clone(),
+            changed: Vec::with_capacity(cells.len()),
+            there: Vec::with_capacity(cells.len()),
+            before: Vec::with_capacity(cells.len()),
             cells,
+            measured,
         }
     }
 
@@ -102,6 +118,70 @@ impl Touches {
     ///
     /// Work grows with the cells that something ever touches; no allocation.
     pub fn changes(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
+        let mut changed = core::mem::take(&mut self.changed);
+        changed.clear();
+        if self.measured.is_some() {
+            self.measured_changes(before, epoch, &mut changed);
+        } else {
+            changed.extend(self.perfect_changes(before, epoch));
+        }
+        self.changed = changed;
+        self.changed.iter().copied()
+    }
+
+    fn measured_changes(&mut self, before: Option<u64>, epoch: u64, changed: &mut Vec<Stimulus>) {
+        let Some(mut measured) = self.measured.take() else { return };
+        self.before.clear();
+        if let Some(before) = before {
+            self.measure(&mut measured, before);
+            self.before.extend(measured.words());
+        } else {
+            self.before.resize(self.cells.len(), SkinSensors::default());
+        }
+        self.measure(&mut measured, epoch);
+        let words = self.cells.iter().zip(&self.before).zip(measured.words());
+        changed.extend(words.filter(|((_, before), now)| before != now).map(|((touched, _), now)| {
+            Stimulus { cell: touched.cell, bus: touched.bus, node: touched.node, sensors: *now }
+        }));
+        self.measured = Some(measured);
+    }
+
+    /// Computes what is measured up to an epoch, from the beginning if that has passed.
+    fn measure(&mut self, measured: &mut Measured, epoch: u64) {
+        if measured.next() > epoch + 1 {
+            measured.restart();
+        }
+        let mut there = core::mem::take(&mut self.there);
+        while measured.next() <= epoch {
+            let time = self.time_of(measured.next());
+            there.clear();
+            there.extend(self.cells.iter().map(|touched| self.there(touched, time)));
+            measured.step(time, &there);
+        }
+        self.there = there;
+    }
+
+    /// What is there for a cell to measure.
+    fn there(&self, touched: &Touched, time: Micros) -> True {
+        let mut there = True::default();
+        for touch in touched.touches.iter().filter_map(|&index| self.touches.get(index)) {
+            let Some(level) = touch.level(time) else { continue };
+            there.force_n += level;
+            there.sensors.proximity = there.sensors.proximity.max(touch.proximity);
+            if let Some(temperature) = touch.temperature {
+                (there.sensors.temperature, there.is_warmed) = (temperature, true);
+            }
+        }
+        for wrong in touched.faults.iter().filter(|wrong| wrong.holds_at(time)) {
+            match wrong.fault {
+                SensorFault::Stuck => there.is_stuck = true,
+                SensorFault::Drift { n_per_s } => there.added_n += n_per_s * seconds(time.since(wrong.at)),
+            }
+        }
+        there
+    }
+
+    fn perfect_changes(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
         let times = [before.map(|before| self.time_of(before)), Some(self.time_of(epoch))];
         for (levels, touch) in self.levels.iter_mut().zip(&self.touches) {
             *levels = times.map(|time| time.and_then(|time| touch.level(time)));
@@ -127,6 +207,14 @@ impl Touches {
     /// The words of a cell in an epoch: for one that has restarted.
     #[must_use]
     pub fn sensors(&self, cell: usize, epoch: u64) -> SkinSensors {
+        if let Some(measured) = &self.measured {
+            if measured.next() == epoch + 1 {
+                return measured.words().get(cell).copied().unwrap_or_default();
+            }
+            let (mut this, mut again) = (self.clone(), measured.clone());
+            this.measure(&mut again, epoch);
+            return again.words().get(cell).copied().unwrap_or_default();
+        }
         match self.cells.binary_search_by_key(&cell, |touched| touched.cell) {
             Ok(at) => self
                 .cells

@@ -1,0 +1,192 @@
+//! What sensors read that are not perfect: a function of the scenario, its seed and the epoch, computed epoch by epoch,
+//! because hysteresis, creep and drift have a past.
+//!
+//! ```text
+//!   force, neighbours ─> hysteresis ─> + creep ─> * gain(T) ─> + zero(T) + random walk + noise ─> contact words
+//! ```
+
+use core::f64::consts::TAU;
+
+use protocol::fixed::Q9_6;
+use protocol::message::SkinSensors;
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+use super::sensors::{ForceErrors, REFERENCE_C, Sensors};
+use super::touches::contact_words;
+
+/// Time constants of creep in s: together they are nearly a logarithm of time.
+const CREEP_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
+
+/// What is there for a cell to measure.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct True {
+    /// The force of touches in N.
+    pub(super) force_n: f64,
+    /// Proximity, and the temperature that a touch brings.
+    pub(super) sensors: SkinSensors,
+    pub(super) is_warmed: bool,
+    /// What a fault adds to the reading in N.
+    pub(super) added_n: f64,
+    pub(super) is_stuck: bool,
+}
+
+/// The sensors of all cells.
+#[derive(Clone, Debug)]
+pub(super) struct Measured {
+    sensors: Sensors,
+    seed: u64,
+    period_s: f64,
+    cells: Vec<CellSensors>,
+    /// What the cells of the epoch before the next one measured.
+    words: Vec<SkinSensors>,
+    next: u64,
+}
+
+/// One cell's errors, and the past of its force sensor.
+#[derive(Clone, Debug)]
+struct CellSensors {
+    neighbours: Vec<usize>,
+    /// As parts of the largest, -1 to 1.
+    offset: f64,
+    gain: f64,
+    temperature_n: f64,
+    temperature_gain: f64,
+    read_n: f64,
+    creep_n: [f64; CREEP_S.len()],
+    walk_n: f64,
+    dice: Dice,
+}
+
+impl Measured {
+    /// That of a skin, before the first epoch.
+    pub(super) fn new(sensors: &Sensors, seed: u64, skin: &Skin) -> Self {
+        let find = |cell: &protocol::skin::Cell, node| {
+            skin.cells.iter().position(|other| other.bus == cell.bus && other.node == node)
+        };
+        let neighbours = |cell: &protocol::skin::Cell| {
+            let mut all: Vec<_> =
+                cell.neighbors.iter().flatten().filter_map(|node| find(cell, *node)).collect();
+            all.sort_unstable();
+            all.dedup();
+            all
+        };
+        let neighbours = skin.cells.iter().map(neighbours);
+        let cells = neighbours.zip(0..).map(|(neighbours, index)| CellSensors::new(neighbours, seed, index));
+        let period_s = 1.0 / skin.timing.broadcast_hz();
+        let words = vec![SkinSensors::default(); skin.cells.len()];
+        Self { sensors: sensors.clone(), seed, period_s, cells: cells.collect(), words, next: 0 }
+    }
+
+    /// What each cell measures in the epoch before [`Self::next`]; the default before the first.
+    pub(super) fn words(&self) -> &[SkinSensors] {
+        &self.words
+    }
+
+    /// The epoch that comes next.
+    pub(super) const fn next(&self) -> u64 {
+        self.next
+    }
+
+    /// Begins again before the first epoch.
+    pub(super) fn restart(&mut self) {
+        for (cell, index) in self.cells.iter_mut().zip(0..) {
+            *cell = CellSensors::new(core::mem::take(&mut cell.neighbours), self.seed, index);
+        }
+        self.words.fill(SkinSensors::default());
+        self.next = 0;
+    }
+
+    /// The next epoch, which is at `time`, with what is there for each cell.
+    pub(super) fn step(&mut self, time: Micros, there: &[True]) {
+        let ambient = self.sensors.temperature_at(time).unwrap_or(REFERENCE_C);
+        for ((cell, there_is), words) in self.cells.iter_mut().zip(there).zip(&mut self.words) {
+            let beside: f64 =
+                cell.neighbours.iter().filter_map(|&index| Some(there.get(index)?.force_n)).sum();
+            let mut sensors = there_is.sensors;
+            if !there_is.is_warmed {
+                sensors.temperature = [Q9_6::nearest(ambient); 2];
+            }
+            let [temperature, _] = sensors.temperature;
+            let errors = &self.sensors.force;
+            let force_n = there_is.force_n + errors.crosstalk * beside;
+            let read_n = cell.read(force_n, temperature.to_f64() - REFERENCE_C, errors, self.period_s);
+            if !there_is.is_stuck {
+                *words = SkinSensors { contact: contact_words(read_n + there_is.added_n), ..sensors };
+            }
+        }
+        self.next += 1;
+    }
+}
+
+impl CellSensors {
+    fn new(neighbours: Vec<usize>, seed: u64, index: u64) -> Self {
+        let mut dice = Dice::new(seed, index);
+        let [offset, gain, temperature_n, temperature_gain] =
+            core::array::from_fn(|_| 2.0 * dice.part() - 1.0);
+        Self {
+            neighbours,
+            offset,
+            gain,
+            temperature_n,
+            temperature_gain,
+            read_n: 0.0,
+            creep_n: [0.0; CREEP_S.len()],
+            walk_n: 0.0,
+            dice,
+        }
+    }
+
+    /// What it reads in N, `period_s` after the last time, so many degrees above the reference.
+    fn read(&mut self, force_n: f64, degrees: f64, errors: &ForceErrors, period_s: f64) -> f64 {
+        // A play between the curve of a rising force and that of a falling one.
+        let falling = force_n * (1.0 + errors.hysteresis);
+        self.read_n = self.read_n.clamp(force_n.min(falling), force_n.max(falling));
+        for (creep, time_s) in self.creep_n.iter_mut().zip(CREEP_S) {
+            *creep += (force_n - *creep) * -(-period_s / time_s).exp_m1();
+        }
+        if errors.drift_n > 0.0 {
+            self.walk_n += errors.drift_n * (period_s / 3_600.0).sqrt() * self.dice.normal();
+        }
+        let noise = if errors.noise_n > 0.0 { errors.noise_n * self.dice.normal() } else { 0.0 };
+        let gain =
+            1.0 + errors.gain * self.gain + errors.temperature_gain_per_c * self.temperature_gain * degrees;
+        let zero = errors.offset_n * self.offset + errors.temperature_n_per_c * self.temperature_n * degrees;
+        gain * (self.read_n + errors.creep * self.creep_n.iter().sum::<f64>()) + zero + self.walk_n + noise
+    }
+}
+
+/// Random numbers of one cell (SplitMix64).
+#[derive(Clone, Debug)]
+struct Dice(u64);
+
+impl Dice {
+    fn new(seed: u64, index: u64) -> Self {
+        let mut dice = Self(seed);
+        let mixed = dice.next();
+        Self(mixed ^ index.wrapping_mul(0xD1B5_4A32_D192_ED03))
+    }
+
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mixed = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        mixed ^ (mixed >> 31)
+    }
+
+    /// 0 to 1.
+    #[expect(clippy::cast_precision_loss, reason = "53 bits")]
+    fn part(&mut self) -> f64 {
+        (self.next() >> 11) as f64 / (1_u64 << 53) as f64
+    }
+
+    /// Of mean 0 and standard deviation 1.
+    fn normal(&mut self) -> f64 {
+        let radius = (-2.0 * (1.0 - self.part()).ln()).sqrt();
+        radius * (TAU * self.part()).cos()
+    }
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "steps of 2^-10 N are exact in f64")]
+mod tests;
