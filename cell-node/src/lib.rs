@@ -1,6 +1,7 @@
 #![doc = include_str!("../README.md")]
 #![cfg_attr(not(any(feature = "oracle", test)), no_std)]
 
+pub mod baseline;
 pub mod contact;
 pub mod flash;
 pub mod identity;

@@ -142,6 +142,8 @@ struct Stimulus {
 ///   sensing off | continuous PERIOD | event   (ms)
 ///   events CONTACT PROXIMITY TEMPERATURE ACCELERATION HYSTERESIS   (N, °C, g; 0 to 1 of each)
 ///   links_down none | 0+2   (ports that receive nothing, in test mode only)
+///   baseline off | hold|follow THRESHOLD HYSTERESIS RATE LIMIT SLOPE   (N; 0 to 1 of it; uN/s; N; N/°C)
+///   tare none | tared | forced   (forget the zero, find it unless touched, find it anyhow)
 ///   row1 to row6  A D ALPHA THETA_OFFSET   (m, m, rad, rad)
 ///   commit HASH   (hexadecimal)
 ///

@@ -112,6 +112,8 @@ fn every_key_of_a_skin_is_documented_and_no_other() {
         let text = spoilt(skin_text(), line);
         assert_eq!(documented(SKIN_MD, &format!("### `{line}`")), allowed(&text, read_skin), "{line}");
     }
+    let baseline = skin_text().replacen("[timing]", "[baseline]\nzzz = 1\n[timing]", 1);
+    assert_eq!(documented(SKIN_MD, "### `[baseline]`"), allowed(&baseline, read_skin));
     let row = skin_text().replacen("{ a =", "{ zzz = 1, a =", 1);
     assert_eq!(documented(SKIN_MD, "### `robot.joints`"), allowed(&row, read_skin));
 }

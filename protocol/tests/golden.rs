@@ -18,7 +18,7 @@ use protocol::fixed::{Acc, TorqueFormat};
 use protocol::id::{CellId, Id, Kind};
 use protocol::message::{Answer, Message, Request};
 use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Segment, crc16, data_id};
-use protocol::parameters::{Events, Parameter, ParameterError, Parameters, Reply, Sensing};
+use protocol::parameters::{Baseline, Events, Parameter, ParameterError, Parameters, Reply, Sensing, Tare};
 use protocol::time::Micros;
 use protocol::wire::LinkId;
 
@@ -109,7 +109,7 @@ fn every_kind_command_and_page_has_its_golden_frame() {
         );
     }
     for (kind, counts) in [
-        (Kind::Sensors, &[0, 1][..]),
+        (Kind::Sensors, &[0, 1, 3][..]),
         (Kind::Network, &[0, 1, 2, 3, 4]),
         (Kind::Stimulus, &[0, 1, 0x80, 0x81]),
     ] {
@@ -263,6 +263,8 @@ fn unsound_parameters_are_refused_with_the_code_of_the_log() {
             Some(Parameter::Reply) => (*number, cannot_be(Reply::from_words(*words))),
             Some(Parameter::Sensing) => (*number, cannot_be(Sensing::from_words(*words))),
             Some(Parameter::Events) => (*number, cannot_be(Events::from_words(*words))),
+            Some(Parameter::Baseline) => (*number, cannot_be(Baseline::from_words(*words))),
+            Some(Parameter::Tare) => (*number, cannot_be(Tare::from_words(*words))),
             // The cell of the session is not in test mode.
             Some(Parameter::LinksDown) => (*number, Answer::CANNOT_BE),
             Some(parameter) => match spoilt.set(parameter, *words) {

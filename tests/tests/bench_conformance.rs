@@ -196,6 +196,11 @@ fn wrong_sensor_pages_are_found() {
 }
 
 #[test]
+fn wrong_zeros_are_found() {
+    are_found(mutants::baseline::BASELINE, Format::Fd);
+}
+
+#[test]
 fn wrong_starts_are_found() {
     are_found(mutants::starts::STARTS, Format::Fd);
 }

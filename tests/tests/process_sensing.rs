@@ -3,7 +3,9 @@
 
 mod process;
 
+use process::log::Log;
 use process::{PRESSED, Place, Running, skin};
+use protocol::can::Format;
 use protocol::id::CellId;
 use protocol::message::{Answer, Message, SensorPage};
 use protocol::touch::contact;
@@ -102,6 +104,43 @@ fn a_cell_that_restarts_is_switched_again_to_what_it_was() {
     ends(bench);
     place.is_left_clean();
     place.summary().adds_up();
+}
+
+/// The sizes of a cell's torques in a log, in their order.
+fn sizes(log: &Log, cell: u8) -> Vec<i32> {
+    let size = |(message, _): &(Message, _)| {
+        let Message::Torque { from, torque, .. } = message else { return None };
+        let size = torque.padded().iter().map(|word| i32::from(*word).abs()).sum();
+        (from.get() == cell).then_some(size)
+    };
+    log.messages.iter().filter_map(size).collect()
+}
+
+/// Ten degrees in eight seconds; offsets that would all be contacts without a baseline.
+#[test]
+fn cells_whose_sensors_drift_feel_what_touches_them_and_nothing_else() {
+    let place = Place::new();
+    let head = skin(4);
+    place.write("skin.toml", &head.replacen("[controller]", "[baseline]\nlimit_n = 2.0\n\n[controller]", 1));
+    place.scenario(
+        "duration_s = 8.0\n[motion]\nkind = \"hold\"\n[[touch]]\nat_s = 2.0\nfor_s = 5.0\ncells = [2]\nforce_n = 1.0\n\
+         [sensors]\ntemperature_c = [[0.0, 25.0], [8.0, 35.0]]\n[sensors.force]\nkind = \"piezoresistive\"\n",
+    );
+    place.bench(8.0, "").end().well();
+    place.is_left_clean();
+    let log = Log::read(&place.read("run.log"), Format::Fd);
+    let torques = sizes(&log, 2);
+    assert!(torques.len() > 100, "{} torques of a touch", torques.len());
+    // The last one is of zeros, those beside it may be of the touch's first and last epochs.
+    let (first, last) = (torques[2], torques[torques.len() - 3]);
+    assert!(f64::from(last) > 0.95 * f64::from(first), "{first} {last}");
+    assert_eq!(torques.last(), Some(&0), "after the release nothing is there");
+    for cell in [1, 3, 4] {
+        assert_eq!(sizes(&log, cell), [0; 0], "cell {cell}");
+    }
+    let summary = place.summary();
+    summary.adds_up();
+    assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
 }
 
 #[test]

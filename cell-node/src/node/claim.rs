@@ -82,6 +82,7 @@ impl Node {
         }
         let pages = self.sensing.beat(now);
         self.push_sensors(pages);
+        self.beat_zero();
         self.claim.next_heartbeat = phase::next(self.claim.next_heartbeat, HEARTBEAT, now);
     }
 

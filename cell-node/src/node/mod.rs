@@ -17,6 +17,7 @@ mod receiver;
 mod sensing;
 mod stimuli;
 mod summing;
+mod zero;
 
 use heapless::Deque;
 use protocol::can::{Format, Frame};
@@ -27,6 +28,7 @@ use protocol::packet::{self, Epoch, Length, Lengths, Packet};
 use protocol::time::{Micros, Span};
 use protocol::wire::{PORTS, PortMessage};
 
+use crate::baseline::Baseline;
 use crate::contact::{Force, Torque};
 use crate::flash::{Flash, Kept};
 use crate::identity::{Identity, OWN};
@@ -39,6 +41,7 @@ use receiver::Receiver;
 use sensing::{Pages, Sensing};
 use stimuli::{Arrival, Stimuli};
 use summing::Summing;
+use zero::Reported;
 
 pub use claim::{CLAIM, HEARTBEAT};
 pub use stimuli::PENDING;
@@ -56,6 +59,8 @@ pub struct Node {
     configuration: Configuration,
     switches: Switches,
     stimuli: Stimuli,
+    baseline: Baseline,
+    reported: Reported,
     sensing: Sensing,
     summing: Summing,
     receiver: Receiver,
@@ -91,6 +96,8 @@ impl Node {
             configuration: Configuration::new(),
             switches: Switches::default(),
             stimuli: Stimuli::default(),
+            baseline: Baseline::default(),
+            reported: Reported::default(),
             sensing: Sensing::default(),
             summing: Summing::new(now),
             receiver: Receiver::new(format),
@@ -237,6 +244,7 @@ impl Node {
                 // What was latched at joints that were too old is sent with the next.
                 if self.heard.joints != taken {
                     self.sense(now);
+                    self.report_zero();
                 }
                 self.sense_before_the_next_joints(now);
                 self.speak_before_the_next_joints(now);
@@ -259,6 +267,7 @@ impl Node {
                 self.push_network(NetworkPage::Heard(self.heard));
                 self.push_network(NetworkPage::Refused(self.receiver.refused));
                 self.push_sensors(Pages::BOTH);
+                self.push_zero();
                 if self.summing.network.exists() {
                     self.push_tree(now);
                     self.push_ports(now);
@@ -268,6 +277,7 @@ impl Node {
                 self.configure(now, tag, request);
                 // Another mode starts again, and a cell that leaves test mode measures no contact any more.
                 self.sense(now);
+                self.report_zero();
             }
             Message::Sum { torque, .. } if self.length().is_some_and(|length| torque.length() != length) => {
                 count(&mut self.receiver.refused.meaning);
@@ -300,6 +310,9 @@ impl Node {
         // the contact state from before.
         self.epoch = Some(epoch);
         self.stimuli.latch(epoch);
+        if let Some(in_use) = in_use {
+            self.baseline.take(&self.stimuli.sensed.skin, in_use.parameters.period_us);
+        }
         if in_use.is_some_and(|in_use| age > in_use.period()) {
             count(&mut self.heard.joints_late);
             return self.summing.sum.skip();
@@ -307,7 +320,7 @@ impl Node {
         count(&mut self.heard.joints);
         let answers = self.claim.is_settled() && !self.flags.has(State::HALTED);
         let Some(in_use) = in_use.filter(|_| answers) else { return self.summing.sum.skip() };
-        let skin = &self.stimuli.sensed.skin;
+        let skin = self.baseline.net(&self.stimuli.sensed.skin);
         let force = Force::fuse(skin.contact, skin.proximity, &in_use.parameters.contact);
         let jacobian;
         let torque = if force.is_active() {

@@ -2,10 +2,13 @@
 
 use protocol::message::{Answer, Message, Request, State, VERSION};
 use protocol::packet::WORDS;
-use protocol::parameters::{Abilities, Events, LinksDown, Parameter, Parameters, Reply, Sensing};
+use protocol::parameters::{
+    Abilities, Baseline, Events, LinksDown, Parameter, Parameters, Reply, Sensing, Tare,
+};
 use protocol::time::Micros;
 
 use super::Node;
+use crate::baseline::Refused;
 
 /// What is switched at run time and not kept: parameters 6 to 9.
 #[derive(Clone, Copy, Debug, Default)]
@@ -90,6 +93,8 @@ impl Node {
             Parameter::Sensing => self.switches.sensing.words(),
             Parameter::Events => self.switches.events.words(),
             Parameter::LinksDown => self.switches.links_down.words(),
+            Parameter::Baseline => self.baseline.rule().words(),
+            Parameter::Tare => padded([self.baseline.is_tared().into()]),
             Parameter::Mount
             | Parameter::Pose
             | Parameter::Contact
@@ -115,7 +120,18 @@ impl Node {
             Parameter::Mode => {
                 self.flags = self.flags.with(State::TEST_MODE, words.first() == Some(&1));
                 self.stimuli.clear();
+                self.baseline.forget();
                 Some(())
+            }
+            Parameter::Baseline => Baseline::from_words(words).map(|rule| self.baseline.set(rule)),
+            Parameter::Tare => {
+                let how = Tare::from_words(words).ok_or(Answer::CANNOT_BE)?;
+                let done = self.baseline.tare(&self.stimuli.sensed.skin, how);
+                return done.map(|()| self.read(parameter)).map_err(|why| match why {
+                    Refused::Off => Answer::CANNOT_BE,
+                    Refused::Touched => Answer::TOUCHED,
+                    Refused::Limit => Answer::BEYOND_LIMIT,
+                });
             }
             Parameter::Identity
             | Parameter::Mount

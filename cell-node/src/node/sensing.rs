@@ -146,7 +146,7 @@ impl Node {
         // Nothing is sent until the cell owns its node id; the contact state is compared with what was sent, so that
         // nothing is lost.
         let Some(cell) = self.identity.cell.filter(|_| self.claim.is_settled()) else { return };
-        let pages = self.sensing.look(now, &self.switches, cell, &self.stimuli.sensed);
+        let pages = self.sensing.look(now, &self.switches, cell, &self.net());
         self.push_sensors(pages);
     }
 
@@ -179,8 +179,9 @@ impl Node {
     /// Sends the present contact state.
     pub(super) fn push_sensors(&mut self, Pages { skin, acceleration }: Pages) {
         let Some(from) = self.identity.cell else { return };
-        let skin = skin.then_some(SensorPage::Skin(self.stimuli.sensed.skin));
-        let acceleration = acceleration.then_some(SensorPage::Acceleration(self.stimuli.sensed.acceleration));
+        let net = self.net();
+        let skin = skin.then_some(SensorPage::Skin(net.skin));
+        let acceleration = acceleration.then_some(SensorPage::Acceleration(net.acceleration));
         for page in skin.into_iter().chain(acceleration) {
             self.sensing.sent.set(&page);
             self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });

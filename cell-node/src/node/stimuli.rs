@@ -36,6 +36,7 @@ impl Sensed {
         match *page {
             SensorPage::Skin(skin) => self.skin = skin,
             SensorPage::Acceleration(acceleration) => self.acceleration = acceleration,
+            SensorPage::Baseline(_) => {}
         }
     }
 }

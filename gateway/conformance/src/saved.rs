@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::message::{Message, State};
+use protocol::message::{Answer, Message, State};
 use protocol::packet::{WORDS, words};
 use protocol::parameters::Parameter;
 use protocol::time::Span;
@@ -19,8 +19,14 @@ const SETTLE: Span = Span::from_millis(60);
 const ATTEMPTS: usize = 3;
 
 /// What is switched and not stored.
-const SWITCHES: [Parameter; 5] =
-    [Parameter::Reply, Parameter::Sensing, Parameter::Events, Parameter::LinksDown, Parameter::Mode];
+const SWITCHES: [Parameter; 6] = [
+    Parameter::Reply,
+    Parameter::Sensing,
+    Parameter::Events,
+    Parameter::Baseline,
+    Parameter::LinksDown,
+    Parameter::Mode,
+];
 
 /// What a cell had.
 #[derive(Clone, Debug, Deserialize, Eq, PartialEq, Serialize)]
@@ -55,10 +61,14 @@ impl Session<'_> {
         let all = Parameter::stored(abilities.rows()).chain(SWITCHES);
         for parameter in all.collect::<Vec<_>>() {
             let number = parameter.number();
-            let Reply::Value(words) = self.read(number)? else {
-                return Ok(Err(format!("it does not answer a read of parameter {number}")));
-            };
-            parameters.insert(number, words);
+            match self.read(number)? {
+                Reply::Value(words) => _ = parameters.insert(number, words),
+                // It knows the protocol without it.
+                Reply::Refused(Answer::UNKNOWN) if parameter == Parameter::Baseline => {}
+                Reply::Refused(_) | Reply::Nothing => {
+                    return Ok(Err(format!("it does not answer a read of parameter {number}")));
+                }
+            }
         }
         self.about.serial = Some(serial);
         self.about.abilities = abilities;

@@ -22,6 +22,7 @@ use crate::timing::Timings;
 
 use accounts::Accounts;
 pub(crate) use exchange::Exchange;
+pub(crate) use joints::Step;
 pub(crate) use known::{About, Known};
 pub(crate) use request::Reply;
 

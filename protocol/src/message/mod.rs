@@ -18,7 +18,7 @@ mod sensors;
 mod state;
 
 pub use network::{Heard, Heartbeat, NetworkPage, PortState, Ports, Refused, Tree};
-pub use sensors::{SensorPage, SkinSensors};
+pub use sensors::{BaselinePage, SensorPage, SkinSensors};
 pub use state::State;
 
 use core::ops::RangeInclusive;
@@ -105,6 +105,10 @@ impl Answer {
     pub const UNKNOWN: i16 = 18;
     /// Words that this parameter cannot have, or `links_down` outside test mode.
     pub const CANNOT_BE: i16 = 19;
+    /// It is no tare while something touches the cell, or before it has taken joints.
+    pub const TOUCHED: i16 = 20;
+    /// What the sensor reads is farther from 0 than the baseline's limit.
+    pub const BEYOND_LIMIT: i16 = 21;
 }
 
 /// A packet's meaning.

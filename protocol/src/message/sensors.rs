@@ -12,6 +12,27 @@ pub enum SensorPage {
     Skin(SkinSensors),
     /// Page 1: accelerometer x, y, z in g.
     Acceleration([Q3_12; 3]),
+    /// Page 3: the zero of the force sensor; no stimulus has it.
+    Baseline(BaselinePage),
+}
+
+/// Page 3 of the sensors.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct BaselinePage {
+    /// The zero, in N, which is subtracted from the sum of the contact words.
+    pub zero: Q5_10,
+    /// The zero's shift with temperature, in N/°C.
+    pub n_per_c: Q1_14,
+    /// The temperature at which the zero was found, in degrees Celsius.
+    pub temperature: Q9_6,
+    /// There is a zero.
+    pub tared: bool,
+    /// Something touches the cell: the zero holds.
+    pub touched: bool,
+    /// The zero would go further than its limit.
+    pub limited: bool,
+    /// Tares that were refused, modulo 2^16.
+    pub refused: u16,
 }
 
 /// Page 0 of the sensors.
@@ -35,6 +56,15 @@ impl SensorPage {
                 temperature: [e, f].map(Q9_6::from_bits),
             })),
             1 => Ok(Self::Acceleration([a, b, c].map(Q3_12::from_bits))),
+            3 if kind == Kind::Sensors => Ok(Self::Baseline(BaselinePage {
+                zero: Q5_10::from_bits(a),
+                n_per_c: Q1_14::from_bits(b),
+                temperature: Q9_6::from_bits(c),
+                tared: d & 1 != 0,
+                touched: d & 2 != 0,
+                limited: d & 4 != 0,
+                refused: e.cast_unsigned(),
+            })),
             _ => Err(MessageError::Page { kind, page }),
         }
     }
@@ -46,6 +76,12 @@ impl SensorPage {
                 (0, packet::words([a, b, c, proximity.to_bits(), e, f]))
             }
             Self::Acceleration(xyz) => (1, packet::words(xyz.map(Q3_12::to_bits))),
+            Self::Baseline(BaselinePage { zero, n_per_c, temperature, tared, touched, limited, refused }) => {
+                let state = i16::from(tared) | i16::from(touched) << 1 | i16::from(limited) << 2;
+                let words =
+                    [zero.to_bits(), n_per_c.to_bits(), temperature.to_bits(), state, refused.cast_signed()];
+                (3, packet::words(words))
+            }
         }
     }
 }

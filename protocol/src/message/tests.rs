@@ -26,6 +26,7 @@ fn what_cannot_be_is_refused_with_the_value() {
     assert_eq!(says(0x2FF, 1), "torque from node 255, which is no cell");
     assert_eq!(says(0x201, 2), "torque with count 2; 1 is allowed");
     assert_eq!(says(0x301, 2), "sensors page 2 does not exist");
+    assert_eq!(says(0x701, 3), "stimulus page 3 does not exist");
     assert_eq!(says(0x401, 9), "network page 9 does not exist");
     assert_eq!(says(0x500, 0), "configure to node 0, which is no cell");
 }

@@ -15,6 +15,8 @@
 //! | 7 | sensing, volatile | 0: off, 1: continuous, 2: event; period in ms |
 //! | 8 | events, volatile | thresholds: contact N Q5.10, proximity Q1.14, temperature °C Q9.6, acceleration g Q3.12; hysteresis, a part of each, Q1.14 |
 //! | 9 | links_down, volatile | bit p: port p receives nothing (only in test mode) |
+//! | 11 | baseline, volatile | 0: off, 1: hold, 2: follow; threshold in N Q5.10; hysteresis, a part of it, Q1.14; rate in µN/s, unsigned; limit in N Q5.10; N/°C Q1.14 |
+//! | 12 | tare, volatile | 0: forget the zero, 1: tare unless it is touched, 2: tare; read: 1 if there is a zero |
 //! | 16..=47 | Denavit-Hartenberg row 1..=32 | a, d in m, Q1.14; alpha, theta offset in quarter turns, Q1.14; kind (0 revolute, 1 prismatic, 2 fixed) |
 //! | 127 | commit, write only | hash that the written parameters must have |
 //!
@@ -22,11 +24,13 @@
 //! all of it or nothing.
 
 mod abilities;
+mod baseline;
 mod error;
 mod rows;
 mod switches;
 
 pub use abilities::{Abilities, Ability};
+pub use baseline::{Baseline, Tare, Zeroing};
 pub use error::ParameterError;
 pub use rows::{Row, RowKind};
 pub use switches::{Events, LinksDown, Reply, Sensing, Slots};
@@ -69,6 +73,10 @@ pub enum Parameter {
     Events,
     /// 9: the ports whose links are down, for tests.
     LinksDown,
+    /// 11: what it takes for the zero of its force sensor.
+    Baseline,
+    /// 12: it takes what it reads for its zero now.
+    Tare,
     /// 16 to 47: one row of the chain's table, counted from 0.
     Row(u8),
     /// 127: take what was written into use.
@@ -79,7 +87,7 @@ pub enum Parameter {
 const STORED: [Parameter; 4] = [Parameter::Mount, Parameter::Pose, Parameter::Contact, Parameter::Timing];
 
 /// Every parameter that is no row, and its number.
-const NUMBERS: [(Parameter, u8); 11] = [
+const NUMBERS: [(Parameter, u8); 13] = [
     (Parameter::Identity, 0),
     (Parameter::Mount, 1),
     (Parameter::Pose, 2),
@@ -90,6 +98,8 @@ const NUMBERS: [(Parameter, u8); 11] = [
     (Parameter::Sensing, 7),
     (Parameter::Events, 8),
     (Parameter::LinksDown, 9),
+    (Parameter::Baseline, 11),
+    (Parameter::Tare, 12),
     (Parameter::Commit, 127),
 ];
 
@@ -129,7 +139,16 @@ impl Parameter {
     /// Whether it applies as soon as it is written, is not stored, and is lost at a restart.
     #[must_use]
     pub const fn is_volatile(self) -> bool {
-        matches!(self, Self::Mode | Self::Reply | Self::Sensing | Self::Events | Self::LinksDown)
+        matches!(
+            self,
+            Self::Mode
+                | Self::Reply
+                | Self::Sensing
+                | Self::Events
+                | Self::LinksDown
+                | Self::Baseline
+                | Self::Tare
+        )
     }
 
     /// Whether a cell can have these words; those of stored parameters it checks at the commit.
@@ -139,6 +158,8 @@ impl Parameter {
             Self::Reply => Reply::from_words(words).is_some(),
             Self::Sensing => Sensing::from_words(words).is_some(),
             Self::Events => Events::from_words(words).is_some(),
+            Self::Baseline => Baseline::from_words(words).is_some(),
+            Self::Tare => Tare::from_words(words).is_some(),
             Self::Identity
             | Self::Mount
             | Self::Pose
@@ -259,6 +280,8 @@ impl Parameters {
             | Parameter::Sensing
             | Parameter::Events
             | Parameter::LinksDown
+            | Parameter::Baseline
+            | Parameter::Tare
             | Parameter::Commit => [0; WORDS],
         }
     }
@@ -307,6 +330,8 @@ impl Parameters {
             | Parameter::Sensing
             | Parameter::Events
             | Parameter::LinksDown
+            | Parameter::Baseline
+            | Parameter::Tare
             | Parameter::Commit => {
                 return Err(ParameterError::NotWritable(parameter.number()));
             }

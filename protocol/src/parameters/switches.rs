@@ -1,4 +1,4 @@
-//! What is switched at run time: the parameters 6 to 9, which are volatile.
+//! What is switched at run time: the parameters 6 to 9, which are volatile. So is the baseline, in a file of its own.
 
 use crate::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use crate::packet::{self, WORDS};

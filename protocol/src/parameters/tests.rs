@@ -28,7 +28,7 @@ fn every_parameter_number_comes_back() {
     assert_eq!(Parameter::from_number(47), Some(Parameter::Row(31)));
     assert_eq!(Parameter::from_number(48), None);
     let volatile = (0..=u8::MAX).filter(|&it| Parameter::from_number(it).is_some_and(Parameter::is_volatile));
-    assert!(volatile.eq(5..=9));
+    assert!(volatile.eq([5, 6, 7, 8, 9, 11, 12]));
 }
 
 #[test]

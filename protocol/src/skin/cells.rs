@@ -4,16 +4,23 @@ use std::collections::HashMap;
 
 use super::check::Checked;
 use super::reach::{REACH, reach};
-use super::{Bus, Cell, Robot, raw};
+use super::{Bus, Cell, Robot, baseline, raw};
 use crate::document::Place;
 use crate::fixed::Q;
 use crate::id::CellId;
-use crate::parameters::Contact;
+use crate::parameters::{Baseline, Contact};
 
 /// How far a quaternion's length may be from one.
 const UNIT_TOLERANCE: f64 = 1e-3;
 
-pub(super) fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Contact) -> Checked<Vec<Cell>> {
+/// What a cell has that overrides none of it.
+#[derive(Clone, Copy)]
+pub(super) struct Base {
+    pub(super) contact: Contact,
+    pub(super) baseline: Baseline,
+}
+
+pub(super) fn cells(raw: &[raw::Cell], robot: &Robot, buses: &[Bus], base: Base) -> Checked<Vec<Cell>> {
     let mut taken = HashMap::new();
     let mut serials = HashMap::new();
     let mut cells = Vec::with_capacity(raw.len());
@@ -71,7 +78,7 @@ fn contradictions(cells: &[Cell]) -> Checked<()> {
     Ok(())
 }
 
-fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Contact) -> Checked<Cell> {
+fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Base) -> Checked<Cell> {
     let bus = bus(at, raw, buses)?;
     let node = CellId::new(raw.node);
     let why = "a cell's node is 1 to 254; further cells need another bus";
@@ -109,7 +116,8 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Contact
         normal: normal(at, raw)?,
         neighbors,
         root: raw.root,
-        contact: contact(at, raw.contact(), base)?,
+        contact: contact(at, raw.contact(), base.contact)?,
+        baseline: baseline::of_cell(at, raw, base.baseline)?,
     })
 }
 

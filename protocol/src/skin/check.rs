@@ -1,6 +1,6 @@
 //! From the file's words to checked types.
 
-use super::{Bus, Cell, buses, cells};
+use super::{Bus, Cell, baseline, buses, cells};
 use super::{Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing, raw, robot, sensing};
 use crate::document::{Fault, Place, span};
 use crate::fixed::Q;
@@ -37,7 +37,8 @@ fn checked(raw: raw::Skin, has_cells: impl Fn(&Bus) -> bool) -> Checked<Skin> {
     let buses = buses::buses(&raw.bus, &robot)?;
     let controller = controller(raw.controller, robot.joints.len())?;
     let safety = safety(&raw.safety)?;
-    let cells = cells::cells(&raw.cell, &robot, &buses, contact)?;
+    let base = cells::Base { contact, baseline: baseline::of_skin(raw.baseline)? };
+    let cells = cells::cells(&raw.cell, &robot, &buses, base)?;
     let skin = Skin { name: raw.name, robot, timing, events, buses, controller, safety, cells };
     let Some(period_us) = skin.period_us() else {
         let why = "at least 15.3 Hz are possible";

@@ -3,6 +3,7 @@
 //! A [`Skin`] exists only when everything in its file has been checked. Every error names the line, the key, the value and what is
 //! allowed, in one line.
 
+mod baseline;
 mod buses;
 mod cells;
 mod check;
@@ -20,7 +21,7 @@ use crate::document::{self, DocumentError};
 use crate::fixed::{Q1_14, TorqueFormat};
 use crate::id::CellId;
 use crate::packet::Length;
-use crate::parameters::{Contact, Events, Parameters, Pose, Row, Sensing};
+use crate::parameters::{Baseline, Contact, Events, Parameters, Pose, Row, Sensing};
 use crate::time::Span;
 
 pub use reach::{REACH, reach};
@@ -30,7 +31,7 @@ pub use wires::Wires;
 /// The keys by which a skin is known from a scenario, and the other way round.
 pub const KEYS: &[&str] = &["robot", "cell"];
 /// See [`KEYS`].
-const SCENARIO_KEYS: &[&str] = &["duration_s", "motion", "mode", "touch", "fault"];
+const SCENARIO_KEYS: &[&str] = &["duration_s", "motion", "mode", "touch", "fault", "sensors"];
 
 /// A checked description.
 #[derive(Clone, Debug, PartialEq)]
@@ -198,6 +199,8 @@ pub struct Cell {
     pub root: bool,
     /// Its gains and thresholds as words.
     pub contact: Contact,
+    /// What it takes for the zero of its force sensor.
+    pub baseline: Baseline,
 }
 
 impl Skin {

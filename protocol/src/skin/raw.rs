@@ -19,6 +19,7 @@ pub(super) struct Skin {
     pub(super) contact: Contact,
     #[serde(default)]
     pub(super) events: Events,
+    pub(super) baseline: Option<Baseline>,
     #[serde(default = "one_bus")]
     pub(super) bus: Vec<Bus>,
     #[serde(default)]
@@ -169,6 +170,18 @@ pub(super) struct Events {
     pub(super) hysteresis: Option<f64>,
 }
 
+/// What cells take for the zero of their force sensors.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub(super) struct Baseline {
+    pub(super) mode: Option<String>,
+    pub(super) threshold_n: Option<f64>,
+    pub(super) hysteresis: Option<f64>,
+    pub(super) rate_n_per_s: Option<f64>,
+    pub(super) limit_n: Option<f64>,
+    pub(super) n_per_c: Option<f64>,
+}
+
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub(super) struct Controller {
@@ -232,6 +245,8 @@ pub(super) struct Cell {
     pub(super) contact_threshold_n: Option<f64>,
     pub(super) proximity_threshold: Option<f64>,
     pub(super) force_threshold_n: Option<f64>,
+    pub(super) baseline_limit_n: Option<f64>,
+    pub(super) baseline_n_per_c: Option<f64>,
 }
 
 impl Cell {

@@ -321,6 +321,36 @@ def links_down(*deaf):
     return 9, f"deaf={'+'.join(map(str, deaf)) or 'none'}", [sum(1 << port for port in deaf)]
 
 
+BASELINES = ("off", "hold", "follow")
+
+
+def baseline(kind, threshold=0, hysteresis=0, rate_un_per_s=0, limit=0, n_per_c=0):
+    """Threshold and limit in N, the slope in N/degree."""
+    words = [at_least(threshold, FORCE), nearest(hysteresis, UNIT), signed(rate_un_per_s)]
+    words += [nearest(limit, FORCE), nearest(n_per_c, UNIT)]
+    text = f"baseline={kind}"
+    if kind != "off":
+        text += (
+            f" threshold={number(words[0], FORCE)} hysteresis={number(words[1], UNIT)} rate_un_per_s={rate_un_per_s}"
+            f" limit={number(words[3], FORCE)} n_per_c={number(words[4], UNIT)}"
+        )
+    return 11, text, [BASELINES.index(kind), *words]
+
+
+def tare(word):
+    return 12, f"tare={word}", [word]
+
+
+def zero(force, n_per_c, found_at, state, refused):
+    """Sensors page 3: the zero in steps of a contact word, the slope and the temperature in theirs."""
+    text = (
+        f"zero={number(force, FORCE)} n_per_c={number(n_per_c, UNIT)} found_at={number(found_at, TEMPERATURE)}"
+        f" flags={'+'.join(state) or 'none'} refused={refused}"
+    )
+    bits = sum(1 << ("tared", "touched", "limited").index(name) for name in state)
+    return text, 3, [force, n_per_c, found_at, bits, signed(refused)]
+
+
 def row(number_of_row, a, d, alpha, theta_offset, kind="revolute"):
     words = [nearest(a, LENGTH), nearest(d, LENGTH), angle(alpha), angle(theta_offset), KINDS.index(kind)]
     text = (
@@ -677,6 +707,22 @@ def fd():
         stimulus(EVERYONE, None, skin([MAX, MIN, -1], -1, [MIN, MAX])),
         stimulus(254, 128, acceleration([4096, -4096, 1])),
         stimulus(EVERYONE, None, acceleration([0, 0, MIN])),
+    )
+
+    log.title("the baseline of a force sensor")
+    log.put(*(read(12, parameter, parameter) for parameter in (11, 12)))
+    log.put(
+        write(12, 32, baseline("off")),
+        write(EVERYONE, 33, baseline("hold", Fraction("0.1"), Fraction("0.5"), 0, Fraction("0.5"), Fraction("0.02"))),
+        write(12, 34, baseline("follow", Fraction("0.1"), Fraction("0.5"), 2000, 1, Fraction("-0.02"))),
+        write(12, 35, baseline("follow", Fraction(MAX, 1024), 1, 65535, Fraction(MAX, 1024), -2)),
+        *(write(12, 36 + word, tare(word)) for word in (0, 1, 2)),
+        value(12, 34, baseline("follow", Fraction("0.1"), Fraction("0.5"), 2000, 1, Fraction("-0.02")), True),
+        value(12, 37, tare(1), True),
+        *(refusal(12, 200, 12, reason) for reason in (20, 21)),
+        sensors(12, 7, zero(307, -328, 1600, ("tared", "touched"), 1)),
+        sensors(254, 255, zero(MIN, MAX, MIN, ("tared", "touched", "limited"), 65535)),
+        sensors(1, 0, zero(0, 0, 0, (), 0)),
     )
     return log
 

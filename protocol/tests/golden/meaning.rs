@@ -6,12 +6,13 @@ use std::str::FromStr;
 use protocol::fixed::{Q, TorqueFormat};
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{
-    Answer, From, Heard, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState, Ports, Refused,
-    Request, SensorPage, SkinSensors, State, Tree,
+    Answer, BaselinePage, From, Heard, Heartbeat, Joints, Message, MessageError, NetworkPage, PortState,
+    Ports, Refused, Request, SensorPage, SkinSensors, State, Tree,
 };
 use protocol::packet::{Epoch, Length, MAX_WORDS, PacketError, WORDS, Words};
 use protocol::parameters::{
-    Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, RowKind, Sensing, Slots,
+    Baseline, Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, RowKind, Sensing, Slots,
+    Zeroing,
 };
 use protocol::wire::{Hello, LinkId, PortMessage, Rank, Walk};
 
@@ -95,6 +96,19 @@ impl<'a> Meaning<'a> {
     fn sensors(&mut self) -> SensorPage {
         if self.has("acceleration") {
             return SensorPage::Acceleration(self.several("acceleration"));
+        }
+        if self.has("zero") {
+            let flags = self.take("flags");
+            let [tared, touched, limited] = self.flags(flags, ["tared", "touched", "limited"]);
+            return SensorPage::Baseline(BaselinePage {
+                zero: self.one("zero"),
+                n_per_c: self.one("n_per_c"),
+                temperature: self.one("found_at"),
+                tared,
+                touched,
+                limited,
+                refused: self.number("refused"),
+            });
         }
         SensorPage::Skin(SkinSensors {
             contact: self.several("contact"),
@@ -212,6 +226,22 @@ impl<'a> Meaning<'a> {
         }
     }
 
+    fn baseline(&mut self) -> Baseline {
+        let kind = self.take("baseline");
+        if kind == "off" {
+            return Baseline::Off;
+        }
+        let zeroing = Zeroing {
+            threshold: self.one("threshold"),
+            hysteresis: self.one("hysteresis"),
+            rate_un_per_s: self.number("rate_un_per_s"),
+            limit: self.one("limit"),
+            n_per_c: self.one("n_per_c"),
+        };
+        assert_eq!(kind, if zeroing.rate_un_per_s == 0 { "hold" } else { "follow" }, "{}", self.text);
+        Baseline::On(zeroing)
+    }
+
     /// The words of a parameter, through the struct that gives them their meaning.
     fn words(&mut self, number: u8) -> [i16; WORDS] {
         if self.has("words") {
@@ -259,6 +289,8 @@ impl<'a> Meaning<'a> {
             Parameter::Sensing => return self.sensing().words(),
             Parameter::Events => return self.events().words(),
             Parameter::LinksDown => return LinksDown { deaf: self.bits("deaf") }.words(),
+            Parameter::Baseline => return self.baseline().words(),
+            Parameter::Tare => return [self.number("tare"), 0, 0, 0, 0, 0],
             Parameter::Commit => return [self.hex("hash").cast_signed(), 0, 0, 0, 0, 0],
             Parameter::Identity => panic!("{}: identity is given in words", self.text),
         }

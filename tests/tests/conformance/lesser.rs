@@ -1,7 +1,7 @@
 //! Cells that are right and are not as this project's: they lack options, or are slow.
 
 use protocol::can::Format;
-use protocol::message::{Answer, Message, Request};
+use protocol::message::{Answer, Message, Request, SensorPage};
 
 use crate::wrong::{Memory, Wrong};
 
@@ -11,6 +11,32 @@ type Lesser = (&'static str, fn(&mut Wrong));
 pub(crate) const ALL: &[Lesser] = &[
     ("no sensor values without a request", |it| {
         it.say = |memory, message| vec![(0, without(memory, message, &[7, 8]))]
+    }),
+    ("no baseline", |it| {
+        it.say = |memory, message| {
+            if matches!(message, Message::Sensors { page: SensorPage::Baseline(_), .. }) {
+                return Vec::new();
+            }
+            vec![(0, without(memory, message, &[11, 12]))]
+        }
+    }),
+    ("the protocol before there was a baseline", |it| {
+        it.say = |memory, message| {
+            if matches!(message, Message::Sensors { page: SensorPage::Baseline(_), .. }) {
+                return Vec::new();
+            }
+            let asked = match memory.heard {
+                Some(Message::Configure {
+                    request: Request::Read { number } | Request::Write { number, .. },
+                    ..
+                }) => number,
+                _ => 0,
+            };
+            let Message::Configured { from, tag, .. } = message else { return vec![(0, message)] };
+            let unknown = Answer::Refused { number: asked, reason: Answer::UNKNOWN };
+            let unknown = Message::Configured { from, tag, answer: unknown };
+            vec![(0, if [11, 12].contains(&asked) { unknown } else { message })]
+        }
     }),
     ("no test mode", |it| {
         it.hear = |_, message, frame| match message {

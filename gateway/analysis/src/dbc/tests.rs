@@ -68,8 +68,10 @@ fn every_message_says_through_the_dbc_what_the_protocol_says() {
     let dbc = parsed(&full(), 0);
     let messages = by_id(&dbc);
     let mut met: BTreeSet<(u16, String)> = BTreeSet::new();
-    let counts = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 17, 18, 19, 20, 21, 99, 126, 127];
-    let counts = counts.into_iter().flat_map(|count: u8| [count, count + 128]).chain([10, 200, 255]);
+    let counts = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 16, 17, 18, 19, 20, 21, 99, 126, 127];
+    let counts = counts.into_iter().flat_map(|count: u8| [count, count + 128]);
+    // Few words are a baseline.
+    let counts = counts.chain([10, 200, 255, 139, 139, 139]);
     // The joints have one identifier of 2048, and are to be met as surely as the cells.
     let node = prop_oneof![1 => Just(1_u16), 1 => Just(0xFF), 6 => 0_u16..0x100];
     let cases = (
@@ -190,9 +192,9 @@ fn words_have_names_units_and_ranges() {
     assert_eq!(signal(0x001, "count"), ("1 to 14 ".to_owned(), vec![]));
     assert_eq!(signal(0x301, "proximity"), ("0 to 1 ".to_owned(), vec![]));
     assert_eq!(signal(0x301, "temperature_2"), ("-512 to 511.984375 degC".to_owned(), vec![]));
-    assert_eq!(signal(0x301, "page").1, [(0, "skin"), (1, "acceleration")]);
+    assert_eq!(signal(0x301, "page").1, [(0, "skin"), (1, "acceleration"), (3, "baseline")]);
     assert_eq!(signal(0x701, "from_next").1, [(0, "from this epoch on"), (1, "from the next joints on")]);
-    assert_eq!(signal(0x501, "parameter").1.len(), 17);
+    assert_eq!(signal(0x501, "parameter").1.len(), 19);
     assert_eq!(signal(0x401, "parent"), ("0 to 255 ".to_owned(), vec![(0, "gateway"), (255, "unreachable")]));
     assert_eq!(signal(0x501, "events_temperature"), ("0 to 511.984375 degC".to_owned(), vec![]));
     let refusal = signal(0x601, "parameter").1;

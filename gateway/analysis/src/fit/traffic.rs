@@ -181,6 +181,7 @@ impl Traffic {
             Message::Report => Sorted { says: Says::Preparation, ..bench(Bench::Report) },
             Message::Sensors { from, page: SensorPage::Skin(_), .. } => self.page(*from, 1),
             Message::Sensors { from, page: SensorPage::Acceleration(_), .. } => self.page(*from, 2),
+            Message::Sensors { page: SensorPage::Baseline(_), .. } => Sorted::OTHER,
             Message::Network { from, page, .. } => {
                 let Node::Cell(from) = from else { return Sorted::OTHER };
                 match page {

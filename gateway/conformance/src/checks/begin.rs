@@ -4,7 +4,7 @@ use protocol::message::{Message, VERSION};
 use protocol::parameters::Parameter;
 use protocol::time::Span;
 
-use super::unconfigured;
+use super::{baseline, unconfigured};
 use crate::arm;
 use crate::bus::Stop;
 use crate::session::{Reply, Session};
@@ -73,6 +73,12 @@ fn options(session: &mut Session<'_>) -> Result<(), Stop> {
         format!("a write of parameter 7 with 2 was answered with {reply}")
     });
     session.set(Parameter::Sensing.number(), [0])?;
+    let reply = session.write(Parameter::Baseline.number(), baseline::HOLD)?;
+    session.about.baseline = reply.words().is_some();
+    // A cell that knows the protocol without it refuses with 18.
+    let is_known = session.about.baseline || matches!(reply, Reply::Refused(18 | 19));
+    session.check("OPT-1", is_known, || format!("a write of parameter 11 was answered with {reply}"));
+    session.set(Parameter::Baseline.number(), [0])?;
     session.settle()?;
     session.known.senses = false;
     Ok(())

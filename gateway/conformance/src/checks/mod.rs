@@ -1,5 +1,6 @@
 //! The checks, in groups that each begin with a cell that is ready.
 
+mod baseline;
 mod beats;
 mod begin;
 mod claims;
@@ -38,6 +39,8 @@ enum Needs {
     Restart,
     /// Sensor values without a request.
     Sensing,
+    /// A zero that is subtracted.
+    Baseline,
     /// Classic frames.
     Classic,
 }
@@ -78,6 +81,11 @@ const GROUPS: &[Group] = &[
         &["CMD-1", "CMD-2", "CMD-3", "CMD-4", "STATE-1", "SENSE-1", "SENSE-2"],
         Needs::Press,
         commands::run,
+    ),
+    group(
+        &["BASE-1", "BASE-2", "BASE-3", "BASE-4", "BASE-5", "BASE-6", "BASE-7", "BASE-8"],
+        Needs::Baseline,
+        baseline::run,
     ),
     group(&["COUNT-1", "SEND-1"], Needs::Nothing, counters::run),
     group(&["COUNT-3"], Needs::Classic, segments::run),
@@ -198,10 +206,19 @@ fn met(session: &Session<'_>, needs: Needs) -> Result<(), (bool, &'static str)> 
         Needs::Sensing if !about.test_mode => {
             Err((true, "without test mode (parameter 5) nothing can press the cell"))
         }
+        Needs::Baseline if !about.baseline => Err((false, "it subtracts no zero from its readings")),
+        Needs::Baseline if !about.test_mode || !about.committed => {
+            Err((true, "without test mode (parameter 5) and a configuration nothing can press the cell"))
+        }
         Needs::Classic if session.format == Format::Fd => {
             Err((false, "the bus is FD: there are no segments"))
         }
-        Needs::Nothing | Needs::Press | Needs::Restart | Needs::Sensing | Needs::Classic => Ok(()),
+        Needs::Nothing
+        | Needs::Press
+        | Needs::Restart
+        | Needs::Sensing
+        | Needs::Baseline
+        | Needs::Classic => Ok(()),
     }
 }
 

@@ -14,6 +14,8 @@ const REPLY: u8 = 6;
 const SENSING: u8 = 7;
 const EVENTS: u8 = 8;
 const LINKS: u8 = 9;
+const BASELINE: u8 = 11;
+const TARE: u8 = 12;
 
 pub(super) fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
     session.ready(&arm::document(2))?;
@@ -21,6 +23,7 @@ pub(super) fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
     mode(session)?;
     reply_mode(session)?;
     sensing(session)?;
+    no_baseline(session)?;
     links(session)?;
     rows(session)?;
     session.set(SENSING, [0])?;
@@ -139,6 +142,19 @@ fn sensing(session: &mut Session<'_>) -> Result<(), Stop> {
         expect(session, "SENSE-3", EVENTS, [a, b, c, d, e, 77], Reply::Value(good))?;
         let reply = session.read(EVENTS)?;
         session.check("CONF-9", reply == Reply::Value(good), || format!("parameter 8 is read as {reply}"));
+    }
+    Ok(())
+}
+
+/// To a cell without a baseline its parameters can only be zeros.
+fn no_baseline(session: &mut Session<'_>) -> Result<(), Stop> {
+    let reply = session.read(BASELINE)?;
+    if session.about.baseline || reply == Reply::Refused(18) {
+        return Ok(());
+    }
+    for number in [BASELINE, TARE] {
+        expect(session, "OPT-1", number, [0; WORDS], Reply::Value([0; WORDS]))?;
+        refuse(session, "OPT-1", number, words([1, 102]))?;
     }
     Ok(())
 }

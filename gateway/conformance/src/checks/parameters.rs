@@ -217,7 +217,7 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
 }
 
 fn unknown(session: &mut Session<'_>) -> Result<(), Stop> {
-    for number in (10..16).chain(48..127) {
+    for number in (10..=10).chain(13..16).chain(48..127) {
         // Each kind of request every other time.
         let reply = if number % 2 == 0 { session.read(number)? } else { session.set(number, [1, 2, 3])? };
         session.check("CONF-13", reply == Reply::Refused(18), || {

@@ -77,6 +77,7 @@ impl Model {
         match *page {
             SensorPage::Skin(skin) => self.sent.0 = skin,
             SensorPage::Acceleration(acceleration) => self.sent.1 = acceleration,
+            SensorPage::Baseline(_) => {}
         }
     }
 
@@ -85,6 +86,8 @@ impl Model {
         match *page {
             SensorPage::Skin(skin) => self.latched.0 == skin,
             SensorPage::Acceleration(acceleration) => self.latched.1 == acceleration,
+            // There is none without a baseline.
+            SensorPage::Baseline(_) => false,
         }
     }
 

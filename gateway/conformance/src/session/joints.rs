@@ -115,7 +115,8 @@ impl Session<'_> {
 
     /// F_z of what is latched, as far as it is known.
     fn force(&self) -> Option<i64> {
-        Some(arm::force(&self.known.parameters?.contact, &self.known.skin?))
+        let skin = self.known.skin.filter(|_| !self.known.adapts)?;
+        Some(arm::force(&self.known.parameters?.contact, &skin))
     }
 
     /// Looks at what came to joints.

@@ -16,6 +16,8 @@ pub(crate) struct About {
     pub(crate) test_mode: bool,
     /// It sends sensor values without a request.
     pub(crate) sensing: bool,
+    /// It can subtract a zero from its force sensor's readings.
+    pub(crate) baseline: bool,
     /// Its flash takes parameters.
     pub(crate) committed: bool,
 }
@@ -42,6 +44,8 @@ pub(crate) struct Known {
     pub(crate) staged: Option<Parameters>,
     /// What is latched.
     pub(crate) skin: Option<SkinSensors>,
+    /// It subtracts a zero: what it computes with is not what is latched.
+    pub(crate) adapts: bool,
     /// What the next joints latch.
     pub(crate) pending: Option<SkinSensors>,
 }

@@ -62,7 +62,11 @@ fn page_name(message: &Message) -> &'static str {
             NetworkPage::Ports(_) => "network 4",
         }
     } else if let Message::Sensors { page, .. } = message {
-        if matches!(page, SensorPage::Skin(_)) { "sensors 0" } else { "sensors 1" }
+        match page {
+            SensorPage::Skin(_) => "sensors 0",
+            SensorPage::Acceleration(_) => "sensors 1",
+            SensorPage::Baseline(_) => "sensors 3",
+        }
     } else {
         message.id().kind.name()
     }
@@ -239,7 +243,7 @@ impl Session<'_> {
     /// The pages that come to a report of then.
     pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<Heard>, Stop> {
         let expected = if self.about.ports { 6 } else { 4 };
-        let pages = self.collect(asked, expected)?;
+        let pages = self.collect(asked, expected + usize::from(self.known.adapts))?;
         if !self.known.senses {
             let names: Vec<_> = pages.iter().map(|it| page_name(&it.message)).collect();
             let order = REPORT_OF.get(..expected).unwrap_or_default();

@@ -18,8 +18,8 @@ const MAX: u8 = 127;
 pub enum ParameterTextError {
     /// No such name.
     #[error(
-        "{got:?} is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, row1 to \
-         row6 and commit are, and every number from 0 to {MAX}"
+        "{got:?} is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
+         baseline, tare, row1 to row6 and commit are, and every number from 0 to {MAX}"
     )]
     Unknown {
         /// What was given instead.
@@ -27,8 +27,8 @@ pub enum ParameterTextError {
     },
     /// It cannot be written.
     #[error(
-        "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, row1 to row6 \
-         or commit"
+        "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, baseline, \
+         tare, row1 to row6 or commit"
     )]
     ReadOnly,
     /// More or fewer values than it has.
@@ -245,7 +245,7 @@ mod tests {
         assert_eq!(
             says("poes", &["1"]),
             "\"poes\" is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
-             row1 to row6 and commit are, and every number from 0 to 127"
+             baseline, tare, row1 to row6 and commit are, and every number from 0 to 127"
         );
         assert_eq!(says("128", &[]), says("poes", &[]).replace("poes", "128"));
         assert_eq!(
@@ -262,8 +262,8 @@ mod tests {
         assert_eq!(says("commit", &["12345"]), "hash = 12345: a hash has up to 4 hexadecimal digits");
         assert_eq!(
             says("identity", &["1"]),
-            "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, row1 to \
-             row6 or commit"
+            "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
+             baseline, tare, row1 to row6 or commit"
         );
         assert_eq!(says("99", &["65536"]), "word = 65536: a word is -32768 to 32767, or 0x0 to 0xFFFF");
         assert_eq!(says("99", &["0"; 7]), "7 words are too many for parameter 99: at most 6");
@@ -288,6 +288,15 @@ mod tests {
         assert_eq!(words("links_down", "0+2"), (9, [5, 0, 0, 0, 0, 0]));
         assert_eq!(words("links_down", "3,uplink"), (9, [24, 0, 0, 0, 0, 0]));
         assert_eq!(words("links_down", "none"), (9, [0; WORDS]));
+        assert_eq!(words("tare", "tared"), (12, [1, 0, 0, 0, 0, 0]));
+        assert_eq!(
+            says("baseline", &["keep"]),
+            "baseline = keep: off is, and hold or follow with THRESHOLD_N HYSTERESIS RATE_UN_PER_S LIMIT_N N_PER_C"
+        );
+        assert_eq!(
+            says("tare", &["now"]),
+            "tare = now: none forgets the zero, tared finds it unless something touches the cell, forced finds it anyhow"
+        );
         assert_eq!(says("reply", &["sums"]), "reply = sums: torque is, and sum SLOT_US DEEPEST CARRY");
         assert_eq!(
             says("reply", &["sum", "1500"]),
@@ -319,6 +328,18 @@ mod tests {
             ("reply", "torque", "torque"),
             ("reply", "sum 65535 253 0", "sum, slot 65535 us, deepest 253, no carry"),
             ("sensing", "continuous 65535", "continuous, every 65535 ms"),
+            ("baseline", "off", "off"),
+            (
+                "baseline",
+                "hold 0.1 0.5 1 1 0.02",
+                "hold, touched from 0.101 N, hysteresis 0.5000, limit 1.000 N, 0.0200 N/°C",
+            ),
+            (
+                "baseline",
+                "follow 0.25 0.5 2000 1 -0.02",
+                "follow, touched from 0.250 N, hysteresis 0.5000, 2000 uN/s, limit 1.000 N, -0.0200 N/°C",
+            ),
+            ("tare", "forced", "forced"),
             (
                 "events",
                 "0.1 0.05 0.5 0.1 1",

@@ -245,6 +245,7 @@ impl Cell {
     /// A sensors frame of the cell came.
     pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, events: &Events) {
         self.sensed.hear(at, page, events);
+        self.switched.subtracts |= matches!(page, SensorPage::Baseline(_));
         self.contact.learn(*page, ());
     }
 
@@ -265,9 +266,12 @@ impl Cell {
         self.switched.lacks()
     }
 
-    /// Its sensors; `None` where they are unknown, because it measures or may not be on the bus.
+    /// What it computes with; `None` where that is unknown, because it measures, subtracts a zero of its own, or may not
+    /// be on the bus.
     pub(super) fn sensors(&self) -> Option<SkinSensors> {
-        let obeys = self.tracked.claim().says(State::TEST_MODE) && !self.tracked.account.is_interrupted();
+        let obeys = self.tracked.claim().says(State::TEST_MODE)
+            && !self.switched.subtracts
+            && !self.tracked.account.is_interrupted();
         self.contact.skin().filter(|_| obeys).map(|(skin, ())| *skin)
     }
 
@@ -440,7 +444,7 @@ mod tests {
     fn a_heartbeat_from_before_a_halt_does_not_end_it() {
         let skin = crate::testing::skin();
         let described = skin.cells.first().unwrap();
-        let switched = Switched::new(skin.events, Default::default());
+        let switched = Switched::new(skin.events, Default::default(), Default::default());
         let mut cell = Cell::new(described, &skin.parameters(described), false, switched);
         let says = |cell: &mut Cell, sent, state: State| {
             let heartbeat = Heartbeat { sent, state, ..Heartbeat::default() };

@@ -168,7 +168,7 @@ impl Table {
                 *place = Some(cells.len());
             }
             let sensing = skin.buses.get(bus).map_or(Sensing::Off, |bus| bus.sensing);
-            let switched = Switched::new(skin.events, sensing);
+            let switched = Switched::new(skin.events, sensing, described.baseline);
             cells.push(Cell::new(described, &part.parameters(described), summed, switched));
         }
         let snapshot = Snapshot { sums: Sums::default(), sensors: vec![SkinSensors::default(); cells.len()] };

@@ -1,50 +1,60 @@
-//! Switches of a cell, which a restart resets: events and sensing, parameters 8 and 7.
+//! Switches of a cell, which a restart resets: events, sensing and baseline, parameters 8, 7 and 11.
 //!
 //! Their target is the skin's, until the cell confirms another value, which was written from a command line. They
 //! are written to the cell until it confirms them.
 
 use protocol::message::Answer;
 use protocol::packet::WORDS;
-use protocol::parameters::{Events, Parameter, Sensing};
+use protocol::parameters::{Baseline, Events, Parameter, Sensing};
 
 /// A parameter's number and its target words.
 pub type Switch = (u8, [i16; WORDS]);
 
 /// How many there are.
-pub const SWITCHES: usize = 2;
+pub const SWITCHES: usize = 3;
 
 /// The switches of one cell, in the order in which they are written: thresholds before the mode that needs them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Switched {
     target: [Switch; SWITCHES],
     confirmed: [bool; SWITCHES],
+    /// It has a baseline: it subtracts a zero from what it is given to measure.
+    pub(super) subtracts: bool,
 }
 
 impl Switched {
     /// A cell that has just started, with the skin's targets.
-    pub(super) fn new(events: Events, sensing: Sensing) -> Self {
-        let target =
-            [(Parameter::Events.number(), events.words()), (Parameter::Sensing.number(), sensing.words())];
-        let mut switched = Self { target, confirmed: [false; SWITCHES] };
+    pub(super) fn new(events: Events, sensing: Sensing, baseline: Baseline) -> Self {
+        let target = [
+            (Parameter::Events.number(), events.words()),
+            (Parameter::Sensing.number(), sensing.words()),
+            (Parameter::Baseline.number(), baseline.words()),
+        ];
+        let mut switched = Self { target, confirmed: [false; SWITCHES], subtracts: false };
         switched.restart();
         switched
     }
 
     /// The cell restarted: its switches are as at every start.
     pub(super) fn restart(&mut self) {
-        let start = [Events::default().words(), Sensing::default().words()];
+        let start = [Events::default().words(), Sensing::default().words(), Baseline::default().words()];
         for ((confirmed, (_, target)), start) in self.confirmed.iter_mut().zip(self.target).zip(start) {
             *confirmed = target == start;
         }
+        self.subtracts = false;
     }
 
     /// The cell answered a write. A refused one is not repeated.
     pub(super) fn answered(&mut self, answer: &Answer) {
         let (of, words) = match *answer {
             Answer::Value { number, written: true, words } => (number, Some(words)),
-            Answer::Refused { number, reason: Answer::UNKNOWN } => (number, None),
+            // A cell without the option can have no other words than zeros.
+            Answer::Refused { number, reason: Answer::UNKNOWN | Answer::CANNOT_BE } => (number, None),
             Answer::Value { .. } | Answer::Refused { .. } => return,
         };
+        if let (Some(words), true) = (words, of == Parameter::Baseline.number()) {
+            self.subtracts = words != Baseline::Off.words();
+        }
         for ((number, target), confirmed) in self.target.iter_mut().zip(&mut self.confirmed) {
             if *number == of {
                 (*target, *confirmed) = (words.unwrap_or(*target), true);
@@ -65,6 +75,8 @@ impl Switched {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use protocol::fixed::Q;
+    use protocol::parameters::Zeroing;
 
     const MODE: u8 = 7;
 
@@ -74,10 +86,10 @@ mod tests {
 
     #[test]
     fn a_cell_lacks_what_differs_from_its_start_until_it_confirms() {
-        let plain = Switched::new(Events::default(), Sensing::Off);
+        let plain = Switched::new(Events::default(), Sensing::Off, Baseline::Off);
         assert_eq!(lacks(&plain), [0_u8; 0]);
         let finer = Events { contact: protocol::fixed::Q5_10::from_bits(5), ..Events::default() };
-        let mut switched = Switched::new(finer, Sensing::Event);
+        let mut switched = Switched::new(finer, Sensing::Event, Baseline::Off);
         assert_eq!(lacks(&switched), [8, MODE], "thresholds first");
         let (number, words) = switched.lacks()[1].unwrap();
         switched.answered(&Answer::Value { number, written: false, words });
@@ -91,8 +103,26 @@ mod tests {
     }
 
     #[test]
+    fn a_cell_subtracts_a_zero_from_its_answer_on_until_it_restarts() {
+        let rule = Zeroing {
+            threshold: Q::from_bits(103),
+            hysteresis: Q::from_bits(0),
+            rate_un_per_s: 5,
+            limit: Q::from_bits(512),
+            n_per_c: Q::from_bits(0),
+        };
+        let mut switched = Switched::new(Events::default(), Sensing::Off, Baseline::On(rule));
+        let (number, words) = switched.lacks()[2].unwrap();
+        assert!(!switched.subtracts);
+        switched.answered(&Answer::Value { number, written: true, words });
+        assert!(switched.subtracts && lacks(&switched).is_empty());
+        switched.restart();
+        assert!(!switched.subtracts && lacks(&switched) == [11]);
+    }
+
+    #[test]
     fn another_confirmed_value_becomes_the_target() {
-        let mut switched = Switched::new(Events::default(), Sensing::Off);
+        let mut switched = Switched::new(Events::default(), Sensing::Off, Baseline::Off);
         let words = Sensing::Continuous { period_ms: 16 }.words();
         switched.answered(&Answer::Value { number: MODE, written: true, words });
         assert_eq!(lacks(&switched), [0_u8; 0]);

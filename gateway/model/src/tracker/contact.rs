@@ -42,6 +42,7 @@ impl<T> Contact<T> {
             match page {
                 SensorPage::Skin(skin) => self.skin = Some((skin, tag)),
                 SensorPage::Acceleration(acceleration) => self.acceleration = Some((acceleration, tag)),
+                SensorPage::Baseline(_) => {}
             }
         }
     }
@@ -54,6 +55,8 @@ impl<T> Contact<T> {
             SensorPage::Acceleration(acceleration) => {
                 _ = self.acceleration.get_or_insert((acceleration, tag))
             }
+            // What the cell computes with, and no reading.
+            SensorPage::Baseline(_) => {}
         }
     }
 

@@ -1,6 +1,7 @@
 //! One wrong cell for each thing that a cell can do wrong, and the requirement that it breaks.
 
 pub(crate) mod arithmetic;
+pub(crate) mod baseline;
 pub(crate) mod beats;
 pub(crate) mod commands;
 pub(crate) mod counters;
@@ -35,6 +36,7 @@ pub(crate) const ALL: &[(&[Spoilt], Format)] = &[
     (counters::COUNTERS, Format::Fd),
     (segments::SEGMENTS, Format::Classic),
     (sensing::SENSING, Format::Fd),
+    (baseline::BASELINE, Format::Fd),
     (starts::STARTS, Format::Fd),
     (flash::FLASH, Format::Fd),
     (flash::LEAVES, Format::Fd),

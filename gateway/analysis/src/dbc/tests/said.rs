@@ -47,6 +47,16 @@ impl Said {
                     self.put(format!("acceleration_{axis}"), value.to_f64());
                 }
             }
+            SensorPage::Baseline(page) => {
+                self.put("page", 3);
+                self.put("baseline_zero", page.zero.to_f64());
+                self.put("baseline_n_per_c", page.n_per_c.to_f64());
+                self.put("baseline_found_at", page.temperature.to_f64());
+                self.put("baseline_tared", u8::from(page.tared));
+                self.put("baseline_touched", u8::from(page.touched));
+                self.put("baseline_limited", u8::from(page.limited));
+                self.put("baseline_refused", page.refused);
+            }
         }
     }
 
@@ -111,6 +121,15 @@ impl Said {
                     self.put(format!("link_down_port_{port}"), words[0] >> port & 1);
                 }
             }
+            Some(Parameter::Baseline) => {
+                self.put("baseline", words[0]);
+                self.put("baseline_threshold", newtons(1));
+                self.put("baseline_hysteresis", q14(2).to_f64());
+                self.put("baseline_rate_un_per_s", unsigned[3]);
+                self.put("baseline_limit", newtons(4));
+                self.put("baseline_n_per_c", q14(5).to_f64());
+            }
+            Some(Parameter::Tare) => self.put("tare", words[0]),
             Some(Parameter::Row(row)) => {
                 let row = row + 1;
                 self.put(format!("row{row}_a"), q14(0).to_f64());

@@ -1,0 +1,305 @@
+//! What the force sensor reads when nothing touches it: its zero, which is subtracted from its readings.
+//!
+//! ```text
+//!   untared ── 32 joints steady, within the limit ──> tared, free <──> touched
+//!      ^        what is within the limit is none       follows         holds
+//!      └───── a write of parameter 5 or 11, or of parameter 12 with 0 ─────┘
+//! ```
+//!
+//! Integers only, no division. The zero moves at joints, by what fits into a period, so that it is a function of the
+//! frames that came, and a replay brings it back. With the temperature it moves by the coefficient, in contact too: there
+//! nothing else shows how the sensor drifts.
+
+use protocol::fixed::{Q1_14, Q5_10, Q9_6};
+use protocol::message::{BaselinePage, SkinSensors};
+use protocol::parameters::{Baseline as Rule, Tare, Zeroing};
+use protocol::touch::{Touch, contact};
+
+/// Joints with a steady reading before the first tare.
+pub const STEADY: u8 = 32;
+/// Fraction bits of the zero, in N, beyond those of a contact word.
+const FINER: u32 = 12;
+/// The mean is over 2 to this many joints.
+const MEAN: u32 = 3;
+/// At each joints the zero comes nearer by this part of what is left, 2 to the minus this many, if the rate allows it.
+const NEARER: u32 = 4;
+/// Temperature differences beyond 64 °C are taken for 64 °C.
+const MAX_DEGREES: i32 = 64 << 6;
+/// The coefficient is learned over 2 °C.
+const LEARNED: i32 = 2 << 6;
+/// With a quicker change the zero has not come along.
+const TOO_QUICK: i32 = LEARNED + (LEARNED >> 2);
+/// In more joints the zero may have drifted for another reason.
+const TOO_SLOW: u16 = 1 << 14;
+
+/// Why there is no tare.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Refused {
+    /// There is no baseline.
+    Off,
+    /// Something touches it, or no joints have been taken.
+    Touched,
+    /// What it reads is beyond the limit.
+    Limit,
+}
+
+/// The zero of one force sensor. Forces have 22 fraction bits, in N.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Baseline {
+    rule: Rule,
+    /// The zero at the reference temperature.
+    base: i32,
+    /// The zero at the present temperature.
+    zero: i32,
+    reference: Q9_6,
+    /// The coefficient in use: the rule's, or what was learned.
+    n_per_c: Q1_14,
+    /// Something is known of it: half of what it lacks is added.
+    is_n_per_c_known: bool,
+    /// The mean of the last readings; none before the first joints.
+    mean: Option<i32>,
+    is_steady: bool,
+    /// How many readings were steady, until the first tare.
+    steady: u8,
+    is_tared: bool,
+    is_limited: bool,
+    touch: Touch,
+    refused: u16,
+    /// Tares and settings: a change of it is reported.
+    changes: u8,
+    anchor: Option<Anchor>,
+    pace: Pace,
+}
+
+/// How far the zero may go at each joints.
+#[derive(Clone, Copy, Debug, Default)]
+struct Pace {
+    period_us: u16,
+    step: i32,
+}
+
+/// Where learning of the coefficient began.
+#[derive(Clone, Copy, Debug)]
+struct Anchor {
+    temperature: Q9_6,
+    base: i32,
+    joints: u16,
+}
+
+impl Baseline {
+    /// Another rule: the zero is found again.
+    pub fn set(&mut self, rule: Rule) {
+        self.rule = rule;
+        self.forget();
+        self.pace = Pace::default();
+    }
+
+    /// The rule.
+    #[must_use]
+    pub const fn rule(&self) -> Rule {
+        self.rule
+    }
+
+    /// Whether there is a zero.
+    #[must_use]
+    pub const fn is_tared(&self) -> bool {
+        self.is_tared
+    }
+
+    /// Begins as after a start; the rule and the count of refused tares stay.
+    pub fn forget(&mut self) {
+        let Self { rule, refused, changes, pace, .. } = *self;
+        let n_per_c = if let Rule::On(zeroing) = rule { zeroing.n_per_c } else { Q1_14::ZERO };
+        let changes = changes.wrapping_add(1);
+        let is_n_per_c_known = n_per_c != Q1_14::ZERO;
+        *self = Self { rule, refused, changes, pace, n_per_c, is_n_per_c_known, ..Self::default() };
+    }
+
+    /// Joints were taken with these readings, in this period.
+    pub fn take(&mut self, raw: &SkinSensors, period_us: u16) {
+        let Rule::On(rule) = self.rule else { return };
+        if self.pace.period_us != period_us {
+            self.pace = Pace { period_us, step: step(rule.rate_un_per_s, period_us) };
+        }
+        let [temperature, _] = raw.temperature;
+        let (sum, reading) = (contact(raw), contact(raw) << FINER);
+        let mean = self.mean.unwrap_or(reading);
+        self.is_steady = (reading - mean).abs() < rule.threshold.finer() >> 2;
+        let mean = mean + ((reading - mean) >> MEAN);
+        self.mean = Some(mean);
+        if !self.is_tared {
+            let is_within = mean.abs() <= rule.limit.finer();
+            self.steady = if self.is_steady && is_within { self.steady + 1 } else { 0 };
+            if self.steady < STEADY {
+                let net = if is_none(sum, &rule) { 0 } else { sum };
+                self.touch = self.touch.next(net, rule.threshold.to_bits(), rule.hysteresis);
+                return;
+            }
+            self.zero_at(mean, temperature);
+        }
+        let shift = self.shift(temperature);
+        let limit = rule.limit.finer();
+        self.zero = (self.base + shift).clamp(-limit, limit);
+        let net = sum - self.coarse_zero();
+        self.touch = self.touch.next(net, rule.threshold.to_bits(), rule.hysteresis);
+        if self.touch == Touch::Touched {
+            self.anchor = None;
+        } else if rule.rate_un_per_s > 0 {
+            self.follow(reading, shift, limit);
+            self.learn(temperature);
+        }
+    }
+
+    /// What is left of readings when the zero is subtracted.
+    #[must_use]
+    pub fn net(&self, raw: &SkinSensors) -> SkinSensors {
+        let Rule::On(rule) = self.rule else { return *raw };
+        if !self.is_tared {
+            let is_none = is_none(contact(raw), &rule);
+            return if is_none { SkinSensors { contact: [Q5_10::ZERO; 3], ..*raw } } else { *raw };
+        }
+        let zero = self.coarse_zero();
+        // A third, rounded down; the last word gets what is left of it.
+        let third = (zero * 21_845) >> 16;
+        let [first, second, last] = raw.contact;
+        let contact = [less(first, third), less(second, third), less(last, zero - 2 * third)];
+        SkinSensors { contact, ..*raw }
+    }
+
+    /// A tare by command, with the present readings.
+    ///
+    /// # Errors
+    /// Why there is none; then nothing has changed but the count of these.
+    pub fn tare(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), Refused> {
+        let done = self.tared(raw, how);
+        if done.is_err() {
+            self.refused = self.refused.wrapping_add(1);
+        }
+        done
+    }
+
+    fn tared(&mut self, raw: &SkinSensors, how: Tare) -> Result<(), Refused> {
+        if how == Tare::Forget {
+            self.forget();
+            return Ok(());
+        }
+        let Rule::On(rule) = self.rule else { return Err(Refused::Off) };
+        let is_free = how == Tare::Anyhow || self.is_steady && self.touch != Touch::Touched;
+        let mean = self.mean.filter(|_| is_free).ok_or(Refused::Touched)?;
+        if mean.abs() > rule.limit.finer() {
+            return Err(Refused::Limit);
+        }
+        let [temperature, _] = raw.temperature;
+        self.zero_at(mean, temperature);
+        Ok(())
+    }
+
+    /// Sensors page 3; none while there is no baseline.
+    #[must_use]
+    pub fn page(&self) -> Option<BaselinePage> {
+        let page = BaselinePage {
+            zero: Q5_10::from_bits(word(self.coarse_zero())),
+            n_per_c: self.n_per_c,
+            temperature: self.reference,
+            tared: self.is_tared,
+            touched: self.touch == Touch::Touched,
+            limited: self.is_limited,
+            refused: self.refused,
+        };
+        (self.rule != Rule::Off).then_some(page)
+    }
+
+    /// What makes page 3 worth sending when it changes.
+    #[must_use]
+    pub fn status(&self) -> Status {
+        (self.is_tared, self.touch == Touch::Touched, self.is_limited, self.refused, self.changes)
+    }
+
+    fn zero_at(&mut self, reading: i32, temperature: Q9_6) {
+        (self.base, self.zero, self.reference) = (reading, reading, temperature);
+        (self.is_tared, self.is_limited, self.touch, self.anchor) = (true, false, Touch::Free, None);
+        self.changes = self.changes.wrapping_add(1);
+    }
+
+    /// How far a temperature moves the zero.
+    fn shift(&self, temperature: Q9_6) -> i32 {
+        let degrees = i32::from(temperature.to_bits()) - i32::from(self.reference.to_bits());
+        let degrees = degrees.clamp(-MAX_DEGREES, MAX_DEGREES);
+        // 14 and 6 fraction bits.
+        (i32::from(self.n_per_c.to_bits()) * degrees) << 2
+    }
+
+    /// The zero in steps of a contact word.
+    const fn coarse_zero(&self) -> i32 {
+        (self.zero + (1 << (FINER - 1))) >> FINER
+    }
+
+    /// Nothing touches it: the zero comes nearer to what it reads.
+    fn follow(&mut self, reading: i32, shift: i32, limit: i32) {
+        let step = self.pace.step;
+        let target = self.zero + ((reading - self.zero) >> NEARER).clamp(-step, step);
+        self.zero = target.clamp(-limit, limit);
+        self.is_limited = self.zero != target;
+        self.base = self.zero - shift;
+    }
+
+    /// How far the zero had to follow while the temperature changed is what the coefficient lacks.
+    fn learn(&mut self, temperature: Q9_6) {
+        let fresh = Anchor { temperature, base: self.base, joints: 0 };
+        let anchor = self.anchor.get_or_insert(fresh);
+        anchor.joints = anchor.joints.saturating_add(1);
+        let degrees = i32::from(temperature.to_bits()) - i32::from(anchor.temperature.to_bits());
+        if degrees.abs() < LEARNED {
+            return;
+        }
+        if degrees.abs() <= TOO_QUICK && anchor.joints <= TOO_SLOW && !self.is_limited {
+            // Per 2 °C, with 14 fraction bits; from the second time on the half of it, so that one error is not taken for all.
+            let lacks = (self.base - anchor.base) >> (FINER + 10 - 14 + 1 + u32::from(self.is_n_per_c_known));
+            self.is_n_per_c_known = true;
+            let lacks = if degrees < 0 { -lacks } else { lacks };
+            let n_per_c = i32::from(self.n_per_c.to_bits()) + lacks;
+            self.n_per_c = Q1_14::from_bits(word(n_per_c));
+        }
+        (self.base, self.reference) = (self.zero, temperature);
+        self.anchor = Some(Anchor { temperature, base: self.zero, joints: 0 });
+    }
+}
+
+/// See [`Baseline::status`].
+pub type Status = (bool, bool, bool, u16, u8);
+
+/// Steps of a zero's fraction.
+trait Finer {
+    fn finer(self) -> i32;
+}
+
+impl Finer for Q5_10 {
+    fn finer(self) -> i32 {
+        i32::from(self.to_bits()) << FINER
+    }
+}
+
+/// Whether a reading of an untared sensor may be its zero.
+fn is_none(sum: i32, rule: &Zeroing) -> bool {
+    sum.abs() <= i32::from(rule.limit.to_bits())
+}
+
+/// How far the zero may go in a period, in steps of 2^-22 N, rounded down.
+fn step(rate_un_per_s: u16, period_us: u16) -> i32 {
+    // 2^22 / 10^12 is 18 014.398 / 2^32.
+    let rate = u64::from(u32::from(rate_un_per_s) * u32::from(period_us));
+    i32::try_from((rate * 18_014) >> 32).unwrap_or(0)
+}
+
+/// Held in the range of a word.
+fn word(value: i32) -> i16 {
+    i16::try_from(value).unwrap_or(if value < 0 { i16::MIN } else { i16::MAX })
+}
+
+fn less(reading: Q5_10, zero: i32) -> Q5_10 {
+    Q5_10::from_bits(word(i32::from(reading.to_bits()) - zero))
+}
+
+#[cfg(test)]
+#[expect(clippy::float_cmp, reason = "steps of 2^-10 N are exact in f64")]
+mod tests;

@@ -1,0 +1,48 @@
+//! When a cell reports the zero of its force sensor, sensors page 3: when its state changes, and once a second.
+
+use protocol::message::{Message, SensorPage};
+
+use super::Node;
+use super::stimuli::Sensed;
+use crate::baseline::Status;
+
+/// Every so many heartbeats carry the page.
+const BEATS: u8 = 4;
+
+/// What was reported last.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Reported {
+    status: Status,
+    beats: u8,
+}
+
+impl Node {
+    /// What the sensors read, less the zero.
+    pub(super) fn net(&self) -> Sensed {
+        let Sensed { skin, acceleration } = self.stimuli.sensed;
+        Sensed { skin: self.baseline.net(&skin), acceleration }
+    }
+
+    /// Reports the zero if its state has changed. Nothing is sent until the cell owns its node id.
+    pub(super) fn report_zero(&mut self) {
+        if self.claim.is_settled() && self.reported.status != self.baseline.status() {
+            self.push_zero();
+        }
+    }
+
+    /// A regular heartbeat goes out.
+    pub(super) fn beat_zero(&mut self) {
+        self.reported.beats = (self.reported.beats + 1) % BEATS;
+        if self.reported.beats == 0 {
+            self.push_zero();
+        }
+    }
+
+    /// Reports the zero, if there is a baseline.
+    pub(super) fn push_zero(&mut self) {
+        self.reported.status = self.baseline.status();
+        let (Some(from), Some(page)) = (self.identity.cell, self.baseline.page()) else { return };
+        let page = SensorPage::Baseline(page);
+        self.push(Message::Sensors { from, epoch: self.epoch.unwrap_or_default(), page });
+    }
+}

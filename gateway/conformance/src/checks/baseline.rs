@@ -1,0 +1,296 @@
+//! The zero of the force sensor: how it is found, followed, held and reported.
+
+use protocol::fixed::Q9_6;
+use protocol::message::{BaselinePage, SensorPage, SkinSensors};
+use protocol::packet::{WORDS, words};
+use protocol::parameters::MAX_JOINTS;
+use protocol::time::Span;
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::{Heard, Reply, Session, Step};
+
+const BASELINE: u8 = 11;
+const TARE: u8 = 12;
+/// Touched from 0.1 N on, released at half of it; the zero holds, within 0.5 N.
+pub(super) const HOLD: [i16; WORDS] = [1, 102, 8_192, 0, LIMIT, 0];
+const LIMIT: i16 = 512;
+/// The highest rate: 1.07 steps of a contact word at each joints.
+const FOLLOW: [i16; WORDS] = [2, 102, 8_192, -1, LIMIT, 0];
+/// 0.02 N/°C.
+const SLOPE: i16 = 328;
+/// Joints before the first tare, and a few.
+const START: usize = 40;
+/// 25 °C.
+const WARM: i16 = 25 << 6;
+const TOUCH: i32 = 1_024;
+const TOUCHED: i16 = 20;
+const BEYOND: i16 = 21;
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    session.ready(&arm::in_time(6))?;
+    (session.known.senses, session.known.adapts) = (true, true);
+    let done = ranges(session)
+        .and_then(|()| start(session))
+        .and_then(|()| holds(session))
+        .and_then(|()| follows(session))
+        .and_then(|()| temperature(session))
+        .and_then(|()| tares(session))
+        .and_then(|()| pages(session));
+    done?;
+    session.set(BASELINE, [0])?;
+    session.settle()?;
+    (session.known.senses, session.known.adapts) = (false, false);
+    session.ready(&arm::in_time(6))?;
+    Ok(())
+}
+
+fn reading(sum: i32, temperature: i16) -> SkinSensors {
+    SkinSensors { temperature: [Q9_6::from_bits(temperature); 2], ..arm::press(sum) }
+}
+
+/// So many joints with this reading; what came of the last ones.
+fn reads(session: &mut Session<'_>, sum: i32, temperature: i16, joints: usize) -> Result<Step, Stop> {
+    session.press(reading(sum, temperature))?;
+    let mut step = session.step(&[0x0321; MAX_JOINTS])?;
+    for _ in 1..joints {
+        step = session.step(&[0x0321; MAX_JOINTS])?;
+    }
+    Ok(step)
+}
+
+/// Sensors pages 0 and 3 of a report: the sum of the contact words, and the zero.
+fn report(session: &mut Session<'_>) -> Result<Option<(i32, BaselinePage, SkinSensors)>, Stop> {
+    session.quiet(Span::from_millis(30))?;
+    let pages = session.report()?;
+    let pages: Vec<_> = pages.iter().filter_map(Heard::sensors).map(|(_, page)| *page).collect();
+    let skin =
+        pages.iter().find_map(|page| if let SensorPage::Skin(skin) = page { Some(*skin) } else { None });
+    let zero = pages.iter().find_map(zero_of);
+    session.check("BASE-7", zero.is_some(), || "no sensors page 3 came to a report".to_owned());
+    let sum = |skin: SkinSensors| skin.contact.iter().map(|word| i32::from(word.to_bits())).sum();
+    Ok(skin.zip(zero).map(|(skin, zero)| (sum(skin), zero, skin)))
+}
+
+const fn zero_of(page: &SensorPage) -> Option<BaselinePage> {
+    if let SensorPage::Baseline(page) = page { Some(*page) } else { None }
+}
+
+/// Another rule, with which the zero is found again.
+fn set(session: &mut Session<'_>, rule: [i16; WORDS]) -> Result<(), Stop> {
+    let reply = session.write(BASELINE, rule)?;
+    session.check("BASE-1", reply == Reply::Value(rule), || {
+        format!("parameter 11 was written with {}: {reply}", Reply::Value(rule))
+    });
+    Ok(())
+}
+
+/// Another rule, and a first tare at this reading.
+fn tared(session: &mut Session<'_>, rule: [i16; WORDS], sum: i32) -> Result<(), Stop> {
+    set(session, rule)?;
+    reads(session, sum, WARM, START)?;
+    Ok(())
+}
+
+fn near(value: i32, expected: i32, by: i32) -> bool {
+    (value - expected).abs() <= by
+}
+
+fn ranges(session: &mut Session<'_>) -> Result<(), Stop> {
+    let bad = [
+        [3, 102, 8_192, 2_000, 512, 0],
+        [-1, 102, 8_192, 2_000, 512, 0],
+        [2, 0, 8_192, 2_000, 512, 0],
+        [1, -1, 8_192, 2_000, 512, 0],
+        [2, 102, -1, 2_000, 512, 0],
+        [2, 102, 16_385, 2_000, 512, 0],
+        [2, 102, 8_192, 0, 512, 0],
+        [1, 102, 8_192, 0, -1, 0],
+    ];
+    set(session, [0; WORDS])?;
+    let cases = bad.map(|words| (BASELINE, words)).into_iter();
+    for (number, bad) in cases.chain([3, -1, 1, 2].map(|word| (TARE, words([word])))) {
+        let reply = session.write(number, bad)?;
+        session.check("BASE-1", reply == Reply::Refused(19), || {
+            format!("parameter {number} was written with {}, without a baseline: {reply}", Reply::Value(bad))
+        });
+    }
+    for (written, expected) in [([0, 9, 9, 9, 9, 9], [0; WORDS]), ([1, 102, 8_192, 77, LIMIT, 0], HOLD)] {
+        let reply = session.write(BASELINE, written)?;
+        session.check("CONF-3", reply == Reply::Value(expected), || {
+            format!("parameter 11 was written with {}: {reply}", Reply::Value(written))
+        });
+    }
+    set(session, [0; WORDS])?;
+    let step = reads(session, 307, WARM, 1)?;
+    session.check("BASE-1", step.torque.is_some(), || "without a baseline 0.3 N made no torque".to_owned());
+    reads(session, 0, WARM, 2)?;
+    Ok(())
+}
+
+fn start(session: &mut Session<'_>) -> Result<(), Stop> {
+    set(session, HOLD)?;
+    let first = reads(session, 307, WARM, 1)?;
+    session.check("BASE-2", first.torque.is_none_or(|torque| torque.is_zero()), || {
+        "0.3 N before the first tare, within the limit of 0.5 N: a torque came".to_owned()
+    });
+    reads(session, 307, WARM, START)?;
+    if let Some((sum, zero, _)) = report(session)? {
+        let is_so = zero.tared && near(zero.zero.to_bits().into(), 307, 1) && near(sum, 0, 1);
+        session.check("BASE-2", is_so, || {
+            format!("after {START} joints with 0.3 N: {}, page 0 adds up to {sum}", text(zero))
+        });
+    }
+    let raw = reading(307 + TOUCH, WARM);
+    let step = reads(session, 307 + TOUCH, WARM, 1)?;
+    session.check("BASE-8", step.torque.is_some(), || "1 N above the zero: no torque came".to_owned());
+    if let Some((_, zero, skin)) = report(session)? {
+        let zero = i32::from(zero.zero.to_bits());
+        let third = (zero * 21_845) >> 16;
+        let expected: Vec<_> = raw
+            .contact
+            .iter()
+            .zip([third, third, zero - 2 * third])
+            .map(|(word, part)| i32::from(word.to_bits()) - part)
+            .collect();
+        let got: Vec<_> = skin.contact.iter().map(|word| i32::from(word.to_bits())).collect();
+        session.check("BASE-8", got == expected, || {
+            format!("contact words {got:?} of page 0 with a zero of {zero}, not {expected:?}")
+        });
+    }
+    // Beyond the limit it is a touch from the start.
+    set(session, HOLD)?;
+    let step = reads(session, 700, WARM, START)?;
+    session.check("BASE-2", step.torque.is_some(), || {
+        "0.68 N from the start, beyond the limit of 0.5 N: no torque came".to_owned()
+    });
+    if let Some((sum, zero, _)) = report(session)? {
+        session.check("BASE-2", !zero.tared && sum == 700, || {
+            format!("0.68 N from the start: {}, page 0 adds up to {sum}", text(zero))
+        });
+    }
+    Ok(())
+}
+
+fn text(zero: BaselinePage) -> String {
+    arm::page(SensorPage::Baseline(zero))
+}
+
+fn holds(session: &mut Session<'_>) -> Result<(), Stop> {
+    tared(session, FOLLOW, 0)?;
+    for joints in [1, 60] {
+        reads(session, TOUCH, WARM, joints)?;
+        if let Some((sum, zero, _)) = report(session)? {
+            session.check("BASE-3", near(sum, TOUCH, 1) && near(zero.zero.to_bits().into(), 0, 1), || {
+                format!("{joints} joints under 1 N: {}, page 0 adds up to {sum}, not {TOUCH}", text(zero))
+            });
+        }
+    }
+    reads(session, 0, WARM, 2)?;
+    Ok(())
+}
+
+fn follows(session: &mut Session<'_>) -> Result<(), Stop> {
+    const JOINTS: usize = 30;
+    for (rate, min, max) in [(-1, 15, 34), (1_000, -1, 2)] {
+        let mut rule = FOLLOW;
+        rule.iter_mut().skip(3).take(1).for_each(|word| *word = rate);
+        tared(session, rule, 0)?;
+        let skips = session.skips;
+        reads(session, 80, WARM, JOINTS)?;
+        let Some((_, zero, _)) = report(session)? else { continue };
+        let steps = i32::from(zero.zero.to_bits());
+        let is_so = (min..=max).contains(&steps) || skips != session.skips;
+        session.check("BASE-4", is_so, || {
+            format!(
+                "{JOINTS} joints with 80 steps at {} uN/s: the zero is {steps} steps, {min} to {max} are right",
+                rate.cast_unsigned()
+            )
+        });
+    }
+    Ok(())
+}
+
+fn temperature(session: &mut Session<'_>) -> Result<(), Stop> {
+    let mut rule = HOLD;
+    rule.iter_mut().skip(5).take(1).for_each(|word| *word = SLOPE);
+    tared(session, rule, 0)?;
+    // 5 °C more, in contact: 0.1 N. Then less.
+    for (degrees, expected) in [(5, 102), (-5, -102)] {
+        reads(session, TOUCH, WARM + (degrees << 6), 1)?;
+        if let Some((sum, zero, _)) = report(session)? {
+            session.check("BASE-5", near(sum, TOUCH - expected, 2), || {
+                format!(
+                    "{degrees} °C more with 0.02 N/°C: {}, page 0 adds up to {sum}, not {}",
+                    text(zero),
+                    TOUCH - expected
+                )
+            });
+        }
+    }
+    reads(session, 0, WARM, 2)?;
+    Ok(())
+}
+
+fn tares(session: &mut Session<'_>) -> Result<(), Stop> {
+    tared(session, HOLD, 0)?;
+    let tare = |session: &mut Session<'_>, word: i16, expected: Reply, what: &str| {
+        let reply = session.set(TARE, [word])?;
+        session.check("BASE-6", reply == expected, || {
+            format!("parameter 12 was written with {word}, {what}: {reply}")
+        });
+        Ok::<_, Stop>(())
+    };
+    let zero_is = |session: &mut Session<'_>, expected: i32, refused: Option<u16>, what: &str| {
+        if let Some((_, zero, _)) = report(session)? {
+            let is_counted = refused.is_none_or(|refused| zero.refused == refused);
+            let is_so = near(zero.zero.to_bits().into(), expected, 2) && is_counted;
+            session.check("BASE-6", is_so, || format!("{what}: {}", text(zero)));
+        }
+        Ok::<_, Stop>(())
+    };
+    reads(session, 300, WARM, 40)?;
+    let before = report(session)?.map(|(_, zero, _)| zero.refused.wrapping_add(1));
+    tare(session, 1, Reply::Refused(TOUCHED), "touched with 0.3 N")?;
+    zero_is(session, 0, before, "after a tare that was refused")?;
+    tare(session, 2, Reply::Value(words([1])), "touched, forced")?;
+    zero_is(session, 300, None, "after a forced tare at 0.3 N")?;
+    reads(session, 250, WARM, 40)?;
+    tare(session, 1, Reply::Value(words([1])), "not touched")?;
+    zero_is(session, 250, None, "after a tare at 0.24 N")?;
+    reads(session, 800, WARM, 40)?;
+    tare(session, 2, Reply::Refused(BEYOND), "forced, beyond the limit of 0.5 N")?;
+    zero_is(session, 250, None, "after a tare beyond the limit")?;
+    tare(session, 0, Reply::Value([0; WORDS]), "to forget the zero")?;
+    let reply = session.read(TARE)?;
+    session.check("BASE-6", reply == Reply::Value([0; WORDS]), || {
+        format!("parameter 12 is read as {reply} without a zero")
+    });
+    Ok(())
+}
+
+fn pages(session: &mut Session<'_>) -> Result<(), Stop> {
+    tared(session, HOLD, 0)?;
+    for (sum, touched) in [(TOUCH, true), (0, false)] {
+        session.quiet(Span::from_millis(60))?;
+        let step = reads(session, sum, WARM, 1)?;
+        let mut pages = step.exchange.answers.iter().filter_map(Heard::sensors);
+        let came = pages.find_map(|(_, page)| zero_of(page));
+        session.check("BASE-7", came.is_some_and(|page| page.touched == touched), || {
+            let came = came.map_or_else(|| "none".to_owned(), text);
+            format!("a touch or its end has to bring page 3: {came} came")
+        });
+    }
+    session.quiet(Span::from_millis(60))?;
+    session.mark();
+    session.start();
+    session.idle(Span::from_millis(2_050))?;
+    let beats = session.answers().iter().filter(|it| it.beat().is_some()).count();
+    let pages = session.answers().iter().filter_map(Heard::sensors);
+    let count = pages.filter(|(_, page)| zero_of(page).is_some()).count();
+    session.consume();
+    session.check("BASE-7", count >= beats / 4 && count <= beats / 4 + 1, || {
+        format!("page 3 came {count} times with {beats} heartbeats; with each fourth is right")
+    });
+    Ok(())
+}

@@ -1,0 +1,119 @@
+//! The baseline of a cell's force sensor, parameter 11: what the sensor reads when nothing touches it.
+
+use crate::fixed::{Q1_14, Q5_10};
+use crate::packet::{self, WORDS};
+
+/// What a cell takes for its zero, parameter 11. Volatile: a cell starts with [`Baseline::Off`].
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub enum Baseline {
+    /// Zero is zero.
+    #[default]
+    Off,
+    /// Zero is what a tare found.
+    On(Zeroing),
+}
+
+/// How a cell finds its zero, and follows it.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Zeroing {
+    /// At this force above the zero, in N, something touches the cell; above 0.
+    pub threshold: Q5_10,
+    /// What part of the threshold the force has to fall below it for a release, 0 to 1.
+    pub hysteresis: Q1_14,
+    /// How quickly the zero follows without a touch, in µN/s; 0: it does not.
+    pub rate_un_per_s: u16,
+    /// How far the zero may be from 0, in N.
+    pub limit: Q5_10,
+    /// The zero's shift with temperature, in N/°C.
+    pub n_per_c: Q1_14,
+}
+
+impl Baseline {
+    const HOLD: i16 = 1;
+    const FOLLOW: i16 = 2;
+
+    /// The words of the parameter.
+    #[must_use]
+    pub fn words(self) -> [i16; WORDS] {
+        let Self::On(zeroing) = self else { return [0; WORDS] };
+        let Zeroing { threshold, hysteresis, rate_un_per_s, limit, n_per_c } = zeroing;
+        packet::words([
+            if rate_un_per_s == 0 { Self::HOLD } else { Self::FOLLOW },
+            threshold.to_bits(),
+            hysteresis.to_bits(),
+            rate_un_per_s.cast_signed(),
+            limit.to_bits(),
+            n_per_c.to_bits(),
+        ])
+    }
+
+    /// Decodes the words; `None` when they cannot be: no such mode, a threshold of 0 or below, a hysteresis below 0 or
+    /// above 1, a limit below 0, or a zero that follows at a rate of 0.
+    #[must_use]
+    pub fn from_words(words: [i16; WORDS]) -> Option<Self> {
+        let [mode, threshold, hysteresis, rate, limit, n_per_c] = words;
+        let rate_un_per_s = match mode {
+            0 => return Some(Self::Off),
+            Self::HOLD => 0,
+            Self::FOLLOW if rate != 0 => rate.cast_unsigned(),
+            _ => return None,
+        };
+        let sound = threshold > 0 && (0..=1 << 14).contains(&hysteresis) && limit >= 0;
+        sound.then_some(Self::On(Zeroing {
+            threshold: Q5_10::from_bits(threshold),
+            hysteresis: Q1_14::from_bits(hysteresis),
+            rate_un_per_s,
+            limit: Q5_10::from_bits(limit),
+            n_per_c: Q1_14::from_bits(n_per_c),
+        }))
+    }
+}
+
+/// What a write of parameter 12 asks for.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Tare {
+    /// 0: the zero is forgotten, and found again as after a start.
+    Forget,
+    /// 1: what the sensor reads is its zero, unless something touches it.
+    Untouched,
+    /// 2: what the sensor reads is its zero, whatever touches it.
+    Anyhow,
+}
+
+impl Tare {
+    /// Decodes the words; `None` when there is no such tare.
+    #[must_use]
+    pub const fn from_words(words: [i16; WORDS]) -> Option<Self> {
+        match words {
+            [0, ..] => Some(Self::Forget),
+            [1, ..] => Some(Self::Untouched),
+            [2, ..] => Some(Self::Anyhow),
+            _ => None,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_that_cannot_be_are_none_and_unused_ones_are_zero() {
+        let sound = [2, 102, 8_192, 2_000, 512, -33];
+        assert_eq!(Baseline::from_words(sound).map(Baseline::words), Some(sound));
+        let hold = Baseline::from_words([1, 102, 0, 2_000, 512, 0]).map(Baseline::words);
+        assert_eq!(hold, Some([1, 102, 0, 0, 512, 0]));
+        assert_eq!(Baseline::from_words([0, -1, -1, -1, -1, -1]), Some(Baseline::Off));
+        let spoilt = [
+            [3, 102, 0, 1, 512, 0],
+            [-1, 102, 0, 1, 512, 0],
+            [2, 0, 0, 1, 512, 0],
+            [2, -1, 0, 1, 512, 0],
+            [2, 102, -1, 1, 512, 0],
+            [2, 102, 16_385, 1, 512, 0],
+            [2, 102, 0, 0, 512, 0],
+            [2, 102, 0, 1, -1, 0],
+        ];
+        assert!(spoilt.iter().all(|words| Baseline::from_words(*words).is_none()));
+    }
+}

@@ -1,0 +1,126 @@
+//! What cells take for the zero of their force sensors, as a skin's file has it.
+
+use super::raw;
+use crate::document::{Fault, Place};
+use crate::fixed::{Q1_14, Q5_10};
+use crate::parameters::{Baseline, Zeroing};
+
+/// What is meant where the file says nothing else.
+const DEFAULT: Zeroing = Zeroing {
+    threshold: Q5_10::from_bits(103),
+    hysteresis: Q1_14::from_bits(8_192),
+    rate_un_per_s: 2_000,
+    limit: Q5_10::from_bits(512),
+    n_per_c: Q1_14::ZERO,
+};
+
+/// The table `[baseline]`.
+pub(super) fn of_skin(raw: Option<raw::Baseline>) -> Result<Baseline, Fault> {
+    let Some(raw) = raw else { return Ok(Baseline::Off) };
+    let at = Place::named("baseline");
+    let modes = [("off", None), ("hold", Some(false)), ("follow", Some(true))];
+    let follows = at.key("mode").word(raw.mode.as_deref().unwrap_or("follow"), &modes)?;
+    let mut to = DEFAULT;
+    at.key("threshold_n").set(raw.threshold_n, &mut to.threshold, Q5_10::try_at_least)?;
+    if let Some(got) = raw.threshold_n.filter(|_| to.threshold <= Q5_10::ZERO) {
+        return Err(at.key("threshold_n").fault(got, "must be above 0"));
+    }
+    at.key("hysteresis").set(raw.hysteresis, &mut to.hysteresis, Q1_14::try_nearest)?;
+    if let Some(got) = raw.hysteresis.filter(|&part| part > 1.0) {
+        return Err(at.key("hysteresis").fault(got, "a part of the threshold: 0 to 1 is possible"));
+    }
+    at.key("limit_n").set(raw.limit_n, &mut to.limit, Q5_10::try_nearest)?;
+    slope(&at.key("n_per_c"), raw.n_per_c, &mut to)?;
+    if let Some(got) = raw.rate_n_per_s {
+        to.rate_un_per_s = rate(got)
+            .ok_or_else(|| at.key("rate_n_per_s").fault(got, "1e-6 to 0.065535 N/s are possible"))?;
+    }
+    Ok(match follows {
+        None => Baseline::Off,
+        Some(true) => Baseline::On(to),
+        Some(false) => Baseline::On(Zeroing { rate_un_per_s: 0, ..to }),
+    })
+}
+
+/// What a cell overrides.
+pub(super) fn of_cell(at: &Place, raw: &raw::Cell, base: Baseline) -> Result<Baseline, Fault> {
+    let Baseline::On(mut to) = base else {
+        let given = [("baseline_limit_n", raw.baseline_limit_n), ("baseline_n_per_c", raw.baseline_n_per_c)];
+        let given = given.into_iter().find_map(|(key, value)| Some((key, value?)));
+        return given.map_or(Ok(base), |(key, value)| {
+            Err(at.key(key).fault(value, "the skin has no [baseline], or its mode is \"off\""))
+        });
+    };
+    at.key("baseline_limit_n").set(raw.baseline_limit_n, &mut to.limit, Q5_10::try_nearest)?;
+    slope(&at.key("baseline_n_per_c"), raw.baseline_n_per_c, &mut to)?;
+    Ok(Baseline::On(to))
+}
+
+/// Of either sign.
+fn slope(at: &Place, given: Option<f64>, to: &mut Zeroing) -> Result<(), Fault> {
+    if let Some(given) = given {
+        to.n_per_c = at.fit(given, Q1_14::try_nearest)?;
+    }
+    Ok(())
+}
+
+#[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "within 1 to 65535")]
+fn rate(n_per_s: f64) -> Option<u16> {
+    let rate = (n_per_s * 1e6).round();
+    (1.0..=65_535.0).contains(&rate).then_some(rate as u16)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::skin::Skin;
+
+    const HEAD: &str = "[robot]\njoints = [{ d = 0.1 }, { a = 0.5 }]\n";
+    const CELL: &str =
+        "[[cell]]\nnode = 1\njoint = 2\nposition = [0.1, 0.0, 0.1]\nnormal = [0.0, 0.0, 1.0]\n";
+
+    fn read(baseline: &str, cell: &str) -> Result<Baseline, String> {
+        let text = format!("{HEAD}{baseline}\n{CELL}{cell}\n");
+        Skin::parse("skin.toml", &text)
+            .map(|skin| skin.cells.first().map(|cell| cell.baseline).unwrap())
+            .map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn cells_have_no_baseline_unless_the_skin_has() {
+        assert_eq!(read("", ""), Ok(Baseline::Off));
+        assert_eq!(read("[baseline]\nmode = \"off\"\nlimit_n = 1.0", ""), Ok(Baseline::Off));
+        assert_eq!(read("[baseline]", ""), Ok(Baseline::On(DEFAULT)));
+        let hold = Zeroing { rate_un_per_s: 0, ..DEFAULT };
+        assert_eq!(read("[baseline]\nmode = \"hold\"", ""), Ok(Baseline::On(hold)));
+        let said = "threshold_n = 0.1\nhysteresis = 0.5\nrate_n_per_s = 0.002\nlimit_n = 0.5\nn_per_c = 0.0";
+        assert_eq!(read(&format!("[baseline]\n{said}"), ""), Ok(Baseline::On(DEFAULT)), "the defaults");
+    }
+
+    #[test]
+    fn a_cell_overrides_limit_and_slope() {
+        let own = Zeroing { limit: Q5_10::nearest(1.5), n_per_c: Q1_14::nearest(-0.02), ..DEFAULT };
+        let cell = "baseline_limit_n = 1.5\nbaseline_n_per_c = -0.02";
+        assert_eq!(read("[baseline]", cell), Ok(Baseline::On(own)));
+        let why = read("", cell).unwrap_err();
+        assert!(
+            why.ends_with("baseline_limit_n = 1.5: the skin has no [baseline], or its mode is \"off\""),
+            "{why}"
+        );
+    }
+
+    #[test]
+    fn what_cannot_be_is_refused_in_one_line() {
+        for (key, why) in [
+            ("mode = \"on\"", "baseline.mode = \"on\": \"off\", \"hold\" or \"follow\""),
+            ("threshold_n = 0.0", "baseline.threshold_n = 0: must be above 0"),
+            ("limit_n = -1.0", "baseline.limit_n = -1: must not be negative"),
+            ("hysteresis = 1.5", "baseline.hysteresis = 1.5: a part of the threshold: 0 to 1 is possible"),
+            ("rate_n_per_s = 0.0", "baseline.rate_n_per_s = 0: 1e-6 to 0.065535 N/s are possible"),
+            ("rate_n_per_s = 0.1", "baseline.rate_n_per_s = 0.1: 1e-6 to 0.065535 N/s are possible"),
+        ] {
+            let said = read(&format!("[baseline]\n{key}"), "").unwrap_err();
+            assert!(said.ends_with(why), "{said}");
+        }
+    }
+}
