@@ -244,6 +244,7 @@ fn cells(skin: &Description, node: Option<u8>) -> String {
             row,
             position,
             normal,
+            orientation: _,
             neighbors,
             root,
             contact: _,

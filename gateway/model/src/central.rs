@@ -212,6 +212,12 @@ fn base(skin: &Skin) -> IsometryMatrix3<f64> {
 }
 
 impl Frames {
+    /// The frame of a row, counted from 1, seen from the robot's base; of 0, frame 0 of the chain.
+    #[must_use]
+    pub fn row(&self, row: usize) -> Option<&IsometryMatrix3<f64>> {
+        self.frames.get(row)
+    }
+
     /// Adds the torques of a cell at `place` with the force `f_z` on it about joints 1 to k:
     /// `z_(l-1) x (t - t_(l-1)) . force`, of prismatic joints `z_(l-1) . force`.
     fn add_torque(&self, place: &Place, f_z: f64, torque: &mut [f64; MAX_JOINTS]) {

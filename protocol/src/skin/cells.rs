@@ -114,6 +114,7 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Base) -
         row,
         position: raw.position,
         normal: normal(at, raw)?,
+        orientation: raw.orientation.map(|it| unit(&at.key("orientation"), "quaternion", it)).transpose()?,
         neighbors,
         root: raw.root,
         contact: contact(at, raw.contact(), base.contact)?,

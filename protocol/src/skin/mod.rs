@@ -193,6 +193,8 @@ pub struct Cell {
     pub position: [f64; 3],
     /// Outward normal in the same frame: the cell's z axis.
     pub normal: [f64; 3],
+    /// Its orientation in the same frame, a quaternion x, y, z, w, if the file has more than its normal.
+    pub orientation: Option<[f64; 4]>,
     /// What is wired to its ports.
     pub neighbors: [Option<CellId>; 4],
     /// Whether it is wired to the gateway's side.

@@ -1,0 +1,298 @@
+//! All cells of a skin: each by itself, then with its neighbours, then which of them to distrust.
+
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
+use protocol::skin::{Cell, Skin};
+
+use crate::each::each;
+use crate::estimate::{Estimate, Guess, estimate};
+use crate::help::{Help, helpful};
+use crate::kinematics::G;
+use crate::neighbors::{Known, Spacing, improve};
+use crate::observe::{Observations, Reading};
+use crate::plan::Bounds;
+use crate::result::{Calibration, CellResult, Pose, Summary, Trouble};
+use crate::sensor::{DataSheet, rotation};
+use crate::table::Table;
+
+/// What is known before a calibration.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
+    /// Of the accelerometers.
+    pub sheet: DataSheet,
+    /// Gravity as seen from the robot's base, in m/s2.
+    pub gravity: [f64; 3],
+    /// How far wired cells are apart, if that is known.
+    pub spacing: Option<Spacing>,
+    /// How many threads compute.
+    pub threads: usize,
+    /// How the robot may move: for advice only.
+    pub bounds: Bounds,
+}
+
+impl Settings {
+    /// Sensors as the default data sheet says, on a robot that stands upright.
+    #[must_use]
+    pub fn of(skin: &Skin) -> Self {
+        Self {
+            sheet: DataSheet::default(),
+            gravity: [0.0, 0.0, -G],
+            spacing: None,
+            threads: 1,
+            bounds: Bounds::of(skin),
+        }
+    }
+}
+
+/// A cell that sends less than this part of what it could is named.
+const SILENT: f64 = 0.5;
+/// A cell with fewer readings than this is not estimated.
+const FEWEST: usize = 200;
+/// Residuals this many times as large as those of most cells come from a cell that is loose or damaged.
+const ROUGH: f64 = 1.5;
+/// The logarithm of a likelihood ratio above which one joint is better than the next.
+const SURE: f64 = 10.0;
+/// Poses that are less certain than this are not told: in m, and in rad.
+const TOLD: [f64; 2] = [0.02, 0.09];
+/// Another described pose is nearer if it is this many times nearer.
+const NEARER: f64 = 2.0;
+
+/// Estimates every cell.
+#[must_use]
+pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Calibration {
+    let buses: Vec<_> = (0..skin.buses.len()).collect();
+    let tables: Vec<_> = each(buses.len(), settings.threads, |bus| {
+        let is_used = skin.cells_of(bus).next().is_some();
+        is_used.then(|| Table::new(skin, bus, seen, &settings.sheet, settings.gravity))
+    });
+    let estimates = each(skin.cells.len(), settings.threads, |index| {
+        let cell = skin.cells.get(index)?;
+        let table = tables.get(cell.bus)?.as_ref()?;
+        let readings = seen.cells.get(index)?;
+        if readings.len() < FEWEST || is_stuck(readings) {
+            return None;
+        }
+        let own = table.arm.between(cell.row, skin.chain(cell.bus).row_of(cell.joint).unwrap_or_default());
+        let guess = Guess {
+            joint: cell.joint,
+            rotation: own.rotation * rotation(cell.orientation, cell.normal),
+            position: own.transform_point(&cell.position.into()).coords,
+        };
+        estimate(table, readings, &guess, &settings.sheet)
+    });
+    let mut cells: Vec<_> = skin
+        .cells
+        .iter()
+        .zip(&estimates)
+        .zip(&seen.cells)
+        .map(|((cell, estimate), readings)| {
+            let known = tables.get(cell.bus).and_then(Option::as_ref).map_or(0, Table::known);
+            result(skin, cell, estimate.as_ref(), readings, known)
+        })
+        .collect();
+    rough(&mut cells);
+    let wires = with_neighbors(skin, &mut cells, settings);
+    confused(skin, &mut cells);
+    advise(skin, &estimates, &mut cells, settings);
+    for (result, cell) in cells.iter_mut().zip(&skin.cells) {
+        result.settle(skin, cell, tables.get(cell.bus).and_then(Option::as_ref).map(|table| &table.arm));
+    }
+    let summary = Summary::of(&cells, wires);
+    Calibration { summary, cells }
+}
+
+/// Whether all readings are one value.
+fn is_stuck(readings: &[Reading]) -> bool {
+    let mut readings = readings.iter().map(|reading| reading.g.map(f64::to_bits));
+    let first = readings.next();
+    readings.all(|reading| Some(reading) == first)
+}
+
+/// What is known of a cell by itself.
+fn result(
+    skin: &Skin,
+    cell: &Cell,
+    estimate: Option<&Estimate>,
+    readings: &[Reading],
+    known: usize,
+) -> CellResult {
+    let mut result = CellResult::unknown(skin, cell, readings.len());
+    let share = real(readings.len()) / real(known).max(1.0);
+    if readings.is_empty() {
+        result.troubles.push(Trouble::Dead);
+    } else if is_stuck(readings) {
+        result.troubles.push(Trouble::Stuck);
+    } else if share < SILENT || readings.len() < FEWEST {
+        result.troubles.push(Trouble::Silent { share: rounded(share, 3) });
+    }
+    let Some(estimate) = estimate else {
+        if result.troubles.is_empty() {
+            result.troubles.push(Trouble::Silent { share: rounded(share, 3) });
+        }
+        return result;
+    };
+    let mirror = estimate.model.matrix;
+    result.sensor.bias_g = estimate.model.bias.into();
+    result.sensor.gain = mirror.diagonal().into();
+    result.sensor.noise_g = estimate.noise_g;
+    result.sensor.rough_g = estimate.rough_g;
+    if estimate.joint == 0 {
+        result.troubles.push(Trouble::Still);
+        return result;
+    }
+    if estimate.margin < SURE {
+        result.troubles.push(Trouble::Joint { joint: estimate.joint });
+    }
+    result.pose = Some(Pose {
+        joint: estimate.joint,
+        position: estimate.model.position,
+        rotation: estimate.model.rotation,
+        position_covariance: estimate.position_covariance(),
+        turn_covariance: estimate.turn_covariance(),
+    });
+    result
+}
+
+/// Names cells whose readings scatter much more than those of most.
+fn rough(cells: &mut [CellResult]) {
+    let told = cells.iter().filter(|cell| cell.pose.is_some());
+    let mut all: Vec<_> = told.map(|cell| cell.sensor.rough_g).collect();
+    all.sort_by(f64::total_cmp);
+    let Some(&most) = all.get(all.len() / 2) else { return };
+    for cell in cells.iter_mut().filter(|cell| cell.pose.is_some()) {
+        let times = cell.sensor.rough_g / most.max(1e-4);
+        if times > ROUGH {
+            cell.troubles.push(Trouble::Loose { times: rounded(times, 1) });
+        }
+    }
+}
+
+/// Improves positions link by link; returns how many wires were used.
+fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) -> usize {
+    let Some(spacing) = settings.spacing else { return 0 };
+    let mut used = 0;
+    for bus in 0..skin.buses.len() {
+        for joint in 1..=u8::try_from(skin.chain(bus).joints.len()).unwrap_or_default() {
+            let on_link = |(_, (cell, result)): &(usize, (&Cell, &CellResult))| {
+                let told = result.pose.as_ref().is_some_and(|pose| pose.joint == joint && pose.is_told());
+                cell.bus == bus && told && result.troubles.is_empty()
+            };
+            let members: Vec<_> =
+                skin.cells.iter().zip(&*cells).enumerate().filter(on_link).map(|(index, _)| index).collect();
+            let mut known: Vec<_> = members
+                .iter()
+                .filter_map(|&index| cells.get(index)?.pose.as_ref())
+                .map(|pose| Known {
+                    position: pose.position,
+                    normal: pose.rotation * Vector3::z(),
+                    covariance: pose.position_covariance,
+                })
+                .collect();
+            let place = |node| {
+                members.iter().position(|&index| skin.cells.get(index).is_some_and(|cell| cell.node == node))
+            };
+            let mut wires = Vec::new();
+            for (one, cell) in members.iter().filter_map(|&index| skin.cells.get(index)).enumerate() {
+                let others = cell.neighbors.iter().flatten().filter_map(|node| place(*node));
+                wires.extend(others.filter(|other| one < *other).map(|other| (one, other)));
+            }
+            used += improve(&mut known, &wires, &spacing);
+            for (index, known) in members.into_iter().zip(known) {
+                if let Some(pose) = cells.get_mut(index).and_then(|cell| cell.pose.as_mut()) {
+                    (pose.position, pose.position_covariance) = (known.position, known.covariance);
+                }
+            }
+        }
+    }
+    used
+}
+
+/// Names cells that sit where the skin has another one.
+fn confused(skin: &Skin, cells: &mut [CellResult]) {
+    let found: Vec<_> =
+        skin.cells.iter().zip(&*cells).map(|(cell, result)| place_of(skin, cell, result)).collect();
+    for (index, (result, place)) in cells.iter_mut().zip(&found).enumerate() {
+        let Some(other) = place else { continue };
+        let Some(there) = skin.cells.get(*other) else { continue };
+        let both = found.get(*other).copied().flatten() == Some(index);
+        let node = there.node.get();
+        result.troubles.push(if both { Trouble::Swapped { node } } else { Trouble::Elsewhere { node } });
+    }
+}
+
+/// The other cell of the same bus in whose described place a cell was found.
+fn place_of(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize> {
+    let pose = result.pose.as_ref().filter(|pose| pose.is_told())?;
+    // Half a turn counts as much as a metre: an offset by a cell's width is worth 5 degrees.
+    let far = |described: &Cell| {
+        if described.joint != pose.joint {
+            return f64::INFINITY;
+        }
+        let normal = pose.rotation * Vector3::z();
+        let way = (Vector3::from(described.position) - pose.position).norm();
+        way + normal.angle(&Vector3::from(described.normal)) / core::f64::consts::PI
+    };
+    let own = far(cell);
+    let others = skin.cells.iter().enumerate();
+    let others = others.filter(|(_, other)| other.bus == cell.bus && other.node != cell.node);
+    let mut distances: Vec<_> = others.map(|(index, other)| (far(other), index)).collect();
+    distances.sort_by(|one, other| one.0.total_cmp(&other.0));
+    let (nearest, index) = *distances.first()?;
+    let next = distances.get(1).map_or(f64::INFINITY, |(next, _)| *next);
+    let certain = 2.0 * pose.position_95() + 0.002;
+    (nearest * NEARER < own && nearest * NEARER < next + 2e-3 && own > certain).then_some(index)
+}
+
+/// Says what would help where a pose is not told.
+fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult], settings: &Settings) {
+    let mut known: Vec<((usize, u8), Help)> = Vec::new();
+    for ((cell, estimate), result) in skin.cells.iter().zip(estimates).zip(cells) {
+        let (Some(estimate), Some(pose)) = (estimate, &result.pose) else { continue };
+        if pose.is_told() {
+            continue;
+        }
+        let key = (cell.bus, pose.joint);
+        let help = known.iter().find(|(of, _)| *of == key).map(|(_, help)| help.clone());
+        let help = help.unwrap_or_else(|| {
+            let help = helpful(skin, cell.bus, estimate, settings);
+            known.push((key, help.clone()));
+            help
+        });
+        let [position_mm, orientation_deg] = [pose.position_95() * 1e3, pose.turn_95().to_degrees()];
+        result.troubles.push(Trouble::NotTold {
+            position_mm: rounded(position_mm, 1),
+            orientation_deg: rounded(orientation_deg, 1),
+            help,
+        });
+    }
+}
+
+impl Pose {
+    /// Whether it is certain enough to be used.
+    #[must_use]
+    pub fn is_told(&self) -> bool {
+        let [position, turn] = TOLD;
+        self.position_95() < position && self.turn_95() < turn
+    }
+
+    /// The same, seen from another frame of the same link.
+    pub(crate) fn seen_from(&self, (turn, shift): (&UnitQuaternion<f64>, &Vector3<f64>)) -> Self {
+        let matrix: Matrix3<f64> = turn.to_rotation_matrix().matrix().to_owned();
+        Self {
+            position: turn * self.position + shift,
+            rotation: turn * self.rotation,
+            position_covariance: matrix * self.position_covariance * matrix.transpose(),
+            ..*self
+        }
+    }
+}
+
+/// To so many digits behind the point.
+pub(crate) fn rounded(value: f64, digits: i32) -> f64 {
+    let scale = 10.0_f64.powi(digits);
+    (value * scale).round() / scale + 0.0
+}
+
+#[expect(clippy::cast_precision_loss, reason = "counts of readings")]
+const fn real(of: usize) -> f64 {
+    of as f64
+}

@@ -1,0 +1,263 @@
+//! What a cell would show, as a function of what is unknown of it.
+//!
+//! With `A = (I + gain + cross) R^T` it shows `A (force + gradient p) + bias`, `force` and `gradient` being those of its
+//! row. That is linear in the 12 numbers of the row's motion; so sums of their products hold all that a long
+//! recording says, and least squares need the recording only once.
+//!
+//! The age of readings enters by three such sets, at three ages, between which a parabola leads.
+
+#![expect(clippy::indexing_slicing, reason = "matrices of constant size, with indices below it")]
+
+use core::ops::Range;
+
+use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector3};
+
+use crate::kinematics::RowMotion;
+use crate::sensor::DataSheet;
+
+/// Numbers of a row's motion: its force, and its gradient by columns.
+pub(crate) const ROW: usize = 12;
+/// Ages at which motions are known.
+pub(crate) const AGES: usize = 3;
+/// From one of these ages to the next, in s.
+pub(crate) const AGE_STEP: f64 = 0.006;
+/// Numbers of a moment: motions at all ages, and 1.
+pub(crate) const MOMENT: usize = AGES * ROW + 1;
+/// What is unknown of a cell.
+pub(crate) const UNKNOWNS: usize = 19;
+
+/// Of the unknowns: the turn from the present orientation, as a rotation vector in the frame of the cell.
+pub(crate) const TURN: Range<usize> = 0..3;
+/// The position in the frame of the row.
+pub(crate) const POSITION: Range<usize> = 3..6;
+pub(crate) const BIAS: Range<usize> = 6..9;
+pub(crate) const GAIN: Range<usize> = 9..12;
+/// What axes show of each other.
+const CROSS: Range<usize> = 12..18;
+const AGE: usize = 18;
+
+/// Row and column of each of [`CROSS`].
+const OFF_DIAGONAL: [(usize, usize); 6] = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)];
+
+/// One moment's numbers.
+pub(crate) type Moment = [f64; MOMENT];
+/// What each axis makes of them.
+pub(crate) type Coefficients = SMatrix<f64, MOMENT, 3>;
+pub(crate) type Unknowns = SVector<f64, UNKNOWNS>;
+pub(crate) type Information = SMatrix<f64, UNKNOWNS, UNKNOWNS>;
+
+/// A cell as it is supposed to be.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct CellModel {
+    pub(crate) rotation: UnitQuaternion<f64>,
+    pub(crate) position: Vector3<f64>,
+    pub(crate) bias: Vector3<f64>,
+    /// `I + gain + cross`.
+    pub(crate) matrix: Matrix3<f64>,
+    /// Age of its readings less the middle one of the ages, in s.
+    pub(crate) age: f64,
+}
+
+impl CellModel {
+    /// One with a perfect sensor.
+    pub(crate) fn at(rotation: UnitQuaternion<f64>, position: Vector3<f64>) -> Self {
+        Self { rotation, position, bias: Vector3::zeros(), matrix: Matrix3::identity(), age: 0.0 }
+    }
+
+    /// What each axis makes of a moment.
+    pub(crate) fn coefficients(&self) -> Coefficients {
+        let rotation = self.rotation.to_rotation_matrix().matrix().to_owned();
+        let mut all =
+            spread(&row(&(self.matrix * rotation.transpose()), &self.position), &parabola(self.age));
+        all.row_mut(MOMENT - 1).copy_from(&self.bias.transpose());
+        all
+    }
+
+    /// How these change with each unknown.
+    pub(crate) fn derivatives(&self) -> [Coefficients; UNKNOWNS] {
+        let turned = self.rotation.to_rotation_matrix().matrix().transpose();
+        let axes = self.matrix * turned;
+        let ages = parabola(self.age);
+        let unit = |axis: usize| Vector3::from_fn(|row, _| if row == axis { 1.0 } else { 0.0 });
+        core::array::from_fn(|unknown| {
+            if let Some(axis) = within(&TURN, unknown) {
+                let axes = -self.matrix * unit(axis).cross_matrix() * turned;
+                spread(&row(&axes, &self.position), &ages)
+            } else if let Some(axis) = within(&POSITION, unknown) {
+                let mut part = row(&axes, &unit(axis));
+                part.fixed_rows_mut::<3>(0).fill(0.0);
+                spread(&part, &ages)
+            } else if let Some(axis) = within(&BIAS, unknown) {
+                let mut all = Coefficients::zeros();
+                all.row_mut(MOMENT - 1).copy_from(&unit(axis).transpose());
+                all
+            } else if unknown == AGE {
+                spread(&row(&axes, &self.position), &slope(self.age))
+            } else {
+                let (to, from) = matrix_entry(unknown);
+                let mut one = Matrix3::zeros();
+                one.set_row(to, &turned.row(from));
+                spread(&row(&one, &self.position), &ages)
+            }
+        })
+    }
+
+    /// The same with other values of the unknowns.
+    pub(crate) fn moved(&self, step: &Unknowns) -> Self {
+        let part = |range: &Range<usize>| Vector3::from_fn(|at, _| step[range.start + at]);
+        let mut matrix = self.matrix;
+        for unknown in GAIN.start..CROSS.end {
+            matrix[matrix_entry(unknown)] += step[unknown];
+        }
+        Self {
+            rotation: self.rotation * UnitQuaternion::from_scaled_axis(part(&TURN)),
+            position: self.position + part(&POSITION),
+            bias: self.bias + part(&BIAS),
+            matrix,
+            age: self.age + step[AGE],
+        }
+    }
+
+    /// The unknowns that a data sheet knows something of, less what it expects of them.
+    pub(crate) fn unexpected(&self) -> Unknowns {
+        Unknowns::from_fn(|unknown, _| {
+            if let Some(axis) = within(&BIAS, unknown) {
+                self.bias[axis]
+            } else if (GAIN.start..CROSS.end).contains(&unknown) {
+                let (to, from) = matrix_entry(unknown);
+                self.matrix[(to, from)] - if to == from { 1.0 } else { 0.0 }
+            } else if unknown == AGE {
+                self.age
+            } else {
+                0.0
+            }
+        })
+    }
+}
+
+/// What a data sheet says of the unknowns before anything is measured, by the inverse of variances. Of the pose nearly
+/// nothing: it makes the information of a direction that no motion shows regular.
+pub(crate) fn expected(sheet: &DataSheet) -> Unknowns {
+    // Values that are evenly spread have a standard deviation of this part of their limit. None is exact.
+    let even = |limit: f64| (limit / 3.0_f64.sqrt()).max(1e-6);
+    let deviation = |unknown: usize| {
+        if TURN.contains(&unknown) {
+            WEAK_TURN
+        } else if POSITION.contains(&unknown) {
+            WEAK_POSITION
+        } else if BIAS.contains(&unknown) {
+            even(sheet.bias_g)
+        } else if GAIN.contains(&unknown) {
+            even(sheet.gain)
+        } else if CROSS.contains(&unknown) {
+            even(sheet.cross_axis)
+        } else {
+            sheet.age().1.max(1e-6)
+        }
+    };
+    Unknowns::from_fn(|unknown, _| deviation(unknown).powi(-2))
+}
+
+/// How well an orientation is known of which nothing is known, in rad.
+pub(crate) const WEAK_TURN: f64 = 1.0;
+/// How well a position is known of which nothing is known, in m.
+pub(crate) const WEAK_POSITION: f64 = 0.5;
+
+/// The numbers of a row's motion.
+pub(crate) fn numbers(motion: &RowMotion) -> [f64; ROW] {
+    let mut all = motion.force.iter().chain(motion.gradient.iter());
+    core::array::from_fn(|_| all.next().copied().unwrap_or_default())
+}
+
+/// What axes make of a row's motion, at a position.
+fn row(axes: &Matrix3<f64>, position: &Vector3<f64>) -> SMatrix<f64, ROW, 3> {
+    SMatrix::from_fn(|number, axis| {
+        let (block, part) = (number / 3, number % 3);
+        let scale = if block == 0 { 1.0 } else { position[block - 1] };
+        axes[(axis, part)] * scale
+    })
+}
+
+fn spread(row: &SMatrix<f64, ROW, 3>, ages: &[f64; AGES]) -> Coefficients {
+    let mut all = Coefficients::zeros();
+    for (at, age) in ages.iter().enumerate() {
+        for axis in 0..3 {
+            for number in 0..ROW {
+                all[(at * ROW + number, axis)] = row[(number, axis)] * age;
+            }
+        }
+    }
+    all
+}
+
+/// Which entry of the sensor's matrix an unknown is.
+fn matrix_entry(unknown: usize) -> (usize, usize) {
+    within(&GAIN, unknown).map_or_else(
+        || OFF_DIAGONAL.get(unknown.wrapping_sub(CROSS.start)).copied().unwrap_or((0, 0)),
+        |axis| (axis, axis),
+    )
+}
+
+fn within(range: &Range<usize>, unknown: usize) -> Option<usize> {
+    range.contains(&unknown).then(|| unknown - range.start)
+}
+
+/// Weights of the motions at the three ages.
+fn parabola(age: f64) -> [f64; AGES] {
+    let x = age / AGE_STEP;
+    [x * (x - 1.0) / 2.0, 1.0 - x * x, x * (x + 1.0) / 2.0]
+}
+
+/// How these change with the age.
+fn slope(age: f64) -> [f64; AGES] {
+    let x = age / AGE_STEP;
+    [(x - 0.5) / AGE_STEP, -2.0 * x / AGE_STEP, (x + 0.5) / AGE_STEP]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn model() -> CellModel {
+        CellModel {
+            rotation: UnitQuaternion::from_euler_angles(0.4, -0.7, 1.9),
+            position: Vector3::new(0.1, -0.2, 0.05),
+            bias: Vector3::new(0.02, 0.0, -0.03),
+            matrix: Matrix3::new(1.01, 0.004, -0.002, 0.0, 0.98, 0.003, -0.006, 0.001, 1.03),
+            age: 0.002,
+        }
+    }
+
+    #[test]
+    fn derivatives_are_the_differences_of_the_coefficients() {
+        let model = model();
+        let step = 1e-6;
+        for (unknown, derivative) in model.derivatives().iter().enumerate() {
+            let at = |step: f64| {
+                let mut moved = Unknowns::zeros();
+                moved[unknown] = step;
+                model.moved(&moved).coefficients()
+            };
+            let difference = (at(step) - at(-step)) / (2.0 * step);
+            let off = (difference - derivative).norm();
+            assert!(off < 1e-5 * (1.0 + derivative.norm()), "unknown {unknown}: {off}");
+        }
+    }
+
+    #[test]
+    fn coefficients_and_numbers_make_the_reading() {
+        let model = CellModel { age: AGE_STEP, ..model() };
+        let motion = |seed: f64| RowMotion {
+            force: Vector3::new(seed, 0.2, -1.0),
+            gradient: Matrix3::from_fn(|row, column| seed + 0.3 * (row + 2 * column) as f64),
+        };
+        let motions = [0.1, 0.2, 0.3].map(motion);
+        let mut moment = [1.0; MOMENT];
+        for (to, from) in moment.iter_mut().zip(motions.iter().flat_map(numbers)) {
+            *to = from;
+        }
+        let shown = model.coefficients().transpose() * SVector::<f64, MOMENT>::from(moment);
+        let force = model.rotation.inverse() * motions[2].at(&model.position);
+        assert!((shown - (model.matrix * force + model.bias)).norm() < 1e-12);
+    }
+}

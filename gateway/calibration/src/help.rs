@@ -1,0 +1,88 @@
+//! Which motion would tell what the motion that was made did not.
+
+use nalgebra::{Cholesky, Matrix3};
+use protocol::skin::Skin;
+use serde::Serialize;
+
+use crate::calibrate::Settings;
+use crate::cell::{Information, POSITION, TURN};
+use crate::estimate::Estimate;
+use crate::kinematics::Arm;
+use crate::motion::Step;
+use crate::plan::{AIM, SWING_S, Supposed, Swings, informed, poses};
+
+/// What would help where a pose is not told.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(tag = "help", rename_all = "kebab-case")]
+pub enum Help {
+    /// A joint shall swing more.
+    Swing {
+        /// Its name.
+        joint: String,
+    },
+    /// The robot shall stand in more poses.
+    Poses,
+    /// No motion of this robot tells it.
+    Nothing,
+}
+
+impl core::fmt::Display for Help {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match self {
+            Self::Swing { joint } => write!(f, "what would help most is that {joint} swings more"),
+            Self::Poses => f.write_str("what would help most are more poses"),
+            Self::Nothing => f.write_str("no motion of this robot tells more"),
+        }
+    }
+}
+
+/// What is uncertain has to fall to this part for a motion to be called a help.
+const HELP: f64 = 0.7;
+
+/// The motion that would tell most of a cell, beside what was told.
+pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &Settings) -> Help {
+    let swings = Swings::new(skin, &settings.bounds);
+    let arms = [(bus, Arm::new(skin, bus, settings.gravity))];
+    let row = usize::from(skin.chain(bus).row_of(estimate.joint).unwrap_or_default());
+    let supposed = [Supposed { bus, row, model: estimate.model.clone() }];
+    let Some(known) = estimate.covariance.try_inverse() else { return Help::Nothing };
+    let before = uncertain(&known);
+    let mut best = (HELP, Help::Nothing);
+    for pose in poses(skin, &settings.bounds, &swings).iter().step_by(3) {
+        let steps = core::iter::once(Step::Hold { at: pose.clone() }).chain(swings.about(pose));
+        for step in steps {
+            let told = informed(skin, &arms, &supposed, &step, SWING_S, &settings.sheet);
+            // As much of it as fits into a plan.
+            let more = told.first().copied().unwrap_or_else(Information::zeros)
+                * (settings.bounds.length_s / SWING_S);
+            let left = uncertain(&(known + more)) / before;
+            if left >= best.0 {
+                continue;
+            }
+            best = match &step {
+                Step::Swing { amplitude, .. } => {
+                    let joints = skin.robot.joints.iter().zip(amplitude);
+                    let swung = joints.max_by(|(_, one), (_, other)| one.total_cmp(other));
+                    (
+                        left,
+                        Help::Swing {
+                            joint: swung.map_or_else(String::new, |(joint, _)| joint.name.clone()),
+                        },
+                    )
+                }
+                Step::Hold { .. } | Step::Move { .. } => (left, Help::Poses),
+            };
+        }
+    }
+    best.1
+}
+
+/// How uncertain a pose is in its worst direction: a standard deviation, in units of what shall be reached.
+fn uncertain(information: &Information) -> f64 {
+    let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return f64::INFINITY };
+    let part = |start: usize, aim: f64| {
+        let part: Matrix3<f64> = covariance.fixed_view::<3, 3>(start, start).into_owned();
+        part.symmetric_eigenvalues().max().max(0.0).sqrt() / aim
+    };
+    part(POSITION.start, AIM[0]).max(part(TURN.start, AIM[1]))
+}

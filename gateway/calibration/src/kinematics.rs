@@ -1,0 +1,158 @@
+//! What the accelerometer of a cell feels: the specific force at its place while the joints move.
+//!
+//! A row of the chain carries its cells rigidly. With the acceleration `a` of the row's origin, its angular velocity
+//! `w` and angular acceleration `w'`, a cell at `p` in the frame of the row feels, in that frame,
+//!
+//! ```text
+//!   f(p) = R^T (a - g) + ([w']x + [w]x [w]x) p  =  force + gradient p
+//! ```
+//!
+//! The second part holds the tangential and the centripetal acceleration. All of it is in units of g.
+
+use model::central::Central;
+use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
+use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
+use protocol::skin::Skin;
+
+/// Standard gravity in m/s2.
+pub const G: f64 = 9.806_65;
+
+/// Positions, speeds and accelerations of the joints of a chain, in rad or m and seconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct JointState {
+    /// The positions.
+    pub position: [f64; MAX_JOINTS],
+    /// The speeds.
+    pub speed: [f64; MAX_JOINTS],
+    /// The accelerations.
+    pub acceleration: [f64; MAX_JOINTS],
+}
+
+/// What the cells on one row feel, in the frame of the row.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RowMotion {
+    /// The specific force at the row's origin, in g.
+    pub force: Vector3<f64>,
+    /// How it changes with the place, in g/m.
+    pub gradient: Matrix3<f64>,
+}
+
+impl RowMotion {
+    /// The specific force at a place, in g.
+    #[must_use]
+    pub fn at(&self, position: &Vector3<f64>) -> Vector3<f64> {
+        self.force + self.gradient * position
+    }
+}
+
+/// The chain of a bus.
+#[derive(Clone, Debug)]
+pub struct Arm {
+    central: Central,
+    kinds: Vec<RowKind>,
+    /// In the robot's base, in m/s2.
+    gravity: Vector3<f64>,
+}
+
+impl Arm {
+    /// The chain of a bus that has cells; gravity is seen from the robot's base, in m/s2.
+    #[must_use]
+    pub fn new(skin: &Skin, bus: usize, gravity: [f64; 3]) -> Self {
+        let kinds = skin.chain(bus).rows.iter().map(|row| row.kind).collect();
+        Self { central: Central::unquantised(&skin.part_on(bus)), kinds, gravity: gravity.into() }
+    }
+
+    /// What the cells on each row feel; the first is the base of the chain, which no joint moves.
+    #[must_use]
+    pub fn rows(&self, state: &JointState) -> [RowMotion; MAX_ROWS + 1] {
+        let frames = self.central.frames_at(&state.position);
+        let mut rows = [RowMotion::default(); MAX_ROWS + 1];
+        let (mut spin, mut turn, mut linear) = (Vector3::zeros(), Vector3::zeros(), Vector3::zeros());
+        let mut joints = state.speed.iter().zip(&state.acceleration);
+        let kinds = core::iter::once(RowKind::Fixed).chain(self.kinds.iter().copied());
+        for ((index, kind), felt) in kinds.enumerate().zip(&mut rows) {
+            let (Some(below), Some(frame)) = (frames.row(index.saturating_sub(1)), frames.row(index)) else {
+                break;
+            };
+            let moved = if kind == RowKind::Fixed { None } else { joints.next() };
+            let (speed, acceleration) =
+                moved.map_or((0.0, 0.0), |(speed, acceleration)| (*speed, *acceleration));
+            let axis: Vector3<f64> = below.rotation.matrix().column(2).into_owned();
+            if kind == RowKind::Revolute {
+                turn += axis * acceleration + spin.cross(&axis) * speed;
+                spin += axis * speed;
+            }
+            let arm = frame.translation.vector - below.translation.vector;
+            linear += turn.cross(&arm) + spin.cross(&spin.cross(&arm));
+            if kind == RowKind::Prismatic {
+                linear += axis * acceleration + spin.cross(&axis) * (2.0 * speed);
+            }
+            let rotation = frame.rotation.matrix();
+            let local = |vector: Vector3<f64>| rotation.tr_mul(&vector);
+            let (spin, turn) = (local(spin), local(turn));
+            let cross = spin.cross_matrix();
+            felt.force = local(linear - self.gravity) / G;
+            felt.gradient = (turn.cross_matrix() + cross * cross) / G;
+        }
+        rows
+    }
+
+    /// From the frame of one row to that of another one of the same link.
+    pub(crate) fn between(&self, from: u8, to: u8) -> Isometry3<f64> {
+        let frames = self.central.frames_at(&[]);
+        let (Some(from), Some(to)) = (frames.row(from.into()), frames.row(to.into())) else {
+            return Isometry3::identity();
+        };
+        let change = to.inverse() * from;
+        Isometry3::from_parts(change.translation, UnitQuaternion::from_rotation_matrix(&change.rotation))
+    }
+
+    /// Where a place in the frame of a row is, seen from the robot's base, in m.
+    #[must_use]
+    pub fn place(&self, row: usize, position: &Vector3<f64>, joints: &[f64]) -> Vector3<f64> {
+        let frames = self.central.frames_at(joints);
+        frames
+            .row(row)
+            .map_or_else(Vector3::zeros, |frame| (frame * nalgebra::Point3::from(*position)).coords)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing;
+
+    /// Joint positions as functions of time, and what of them is known in closed form.
+    fn state(t: f64, joints: usize) -> JointState {
+        let mut state = JointState::default();
+        for joint in 0..joints {
+            let (amplitude, rate, phase) =
+                (0.2 + 0.03 * joint as f64, 2.0 + 0.7 * joint as f64, joint as f64);
+            let angle = rate * t + phase;
+            state.position[joint] = 0.3 + amplitude * angle.sin();
+            state.speed[joint] = amplitude * rate * angle.cos();
+            state.acceleration[joint] = -amplitude * rate * rate * angle.sin();
+        }
+        state
+    }
+
+    #[test]
+    fn the_force_is_the_second_difference_of_the_place_less_gravity() {
+        for skin in [testing::ur5(), testing::panda(), testing::lift()] {
+            let arm = Arm::new(&skin, 0, [0.0, 0.0, -G]);
+            let joints = skin.chain(0).joints.len();
+            let (t, step) = (0.37, 1e-4);
+            let position = Vector3::new(0.03, -0.05, 0.11);
+            let rows = arm.rows(&state(t, joints));
+            for (row, felt) in rows.iter().enumerate().take(skin.chain(0).rows.len() + 1) {
+                let at = |t: f64| arm.place(row, &position, &state(t, joints).position);
+                let acceleration = (at(t + step) - 2.0 * at(t) + at(t - step)) / (step * step);
+                let frames = arm.central.frames_at(&state(t, joints).position);
+                let rotation = frames.row(row).unwrap().rotation.matrix().to_owned();
+                let expected = rotation.transpose() * (acceleration + Vector3::new(0.0, 0.0, G)) / G;
+                let off = (felt.at(&position) - expected).norm();
+                assert!(off < 1e-5, "{} row {row}: {off}", skin.name);
+            }
+        }
+    }
+}

@@ -1,0 +1,40 @@
+//! Where cells sit, from what their accelerometers feel while the robot moves.
+//!
+//! ```text
+//!   plan ─> motion ─> a robot, real or simulated ─> joints and sensors pages ─> observe ─> calibrate ─> result
+//! ```
+//!
+//! | module | what |
+//! |---|---|
+//! | [`plan`], [`motion`] | which motion to make, and where the joints are in it at a time |
+//! | [`kinematics`] | what an accelerometer at a place of the robot feels |
+//! | [`sensor`], [`simulate`] | an accelerometer with the errors of its data sheet; a skin of them in virtual time |
+//! | [`observe`] | what is kept of the messages of a bus |
+//! | [`mod@calibrate`] | the estimate of every cell, and which of them to distrust |
+//! | [`help`] | which motion would tell what was not told |
+//! | [`neighbors`] | positions made better by the distance of neighbours |
+//! | [`result`], [`write`] | what came out, and a skin file with it |
+
+pub mod calibrate;
+mod cell;
+mod each;
+mod estimate;
+pub mod help;
+pub mod kinematics;
+pub mod motion;
+pub mod neighbors;
+pub mod observe;
+pub mod plan;
+pub mod result;
+pub mod sensor;
+pub mod simulate;
+mod smooth;
+mod sums;
+mod table;
+#[doc(hidden)]
+pub mod testing;
+pub mod write;
+
+pub use calibrate::{Settings, calibrate};
+pub use kinematics::G;
+pub use result::Calibration;

@@ -1,0 +1,213 @@
+//! How the robot moves while accelerations are recorded: holds, moves from pose to pose, and swings about a pose.
+
+use core::f64::consts::TAU;
+
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::MAX_ROBOT_JOINTS;
+use serde::Serialize;
+
+use crate::kinematics::JointState;
+
+/// Positions of all joints of a robot, in rad or m.
+pub type Pose = [f64; MAX_ROBOT_JOINTS];
+
+/// How long a swing takes to reach its amplitude, and to end, in s.
+const RAMP_S: f64 = 0.6;
+
+/// Something that the robot does.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(tag = "do", rename_all = "lowercase")]
+pub enum Step {
+    /// It stands.
+    Hold {
+        /// Where.
+        at: Vec<f64>,
+    },
+    /// It goes from one pose to another; speed, acceleration and jerk are zero at both ends.
+    Move {
+        /// From where.
+        from: Vec<f64>,
+        /// To where.
+        to: Vec<f64>,
+    },
+    /// Joints swing about a pose.
+    Swing {
+        /// The pose.
+        about: Vec<f64>,
+        /// How far each joint swings; 0 for those that stand.
+        amplitude: Vec<f64>,
+        /// How often in a second.
+        rate_hz: Vec<f64>,
+    },
+}
+
+/// A step and when it is done.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Timed {
+    /// When it begins, in s.
+    pub at_s: f64,
+    /// How long it takes, in s.
+    pub for_s: f64,
+    /// What is done.
+    #[serde(flatten)]
+    pub step: Step,
+}
+
+/// What the robot does, one step after the other.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Motion {
+    /// The steps.
+    pub steps: Vec<Timed>,
+}
+
+/// Positions, speeds and accelerations of all joints of a robot.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RobotState {
+    /// The positions.
+    pub position: Pose,
+    /// The speeds.
+    pub speed: Pose,
+    /// The accelerations.
+    pub acceleration: Pose,
+}
+
+impl RobotState {
+    /// Those of a chain, given the robot's joints in it.
+    #[must_use]
+    pub fn of_chain(&self, joints: &[usize]) -> JointState {
+        let pick = |from: &Pose| {
+            let mut to = [0.0; MAX_JOINTS];
+            for (to, &joint) in to.iter_mut().zip(joints) {
+                *to = from.get(joint).copied().unwrap_or_default();
+            }
+            to
+        };
+        JointState {
+            position: pick(&self.position),
+            speed: pick(&self.speed),
+            acceleration: pick(&self.acceleration),
+        }
+    }
+}
+
+impl Motion {
+    /// Adds a step to the end.
+    pub fn then(&mut self, for_s: f64, step: Step) {
+        self.steps.push(Timed { at_s: self.length_s(), for_s, step });
+    }
+
+    /// How long all of it takes, in s.
+    #[must_use]
+    pub fn length_s(&self) -> f64 {
+        self.steps.last().map_or(0.0, |last| last.at_s + last.for_s)
+    }
+
+    /// Where the joints are at a time in s, and how they move; before the first step and after the last one they stand.
+    #[must_use]
+    pub fn at(&self, time: f64) -> RobotState {
+        let index = self.steps.partition_point(|step| step.at_s <= time).saturating_sub(1);
+        let Some(Timed { at_s, for_s, step }) = self.steps.get(index) else { return RobotState::default() };
+        let time = (time - at_s).clamp(0.0, *for_s);
+        let mut state = RobotState::default();
+        let joints = state.position.iter_mut().zip(&mut state.speed).zip(&mut state.acceleration);
+        let joints = joints.map(|((position, speed), acceleration)| [position, speed, acceleration]);
+        match step {
+            Step::Hold { at } => joints.zip(at).for_each(|([position, ..], at)| *position = *at),
+            Step::Move { from, to } => {
+                let [share, rate, change] = rise(time, *for_s);
+                for ([position, speed, acceleration], (from, to)) in joints.zip(from.iter().zip(to)) {
+                    *position = (to - from).mul_add(share, *from);
+                    *speed = (to - from) * rate;
+                    *acceleration = (to - from) * change;
+                }
+            }
+            Step::Swing { about, amplitude, rate_hz } => {
+                let envelope = envelope(time, *for_s);
+                let each = about.iter().zip(amplitude).zip(rate_hz);
+                for ([position, speed, acceleration], ((about, amplitude), rate)) in joints.zip(each) {
+                    let [value, first, second] = swing(envelope, TAU * rate, time);
+                    *position = amplitude.mul_add(value, *about);
+                    *speed = amplitude * first;
+                    *acceleration = amplitude * second;
+                }
+            }
+        }
+        state
+    }
+}
+
+/// From 0 to 1 within a time, with speed, acceleration and jerk zero at both ends: value and two derivatives.
+fn rise(time: f64, length: f64) -> [f64; 3] {
+    if length <= 0.0 {
+        return [1.0, 0.0, 0.0];
+    }
+    let x = (time / length).clamp(0.0, 1.0);
+    let x3 = x * x * x;
+    [
+        x3 * x * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x))),
+        140.0 * x3 * (1.0 - x).powi(3) / length,
+        420.0 * x * x * (1.0 - x).powi(2) * (1.0 - 2.0 * x) / (length * length),
+    ]
+}
+
+/// What the largest speed and acceleration of a move are, of one that is 1 long and takes 1 s.
+pub(crate) const RISE_PEAKS: [f64; 2] = [2.187_5, 7.513_2];
+
+/// Up from 0 to 1 and down again: value and two derivatives.
+fn envelope(time: f64, length: f64) -> [f64; 3] {
+    let ramp = RAMP_S.min(length / 2.0);
+    if time < length / 2.0 {
+        rise(time, ramp)
+    } else {
+        let [value, first, second] = rise(length - time, ramp);
+        [value, -first, second]
+    }
+}
+
+/// A sine within an envelope: value and two derivatives.
+fn swing([value, first, second]: [f64; 3], rate: f64, time: f64) -> [f64; 3] {
+    let (sin, cos) = (rate * time).sin_cos();
+    [
+        value * sin,
+        first * sin + value * rate * cos,
+        second * sin + 2.0 * first * rate * cos - value * rate * rate * sin,
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn speeds_and_accelerations_are_the_differences_of_positions() {
+        let mut motion = Motion::default();
+        motion.then(0.5, Step::Hold { at: vec![0.1, -0.2] });
+        motion.then(1.0, Step::Move { from: vec![0.1, -0.2], to: vec![0.7, 0.4] });
+        let swing = Step::Swing { about: vec![0.7, 0.4], amplitude: vec![0.2, 0.1], rate_hz: vec![1.0, 1.3] };
+        motion.then(3.0, swing);
+        let step = 1e-4;
+        for at in 1..4_499 {
+            let time = f64::from(at) * 1e-3;
+            let [before, now, after] = [time - step, time, time + step].map(|time| motion.at(time));
+            for joint in 0..2 {
+                let position = |state: &RobotState| state.position[joint];
+                let speed = (position(&after) - position(&before)) / (2.0 * step);
+                let acceleration =
+                    (position(&after) - 2.0 * position(&now) + position(&before)) / (step * step);
+                assert!((speed - now.speed[joint]).abs() < 1e-4, "{time}");
+                assert!((acceleration - now.acceleration[joint]).abs() < 2e-2, "{time}: {acceleration}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_move_is_as_quick_as_its_peaks_say() {
+        let samples = || (0..=10_000).map(|at| rise(f64::from(at) * 1e-4, 1.0));
+        let peak = |index: usize| samples().map(|it| it[index].abs()).fold(0.0, f64::max);
+        assert!(
+            (peak(1) - RISE_PEAKS[0]).abs() < 1e-4 && (peak(2) - RISE_PEAKS[1]).abs() < 1e-3,
+            "{}",
+            peak(2)
+        );
+    }
+}

@@ -1,0 +1,123 @@
+//! Positions made better by what is known of neighbours: wired cells are so far apart, on a smooth surface.
+
+use nalgebra::{Cholesky, DMatrix, DVector, Matrix3, Vector3};
+
+/// How far wired cells are apart.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Spacing {
+    /// From the middle of one to the middle of the other, in m.
+    pub distance: f64,
+    /// Its standard deviation, in m.
+    pub deviation: f64,
+}
+
+impl Spacing {
+    /// Cells that are so far apart, in m, within 1 %.
+    #[must_use]
+    pub const fn of(distance: f64) -> Self {
+        Self { distance, deviation: distance * 0.01 }
+    }
+}
+
+/// A cell as it is known from its readings.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Known {
+    pub(crate) position: Vector3<f64>,
+    pub(crate) normal: Vector3<f64>,
+    pub(crate) covariance: Matrix3<f64>,
+}
+
+/// Wires whose ends are this many standard deviations off say nothing: cables, and cells that were taken for others.
+const OFF: f64 = 4.0;
+/// Times that the positions are computed anew.
+const ROUNDS: usize = 3;
+
+/// Improves the positions of cells on one link; wires are pairs of indices. Returns how many wires were used.
+pub(crate) fn improve(cells: &mut [Known], wires: &[(usize, usize)], spacing: &Spacing) -> usize {
+    let pair = |cells: &[Known], &(one, other): &(usize, usize)| Some((*cells.get(one)?, *cells.get(other)?));
+    let fits = |wire: &&(usize, usize)| {
+        pair(cells, wire).is_some_and(|(one, other)| {
+            let way = other.position - one.position;
+            let along = way.try_normalize(1e-9).unwrap_or_else(Vector3::x);
+            let variance = (along.transpose() * (one.covariance + other.covariance) * along).x;
+            let deviation = (variance + spacing.deviation.powi(2)).sqrt();
+            (way.norm() - spacing.distance).abs() < OFF * deviation
+        })
+    };
+    let wires: Vec<_> = wires.iter().filter(fits).copied().collect();
+    if wires.is_empty() {
+        return 0;
+    }
+    let size = 3 * cells.len();
+    let measured: Vec<_> = cells.iter().map(|cell| cell.position).collect();
+    let mut covariance = None;
+    for _ in 0..ROUNDS {
+        let mut information = DMatrix::<f64>::zeros(size, size);
+        let mut gradient = DVector::<f64>::zeros(size);
+        for (index, (cell, measured)) in cells.iter().zip(&measured).enumerate() {
+            let Some(own) = cell.covariance.try_inverse() else { return 0 };
+            information.fixed_view_mut::<3, 3>(3 * index, 3 * index).copy_from(&own);
+            gradient.fixed_rows_mut::<3>(3 * index).copy_from(&(own * (cell.position - measured)));
+        }
+        for wire in &wires {
+            let Some((one, other)) = pair(cells, wire) else { continue };
+            let way = other.position - one.position;
+            let (Some(along), Some(up)) =
+                (way.try_normalize(1e-9), (one.normal + other.normal).try_normalize(1e-3))
+            else {
+                continue;
+            };
+            // As far apart as they are, and level: on an evenly curved surface the way between two cells is at a right
+            // angle to the mean of their normals.
+            for (direction, off) in [(along, way.norm() - spacing.distance), (up, way.dot(&up))] {
+                let weight = spacing.deviation.powi(-2);
+                let block = direction * direction.transpose() * weight;
+                let (a, b) = (3 * wire.0, 3 * wire.1);
+                for (row, column, sign) in [(a, a, 1.0), (b, b, 1.0), (a, b, -1.0), (b, a, -1.0)] {
+                    let mut view = information.fixed_view_mut::<3, 3>(row, column);
+                    view += block * sign;
+                }
+                for (at, sign) in [(a, -1.0), (b, 1.0)] {
+                    let mut view = gradient.fixed_rows_mut::<3>(at);
+                    view += direction * (off * weight * sign);
+                }
+            }
+        }
+        let Some(solved) = Cholesky::new(information) else { return 0 };
+        let step = solved.solve(&gradient);
+        for (index, cell) in cells.iter_mut().enumerate() {
+            cell.position -= step.fixed_rows::<3>(3 * index);
+        }
+        covariance = Some(solved);
+    }
+    if let Some(inverse) = covariance.map(|it| it.inverse()) {
+        for (index, cell) in cells.iter_mut().enumerate() {
+            cell.covariance = inverse.fixed_view::<3, 3>(3 * index, 3 * index).into_owned();
+        }
+    }
+    wires.len()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn neighbours_pull_cells_to_their_distance_and_a_wrong_wire_does_not() {
+        let cell = |x: f64, z: f64| Known {
+            position: Vector3::new(x, 0.0, z),
+            normal: Vector3::z(),
+            covariance: Matrix3::identity() * 1e-6,
+        };
+        let mut cells = [cell(0.0, 0.0), cell(0.030, 0.001), cell(0.057, -0.001), cell(0.5, 0.0)];
+        let spacing = Spacing { distance: 0.028, deviation: 0.2e-3 };
+        let used = improve(&mut cells, &[(0, 1), (1, 2), (2, 3)], &spacing);
+        assert_eq!(used, 2);
+        for (one, other) in [(0, 1), (1, 2)] {
+            let way = cells[other].position - cells[one].position;
+            assert!((way.norm() - 0.028).abs() < 2e-4 && way.z.abs() < 2e-4, "{way}");
+        }
+        assert!((cells[3].position.x - 0.5).abs() < 1e-12);
+        assert!(cells[1].covariance[(0, 0)] < 0.6e-6 && cells[3].covariance[(0, 0)] > 0.9e-6);
+    }
+}

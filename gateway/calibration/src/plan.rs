@@ -1,0 +1,437 @@
+//! Which motion to make: that which tells most of where cells sit, within limits and a time.
+//!
+//! Of some poses within the limits, and of swings about them, those are taken one after the other that add most to the
+//! information on cells that are supposed on each link (Fisher's information of the estimate), for the time that
+//! they take. Static poses tell orientation, bias and gain; swings tell positions.
+
+use core::f64::consts::TAU;
+
+use nalgebra::{Cholesky, Matrix3, UnitQuaternion, Vector3};
+use protocol::parameters::RowKind;
+use protocol::skin::{JointKind, Skin};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+use thiserror::Error;
+
+use crate::cell::{AGE_STEP, CellModel, Information, MOMENT, POSITION, TURN, expected, numbers};
+use crate::kinematics::{Arm, G};
+use crate::motion::{Motion, RISE_PEAKS, Step};
+use crate::sensor::DataSheet;
+use crate::sums::Sums;
+
+/// How a plan may move the robot.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Bounds {
+    /// The pose about which it moves, by joint of the robot; it begins and ends there.
+    pub center: Vec<f64>,
+    /// How far each joint may go from there, in rad or m.
+    pub within: f64,
+    /// How long it may take, in s.
+    pub length_s: f64,
+    /// The part of the joints' maximum speeds that is used.
+    pub speed: f64,
+    /// The largest acceleration of a joint, in rad/s2 or m/s2.
+    pub acceleration: f64,
+    /// The largest acceleration of anything on the robot by one swinging joint, in g.
+    pub force_g: f64,
+    /// From which poses are drawn.
+    pub seed: u64,
+}
+
+/// Why there is no plan.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum PlanError {
+    /// The center has too few or too many joints.
+    #[error("the pose has {got} positions; the robot has {joints} joints: give one for each")]
+    Joints {
+        /// Positions.
+        got: usize,
+        /// Joints.
+        joints: usize,
+    },
+    /// A joint is outside of its limits.
+    #[error("joint {name} at {got}: its limits are {min} to {max}; choose a position between them")]
+    Limits {
+        /// The joint.
+        name: String,
+        /// Its position.
+        got: f64,
+        /// Its lower limit.
+        min: f64,
+        /// Its upper limit.
+        max: f64,
+    },
+    /// There is no time for anything.
+    #[error("{got} s are too short for a calibration; allowed are 20 to 3600 s")]
+    Short {
+        /// The time in s.
+        got: f64,
+    },
+}
+
+/// Poses to choose from.
+const POSES: usize = 24;
+/// How long the robot stands at a pose, in s.
+const HOLD_S: f64 = 0.6;
+/// How long a swing takes, in s.
+pub(crate) const SWING_S: f64 = 3.2;
+/// What a move to another pose is supposed to take, in s.
+const MOVE_S: f64 = 1.6;
+/// How often a joint swings in a second.
+const RATE_HZ: f64 = 1.1;
+/// Joints that swing together have other rates, so that they can be told apart.
+const RATES_HZ: [f64; 7] = [0.8, 1.3, 1.0, 1.5, 0.9, 1.2, 1.4];
+/// From one looked-at moment to the next, in s.
+const LOOK_S: f64 = 1.0 / 15.0;
+/// What an estimate shall reach: position in m, orientation in rad.
+pub(crate) const AIM: [f64; 2] = [0.5e-3, 0.2 * TAU / 360.0];
+
+impl Bounds {
+    /// About the middle of the limits, or about 0 where a joint turns further than half a turn each way.
+    #[must_use]
+    pub fn of(skin: &Skin) -> Self {
+        let middle = |[min, max]: [f64; 2], kind: JointKind| {
+            let wide = kind == JointKind::Revolute && max - min > 0.99 * TAU;
+            if wide { 0.0_f64.clamp(min, max) } else { f64::midpoint(min, max) }
+        };
+        let joints = skin.robot.joints.iter();
+        Self {
+            center: joints.map(|joint| middle(joint.limits, joint.kind)).collect(),
+            within: 1.0,
+            length_s: 150.0,
+            speed: 0.8,
+            acceleration: 8.0,
+            force_g: 0.7,
+            seed: 1,
+        }
+    }
+
+    fn check(&self, skin: &Skin) -> Result<(), PlanError> {
+        let (got, joints) = (self.center.len(), skin.robot.joints.len());
+        if got != joints {
+            return Err(PlanError::Joints { got, joints });
+        }
+        for (joint, &got) in skin.robot.joints.iter().zip(&self.center) {
+            let [min, max] = joint.limits;
+            if !(min..=max).contains(&got) {
+                return Err(PlanError::Limits { name: joint.name.clone(), got, min, max });
+            }
+        }
+        if (20.0..=3600.0).contains(&self.length_s) {
+            Ok(())
+        } else {
+            Err(PlanError::Short { got: self.length_s })
+        }
+    }
+}
+
+/// Something that may be done: a hold at a pose, or a swing about it.
+struct Candidate {
+    pose: usize,
+    step: Step,
+    seconds: f64,
+    /// By supposed cell.
+    information: Vec<Information>,
+}
+
+/// A cell that is supposed to be somewhere.
+pub(crate) struct Supposed {
+    pub(crate) bus: usize,
+    pub(crate) row: usize,
+    pub(crate) model: CellModel,
+}
+
+/// The motion that tells most within its bounds.
+///
+/// # Errors
+/// When the bounds do not fit the robot.
+pub fn plan(skin: &Skin, bounds: &Bounds, sheet: &DataSheet, gravity: [f64; 3]) -> Result<Motion, PlanError> {
+    bounds.check(skin)?;
+    let swings = Swings::new(skin, bounds);
+    let poses = poses(skin, bounds, &swings);
+    let buses = (0..skin.buses.len()).filter(|&bus| skin.cells_of(bus).next().is_some());
+    let arms: Vec<_> = buses.map(|bus| (bus, Arm::new(skin, bus, gravity))).collect();
+    let supposed = supposed(skin, &arms);
+    let mut candidates = Vec::new();
+    for (pose, at) in poses.iter().enumerate() {
+        let hold = (HOLD_S, Step::Hold { at: at.clone() });
+        for (seconds, step) in core::iter::once(hold).chain(swings.about(at).map(|step| (SWING_S, step))) {
+            let information = informed(skin, &arms, &supposed, &step, seconds, sheet);
+            candidates.push(Candidate { pose, step, seconds, information });
+        }
+    }
+    let chosen = choose(&candidates, &supposed, bounds, sheet);
+    Ok(ordered(skin, bounds, &poses, &candidates, &chosen))
+}
+
+/// How far and how often each joint may swing.
+pub(crate) struct Swings {
+    amplitudes: Vec<f64>,
+}
+
+impl Swings {
+    pub(crate) fn new(skin: &Skin, bounds: &Bounds) -> Self {
+        let rate = TAU * RATE_HZ;
+        let joints = skin.robot.joints.iter().zip(&skin.controller.max_speed).enumerate();
+        let amplitudes = joints.map(|(index, (joint, max_speed))| {
+            let reach = reach(skin, index);
+            let [min, max] = joint.limits;
+            let force = bounds.force_g * G / if joint.kind == JointKind::Revolute { reach } else { 1.0 };
+            let speed = bounds.speed * max_speed / rate;
+            let acceleration = bounds.acceleration.min(force) / (rate * rate);
+            speed.min(acceleration).min(bounds.within / 2.0).min((max - min) / 4.0)
+        });
+        Self { amplitudes: amplitudes.collect() }
+    }
+
+    /// Each joint alone, and all together.
+    pub(crate) fn about<'a>(&'a self, pose: &'a [f64]) -> impl Iterator<Item = Step> + 'a {
+        let joints = self.amplitudes.len();
+        let swing =
+            |amplitude: Vec<f64>, rate_hz: Vec<f64>| Step::Swing { about: pose.to_vec(), amplitude, rate_hz };
+        let alone = (0..joints).map(move |joint| {
+            let own = |(at, amplitude): (usize, &f64)| if at == joint { *amplitude } else { 0.0 };
+            swing(self.amplitudes.iter().enumerate().map(own).collect(), vec![RATE_HZ; joints])
+        });
+        let rates: Vec<_> = RATES_HZ.iter().cycle().take(joints).copied().collect();
+        let share = |(amplitude, rate): (&f64, &f64)| amplitude * 0.4 * (RATE_HZ / rate).powi(2).min(1.0);
+        let together = swing(self.amplitudes.iter().zip(&rates).map(share).collect(), rates);
+        alone.chain(core::iter::once(together))
+    }
+}
+
+/// How far from a joint's axis something on the robot can be, in m.
+fn reach(skin: &Skin, joint: usize) -> f64 {
+    let of_chain = |chain: &protocol::skin::Chain| {
+        let at = chain.joints.iter().position(|&it| it == joint)?;
+        let row = chain.row_of(u8::try_from(at + 1).ok()?)?;
+        let rows = chain.rows.get(usize::from(row).saturating_sub(1)..)?;
+        Some(rows.iter().map(|row| row.table.a.hypot(row.table.d)).sum::<f64>())
+    };
+    skin.robot.chains.iter().filter_map(of_chain).fold(0.1, f64::max)
+}
+
+/// Poses within the limits from which every swing stays within them too; the first is the center.
+pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &Swings) -> Vec<Vec<f64>> {
+    let mut dice = Pcg64Mcg::seed_from_u64(bounds.seed);
+    let ranges = skin.robot.joints.iter().zip(&bounds.center).zip(&swings.amplitudes);
+    let ranges: Vec<_> = ranges
+        .map(|((joint, center), amplitude)| {
+            let [min, max] = joint.limits;
+            let (low, high) = (
+                (center - bounds.within).max(min) + amplitude,
+                (center + bounds.within).min(max) - amplitude,
+            );
+            (low.min(high), high.max(low))
+        })
+        .collect();
+    let center = bounds.center.iter().zip(&ranges).map(|(at, (low, high))| at.clamp(*low, *high)).collect();
+    let mut drawn = || ranges.iter().map(|(low, high)| low + (high - low) * dice.random::<f64>()).collect();
+    let mut poses = vec![center];
+    poses.extend((1..POSES).map(|_| drawn()));
+    poses
+}
+
+/// Cells on each link: near its joint, on its middle, and at its end.
+fn supposed(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<Supposed> {
+    let mut all = Vec::new();
+    for &(bus, _) in arms {
+        let chain = skin.chain(bus);
+        for joint in 1..=u8::try_from(chain.joints.len()).unwrap_or_default() {
+            let row = usize::from(chain.row_of(joint).unwrap_or_default());
+            let Some(table) = chain.rows.get(row.saturating_sub(1)) else { continue };
+            let length = if table.kind == RowKind::Revolute { table.table.a } else { 0.0 };
+            for (share, turn) in [(0.2, 0.5), (0.8, 2.1)] {
+                let position = Vector3::new(-length * share, 0.06, 0.04 * share);
+                let rotation = UnitQuaternion::from_euler_angles(turn, 0.3 * turn, 0.7 - turn);
+                all.push(Supposed { bus, row, model: CellModel::at(rotation, position) });
+            }
+        }
+    }
+    all
+}
+
+/// What a step says of each supposed cell.
+pub(crate) fn informed(
+    skin: &Skin,
+    arms: &[(usize, Arm)],
+    supposed: &[Supposed],
+    step: &Step,
+    seconds: f64,
+    sheet: &DataSheet,
+) -> Vec<Information> {
+    let mut motion = Motion::default();
+    motion.then(seconds, step.clone());
+    let mut sums: Vec<Option<Sums>> = vec![None; supposed.len()];
+    let (mut time, look) = (LOOK_S / 2.0, skin.timing.broadcast_hz() * LOOK_S);
+    while time < seconds {
+        for (bus, arm) in arms {
+            let joints = &skin.chain(*bus).joints;
+            let ages = [-AGE_STEP, 0.0, AGE_STEP];
+            let motions = ages.map(|age| arm.rows(&motion.at((time - age).max(0.0)).of_chain(joints)));
+            // The cells of one link see the same motion: the first one's sums are those of the others.
+            let mut seen = usize::MAX;
+            for (one, sum) in supposed.iter().zip(&mut sums) {
+                if one.bus != *bus || one.row == seen {
+                    continue;
+                }
+                seen = one.row;
+                let mut moment = [1.0; MOMENT];
+                let all = motions.iter().flat_map(|rows| rows.get(one.row).map(numbers).unwrap_or_default());
+                moment.iter_mut().zip(all).for_each(|(to, from)| *to = from);
+                sum.get_or_insert_with(Sums::default).add(&moment, &[0.0; 3], look);
+            }
+        }
+        time += LOOK_S;
+    }
+    let variance = sheet.deviation().powi(2) + 0.003_f64.powi(2);
+    let mut last = None;
+    let each = supposed.iter().zip(&sums).map(|(one, sum)| {
+        last = sum.as_ref().or(last);
+        last.map_or_else(Information::zeros, |sum| sum.information(&one.model).0 / variance)
+    });
+    each.collect()
+}
+
+/// Candidates in the order in which they were chosen.
+fn choose(candidates: &[Candidate], supposed: &[Supposed], bounds: &Bounds, sheet: &DataSheet) -> Vec<usize> {
+    let prior = Information::from_diagonal(&expected(sheet));
+    let mut known = vec![prior; supposed.len()];
+    let mut scores: Vec<_> = known.iter().map(score).collect();
+    let mut chosen: Vec<usize> = Vec::new();
+    // The way to the center and back.
+    let mut left = bounds.length_s - 2.0 * MOVE_S;
+    loop {
+        let visited =
+            |pose: usize| chosen.iter().any(|&it| candidates.get(it).is_some_and(|it| it.pose == pose));
+        let rate = |(index, candidate): (usize, &Candidate)| {
+            let seconds = candidate.seconds + if visited(candidate.pose) { 0.0 } else { MOVE_S + HOLD_S };
+            // A step that is done twice tells as much again, but of nothing else.
+            if seconds > left || chosen.contains(&index) {
+                return None;
+            }
+            let each = known.iter().zip(&scores).zip(&candidate.information);
+            let gained: f64 = each.map(|((known, before), more)| before - score(&(known + more))).sum();
+            Some((gained / seconds, index, seconds))
+        };
+        let best =
+            candidates.iter().enumerate().filter_map(rate).max_by(|one, other| one.0.total_cmp(&other.0));
+        let Some((_, index, seconds)) = best else { return chosen };
+        if let Some(candidate) = candidates.get(index) {
+            for ((known, score_of), more) in known.iter_mut().zip(&mut scores).zip(&candidate.information) {
+                *known += more;
+                *score_of = score(known);
+            }
+        }
+        chosen.push(index);
+        left -= seconds;
+    }
+}
+
+/// How much is not known: 0 for a cell that is known exactly.
+fn score(information: &Information) -> f64 {
+    let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return 1e3 };
+    let part = |start: usize, aim: f64| {
+        let part: Matrix3<f64> = covariance.fixed_view::<3, 3>(start, start).into_owned();
+        part.diagonal().iter().map(|variance| (variance / (aim * aim)).ln_1p()).sum::<f64>()
+    };
+    part(POSITION.start, AIM[0]) + part(TURN.start, AIM[1])
+}
+
+/// The chosen steps, pose by pose, each the nearest to the one before.
+fn ordered(
+    skin: &Skin,
+    bounds: &Bounds,
+    poses: &[Vec<f64>],
+    candidates: &[Candidate],
+    chosen: &[usize],
+) -> Motion {
+    let mut left: Vec<_> = (0..poses.len()).collect();
+    left.retain(|pose| chosen.iter().any(|&it| candidates.get(it).is_some_and(|it| it.pose == *pose)));
+    let mut motion = Motion::default();
+    let mut at = bounds.center.clone();
+    motion.then(HOLD_S, Step::Hold { at: at.clone() });
+    let distance = |from: &[f64], pose: usize| {
+        poses.get(pose).map_or(f64::INFINITY, |to| travel(skin, bounds, from, to))
+    };
+    while let Some((place, &pose)) = left
+        .iter()
+        .enumerate()
+        .min_by(|(_, one), (_, other)| distance(&at, **one).total_cmp(&distance(&at, **other)))
+    {
+        left.remove(place);
+        let Some(to) = poses.get(pose) else { continue };
+        go(skin, bounds, &mut motion, &mut at, to);
+        motion.then(HOLD_S, Step::Hold { at: to.clone() });
+        let swings = chosen.iter().filter_map(|&it| candidates.get(it)).filter(|it| it.pose == pose);
+        for Candidate { step, seconds, .. } in swings {
+            if matches!(step, Step::Swing { .. }) {
+                motion.then(*seconds, step.clone());
+            }
+        }
+    }
+    go(skin, bounds, &mut motion, &mut at, &bounds.center);
+    motion.then(HOLD_S, Step::Hold { at });
+    motion
+}
+
+fn go(skin: &Skin, bounds: &Bounds, motion: &mut Motion, at: &mut Vec<f64>, to: &[f64]) {
+    let seconds = travel(skin, bounds, at, to);
+    if seconds > 0.0 {
+        motion.then(seconds, Step::Move { from: at.clone(), to: to.to_vec() });
+        *at = to.to_vec();
+    }
+}
+
+/// How long a move takes, in s.
+fn travel(skin: &Skin, bounds: &Bounds, from: &[f64], to: &[f64]) -> f64 {
+    let [speed_peak, acceleration_peak] = RISE_PEAKS;
+    let joints = from.iter().zip(to).zip(&skin.controller.max_speed);
+    let longest = joints.map(|((from, to), max_speed)| {
+        let way = (to - from).abs();
+        let by_speed = speed_peak * way / (bounds.speed * max_speed);
+        by_speed.max((acceleration_peak * way / bounds.acceleration.min(4.0)).sqrt())
+    });
+    longest.fold(0.0, f64::max)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing;
+
+    #[test]
+    fn a_plan_stays_within_limits_speeds_and_its_time() {
+        for skin in [testing::ur5(), testing::panda()] {
+            let bounds = Bounds::of(&skin);
+            let motion = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -G]).unwrap();
+            assert!(motion.length_s() < 180.0 && motion.length_s() > 100.0, "{}", motion.length_s());
+            let mut time = 0.0;
+            while time < motion.length_s() {
+                let state = motion.at(time);
+                for (index, joint) in skin.robot.joints.iter().enumerate() {
+                    let (position, speed) = (state.position[index], state.speed[index]);
+                    assert!(position >= joint.limits[0] && position <= joint.limits[1], "{time}: {position}");
+                    assert!((position - bounds.center[index]).abs() < bounds.within + 1e-9);
+                    assert!(speed.abs() < 0.85 * skin.controller.max_speed[index], "{time}: {speed}");
+                }
+                time += 0.01;
+            }
+        }
+    }
+
+    #[test]
+    fn a_pose_outside_of_limits_is_refused() {
+        let skin = testing::panda();
+        let mut bounds = Bounds::of(&skin);
+        bounds.center[3] = 0.5;
+        let error = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -G]).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "joint joint4 at 0.5: its limits are -3.0718 to -0.0698; choose a position between them"
+        );
+        bounds.center.pop();
+        let error = plan(&skin, &bounds, &DataSheet::default(), [0.0, 0.0, -G]).unwrap_err();
+        assert_eq!(error.to_string(), "the pose has 6 positions; the robot has 7 joints: give one for each");
+    }
+}

@@ -1,0 +1,126 @@
+//! What a skin would show during a motion, in virtual time: for tests, and to weigh motions.
+
+use nalgebra::Vector3;
+use protocol::fixed::{Q, Q1_14};
+use protocol::message::{Joints, Message, SensorPage};
+use protocol::packet::Epoch;
+use protocol::parameters::{MAX_JOINTS, RowKind};
+use protocol::skin::Skin;
+
+use crate::kinematics::Arm;
+use crate::motion::Motion;
+use crate::observe::Observations;
+use crate::sensor::{Accelerometer, DataSheet, rotation};
+
+/// How one cell differs from what the skin says.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub enum Defect {
+    /// Not at all.
+    #[default]
+    None,
+    /// It sends nothing.
+    Dead,
+    /// It sends one value for ever.
+    Stuck,
+    /// It sends the part of its readings that is given.
+    Silent(f64),
+    /// It tilts by so many rad, to and fro, as the robot moves.
+    Loose(f64),
+}
+
+/// The accelerometers of a skin.
+#[derive(Clone, Debug)]
+pub struct Accelerometers {
+    arms: Vec<Option<Arm>>,
+    /// By cell.
+    sensors: Vec<Accelerometer>,
+}
+
+impl Accelerometers {
+    /// One for each cell, drawn from a data sheet and a seed; gravity is seen from the robot's base, in m/s2.
+    #[must_use]
+    pub fn new(skin: &Skin, sheet: &DataSheet, seed: u64, gravity: [f64; 3]) -> Self {
+        let arm = |bus: usize| skin.cells_of(bus).next().map(|_| Arm::new(skin, bus, gravity));
+        let sensors = skin.cells.iter().map(|cell| {
+            let stream = u64::from(cell.serial).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+            Accelerometer::new(sheet, seed ^ stream)
+        });
+        Self { arms: (0..skin.buses.len()).map(arm).collect(), sensors: sensors.collect() }
+    }
+
+    /// The sensor of a cell.
+    #[must_use]
+    pub fn sensor(&self, cell: usize) -> Option<&Accelerometer> {
+        self.sensors.get(cell)
+    }
+
+    /// What each cell of the skin shows at a time in s, in g.
+    pub fn readings<'a>(
+        &'a self,
+        skin: &'a Skin,
+        motion: &'a Motion,
+        now: f64,
+        tilt: impl Fn(usize, &Vector3<f64>) -> Vector3<f64> + 'a,
+    ) -> impl Iterator<Item = Vector3<f64>> + 'a {
+        skin.cells.iter().zip(&self.sensors).enumerate().map(move |(index, (cell, sensor))| {
+            let moment = motion.at(sensor.sampled(now));
+            let state = moment.of_chain(&skin.chain(cell.bus).joints);
+            let rows = self.arms.get(cell.bus).and_then(Option::as_ref).map(|arm| arm.rows(&state));
+            let row = rows.and_then(|rows| rows.get(usize::from(cell.row)).copied()).unwrap_or_default();
+            let felt = row.at(&cell.position.into());
+            let local = rotation(cell.orientation, cell.normal).inverse() * felt;
+            sensor.reading(now, &tilt(index, &local))
+        })
+    }
+}
+
+/// Moves a skin in virtual time; words are rounded as frames carry them.
+#[must_use]
+pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: &[Defect]) -> Observations {
+    let mut seen = Observations::new(skin);
+    let period = 1.0 / skin.timing.broadcast_hz();
+    let epochs = (motion.length_s() / period).floor();
+    let mut index = 0.0;
+    let mut epoch = Epoch::default();
+    while index < epochs {
+        let now = index * period;
+        let state = motion.at(now);
+        for bus in 0..skin.buses.len() {
+            let chain = skin.chain(bus);
+            let joints = state.of_chain(&chain.joints);
+            let mut positions = [Q1_14::ZERO; MAX_JOINTS];
+            let kinds = chain.rows.iter().map(|row| row.kind).filter(|kind| *kind != RowKind::Fixed);
+            for ((word, position), kind) in positions.iter_mut().zip(joints.position).zip(kinds) {
+                *word = match kind {
+                    RowKind::Prismatic => Q1_14::nearest(position),
+                    RowKind::Revolute | RowKind::Fixed => Q1_14::from_radians(position).unwrap_or_default(),
+                };
+            }
+            let in_use = u8::try_from(chain.joints.len()).unwrap_or_default();
+            seen.take(bus, &Message::Joints { epoch, joints: Joints { positions, in_use } });
+        }
+        let tilt = |cell: usize, force: &Vector3<f64>| match defects.get(cell) {
+            // It rests on one side or on the other, as gravity pulls it.
+            Some(Defect::Loose(angle)) => {
+                let turn = Vector3::new(angle * force.x.signum(), angle * force.y.signum(), 0.0);
+                nalgebra::Rotation3::new(turn) * force
+            }
+            _ => *force,
+        };
+        let shown: Vec<_> = sensors.readings(skin, motion, now, tilt).collect();
+        for ((at, cell), shown) in skin.cells.iter().enumerate().zip(shown) {
+            let shown = match defects.get(at) {
+                Some(Defect::Dead) => continue,
+                Some(Defect::Silent(part)) if (index * 0.618_034).fract() >= *part => continue,
+                Some(Defect::Stuck) => Vector3::new(0.0, 0.0, 1.0),
+                _ => shown,
+            };
+            let words: [f64; 3] = shown.into();
+            let page = SensorPage::Acceleration(words.map(Q::nearest));
+            seen.take(cell.bus, &Message::Sensors { from: cell.node, epoch, page });
+        }
+        epoch = epoch.next();
+        index += 1.0;
+    }
+    seen
+}

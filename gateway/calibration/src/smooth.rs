@@ -1,0 +1,152 @@
+//! Positions of joints at regular times into speeds and accelerations at any time between.
+//!
+//! Joints are broadcast in steps of 96 µrad, 62.5 times a second, and second differences of such words are mostly
+//! rounding. So a polynomial is fitted to the words around each broadcast (Savitzky and Golay), and its derivatives are
+//! taken, a little earlier too: sensors are read later than they measure.
+
+use nalgebra::{SMatrix, SVector};
+use protocol::parameters::MAX_JOINTS;
+
+use crate::kinematics::JointState;
+
+/// Broadcasts before and after the middle one.
+pub(crate) const HALF: usize = 10;
+const WINDOW: usize = 2 * HALF + 1;
+/// Coefficients of the polynomial.
+const TERMS: usize = 7;
+
+/// Positions of the joints of a chain at one broadcast.
+pub(crate) type Positions = [f64; MAX_JOINTS];
+
+/// Fits polynomials to windows of positions.
+#[derive(Clone, Debug)]
+pub(crate) struct Smoother {
+    /// From positions in a window to coefficients, in units of [`HALF`] periods.
+    fit: SMatrix<f64, TERMS, WINDOW>,
+    /// Half a window, in s.
+    half_s: f64,
+}
+
+impl Smoother {
+    /// For positions that are `period_s` apart.
+    #[must_use]
+    pub(crate) fn new(period_s: f64) -> Self {
+        let powers = SMatrix::<f64, WINDOW, TERMS>::from_fn(|at, power| {
+            let x = (real(at) - real(HALF)) / real(HALF);
+            x.powi(i32::try_from(power).unwrap_or_default())
+        });
+        let normal = powers.tr_mul(&powers);
+        // Distinct times and fewer terms than times: it has an inverse.
+        let fit = normal.try_inverse().map_or_else(SMatrix::zeros, |inverse| inverse * powers.transpose());
+        Self { fit, half_s: period_s * real(HALF) }
+    }
+
+    /// How the first `joints` move `earlier_s` before the middle of a window of positions; `None` where the window is
+    /// incomplete.
+    #[must_use]
+    pub(crate) fn state(
+        &self,
+        window: &[Option<Positions>],
+        joints: usize,
+        earlier_s: f64,
+    ) -> Option<JointState> {
+        if window.len() != WINDOW {
+            return None;
+        }
+        let x = -earlier_s / self.half_s;
+        let mut weights = [SVector::<f64, WINDOW>::zeros(); 3];
+        let powers = |order: usize| {
+            SVector::<f64, TERMS>::from_fn(|power, _| {
+                let factor: f64 = (0..order).map(|less| real(power) - real(less)).product();
+                let left = power.checked_sub(order).and_then(|left| i32::try_from(left).ok());
+                left.map_or(0.0, |left| factor * x.powi(left))
+                    / self.half_s.powi(i32::try_from(order).unwrap_or(0))
+            })
+        };
+        for (order, weights) in weights.iter_mut().enumerate() {
+            *weights = self.fit.tr_mul(&powers(order));
+        }
+        let mut state = JointState::default();
+        let [value, first, second] = &weights;
+        for (at, positions) in window.iter().enumerate() {
+            let positions = positions.as_ref()?;
+            let [value, first, second] =
+                [value, first, second].map(|weights| weights.get(at).copied().unwrap_or_default());
+            let to = state.position.iter_mut().zip(&mut state.speed).zip(&mut state.acceleration);
+            for (((position, speed), acceleration), from) in to.zip(positions).take(joints) {
+                *position += value * from;
+                *speed += first * from;
+                *acceleration += second * from;
+            }
+        }
+        Some(state)
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "small counts")]
+const fn real(count: usize) -> f64 {
+    count as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use core::f64::consts::TAU;
+
+    /// A swing as words, and how far the fit is off: position, speed and acceleration.
+    fn off(rate_hz: f64, amplitude: f64, step: f64, earlier: f64) -> [f64; 3] {
+        let (period, rate) = (0.016, TAU * rate_hz);
+        let smoother = Smoother::new(period);
+        let position = |at: f64| amplitude * (rate * at).sin();
+        let words: Vec<_> = (0..500)
+            .map(|at| {
+                let exact = position(f64::from(at) * period);
+                Some([if step > 0.0 { (exact / step).round() * step } else { exact }; MAX_JOINTS])
+            })
+            .collect();
+        let mut worst = [0.0_f64; 3];
+        for middle in HALF..words.len() - HALF {
+            let state = smoother.state(&words[middle - HALF..=middle + HALF], 1, earlier).unwrap();
+            let at = middle as f64 * period - earlier;
+            let speed = amplitude * rate * (rate * at).cos();
+            let acceleration = -rate * rate * position(at);
+            let off = [state.position[0] - position(at), state.speed[0] - speed];
+            worst = [
+                worst[0].max(off[0].abs()),
+                worst[1].max(off[1].abs()),
+                worst[2].max((state.acceleration[0] - acceleration).abs()),
+            ];
+        }
+        worst
+    }
+
+    #[test]
+    fn a_swing_keeps_its_acceleration() {
+        for earlier in [0.0, 0.01] {
+            // 0.1 % of 0.2 rad, 1.9 rad/s and 17.8 rad/s2.
+            let [position, speed, acceleration] = off(1.5, 0.2, 0.0, earlier);
+            assert!(
+                position < 2e-4 && speed < 1.9e-3 && acceleration < 1.8e-2,
+                "{position} {speed} {acceleration}"
+            );
+            // With rounding, single errors.
+            let [position, speed, acceleration] = off(1.0, 0.2, 95.9e-6, earlier);
+            assert!(
+                position < 1e-4 && speed < 5e-3 && acceleration < 0.2,
+                "{position} {speed} {acceleration}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_window_with_a_gap_has_no_state() {
+        let mut window = vec![Some([0.5; MAX_JOINTS]); WINDOW];
+        let smoother = Smoother::new(0.016);
+        let state = smoother.state(&window, 2, 0.0).unwrap();
+        assert!((state.position[1] - 0.5).abs() < 1e-9 && state.speed[1].abs() < 1e-9);
+        assert!(state.position[2].abs() < 1e-12, "not in use");
+        window[3] = None;
+        assert!(smoother.state(&window, 2, 0.0).is_none());
+        assert!(smoother.state(&window[1..], 2, 0.0).is_none());
+    }
+}

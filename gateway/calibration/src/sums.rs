@@ -1,0 +1,152 @@
+//! Sums of products over the readings of a cell, and the least squares that they make.
+
+#![expect(clippy::indexing_slicing, reason = "matrices of constant size, with indices below it")]
+
+use nalgebra::{Cholesky, SMatrix};
+
+use crate::cell::{CellModel, Coefficients, Information, MOMENT, Moment, ROW, UNKNOWNS, Unknowns};
+
+/// Steps of least squares at most.
+const STEPS: usize = 60;
+
+/// What the readings of a cell say, as sums over them.
+#[derive(Clone, Debug)]
+pub(crate) struct Sums {
+    /// Of products of a moment's numbers.
+    moments: SMatrix<f64, MOMENT, MOMENT>,
+    /// Of a moment's numbers and what each axis showed.
+    shown: Coefficients,
+    /// Of squares of what was shown.
+    squares: f64,
+    /// Of the weights.
+    pub(crate) weight: f64,
+}
+
+/// Coefficients of a moment at the middle age, and of 1.
+pub(crate) type Free = SMatrix<f64, 13, 3>;
+
+/// Where a number of a moment at the middle age is among all.
+const fn place(number: usize) -> usize {
+    if number < ROW { ROW + number } else { MOMENT - 1 }
+}
+
+/// The same as coefficients of moments at all ages.
+pub(crate) fn at_middle_age(free: &Free) -> Coefficients {
+    let mut all = Coefficients::zeros();
+    for number in 0..=ROW {
+        all.row_mut(place(number)).copy_from(&free.row(number));
+    }
+    all
+}
+
+/// The result of least squares.
+#[derive(Clone, Debug)]
+pub(crate) struct Fit {
+    pub(crate) model: CellModel,
+    /// Squares of residuals in units of the noise, and of what the data sheet does not expect.
+    pub(crate) cost: f64,
+}
+
+impl Default for Sums {
+    fn default() -> Self {
+        Self { moments: SMatrix::zeros(), shown: Coefficients::zeros(), squares: 0.0, weight: 0.0 }
+    }
+}
+
+impl Sums {
+    /// Adds a reading.
+    pub(crate) fn add(&mut self, moment: &Moment, shown: &[f64; 3], weight: f64) {
+        // Columns of static matrices are consecutive numbers: both loops become vector instructions.
+        for (column, number) in self.moments.as_mut_slice().chunks_exact_mut(MOMENT).zip(moment) {
+            let scale = weight * number;
+            column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += scale * number);
+        }
+        for (column, value) in self.shown.as_mut_slice().chunks_exact_mut(MOMENT).zip(shown) {
+            let scale = weight * value;
+            column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += scale * number);
+            self.squares += scale * value;
+        }
+        self.weight += weight;
+    }
+
+    /// The sum of squares of what is shown less what a model makes of it.
+    pub(crate) fn residual(&self, coefficients: &Coefficients) -> f64 {
+        let mut sum = self.squares;
+        for (mine, shown) in coefficients.column_iter().zip(self.shown.column_iter()) {
+            sum += mine.dot(&(self.moments * mine)) - 2.0 * mine.dot(&shown);
+        }
+        sum.max(0.0)
+    }
+
+    /// What the readings say of the unknowns, per variance of the noise: information, and the gradient of half of the
+    /// residual.
+    pub(crate) fn information(&self, model: &CellModel) -> (Information, Unknowns) {
+        let derivatives = model.derivatives();
+        let coefficients = model.coefficients();
+        let mut information = Information::zeros();
+        let mut gradient = Unknowns::zeros();
+        for axis in 0..3 {
+            let left = self.moments * coefficients.column(axis) - self.shown.column(axis);
+            for (one, derivative) in derivatives.iter().enumerate() {
+                let mine = derivative.column(axis);
+                gradient[one] += mine.dot(&left);
+                let product = self.moments * mine;
+                for (other, derivative) in derivatives.iter().enumerate().skip(one) {
+                    information[(one, other)] += product.dot(&derivative.column(axis));
+                }
+            }
+        }
+        information.fill_lower_triangle_with_upper_triangle();
+        (information, gradient)
+    }
+
+    /// The most likely model, by the method of Levenberg and Marquardt.
+    pub(crate) fn fit(&self, start: CellModel, expected: &Unknowns, variance: f64) -> Fit {
+        let cost = |model: &CellModel| {
+            let unexpected = model.unexpected();
+            self.residual(&model.coefficients()) / variance
+                + unexpected.component_mul(expected).dot(&unexpected)
+        };
+        let mut best = Fit { cost: cost(&start), model: start };
+        let mut damping = 1e-3;
+        for _ in 0..STEPS {
+            let (mut information, mut gradient) = self.information(&best.model);
+            information /= variance;
+            gradient /= variance;
+            gradient += expected.component_mul(&best.model.unexpected());
+            for unknown in 0..UNKNOWNS {
+                information[(unknown, unknown)] += expected[unknown];
+                information[(unknown, unknown)] *= 1.0 + damping;
+            }
+            let Some(step) = Cholesky::new(information).map(|it| -it.solve(&gradient)) else { break };
+            let model = best.model.moved(&step);
+            let now = cost(&model);
+            if now < best.cost {
+                let gained = best.cost - now;
+                best = Fit { model, cost: now };
+                damping = (damping * 0.2).max(1e-12);
+                if gained < 1e-7 * (1.0 + best.cost) {
+                    break;
+                }
+            } else {
+                damping *= 8.0;
+                if damping > 1e8 {
+                    break;
+                }
+            }
+        }
+        best
+    }
+
+    /// Where least squares may begin: what readings say when nothing is known of how their coefficients depend on each
+    /// other, at the middle age. `ridge` holds back those of which they say nothing.
+    pub(crate) fn unconstrained(&self, ridge: f64) -> Option<Free> {
+        let mut moments =
+            SMatrix::<f64, 13, 13>::from_fn(|row, column| self.moments[(place(row), place(column))]);
+        let shown = SMatrix::<f64, 13, 3>::from_fn(|row, axis| self.shown[(place(row), axis)]);
+        for number in 0..13 {
+            moments[(number, number)] += ridge;
+        }
+        Cholesky::new(moments).map(|it| it.solve(&shown))
+    }
+}
