@@ -236,20 +236,7 @@ fn bus_name<'a>(skin: &'a Description, cell: &Cell) -> &'a str {
 fn cells(skin: &Description, node: Option<u8>) -> String {
     let line = |cell: &Cell| {
         let on_bus = bus_name(skin, cell);
-        let Cell {
-            bus: _,
-            node,
-            serial,
-            joint,
-            row,
-            position,
-            normal,
-            orientation: _,
-            neighbors,
-            root,
-            contact: _,
-            baseline: _,
-        } = cell;
+        let Cell { node, serial, joint, row, position, normal, neighbors, root, .. } = cell;
         let (position, ports) = (words(position), words(neighbors.map(|port| or(port, "-"))));
         // What comes of a quaternion has more digits than anybody measured.
         let normal = words(normal.map(|part| (part * 1e4).round() / 1e4 + 0.0));
