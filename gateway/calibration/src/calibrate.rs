@@ -1,6 +1,7 @@
 //! All cells of a skin: each by itself, then with its neighbours, then which of them to distrust.
 
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 
 use crate::each::each;
@@ -13,6 +14,7 @@ use crate::plan::Bounds;
 use crate::result::{Calibration, CellResult, Pose, Summary, Trouble};
 use crate::sensor::{DataSheet, rotation};
 use crate::table::Table;
+use crate::zero::zero_offsets;
 
 /// What is known before a calibration.
 #[derive(Clone, Debug, PartialEq)]
@@ -23,6 +25,8 @@ pub struct Settings {
     pub gravity: [f64; 3],
     /// How far wired cells are apart, if that is known.
     pub spacing: Option<Spacing>,
+    /// Whether zero offsets of the robot's joints are estimated too.
+    pub zero_offsets: bool,
     /// How many threads compute.
     pub threads: usize,
     /// How the robot may move: for advice only.
@@ -37,6 +41,7 @@ impl Settings {
             sheet: DataSheet::default(),
             gravity: [0.0, 0.0, -G],
             spacing: None,
+            zero_offsets: false,
             threads: 1,
             bounds: Bounds::of(skin),
         }
@@ -62,7 +67,7 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Calib
     let buses: Vec<_> = (0..skin.buses.len()).collect();
     let tables: Vec<_> = each(buses.len(), settings.threads, |bus| {
         let is_used = skin.cells_of(bus).next().is_some();
-        is_used.then(|| Table::new(skin, bus, seen, &settings.sheet, settings.gravity))
+        is_used.then(|| Table::new(skin, bus, seen, &settings.sheet, settings.gravity, &[0.0; MAX_JOINTS]))
     });
     let estimates = each(skin.cells.len(), settings.threads, |index| {
         let cell = skin.cells.get(index)?;
@@ -97,7 +102,8 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Calib
         result.settle(skin, cell, tables.get(cell.bus).and_then(Option::as_ref).map(|table| &table.arm));
     }
     let summary = Summary::of(&cells, wires);
-    Calibration { summary, cells }
+    let zero_offsets = settings.zero_offsets.then(|| zero_offsets(skin, seen, settings, &tables, &estimates));
+    Calibration { summary, cells, zero_offsets }
 }
 
 /// Whether all readings are one value.

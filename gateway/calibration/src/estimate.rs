@@ -24,6 +24,8 @@ const TOLERATED: f64 = 3.5;
 const BATCH: u32 = 32;
 /// The median of the squared length of three standard normal numbers.
 const MEDIAN_SQUARE: f64 = 2.366;
+/// What that is below, nine of ten times.
+const MOST_SQUARE: f64 = 6.251;
 
 /// What the readings of a cell say of it.
 #[derive(Clone, Debug)]
@@ -37,7 +39,7 @@ pub(crate) struct Estimate {
     pub(crate) covariance: Information,
     /// Root mean square of the residuals of an axis, in g, from their median.
     pub(crate) noise_g: f64,
-    /// The same, of all residuals alike.
+    /// The same, from what nine of ten residuals are below.
     pub(crate) rough_g: f64,
 }
 
@@ -97,9 +99,9 @@ pub(crate) fn estimate(
         fit = Some(next);
     }
     let model = fit?.model;
-    let (median, mean) = spreads(link, readings, &model.coefficients());
+    let (median, most) = spreads(link, readings, &model.coefficients());
     let covariance = covariance(link, readings, &model, &sums, &expected, spread)?;
-    Some(Estimate { joint, margin, model, covariance, noise_g: median.sqrt(), rough_g: mean.sqrt() })
+    Some(Estimate { joint, margin, model, covariance, noise_g: median.sqrt(), rough_g: most.sqrt() })
 }
 
 /// The joint whose motion explains the readings best.
@@ -174,7 +176,7 @@ fn first(free: &Free) -> Option<CellModel> {
 }
 
 /// Readings at whose time the motion is known.
-fn paired<'a>(
+pub(crate) fn paired<'a>(
     link: &'a [Option<Moment>],
     readings: &'a [Reading],
 ) -> impl Iterator<Item = (&'a Moment, &'a Reading)> {
@@ -185,7 +187,7 @@ fn paired<'a>(
 }
 
 /// What a reading shows more than a model makes of its moment.
-fn residual(coefficients: &Coefficients, moment: &Moment, shown: &[f64; 3]) -> [f64; 3] {
+pub(crate) fn residual(coefficients: &Coefficients, moment: &Moment, shown: &[f64; 3]) -> [f64; 3] {
     let mut left = *shown;
     for (left, column) in left.iter_mut().zip(coefficients.column_iter()) {
         *left -= column.iter().zip(moment).map(|(one, other)| one * other).sum::<f64>();
@@ -203,18 +205,21 @@ fn weight(residual: &[f64; 3], variance: f64) -> f64 {
     if off <= TOLERATED { 1.0 } else { TOLERATED / off }
 }
 
-/// The variance of an axis' residuals, from their median and from their mean.
+/// The variance of an axis' residuals, from the median of their squares and from what nine of ten are below: single
+/// readings that came late, or not as they were sent, spoil neither.
 fn spreads(link: &[Option<Moment>], readings: &[Reading], coefficients: &Coefficients) -> (f64, f64) {
     let squares =
         paired(link, readings).map(|(moment, reading)| square(&residual(coefficients, moment, &reading.g)));
     let mut squares: Vec<_> = squares.collect();
-    let mean = squares.iter().sum::<f64>() / (3.0 * count(squares.len()).max(1.0));
-    let middle = squares.len() / 2;
-    if middle == 0 {
-        return (mean, mean);
+    if squares.is_empty() {
+        return (0.0, 0.0);
     }
-    let (_, median, _) = squares.select_nth_unstable_by(middle, f64::total_cmp);
-    (*median / MEDIAN_SQUARE, mean)
+    let mut below = |part: usize, of: usize| {
+        let place = squares.len() * part / of;
+        let (_, square, _) = squares.select_nth_unstable_by(place, f64::total_cmp);
+        *square
+    };
+    (below(1, 2) / MEDIAN_SQUARE, below(9, 10) / MOST_SQUARE)
 }
 
 /// The covariance of the unknowns. Errors of readings that are close in time depend on each other: clocks drift, and

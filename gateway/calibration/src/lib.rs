@@ -11,6 +11,7 @@
 //! | [`sensor`], [`simulate`] | an accelerometer with the errors of its data sheet; a skin of them in virtual time |
 //! | [`observe`] | what is kept of the messages of a bus |
 //! | [`mod@calibrate`] | the estimate of every cell, and which of them to distrust |
+//! | [`zero`] | zero offsets of the robot's joints |
 //! | [`help`] | which motion would tell what was not told |
 //! | [`neighbors`] | positions made better by the distance of neighbours |
 //! | [`result`], [`write`] | what came out, and a skin file with it |
@@ -34,6 +35,7 @@ mod table;
 #[doc(hidden)]
 pub mod testing;
 pub mod write;
+pub mod zero;
 
 pub use calibrate::{Settings, calibrate};
 pub use kinematics::G;

@@ -61,9 +61,9 @@ pub enum PlanError {
         /// Its upper limit.
         max: f64,
     },
-    /// There is no time for anything.
-    #[error("{got} s are too short for a calibration; allowed are 20 to 3600 s")]
-    Short {
+    /// There is no time for anything, or too much.
+    #[error("a motion of {got} s: 20 to 3600 s are allowed")]
+    Length {
         /// The time in s.
         got: f64,
     },
@@ -120,7 +120,7 @@ impl Bounds {
         if (20.0..=3600.0).contains(&self.length_s) {
             Ok(())
         } else {
-            Err(PlanError::Short { got: self.length_s })
+            Err(PlanError::Length { got: self.length_s })
         }
     }
 }

@@ -7,6 +7,7 @@ use serde::Serialize;
 use crate::calibrate::rounded;
 use crate::help::Help;
 use crate::kinematics::Arm;
+use crate::zero::ZeroOffset;
 
 /// What was found.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -15,6 +16,9 @@ pub struct Calibration {
     pub summary: Summary,
     /// By cell of the skin.
     pub cells: Vec<CellResult>,
+    /// By joint of the robot, if that was asked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub zero_offsets: Option<Vec<ZeroOffset>>,
 }
 
 /// All cells together.
@@ -69,7 +73,7 @@ pub struct SensorResult {
     pub gain: [f64; 3],
     /// How much a reading of an axis scatters, in g, from the median.
     pub noise_g: f64,
-    /// The same from all readings.
+    /// The same from what nine of ten readings are below.
     pub rough_g: f64,
 }
 

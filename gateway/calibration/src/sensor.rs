@@ -7,6 +7,7 @@
 use core::f64::consts::{PI, TAU};
 
 use nalgebra::{Matrix3, Vector3};
+use protocol::document::{Fault, Place};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
@@ -68,6 +69,30 @@ impl DataSheet {
         range_g: 8.0,
         step_g: 0.0,
     };
+
+    /// The same, if its values can be.
+    ///
+    /// # Errors
+    /// The first value that cannot be.
+    pub fn checked(self) -> Result<Self, Fault> {
+        let all = [
+            ("bias_g", self.bias_g, 0.0, 1.0),
+            ("gain", self.gain, 0.0, 0.5),
+            ("cross_axis", self.cross_axis, 0.0, 0.2),
+            ("noise_g", self.noise_g, 0.0, 1.0),
+            ("rate_hz", self.rate_hz, 0.0, 1e5),
+            ("rate_error", self.rate_error, 0.0, 0.5),
+            ("delay_s", self.delay_s, 0.0, 0.1),
+            ("range_g", self.range_g, 1.2, 8.0),
+            ("step_g", self.step_g, 0.0, 0.1),
+        ];
+        for (key, got, min, max) in all {
+            if !(min..=max).contains(&got) {
+                return Err(Place::named(key).fault(got, format_args!("{min} to {max} is allowed")));
+            }
+        }
+        Ok(self)
+    }
 
     /// Mean and standard deviation of the age of a reading, in s.
     #[must_use]

@@ -1,5 +1,6 @@
 //! The motion of each link of a chain at each broadcast, as numbers for least squares.
 
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 
 use crate::cell::{AGE_STEP, AGES, MOMENT, Moment, numbers};
@@ -17,12 +18,14 @@ pub(crate) struct Table {
 }
 
 impl Table {
+    /// `offsets` are added to the positions of joints.
     pub(crate) fn new(
         skin: &Skin,
         bus: usize,
         seen: &Observations,
         sheet: &DataSheet,
         gravity: [f64; 3],
+        offsets: &[f64; MAX_JOINTS],
     ) -> Self {
         let arm = Arm::new(skin, bus, gravity);
         let chain = skin.chain(bus);
@@ -38,10 +41,11 @@ impl Table {
             let mut moments = vec![[1.0; MOMENT]; rows.len()];
             let mut complete = true;
             for (at, age) in [-AGE_STEP, 0.0, AGE_STEP].into_iter().enumerate() {
-                let Some(state) = smoother.state(window, joints, middle + age) else {
+                let Some(mut state) = smoother.state(window, joints, middle + age) else {
                     complete = false;
                     break;
                 };
+                state.position.iter_mut().zip(offsets).for_each(|(position, offset)| *position += offset);
                 let motions = arm.rows(&state);
                 for (moment, &row) in moments.iter_mut().zip(&rows) {
                     let numbers = motions.get(row).map(numbers).unwrap_or_default();

@@ -108,8 +108,11 @@ orientation = [0.0, 0.0, 0.0, 1.0]
         let mut cells: Vec<_> =
             skin.cells.iter().map(|cell| CellResult::unknown(&skin, cell, 9_000)).collect();
         cells[0].found = Some(found);
-        let calibration =
-            |cells: &[CellResult]| Calibration { summary: Default::default(), cells: cells.to_vec() };
+        let calibration = |cells: &[CellResult]| Calibration {
+            summary: Default::default(),
+            cells: cells.to_vec(),
+            zero_offsets: None,
+        };
         let text = calibrated(&skin, SKIN, &calibration(&cells)).unwrap();
         let expected = SKIN
             .replace("[-0.2, 0.0, 0.06]", "[0.01, -0.02, 0.3]")
@@ -124,7 +127,7 @@ orientation = [0.0, 0.0, 0.0, 1.0]
     #[test]
     fn another_text_is_refused() {
         let skin = Skin::parse("skin.toml", SKIN).unwrap();
-        let calibration = Calibration { summary: Default::default(), cells: Vec::new() };
+        let calibration = Calibration { summary: Default::default(), cells: Vec::new(), zero_offsets: None };
         let (one, _) = SKIN.rsplit_once("[[cell]]").unwrap();
         let error = calibrated(&skin, one, &calibration).unwrap_err();
         assert_eq!(

@@ -260,3 +260,27 @@ fn a_joint_that_does_not_move_is_named_as_what_would_help() {
         assert!(!unsure || !result.is_written());
     }
 }
+
+#[test]
+fn zero_offsets_of_joints_are_found_or_called_not_observable() {
+    let skin = testing::panda();
+    let settings = Settings { zero_offsets: true, ..settings(&skin) };
+    let seen = moved(&skin, &settings.bounds, 11, &[]);
+    // The robot that is described has other zeros than the one that moved.
+    let mut described = skin;
+    let offsets = [0.0, 0.01, -0.008, 0.012, -0.01, 0.006, 0.0];
+    for (row, offset) in described.robot.chains[0].rows.iter_mut().zip(offsets) {
+        row.table.theta_offset -= offset;
+    }
+    let mut heard = Observations::new(&described);
+    heard.cells = seen.cells.clone();
+    heard.buses = seen.buses;
+    let calibration = calibrate(&described, &heard, &settings);
+    let found = calibration.zero_offsets.unwrap();
+    println!("zero offsets: {found:?}");
+    assert_eq!((found[0].offset, found[6].offset), (None, None), "about gravity, and with the last cells");
+    for (found, offset) in found.iter().zip(offsets).skip(1).take(5) {
+        let off = found.offset.unwrap() - offset;
+        assert!(off.abs() < 4.0 * found.deviation + 5e-4, "{found:?}, not {offset}");
+    }
+}

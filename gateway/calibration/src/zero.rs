@@ -1,0 +1,160 @@
+//! Zero offsets of the robot's joints: what has to be added to the positions on the bus.
+//!
+//! An offset moves gravity and everything behind the joint. Much of that looks as cells that are mounted differently, so
+//! offsets are estimated together with what is unknown of every cell, of which only what the cells cannot explain is left
+//! (the Schur complement of their information).
+
+#![expect(clippy::indexing_slicing, reason = "matrices with a row for each joint")]
+
+use nalgebra::{Cholesky, DMatrix, DVector, SVector};
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::{JointKind, Skin};
+use serde::Serialize;
+
+use crate::calibrate::{Settings, rounded};
+use crate::cell::{Information, MOMENT, UNKNOWNS, Unknowns, expected};
+use crate::each::each;
+use crate::estimate::{Estimate, paired, residual};
+use crate::observe::{Observations, Reading};
+use crate::table::Table;
+
+/// Offsets that are supposed beforehand, as a standard deviation in rad or m.
+const SUPPOSED: f64 = 0.1;
+/// An offset that is not certain within this, 68 of 100 times, is not observable: 1 degree, or 2 cm.
+const OBSERVED: f64 = 0.0175;
+/// The step of differences.
+const STEP: f64 = 1e-5;
+/// One of so many readings is looked at.
+const STRIDE: usize = 4;
+/// Errors of readings that are close in time depend on each other: each counts as so much of one.
+const SHARE: f64 = 0.5;
+
+/// What was found of a joint.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct ZeroOffset {
+    /// Its name.
+    pub joint: String,
+    /// `rad` or `m`.
+    pub unit: &'static str,
+    /// What has to be added to its positions; `None` if nothing tells.
+    pub offset: Option<f64>,
+    /// The standard deviation of that.
+    pub deviation: f64,
+}
+
+impl core::fmt::Display for ZeroOffset {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let Self { joint, unit, offset, deviation } = self;
+        match offset {
+            Some(offset) => write!(f, "{joint}: zero offset {offset} {unit}, standard deviation {deviation}"),
+            None => write!(
+                f,
+                "{joint}: its zero offset is not observable: cells mounted differently would show the same"
+            ),
+        }
+    }
+}
+
+/// What of a cell's readings depends on offsets, when the cell has explained what it can.
+struct Left {
+    information: DMatrix<f64>,
+    gradient: DVector<f64>,
+}
+
+/// The offsets of all joints of the robot, by one step of least squares from where cells were estimated without any.
+pub(crate) fn zero_offsets(
+    skin: &Skin,
+    seen: &Observations,
+    settings: &Settings,
+    tables: &[Option<Table>],
+    estimates: &[Option<Estimate>],
+) -> Vec<ZeroOffset> {
+    let size = skin.robot.joints.len();
+    let mut information = DMatrix::<f64>::identity(size, size) / (SUPPOSED * SUPPOSED);
+    let mut gradient = DVector::<f64>::zeros(size);
+    for (bus, table) in tables.iter().enumerate() {
+        let Some(table) = table else { continue };
+        let joints = &skin.chain(bus).joints;
+        let moved: Vec<_> = each(joints.len(), settings.threads, |joint| {
+            let mut offsets = [0.0; MAX_JOINTS];
+            if let Some(offset) = offsets.get_mut(joint) {
+                *offset = STEP;
+            }
+            Table::new(skin, bus, seen, &settings.sheet, settings.gravity, &offsets)
+        });
+        let left = each(skin.cells.len(), settings.threads, |index| {
+            let (cell, estimate) = (skin.cells.get(index)?, estimates.get(index)?.as_ref()?);
+            let readings = seen.cells.get(index)?;
+            (cell.bus == bus && estimate.joint > 0)
+                .then(|| left(table, &moved, estimate, readings, settings))?
+        });
+        for left in left.into_iter().flatten() {
+            for (row, &to) in joints.iter().enumerate() {
+                gradient[to] += left.gradient[row];
+                for (column, &beside) in joints.iter().enumerate() {
+                    information[(to, beside)] += left.information[(row, column)];
+                }
+            }
+        }
+    }
+    let Some(solved) = Cholesky::new(information) else { return Vec::new() };
+    let (offsets, covariance) = (solved.solve(&gradient), solved.inverse());
+    let joints = skin.robot.joints.iter().enumerate();
+    let of_joint = joints.map(|(index, joint)| {
+        let deviation = covariance[(index, index)].max(0.0).sqrt();
+        ZeroOffset {
+            joint: joint.name.clone(),
+            unit: if joint.kind == JointKind::Revolute { "rad" } else { "m" },
+            offset: (deviation < OBSERVED).then(|| rounded(offsets[index], 5)),
+            deviation: rounded(deviation, 5),
+        }
+    });
+    of_joint.collect()
+}
+
+/// What the readings of a cell say of offsets.
+fn left(
+    table: &Table,
+    moved: &[Table],
+    estimate: &Estimate,
+    readings: &[Reading],
+    settings: &Settings,
+) -> Option<Left> {
+    let few: Vec<_> = readings.iter().step_by(STRIDE).copied().collect();
+    let model = &estimate.model;
+    let (coefficients, derivatives) = (model.coefficients(), model.derivatives());
+    let size = moved.len();
+    let mut own = Information::from_diagonal(&expected(&settings.sheet));
+    let mut shared = DMatrix::<f64>::zeros(UNKNOWNS, size);
+    let mut information = DMatrix::<f64>::zeros(size, size);
+    let (mut of_own, mut gradient) = (Unknowns::zeros(), DVector::<f64>::zeros(size));
+    let weight = SHARE * f64::from(u8::try_from(STRIDE).unwrap_or(1)) / estimate.noise_g.powi(2).max(1e-10);
+    let links: Vec<_> = moved.iter().map(|table| table.link(estimate.joint)).collect();
+    for (moment, reading) in paired(table.link(estimate.joint), &few) {
+        let at = usize::try_from(reading.epoch).ok()?;
+        let off = residual(&coefficients, moment, &reading.g);
+        let mut changes = Vec::with_capacity(size);
+        for link in &links {
+            let Some(Some(other)) = link.get(at) else { return None };
+            let numbers = other.iter().zip(moment).map(|(other, one)| (other - one) / STEP);
+            changes.push(coefficients.tr_mul(&SVector::<f64, MOMENT>::from_iterator(numbers)));
+        }
+        let now = SVector::<f64, MOMENT>::from(*moment);
+        for (axis, off) in off.into_iter().enumerate() {
+            let mine = Unknowns::from_fn(|unknown, _| {
+                derivatives.get(unknown).map_or(0.0, |derivative| derivative.column(axis).dot(&now))
+            });
+            own.ger(weight, &mine, &mine, 1.0);
+            of_own += mine * (weight * off);
+            let theirs = DVector::from_iterator(size, changes.iter().map(|change| change[axis]));
+            shared.ger(weight, &mine, &theirs, 1.0);
+            information.ger(weight, &theirs, &theirs, 1.0);
+            gradient += theirs * (weight * off);
+        }
+    }
+    let solved = Cholesky::new(own)?;
+    let own = solved.inverse();
+    information -= shared.transpose() * own * &shared;
+    gradient -= shared.transpose() * (own * of_own);
+    Some(Left { information, gradient })
+}
