@@ -9,6 +9,7 @@
 mod ack;
 mod arguments;
 mod buses;
+mod calibrate;
 mod cells;
 mod columns;
 mod commission;
@@ -65,6 +66,7 @@ enum Command {
     Report(report::Report),
     Frame(frame::Frame),
     Commission(commission::Commission),
+    Calibrate(calibrate::Calibrate),
     Conformance(conformance::Conformance),
     Cells(cells::Cells),
     Ack(ack::Ack),
@@ -92,6 +94,7 @@ impl Command {
             Self::Report(command) => command.run(),
             Self::Frame(command) => command.run(),
             Self::Commission(command) => command.run(),
+            Self::Calibrate(command) => command.run(),
             Self::Conformance(command) => command.run(),
             Self::Cells(command) => command.run(),
             Self::Ack(command) => command.run(),

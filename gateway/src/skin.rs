@@ -20,6 +20,7 @@ use protocol::usage::{Failure, print, shown};
 use super::arguments::{FORMATS, Word, bus_names, one_of};
 use super::output::Force;
 use super::print::{count, list, or, words};
+pub(crate) use show::drawing;
 
 const ROBOTS: &[Word<Robot>] = &[("ur5", "Universal Robots UR5", Robot::Ur5)];
 const REPLIES: &[Word<Answers>] =

@@ -56,8 +56,8 @@ const FEWEST: usize = 200;
 const ROUGH: f64 = 1.5;
 /// The logarithm of a likelihood ratio above which one joint is better than the next.
 const SURE: f64 = 10.0;
-/// Poses that are less certain than this are not told: in m, and in rad.
-const TOLD: [f64; 2] = [0.02, 0.09];
+/// Poses that are less certain than this are not determined: in m, and in rad.
+const ENOUGH: [f64; 2] = [0.02, 0.09];
 /// Another described pose is nearer if it is this many times nearer.
 const NEARER: f64 = 2.0;
 
@@ -160,8 +160,8 @@ fn result(
 
 /// Names cells whose readings scatter much more than those of most.
 fn rough(cells: &mut [CellResult]) {
-    let told = cells.iter().filter(|cell| cell.pose.is_some());
-    let mut all: Vec<_> = told.map(|cell| cell.sensor.rough_g).collect();
+    let determined = cells.iter().filter(|cell| cell.pose.is_some());
+    let mut all: Vec<_> = determined.map(|cell| cell.sensor.rough_g).collect();
     all.sort_by(f64::total_cmp);
     let Some(&most) = all.get(all.len() / 2) else { return };
     for cell in cells.iter_mut().filter(|cell| cell.pose.is_some()) {
@@ -179,8 +179,9 @@ fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) ->
     for bus in 0..skin.buses.len() {
         for joint in 1..=u8::try_from(skin.chain(bus).joints.len()).unwrap_or_default() {
             let on_link = |(_, (cell, result)): &(usize, (&Cell, &CellResult))| {
-                let told = result.pose.as_ref().is_some_and(|pose| pose.joint == joint && pose.is_told());
-                cell.bus == bus && told && result.troubles.is_empty()
+                let determined =
+                    result.pose.as_ref().is_some_and(|pose| pose.joint == joint && pose.is_determined());
+                cell.bus == bus && determined && result.troubles.is_empty()
             };
             let members: Vec<_> =
                 skin.cells.iter().zip(&*cells).enumerate().filter(on_link).map(|(index, _)| index).collect();
@@ -227,7 +228,7 @@ fn confused(skin: &Skin, cells: &mut [CellResult]) {
 
 /// The other cell of the same bus in whose described place a cell was found.
 fn place_of(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize> {
-    let pose = result.pose.as_ref().filter(|pose| pose.is_told())?;
+    let pose = result.pose.as_ref().filter(|pose| pose.is_determined())?;
     // Half a turn counts as much as a metre: an offset by a cell's width is worth 5 degrees.
     let far = |described: &Cell| {
         if described.joint != pose.joint {
@@ -248,12 +249,12 @@ fn place_of(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize> {
     (nearest * NEARER < own && nearest * NEARER < next + 2e-3 && own > certain).then_some(index)
 }
 
-/// Says what would help where a pose is not told.
+/// Says what would help where a pose is not determined.
 fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult], settings: &Settings) {
     let mut known: Vec<((usize, u8), Help)> = Vec::new();
     for ((cell, estimate), result) in skin.cells.iter().zip(estimates).zip(cells) {
         let (Some(estimate), Some(pose)) = (estimate, &result.pose) else { continue };
-        if pose.is_told() {
+        if pose.is_determined() {
             continue;
         }
         let key = (cell.bus, pose.joint);
@@ -264,7 +265,7 @@ fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult],
             help
         });
         let [position_mm, orientation_deg] = [pose.position_95() * 1e3, pose.turn_95().to_degrees()];
-        result.troubles.push(Trouble::NotTold {
+        result.troubles.push(Trouble::NotObservable {
             position_mm: rounded(position_mm, 1),
             orientation_deg: rounded(orientation_deg, 1),
             help,
@@ -275,8 +276,8 @@ fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult],
 impl Pose {
     /// Whether it is certain enough to be used.
     #[must_use]
-    pub fn is_told(&self) -> bool {
-        let [position, turn] = TOLD;
+    pub fn is_determined(&self) -> bool {
+        let [position, turn] = ENOUGH;
         self.position_95() < position && self.turn_95() < turn
     }
 

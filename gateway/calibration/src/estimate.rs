@@ -16,11 +16,11 @@ use crate::table::Table;
 const FIRST_LOOK: usize = 1_500;
 /// Joints that are looked at in full.
 const SHORTLIST: usize = 3;
-/// Times that weights are computed anew.
+/// Times that weights are computed again.
 const ROUNDS: usize = 2;
 /// Residuals beyond this many standard deviations of a reading count less: [`weight`].
 const TOLERATED: f64 = 3.5;
-/// Broadcasts whose errors may depend on each other, half a second.
+/// Broadcasts whose errors may depend on each other, about 0.5 s.
 const BATCH: u32 = 32;
 /// The median of the squared length of three standard normal numbers.
 const MEDIAN_SQUARE: f64 = 2.366;
@@ -157,11 +157,11 @@ fn first(free: &Free) -> Option<CellModel> {
     let (left, right) = (parts.u?, parts.v_t?);
     let mut turned = left * right;
     if turned.determinant() < 0.0 {
-        // The direction of which least is known is turned round.
-        let least = parts.singular_values.imin();
+        // The direction that readings say the smallest part of is reversed.
+        let weakest = parts.singular_values.imin();
         let flipped =
             Matrix3::from_fn(
-                |row, column| if column == least { -left[(row, column)] } else { left[(row, column)] },
+                |row, column| if column == weakest { -left[(row, column)] } else { left[(row, column)] },
             );
         turned = flipped * right;
     }

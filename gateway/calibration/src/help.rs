@@ -11,7 +11,7 @@ use crate::kinematics::Arm;
 use crate::motion::Step;
 use crate::plan::{AIM, SWING_S, Supposed, Swings, informed, poses};
 
-/// What would help where a pose is not told.
+/// What would help where a pose is not determined.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "help", rename_all = "kebab-case")]
 pub enum Help {
@@ -39,7 +39,7 @@ impl core::fmt::Display for Help {
 /// What is uncertain has to fall to this part for a motion to be called a help.
 const HELP: f64 = 0.7;
 
-/// The motion that would tell most of a cell, beside what was told.
+/// The motion that would tell most of a cell, beside what is known.
 pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &Settings) -> Help {
     let swings = Swings::new(skin, &settings.bounds);
     let arms = [(bus, Arm::new(skin, bus, settings.gravity))];
@@ -51,9 +51,9 @@ pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &S
     for pose in poses(skin, &settings.bounds, &swings).iter().step_by(3) {
         let steps = core::iter::once(Step::Hold { at: pose.clone() }).chain(swings.about(pose));
         for step in steps {
-            let told = informed(skin, &arms, &supposed, &step, SWING_S, &settings.sheet);
+            let informed = informed(skin, &arms, &supposed, &step, SWING_S, &settings.sheet);
             // As much of it as fits into a plan.
-            let more = told.first().copied().unwrap_or_else(Information::zeros)
+            let more = informed.first().copied().unwrap_or_else(Information::zeros)
                 * (settings.bounds.length_s / SWING_S);
             let left = uncertain(&(known + more)) / before;
             if left >= best.0 {

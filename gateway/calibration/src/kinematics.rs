@@ -70,7 +70,7 @@ impl Arm {
         let (mut spin, mut turn, mut linear) = (Vector3::zeros(), Vector3::zeros(), Vector3::zeros());
         let mut joints = state.speed.iter().zip(&state.acceleration);
         let kinds = core::iter::once(RowKind::Fixed).chain(self.kinds.iter().copied());
-        for ((index, kind), felt) in kinds.enumerate().zip(&mut rows) {
+        for ((index, kind), motion) in kinds.enumerate().zip(&mut rows) {
             let (Some(below), Some(frame)) = (frames.row(index.saturating_sub(1)), frames.row(index)) else {
                 break;
             };
@@ -91,8 +91,8 @@ impl Arm {
             let local = |vector: Vector3<f64>| rotation.tr_mul(&vector);
             let (spin, turn) = (local(spin), local(turn));
             let cross = spin.cross_matrix();
-            felt.force = local(linear - self.gravity) / G;
-            felt.gradient = (turn.cross_matrix() + cross * cross) / G;
+            motion.force = local(linear - self.gravity) / G;
+            motion.gradient = (turn.cross_matrix() + cross * cross) / G;
         }
         rows
     }
@@ -144,13 +144,13 @@ mod tests {
             let (t, step) = (0.37, 1e-4);
             let position = Vector3::new(0.03, -0.05, 0.11);
             let rows = arm.rows(&state(t, joints));
-            for (row, felt) in rows.iter().enumerate().take(skin.chain(0).rows.len() + 1) {
+            for (row, motion) in rows.iter().enumerate().take(skin.chain(0).rows.len() + 1) {
                 let at = |t: f64| arm.place(row, &position, &state(t, joints).position);
                 let acceleration = (at(t + step) - 2.0 * at(t) + at(t - step)) / (step * step);
                 let frames = arm.central.frames_at(&state(t, joints).position);
                 let rotation = frames.row(row).unwrap().rotation.matrix().to_owned();
                 let expected = rotation.transpose() * (acceleration + Vector3::new(0.0, 0.0, G)) / G;
-                let off = (felt.at(&position) - expected).norm();
+                let off = (motion.at(&position) - expected).norm();
                 assert!(off < 1e-5, "{} row {row}: {off}", skin.name);
             }
         }

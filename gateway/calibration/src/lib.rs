@@ -12,7 +12,7 @@
 //! | [`observe`] | what is kept of the messages of a bus |
 //! | [`mod@calibrate`] | the estimate of every cell, and which of them to distrust |
 //! | [`zero`] | zero offsets of the robot's joints |
-//! | [`help`] | which motion would tell what was not told |
+//! | [`help`] | which motion would tell what was not determined |
 //! | [`neighbors`] | positions made better by the distance of neighbours |
 //! | [`result`], [`write`] | what came out, and a skin file with it |
 

@@ -29,7 +29,7 @@ pub(crate) struct Known {
 
 /// Wires whose ends are this many standard deviations off say nothing: cables, and cells that were taken for others.
 const OFF: f64 = 4.0;
-/// Times that the positions are computed anew.
+/// Times that the positions are computed again.
 const ROUNDS: usize = 3;
 
 /// Improves the positions of cells on one link; wires are pairs of indices. Returns how many wires were used.

@@ -79,7 +79,7 @@ pub(crate) const SWING_S: f64 = 3.2;
 const MOVE_S: f64 = 1.6;
 /// How often a joint swings in a second.
 const RATE_HZ: f64 = 1.1;
-/// Joints that swing together have other rates, so that they can be told apart.
+/// Joints that swing together have other rates, so that they can be separated.
 const RATES_HZ: [f64; 7] = [0.8, 1.3, 1.0, 1.5, 0.9, 1.2, 1.4];
 /// From one looked-at moment to the next, in s.
 const LOOK_S: f64 = 1.0 / 15.0;

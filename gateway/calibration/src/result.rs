@@ -27,7 +27,7 @@ pub struct Summary {
     /// Cells of the skin.
     pub cells: usize,
     /// Of these, with a pose that can be used.
-    pub told: usize,
+    pub determined: usize,
     /// Of these, to be distrusted.
     pub troubled: usize,
     /// Median of what positions are certain within, 95 of 100 times, in mm.
@@ -149,7 +149,7 @@ pub enum Trouble {
         node: u8,
     },
     /// The motion did not tell its pose.
-    NotTold {
+    NotObservable {
         /// Within how much the position is certain, in mm.
         position_mm: f64,
         /// The same of the orientation, in degrees.
@@ -184,9 +184,9 @@ impl core::fmt::Display for Trouble {
                 write!(f, "swapped with node {node}: each sits where the skin has the other")
             }
             Self::Elsewhere { node } => write!(f, "it sits where the skin has node {node}"),
-            Self::NotTold { position_mm, orientation_deg, help } => write!(
+            Self::NotObservable { position_mm, orientation_deg, help } => write!(
                 f,
-                "not told: certain within {position_mm} mm and {orientation_deg} degrees; {help}; its description is kept"
+                "not observable: certain within {position_mm} mm and {orientation_deg} degrees; {help}; its description is kept"
             ),
         }
     }
@@ -216,7 +216,7 @@ impl CellResult {
                     | Trouble::Stuck
                     | Trouble::Still
                     | Trouble::Joint { .. }
-                    | Trouble::NotTold { .. }
+                    | Trouble::NotObservable { .. }
             )
         };
         self.found.is_some() && !self.troubles.iter().any(kept)
@@ -289,7 +289,7 @@ impl Summary {
         };
         Self {
             cells: cells.len(),
-            told: cells.iter().filter(|cell| cell.is_written()).count(),
+            determined: cells.iter().filter(|cell| cell.is_written()).count(),
             troubled: cells.iter().filter(|cell| !cell.troubles.is_empty()).count(),
             position_mm: median(&|cell| Some(cell.found?.position_mm)),
             orientation_deg: median(&|cell| Some(cell.found?.orientation_deg)),

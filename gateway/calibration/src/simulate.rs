@@ -67,8 +67,8 @@ impl Accelerometers {
             let state = moment.of_chain(&skin.chain(cell.bus).joints);
             let rows = self.arms.get(cell.bus).and_then(Option::as_ref).map(|arm| arm.rows(&state));
             let row = rows.and_then(|rows| rows.get(usize::from(cell.row)).copied()).unwrap_or_default();
-            let felt = row.at(&cell.position.into());
-            let local = rotation(cell.orientation, cell.normal).inverse() * felt;
+            let force = row.at(&cell.position.into());
+            let local = rotation(cell.orientation, cell.normal).inverse() * force;
             sensor.reading(now, &tilt(index, &local))
         })
     }

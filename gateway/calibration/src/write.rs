@@ -15,7 +15,7 @@ pub enum WriteError {
 }
 
 /// The text of a skin with the poses that were found, and everything else as it was: comments, order, omitted keys. Cells
-/// whose pose was not told keep theirs.
+/// whose pose was not determined keep theirs.
 ///
 /// # Errors
 /// When the text is not the skin's.

@@ -56,7 +56,7 @@ impl core::fmt::Display for ZeroOffset {
 }
 
 /// What of a cell's readings depends on offsets, when the cell has explained what it can.
-struct Left {
+struct Remainder {
     information: DMatrix<f64>,
     gradient: DVector<f64>,
 }
@@ -119,7 +119,7 @@ fn left(
     estimate: &Estimate,
     readings: &[Reading],
     settings: &Settings,
-) -> Option<Left> {
+) -> Option<Remainder> {
     let few: Vec<_> = readings.iter().step_by(STRIDE).copied().collect();
     let model = &estimate.model;
     let (coefficients, derivatives) = (model.coefficients(), model.derivatives());
@@ -156,5 +156,5 @@ fn left(
     let own = solved.inverse();
     information -= shared.transpose() * own * &shared;
     gradient -= shared.transpose() * (own * of_own);
-    Some(Left { information, gradient })
+    Some(Remainder { information, gradient })
 }

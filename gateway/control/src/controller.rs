@@ -204,6 +204,30 @@ impl Controller for Sine {
     }
 }
 
+/// Follows positions that are known for all times.
+#[derive(Clone, Copy, Debug)]
+pub struct Planned<F> {
+    at: F,
+    pace: Pace,
+}
+
+impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
+    /// Follows `at`: positions in rad or m, so many seconds after the run's start. It must not block, allocate, lock or
+    /// log.
+    #[must_use]
+    pub fn new(skin: &Skin, at: F) -> Self {
+        Self { at, pace: Pace::of(skin) }
+    }
+}
+
+impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS] + Send> Controller for Planned<F> {
+    /// Aims at the position for the begin of the next tick, as [`Sine`] does.
+    fn step(&mut self, input: &Input) -> Step {
+        let next = (self.at)(seconds(input.time) + self.pace.tick);
+        Step::Move(self.pace.towards(&next, input))
+    }
+}
+
 /// The limits of joint speeds, and the length of a tick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Pace {

@@ -1,6 +1,6 @@
 //! `gateway skin show`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 use cover::drawing::{Drawing, DrawnCell, page};
@@ -47,16 +47,21 @@ impl Show {
         if let Some(path) = &self.output {
             self.force.check("-o", path)?;
         }
-        let mut robot = Robot::alone(&skin);
-        if let Some(surface) = Surface::read(&self.file, &skin, &self.packages) {
-            robot.look(&skin, &surface);
-        }
-        let page = page(&robot.drawing(&skin));
+        let page = page(&drawing(&self.file, &skin, &self.packages));
         match &self.output {
             Some(path) => self.force.write("-o", path, &page),
             None => print(&page),
         }
     }
+}
+
+/// A skin from a file, as it is drawn.
+pub(crate) fn drawing(file: &Path, skin: &Skin, packages: &Packages) -> Drawing {
+    let mut robot = Robot::alone(skin);
+    if let Some(surface) = Surface::read(file, skin, packages) {
+        robot.look(skin, &surface);
+    }
+    robot.drawing(skin)
 }
 
 /// A robot as it stands.

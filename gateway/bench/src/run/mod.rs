@@ -36,6 +36,8 @@ mod watch;
 
 use std::path::PathBuf;
 
+use calibration::motion::Motion;
+use calibration::simulate::Accelerometers;
 use protocol::bus::Kinds;
 use protocol::skin::Skin;
 
@@ -78,6 +80,17 @@ pub struct Options {
     pub record: crate::record::Options,
     /// Whether progress is shown.
     pub quiet: bool,
+    /// What moves the robot in place of the scenario, and what cells then measure, if the run is for a calibration.
+    pub calibration: Option<Calibrating>,
+}
+
+/// A run from which cells are calibrated.
+#[derive(Clone, Debug)]
+pub struct Calibrating {
+    /// What the robot does; the run begins with it.
+    pub motion: Motion,
+    /// The accelerometers of simulated cells; real ones measure.
+    pub sensors: Option<Accelerometers>,
 }
 
 /// Runs a bench to its end, or until SIGINT or SIGTERM. A run that fails has a summary too, with the reason. While the

@@ -22,13 +22,14 @@ use super::network::Network;
 use super::receiver::{BusEvent, Receiver, look_at};
 use super::roots::{ReceiveFilter, Roots};
 use super::served::{ServedBus, Target, open_or_serve, open_or_serve_all};
-use super::{Options, RunError, realtime};
+use super::{Calibrating, Options, RunError, realtime};
 use crate::emulate::{self, Emulation, Emulator};
 use crate::record::feed::{self, Feed, Outlet};
 use crate::record::{Mcap, Outputs, Recorder, backlog, facts};
 use crate::setup::spawn;
 use crate::signals::{SignalError, caught};
 use crate::view::View;
+use control::controller::{Controller, Planned};
 use control::cycle::Cycle;
 use control::cycle::turn::{Line, Shared, Timed};
 use control::motion::controller_of;
@@ -62,7 +63,13 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         say(&format!("frames are recorded in {}", log.display()));
     }
     // From now on an external controller can connect, so that it is ready when the loop begins.
-    let controller = controller_of(skin, &options.scenario.motion)?;
+    let controller: Box<dyn Controller> = match &options.calibration {
+        Some(Calibrating { motion, .. }) => {
+            let motion = motion.clone();
+            Box::new(Planned::new(skin, move |seconds| motion.at(seconds).position))
+        }
+        None => controller_of(skin, &options.scenario.motion)?,
+    };
     let arm = SimulatedArm::new(skin, options.scenario.motion.start);
     let cycle = Some(Cycle::new(skin, controller, Box::new(arm)));
     let idle = realtime::idle_lateness(skin.timing.tick_nanos());

@@ -9,10 +9,12 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::BusKind;
 use protocol::can::Frame;
+use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
 use protocol::message::{From, Message, SensorPage};
 use protocol::skin::Cell;
 
+use super::Calibrating;
 use super::RunError;
 use super::begin::{Announced, SWITCH_AGAIN};
 use super::bench::Bench;
@@ -194,6 +196,7 @@ impl Bench<'_> {
             for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
                 self.stimulate(&stimulus, from)?;
             }
+            self.accelerate(script, epoch, from)?;
             script.epoch = epoch + 1;
         }
         Ok(())
@@ -215,6 +218,23 @@ impl Bench<'_> {
         let message = Message::Stimulus { to: Node::Cell(stimulus.node), from, page };
         // The cells' contact state follows what the bus carried.
         self.bus_links.get(stimulus.bus).map_or(Ok(true), |bus_link| bus_link.send(&message))?;
+        Ok(())
+    }
+
+    /// Sends what the accelerometers of simulated cells measure in an epoch.
+    fn accelerate(&self, script: &Script, epoch: u64, from: From) -> Result<(), RunError> {
+        let Some(Calibrating { motion, sensors: Some(sensors) }) = &self.options.calibration else {
+            return Ok(());
+        };
+        let skin = &self.options.skin;
+        #[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
+        let now = script.touches.time_of(epoch).0 as f64 * 1e-6;
+        let readings = sensors.readings(skin, motion, now, |_, force| *force);
+        for (&Cell { bus, node, .. }, reading) in skin.cells.iter().zip(readings) {
+            let page = SensorPage::Acceleration([reading.x, reading.y, reading.z].map(Q3_12::nearest));
+            let message = Message::Stimulus { to: Node::Cell(node), from, page };
+            self.bus_links.get(bus).map_or(Ok(true), |bus_link| bus_link.send(&message))?;
+        }
         Ok(())
     }
 

@@ -1,0 +1,335 @@
+//! `gateway calibrate`.
+
+mod picture;
+
+use std::path::PathBuf;
+use std::thread;
+
+use bench::record::{self, Mcap};
+use bench::run::{self, Calibrating, Options};
+use bench::summary::Outcome;
+use calibration::motion::Motion;
+use calibration::neighbors::Spacing;
+use calibration::observe::Observations;
+use calibration::plan::{Bounds, plan};
+use calibration::sensor::DataSheet;
+use calibration::simulate::Accelerometers;
+use calibration::write::calibrated;
+use calibration::{Calibration, G, Settings, calibrate};
+use clap::Args;
+use model::decode::{Decoded, Decoder};
+use model::scenario::Scenario;
+use protocol::bus::GATEWAY_RECEIVE_BUFFER;
+use protocol::document;
+use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
+use protocol::parameters::{Events, Sensing};
+use protocol::skin::{ControllerKind, Skin};
+use protocol::time::{Micros, Span};
+use protocol::usage::{Failure, print};
+use trace::capture::{Entry, Reader};
+use trace::recording::series::{Attached, Split};
+
+use super::arguments::{BusKinds, Programs, bus_names, seconds};
+use super::output::{Force, apart, note};
+use super::print::{count, json};
+use super::robot_file::{RobotOfSkin, urdf_of};
+use super::visuals::Packages;
+
+/// Gravity in the frame of a robot that stands upright.
+const UPRIGHT: [f64; 3] = [0.0, 0.0, -G];
+
+/// Find where cells sit, from their accelerometers
+///
+/// Moves the robot through poses and swings within its limits, records what the cells' accelerometers show, and estimates
+/// for every cell which joint moves it, its position, its orientation, and bias and gain of its sensor, each with how far
+/// it is certain. Simulated cells get accelerometers with the errors of a data sheet. With --from a recording is used instead,
+/// also one of a robot that another program moved. Exit code 0: every cell can be trusted; 1: some cannot, or it failed; 2:
+/// wrong use or configuration.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  gateway calibrate skin.toml -o found.toml && gateway commission found.toml
+  gateway calibrate skin.toml --from run.mcap --page found.html
+  gateway calibrate skin.toml --dry-run > motion.json")]
+pub(crate) struct Calibrate {
+    /// The skin's description: robot, buses and cells; poses of cells need not be right
+    skin: PathBuf,
+    /// Write a copy of the description with the poses that were found
+    #[arg(long, short, value_name = "NEW.toml")]
+    output: Option<PathBuf>,
+    /// Use a recording or candump log instead of a run; all parts of a split one
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["record", "no_spawn", "dry_run"])]
+    from: Vec<PathBuf>,
+    /// Keep the recording of the run
+    #[arg(long, value_name = "FILE.mcap")]
+    record: Option<PathBuf>,
+    /// Write what was found as one HTML page in 3D, with a line from each old position to the new one
+    #[arg(long, value_name = "FILE.html")]
+    page: Option<PathBuf>,
+    /// The pose about which the robot moves, a position of each joint in rad or m, with spaces between them; else the
+    /// middle of the limits
+    #[arg(long, value_name = "POSITIONS", allow_hyphen_values = true)]
+    start: Option<String>,
+    /// How far joints go from there, in rad or m: choose it so that the robot hits nothing
+    #[arg(long, value_name = "RAD", default_value_t = 1.0)]
+    within: f64,
+    /// How long the motion may take
+    #[arg(long, value_name = "TIME", default_value = "150s", value_parser = seconds)]
+    duration: f64,
+    /// How far wired cells are apart, in mm: makes positions better
+    #[arg(long, value_name = "MM")]
+    spacing: Option<f64>,
+    /// Also estimate what has to be added to the positions of each joint
+    #[arg(long)]
+    zero_offsets: bool,
+    /// What the data sheet of the accelerometers says, as TOML; docs/how-to/calibrate.md has the keys. Else a BMA250
+    #[arg(long, value_name = "FILE")]
+    data_sheet: Option<PathBuf>,
+    /// Which accelerometers simulated cells have
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    seed: u64,
+    /// Move nothing: print the motion as JSON
+    #[arg(long)]
+    dry_run: bool,
+    /// Start no cells: they are on the bus already, or are real
+    #[arg(long)]
+    no_spawn: bool,
+    #[command(flatten)]
+    kinds: BusKinds,
+    #[command(flatten)]
+    programs: Programs,
+    #[command(flatten)]
+    packages: Packages,
+    /// Show no progress
+    #[arg(long, short)]
+    quiet: bool,
+    /// One JSON object instead of text
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    force: Force,
+}
+
+impl Calibrate {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let text = document::text(&self.skin).map_err(Failure::usage)?;
+        let skin = Skin::parse(&self.skin.display().to_string(), &text).map_err(Failure::usage)?;
+        let settings = self.settings(&skin)?;
+        let written = [
+            ("-o", self.output.as_deref()),
+            ("--record", self.record.as_deref()),
+            ("--page", self.page.as_deref()),
+        ];
+        apart(written, [self.skin.as_path()].into_iter().chain(self.from.iter().map(PathBuf::as_path)))?;
+        for (option, path) in written {
+            path.map_or(Ok(()), |path| self.force.check(option, path))?;
+        }
+        let calibration = if self.from.is_empty() {
+            let motion = plan(&skin, &settings.bounds, &settings.sheet, settings.gravity);
+            let motion = motion.map_err(Failure::usage)?;
+            if self.dry_run {
+                return print(&json(&motion)?);
+            }
+            self.live(&skin, &text, &settings, motion)?
+        } else {
+            read(&self.from, &skin, &settings)?
+        };
+        if let Some(path) = &self.page {
+            let page = picture::page(&self.skin, &skin, &self.packages, &calibration);
+            self.force.write("--page", path, &page)?;
+        }
+        if let Some(path) = &self.output {
+            let new = calibrated(&skin, &text, &calibration).map_err(Failure::usage)?;
+            self.force.write("-o", path, &new)?;
+        }
+        if self.json {
+            print(&json(&calibration)?)?;
+        } else {
+            print(&report(&skin, &calibration))?;
+        }
+        match calibration.summary.troubled {
+            0 => Ok(()),
+            troubled => Err(Failure::run(format!(
+                "{}: {} of {} cannot be trusted: look at the lines above",
+                skin.name,
+                troubled,
+                count(skin.cells.len(), "cell")
+            ))),
+        }
+    }
+
+    fn settings(&self, skin: &Skin) -> Result<Settings, Failure> {
+        let mut bounds = Bounds { within: self.within, length_s: self.duration, ..Bounds::of(skin) };
+        if !(0.05..=6.3).contains(&self.within) {
+            return Err(Failure::usage(format!("--within {}: 0.05 to 6.3 is allowed", self.within)));
+        }
+        if let Some(start) = &self.start {
+            let number = |word: &str| {
+                let number = word.parse::<f64>().ok().filter(|number| number.is_finite());
+                number.ok_or_else(|| {
+                    Failure::usage(format!("--start {word}: it must be a number, in rad or m"))
+                })
+            };
+            bounds.center = start.split_whitespace().map(number).collect::<Result<_, _>>()?;
+        }
+        let sheet = match &self.data_sheet {
+            Some(path) => {
+                let text = document::text(path).map_err(Failure::usage)?;
+                document::parse(&path.display().to_string(), &text, DataSheet::checked)
+                    .map_err(Failure::usage)?
+            }
+            None => DataSheet::default(),
+        };
+        let spacing = self.spacing.map(|mm| {
+            let fits = (1.0..=1_000.0).contains(&mm);
+            let wrong = || Failure::usage(format!("--spacing {mm}: 1 to 1000 mm are allowed"));
+            fits.then(|| Spacing::of(mm * 1e-3)).ok_or_else(wrong)
+        });
+        let threads = thread::available_parallelism().map_or(1, usize::from);
+        let (spacing, zero_offsets) = (spacing.transpose()?, self.zero_offsets);
+        Ok(Settings { sheet, gravity: UPRIGHT, spacing, zero_offsets, threads, bounds })
+    }
+
+    /// Moves the robot, and uses what was recorded.
+    fn live(
+        &self,
+        skin: &Skin,
+        text: &str,
+        settings: &Settings,
+        motion: Motion,
+    ) -> Result<Calibration, Failure> {
+        if matches!(skin.controller.kind, ControllerKind::External { .. }) {
+            return Err(Failure::usage(
+                "[controller] kind = \"external\": another program moves this robot; record it with `gateway run --record` and \
+                 give the recording with --from",
+            ));
+        }
+        let folder = tempfile::tempdir().map_err(Failure::run)?;
+        let path = self.record.clone().unwrap_or_else(|| folder.path().join("calibration.mcap"));
+        let options = self.options(skin, text, settings, motion, path.clone())?;
+        if !self.quiet {
+            let seconds = options.scenario.duration.0 / 1_000_000;
+            note(format_args!(
+                "the robot moves for {seconds} s about its start, each joint by {} at most",
+                self.within
+            ));
+        }
+        let summary =
+            run::run(&options, None).map_err(|error| Failure::with_code(error.exit_code(), error))?;
+        let mut complaints = summary.complaints();
+        if summary.outcome != Outcome::Done {
+            let last = complaints.pop().unwrap_or_else(|| "the run did not come to its end".to_owned());
+            return Err(Failure::run(last));
+        }
+        complaints.iter().for_each(|line| note(format_args!("gateway: {line}")));
+        read(&[path], skin, settings)
+    }
+
+    /// A run in which each cell sends every acceleration.
+    fn options(
+        &self,
+        skin: &Skin,
+        text: &str,
+        settings: &Settings,
+        motion: Motion,
+        path: PathBuf,
+    ) -> Result<Options, Failure> {
+        let urdf = skin.robot.urdf.as_deref().map(|urdf| urdf_of(&self.skin, urdf));
+        let robot = RobotOfSkin::read(skin, urdf.as_deref())?;
+        let attached = |name: &str, media_type, text: String| Attached {
+            name: name.to_owned(),
+            media_type,
+            bytes: text.into_bytes(),
+        };
+        let mut attachments = vec![attached("skin.toml", "application/toml", text.to_owned())];
+        attachments.extend(robot.urdf.map(|text| attached("robot.urdf", "application/xml", text)));
+        let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+        let mcap = Mcap { path, split: Split::default(), attachments, robot: robot.robot, command_line };
+        let length_us = (motion.length_s() * 1e6).round();
+        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "20 to 3600 s: checked")]
+        let mut scenario = Scenario::idle(Span(length_us as u64));
+        scenario.motion.start = motion.at(0.0).position;
+        let sensors = Accelerometers::new(skin, &settings.sheet, self.seed, settings.gravity);
+        let mut sensing = skin.clone();
+        sensing.buses.iter_mut().for_each(|bus| bus.sensing = Sensing::Event);
+        // Every acceleration is an event, and nothing else is.
+        sensing.events = Events {
+            contact: Q5_10::MAX,
+            proximity: Q1_14::MAX,
+            temperature: Q9_6::MAX,
+            acceleration: Q3_12::ZERO,
+            ..Events::default()
+        };
+        Ok(Options {
+            skin_file: self.skin.clone(),
+            skin: sensing,
+            scenario,
+            kinds: self.kinds.of(bus_names(skin))?,
+            directory: None,
+            spawn: !self.no_spawn,
+            emulated: None,
+            cells_per_process: self.programs.cells_per_process.into(),
+            flash: None,
+            cell_node: self.programs.cell_node.clone(),
+            vcan_setup: self.programs.vcan_setup.clone(),
+            receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
+            record: record::Options { candump: None, mcap: Some(mcap), force: self.force.force },
+            quiet: self.quiet,
+            calibration: Some(Calibrating { motion, sensors: (!self.no_spawn).then_some(sensors) }),
+        })
+    }
+}
+
+/// What a capture says of the cells of a skin.
+fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibration, Failure> {
+    let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
+    let name = reader.name().to_owned();
+    let mut seen = Observations::new(skin);
+    let mut decoder = Decoder::new(None);
+    while let Some(entry) = reader.next().map_err(Failure::run)? {
+        let Entry::Frame(record) = entry else { continue };
+        let at = Micros(record.time.nanos / 1_000);
+        if let (Decoded::Message(message), Some(bus)) =
+            (decoder.decode(at, record.interface, &record.frame), skin.bus_named(record.interface))
+        {
+            seen.take(bus, &message);
+        }
+    }
+    if seen.cells.iter().all(Vec::is_empty) {
+        return Err(Failure::usage(format!(
+            "{name}: no cell of the skin sent an acceleration; record a bus with sensing = \"event\" and [events] \
+             acceleration_g = 0"
+        )));
+    }
+    Ok(calibrate(skin, &seen, settings))
+}
+
+/// What was found, for people.
+fn report(skin: &Skin, calibration: &Calibration) -> String {
+    let summary = &calibration.summary;
+    let mut lines = vec![format!(
+        "{}: {}, {} found, {} not to be trusted",
+        skin.name,
+        count(summary.cells, "cell"),
+        summary.determined,
+        summary.troubled
+    )];
+    lines.push(format!(
+        "certain within {:.2} mm and {:.2} degrees (median; 95 of 100 times); readings scatter by {:.1} mg",
+        summary.position_mm, summary.orientation_deg, summary.noise_mg
+    ));
+    let changes = calibration.cells.iter().filter(|cell| cell.is_written()).filter_map(|cell| cell.found);
+    let mut moved: Vec<_> = changes.filter_map(|found| Some((found.moved_mm?, found.turned_deg?))).collect();
+    moved.sort_by(|one, other| one.0.total_cmp(&other.0));
+    if let (Some(middle), Some(most)) = (moved.get(moved.len() / 2), moved.last()) {
+        let (middle, most) = (middle.0, most.0);
+        lines.push(format!("from where the skin has them: median {middle:.2} mm, at most {most:.2} mm"));
+    }
+    if summary.wires > 0 {
+        lines.push(format!("{} made positions better", count(summary.wires, "wire")));
+    }
+    lines.extend(calibration.zero_offsets.iter().flatten().map(ToString::to_string));
+    for cell in &calibration.cells {
+        lines.extend(cell.troubles.iter().map(|trouble| format!("{} {}: {trouble}", cell.bus, cell.node)));
+    }
+    lines.join("\n") + "\n"
+}
