@@ -6,21 +6,21 @@ use std::path::PathBuf;
 use std::thread;
 
 use bench::record::{self, Mcap};
-use bench::run::{self, Calibrating, Options};
+use bench::run::{self, Options};
 use bench::summary::Outcome;
 use calibration::motion::Motion;
 use calibration::neighbors::Spacing;
 use calibration::observe::Observations;
 use calibration::plan::{Bounds, plan};
-use calibration::sensor::DataSheet;
-use calibration::simulate::Accelerometers;
 use calibration::write::calibrated;
-use calibration::{Calibration, G, Settings, calibrate};
+use calibration::{Calibration, Settings, calibrate};
 use clap::Args;
+use model::accelerometer::kinematics::UPRIGHT;
+use model::accelerometer::sensor::{DataSheet, Given};
 use model::decode::{Decoded, Decoder};
 use model::scenario::Scenario;
 use protocol::bus::GATEWAY_RECEIVE_BUFFER;
-use protocol::document;
+use protocol::document::{self, Place};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
 use protocol::parameters::{Events, Sensing};
 use protocol::skin::{ControllerKind, Skin};
@@ -34,9 +34,6 @@ use super::output::{Force, apart, note};
 use super::print::{count, json};
 use super::robot_file::{RobotOfSkin, urdf_of};
 use super::visuals::Packages;
-
-/// Gravity in the frame of a robot that stands upright.
-const UPRIGHT: [f64; 3] = [0.0, 0.0, -G];
 
 /// Find where cells sit, from their accelerometers
 ///
@@ -81,7 +78,7 @@ pub(crate) struct Calibrate {
     /// Also estimate what has to be added to the positions of each joint
     #[arg(long)]
     zero_offsets: bool,
-    /// What the data sheet of the accelerometers says, as TOML; docs/how-to/calibrate.md has the keys. Else a BMA250
+    /// What the data sheet of the accelerometers says, as TOML; with the keys of a scenario's [sensors.acceleration]. Else a BMA250
     #[arg(long, value_name = "FILE")]
     data_sheet: Option<PathBuf>,
     /// Which accelerometers simulated cells have
@@ -174,8 +171,8 @@ impl Calibrate {
         let sheet = match &self.data_sheet {
             Some(path) => {
                 let text = document::text(path).map_err(Failure::usage)?;
-                document::parse(&path.display().to_string(), &text, DataSheet::checked)
-                    .map_err(Failure::usage)?
+                let sheet = |given: Given| given.sheet(&Place::root());
+                document::parse(&path.display().to_string(), &text, sheet).map_err(Failure::usage)?
             }
             None => DataSheet::default(),
         };
@@ -248,7 +245,8 @@ impl Calibrate {
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "20 to 3600 s: checked")]
         let mut scenario = Scenario::idle(Span(length_us as u64));
         scenario.motion.start = motion.at(0.0).position;
-        let sensors = Accelerometers::new(skin, &settings.sheet, self.seed, settings.gravity);
+        scenario.seed = self.seed;
+        scenario.sensors.acceleration = (!self.no_spawn).then_some(settings.sheet);
         let mut sensing = skin.clone();
         sensing.buses.iter_mut().for_each(|bus| bus.sensing = Sensing::Event);
         // Every acceleration is an event, and nothing else is.
@@ -274,7 +272,7 @@ impl Calibrate {
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
             record: record::Options { candump: None, mcap: Some(mcap), force: self.force.force },
             quiet: self.quiet,
-            calibration: Some(Calibrating { motion, sensors: (!self.no_spawn).then_some(sensors) }),
+            planned: Some(motion),
         })
     }
 }

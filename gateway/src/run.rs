@@ -306,7 +306,7 @@ impl Common {
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
             record: record::Options::default(),
             quiet: self.quiet,
-            calibration: None,
+            planned: None,
         }
     }
 }

@@ -152,6 +152,9 @@ impl Plan {
         if !temperature.is_empty() {
             sensors.insert("temperature_c".to_owned(), json!(temperature));
         }
+        if let Some(sheet) = scenario.sensors.acceleration {
+            sensors.insert("acceleration".to_owned(), json!(sheet));
+        }
         Self { skin: skin.name.clone(), duration_s, seed, motion, events, sensors, remarks }
     }
 
@@ -286,7 +289,8 @@ fn described(how: &Map<String, Value>) -> String {
     let words_of = |value: &Value| match value {
         Value::String(text) => text.clone(),
         Value::Array(values) => words(values),
-        Value::Null | Value::Bool(_) | Value::Number(_) | Value::Object(_) => value.to_string(),
+        Value::Object(values) => format!("({})", described(values)),
+        Value::Null | Value::Bool(_) | Value::Number(_) => value.to_string(),
     };
     list(how.iter().map(|(key, it)| format!("{key} {}", words_of(it))))
 }

@@ -130,7 +130,7 @@ fn every_key_of_a_scenario_is_documented_and_no_other() {
             "{line}"
         );
     }
-    for line in ["[sensors]", "[sensors.force]"] {
+    for line in ["[sensors]", "[sensors.force]", "[sensors.acceleration]"] {
         let keys = allowed(&format!("{line}\nzzz = 1\n"), read_scenario);
         assert_eq!(documented(SCENARIO_MD, &format!("### `{line}`")), keys, "{line}");
     }

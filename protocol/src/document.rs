@@ -43,6 +43,12 @@ pub struct Fault {
 pub struct Place(Vec<Step>);
 
 impl Place {
+    /// The file itself.
+    #[must_use]
+    pub const fn root() -> Self {
+        Self(Vec::new())
+    }
+
     /// A key of the file itself.
     #[must_use]
     pub fn named(key: &'static str) -> Self {

@@ -7,14 +7,14 @@ use protocol::skin::{Cell, Skin};
 use crate::each::each;
 use crate::estimate::{Estimate, Guess, estimate};
 use crate::help::{Help, helpful};
-use crate::kinematics::G;
 use crate::neighbors::{Known, Spacing, improve};
 use crate::observe::{Observations, Reading};
 use crate::plan::Bounds;
 use crate::result::{Calibration, CellResult, Pose, Summary, Trouble};
-use crate::sensor::{DataSheet, rotation};
 use crate::table::Table;
 use crate::zero::zero_offsets;
+use model::accelerometer::kinematics::G;
+use model::accelerometer::sensor::{DataSheet, rotation};
 
 /// What is known before a calibration.
 #[derive(Clone, Debug, PartialEq)]

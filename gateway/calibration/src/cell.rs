@@ -12,8 +12,8 @@ use core::ops::Range;
 
 use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector3};
 
-use crate::kinematics::RowMotion;
-use crate::sensor::DataSheet;
+use model::accelerometer::kinematics::RowMotion;
+use model::accelerometer::sensor::DataSheet;
 
 /// Numbers of a row's motion: its force, and its gradient by columns.
 pub(crate) const ROW: usize = 12;

@@ -8,9 +8,9 @@ use crate::cell::{
     CellModel, Coefficients, Information, Moment, POSITION, TURN, UNKNOWNS, Unknowns, expected,
 };
 use crate::observe::Reading;
-use crate::sensor::DataSheet;
 use crate::sums::{Fit, Free, Sums, at_middle_age};
 use crate::table::Table;
+use model::accelerometer::sensor::DataSheet;
 
 /// Readings that are looked at to find the joint.
 const FIRST_LOOK: usize = 1_500;

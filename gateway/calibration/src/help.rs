@@ -7,9 +7,9 @@ use serde::Serialize;
 use crate::calibrate::Settings;
 use crate::cell::{Information, POSITION, TURN};
 use crate::estimate::Estimate;
-use crate::kinematics::Arm;
 use crate::motion::Step;
 use crate::plan::{AIM, SWING_S, Supposed, Swings, informed, poses};
+use model::accelerometer::kinematics::Arm;
 
 /// What would help where a pose is not determined.
 #[derive(Clone, Debug, PartialEq, Serialize)]

@@ -7,8 +7,7 @@
 //! | module | what |
 //! |---|---|
 //! | [`plan`], [`motion`] | which motion to make, and where the joints are in it at a time |
-//! | [`kinematics`] | what an accelerometer at a place of the robot feels |
-//! | [`sensor`], [`simulate`] | an accelerometer with the errors of its data sheet; a skin of them in virtual time |
+//! | [`simulate`] | a skin of accelerometers in virtual time |
 //! | [`observe`] | what is kept of the messages of a bus |
 //! | [`mod@calibrate`] | the estimate of every cell, and which of them to distrust |
 //! | [`zero`] | zero offsets of the robot's joints |
@@ -21,22 +20,17 @@ mod cell;
 mod each;
 mod estimate;
 pub mod help;
-pub mod kinematics;
 pub mod motion;
 pub mod neighbors;
 pub mod observe;
 pub mod plan;
 pub mod result;
-pub mod sensor;
 pub mod simulate;
 mod smooth;
 mod sums;
 mod table;
-#[doc(hidden)]
-pub mod testing;
 pub mod write;
 pub mod zero;
 
 pub use calibrate::{Settings, calibrate};
-pub use kinematics::G;
 pub use result::Calibration;

@@ -2,14 +2,8 @@
 
 use core::f64::consts::TAU;
 
-use protocol::parameters::MAX_JOINTS;
-use protocol::skin::MAX_ROBOT_JOINTS;
+use model::accelerometer::RobotState;
 use serde::Serialize;
-
-use crate::kinematics::JointState;
-
-/// Positions of all joints of a robot, in rad or m.
-pub type Pose = [f64; MAX_ROBOT_JOINTS];
 
 /// How long a swing takes to reach its amplitude, and to end, in s.
 const RAMP_S: f64 = 0.6;
@@ -58,36 +52,6 @@ pub struct Timed {
 pub struct Motion {
     /// The steps.
     pub steps: Vec<Timed>,
-}
-
-/// Positions, speeds and accelerations of all joints of a robot.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct RobotState {
-    /// The positions.
-    pub position: Pose,
-    /// The speeds.
-    pub speed: Pose,
-    /// The accelerations.
-    pub acceleration: Pose,
-}
-
-impl RobotState {
-    /// Those of a chain, given the robot's joints in it.
-    #[must_use]
-    pub fn of_chain(&self, joints: &[usize]) -> JointState {
-        let pick = |from: &Pose| {
-            let mut to = [0.0; MAX_JOINTS];
-            for (to, &joint) in to.iter_mut().zip(joints) {
-                *to = from.get(joint).copied().unwrap_or_default();
-            }
-            to
-        };
-        JointState {
-            position: pick(&self.position),
-            speed: pick(&self.speed),
-            acceleration: pick(&self.acceleration),
-        }
-    }
 }
 
 impl Motion {

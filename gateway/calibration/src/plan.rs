@@ -14,10 +14,10 @@ use rand_pcg::Pcg64Mcg;
 use thiserror::Error;
 
 use crate::cell::{AGE_STEP, CellModel, Information, MOMENT, POSITION, TURN, expected, numbers};
-use crate::kinematics::{Arm, G};
 use crate::motion::{Motion, RISE_PEAKS, Step};
-use crate::sensor::DataSheet;
 use crate::sums::Sums;
+use model::accelerometer::kinematics::{Arm, G};
+use model::accelerometer::sensor::DataSheet;
 
 /// How a plan may move the robot.
 #[derive(Clone, Debug, PartialEq)]
@@ -398,7 +398,7 @@ fn travel(skin: &Skin, bounds: &Bounds, from: &[f64], to: &[f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing;
+    use model::testing;
 
     #[test]
     fn a_plan_stays_within_limits_speeds_and_its_time() {

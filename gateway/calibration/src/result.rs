@@ -6,8 +6,8 @@ use serde::Serialize;
 
 use crate::calibrate::rounded;
 use crate::help::Help;
-use crate::kinematics::Arm;
 use crate::zero::ZeroOffset;
+use model::accelerometer::kinematics::Arm;
 
 /// What was found.
 #[derive(Clone, Debug, PartialEq, Serialize)]

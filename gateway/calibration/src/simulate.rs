@@ -1,5 +1,6 @@
 //! What a skin would show during a motion, in virtual time: for tests, and to weigh motions.
 
+use model::accelerometer::Accelerometers;
 use nalgebra::Vector3;
 use protocol::fixed::{Q, Q1_14};
 use protocol::message::{Joints, Message, SensorPage};
@@ -7,10 +8,8 @@ use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, RowKind};
 use protocol::skin::Skin;
 
-use crate::kinematics::Arm;
 use crate::motion::Motion;
 use crate::observe::Observations;
-use crate::sensor::{Accelerometer, DataSheet, rotation};
 
 /// How one cell differs from what the skin says.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -26,52 +25,6 @@ pub enum Defect {
     Silent(f64),
     /// It tilts by so many rad, to and fro, as the robot moves.
     Loose(f64),
-}
-
-/// The accelerometers of a skin.
-#[derive(Clone, Debug)]
-pub struct Accelerometers {
-    arms: Vec<Option<Arm>>,
-    /// By cell.
-    sensors: Vec<Accelerometer>,
-}
-
-impl Accelerometers {
-    /// One for each cell, drawn from a data sheet and a seed; gravity is seen from the robot's base, in m/s2.
-    #[must_use]
-    pub fn new(skin: &Skin, sheet: &DataSheet, seed: u64, gravity: [f64; 3]) -> Self {
-        let arm = |bus: usize| skin.cells_of(bus).next().map(|_| Arm::new(skin, bus, gravity));
-        let sensors = skin.cells.iter().map(|cell| {
-            let stream = u64::from(cell.serial).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-            Accelerometer::new(sheet, seed ^ stream)
-        });
-        Self { arms: (0..skin.buses.len()).map(arm).collect(), sensors: sensors.collect() }
-    }
-
-    /// The sensor of a cell.
-    #[must_use]
-    pub fn sensor(&self, cell: usize) -> Option<&Accelerometer> {
-        self.sensors.get(cell)
-    }
-
-    /// What each cell of the skin shows at a time in s, in g.
-    pub fn readings<'a>(
-        &'a self,
-        skin: &'a Skin,
-        motion: &'a Motion,
-        now: f64,
-        tilt: impl Fn(usize, &Vector3<f64>) -> Vector3<f64> + 'a,
-    ) -> impl Iterator<Item = Vector3<f64>> + 'a {
-        skin.cells.iter().zip(&self.sensors).enumerate().map(move |(index, (cell, sensor))| {
-            let moment = motion.at(sensor.sampled(now));
-            let state = moment.of_chain(&skin.chain(cell.bus).joints);
-            let rows = self.arms.get(cell.bus).and_then(Option::as_ref).map(|arm| arm.rows(&state));
-            let row = rows.and_then(|rows| rows.get(usize::from(cell.row)).copied()).unwrap_or_default();
-            let force = row.at(&cell.position.into());
-            let local = rotation(cell.orientation, cell.normal).inverse() * force;
-            sensor.reading(now, &tilt(index, &local))
-        })
-    }
 }
 
 /// Moves a skin in virtual time; words are rounded as frames carry them.
@@ -107,7 +60,7 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
             }
             _ => *force,
         };
-        let shown: Vec<_> = sensors.readings(skin, motion, now, tilt).collect();
+        let shown: Vec<_> = sensors.readings(skin, |time| motion.at(time), now, tilt).collect();
         for ((at, cell), shown) in skin.cells.iter().enumerate().zip(shown) {
             let shown = match defects.get(at) {
                 Some(Defect::Dead) => continue,

@@ -7,7 +7,7 @@
 use nalgebra::{SMatrix, SVector};
 use protocol::parameters::MAX_JOINTS;
 
-use crate::kinematics::JointState;
+use model::accelerometer::kinematics::JointState;
 
 /// Broadcasts before and after the middle one.
 pub(crate) const HALF: usize = 10;

@@ -4,10 +4,10 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 
 use crate::cell::{AGE_STEP, AGES, MOMENT, Moment, numbers};
-use crate::kinematics::Arm;
 use crate::observe::Observations;
-use crate::sensor::DataSheet;
 use crate::smooth::{HALF, Smoother};
+use model::accelerometer::kinematics::Arm;
+use model::accelerometer::sensor::DataSheet;
 
 /// The motion of the links of one bus' chain.
 #[derive(Debug)]

@@ -15,11 +15,14 @@ use calibration::neighbors::Spacing;
 use calibration::observe::Observations;
 use calibration::plan::{Bounds, plan};
 use calibration::result::{CellResult, Trouble};
-use calibration::sensor::{DataSheet, rotation};
-use calibration::simulate::{Accelerometers, Defect, observe};
+use calibration::simulate::{Defect, observe};
 use calibration::write::calibrated;
-use calibration::{Calibration, G, Settings, calibrate, testing};
+use calibration::{Calibration, Settings, calibrate};
+use model::accelerometer::Accelerometers;
+use model::accelerometer::kinematics::G;
+use model::accelerometer::sensor::{DataSheet, rotation};
 use model::central::Central;
+use model::testing;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use protocol::skin::Skin;
 

@@ -5,10 +5,8 @@
 //!                                                                └─> Step::Bad(why)
 //! ```
 //!
-//! [`Kinesthetic`] moves the arm with the torque of a push. [`Hold`] and [`Sine`] are motions of a
-//! scenario that ignore torques. [`crate::external::External`] queries another program.
-
-use core::f64::consts::TAU;
+//! [`Kinesthetic`] moves the arm with the torque of a push. [`Planned`] follows a motion that is known beforehand and
+//! ignores torques. [`crate::external::External`] queries another program.
 
 use protocol::packet::padded;
 use protocol::skin::{ControllerKind, MAX_ROBOT_JOINTS, Skin};
@@ -142,69 +140,7 @@ impl Controller for Kinesthetic {
     }
 }
 
-/// Goes to a position, as quickly as the joints may, and stays there.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Hold {
-    at: [f64; MAX_ROBOT_JOINTS],
-    pace: Pace,
-}
-
-impl Hold {
-    /// Holds `at`, in rad.
-    #[must_use]
-    pub fn new(skin: &Skin, at: [f64; MAX_ROBOT_JOINTS]) -> Self {
-        Self { at, pace: Pace::of(skin) }
-    }
-}
-
-impl Controller for Hold {
-    fn step(&mut self, input: &Input) -> Step {
-        Step::Move(self.pace.towards(&self.at, input))
-    }
-}
-
-/// Swings every joint about a position: `start + amplitude sin(2 pi t / period)`.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sine {
-    start: [f64; MAX_ROBOT_JOINTS],
-    amplitude: [f64; MAX_ROBOT_JOINTS],
-    period_s: f64,
-    pace: Pace,
-}
-
-impl Sine {
-    /// Swings about `start` by `amplitude`, both in rad, once in `period_s`.
-    #[must_use]
-    pub fn new(
-        skin: &Skin,
-        start: [f64; MAX_ROBOT_JOINTS],
-        amplitude: [f64; MAX_ROBOT_JOINTS],
-        period_s: f64,
-    ) -> Self {
-        Self { start, amplitude, period_s, pace: Pace::of(skin) }
-    }
-
-    /// Where it is `seconds` after the run's start, in rad.
-    #[must_use]
-    pub fn at(&self, seconds: f64) -> [f64; MAX_ROBOT_JOINTS] {
-        let swing = (TAU * seconds / self.period_s).sin();
-        let mut at = self.start;
-        for (at, amplitude) in at.iter_mut().zip(self.amplitude) {
-            *at += amplitude * swing;
-        }
-        at
-    }
-}
-
-impl Controller for Sine {
-    /// Aims at the position for the begin of the next tick, so that it neither lags nor drifts.
-    fn step(&mut self, input: &Input) -> Step {
-        let next = self.at(seconds(input.time) + self.pace.tick);
-        Step::Move(self.pace.towards(&next, input))
-    }
-}
-
-/// Follows positions that are known for all times.
+/// Follows positions that are known for all times, as quickly as the joints may.
 #[derive(Clone, Copy, Debug)]
 pub struct Planned<F> {
     at: F,
@@ -221,7 +157,7 @@ impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS]> Planned<F> {
 }
 
 impl<F: Fn(f64) -> [f64; MAX_ROBOT_JOINTS] + Send> Controller for Planned<F> {
-    /// Aims at the position for the begin of the next tick, as [`Sine`] does.
+    /// Aims at the position for the begin of the next tick, so that it neither lags nor drifts.
     fn step(&mut self, input: &Input) -> Step {
         let next = (self.at)(seconds(input.time) + self.pace.tick);
         Step::Move(self.pace.towards(&next, input))
@@ -337,9 +273,9 @@ mod tests {
     }
 
     #[test]
-    fn hold_stays_and_returns_no_quicker_than_it_may() {
+    fn a_robot_that_holds_returns_no_quicker_than_it_may() {
         let at = [0.1, -0.2, 0.3, 0.0, 0.0, 0.0];
-        let mut hold = Hold::new(&skin(), padded(&at));
+        let mut hold = Planned::new(&skin(), |_| padded(&at));
         assert_eq!(moved(hold.step(&Input { q: padded(&at), ..Input::default() })), [0.0; MAX_ROBOT_JOINTS]);
         assert_eq!(moved(hold.step(&Input::default()))[..3], [2.0, -2.0, 2.0]);
         let arm = run(&mut hold, [0.0; 6], 200, [50.0; 6]);
@@ -349,12 +285,13 @@ mod tests {
     }
 
     #[test]
-    fn sine_is_where_it_should_be_at_every_tick() {
+    fn a_planned_motion_is_where_it_should_be_at_every_tick() {
         let start = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0];
-        let mut sine = Sine::new(&skin(), padded(&start), padded(&[0.2, 0.1, 0.0, 0.0, 0.0, 0.3]), 4.0);
+        let swings = |seconds: f64| padded(&start.map(|start| start + 0.2 * (1.5 * seconds).sin()));
+        let mut planned = Planned::new(&skin(), swings);
         for ticks in [1_u32, 7, 500, 4_321] {
-            let arm = run(&mut sine, start, ticks.into(), [0.0; 6]);
-            let target = sine.at(f64::from(ticks) * TICK);
+            let arm = run(&mut planned, start, ticks.into(), [0.0; 6]);
+            let target = swings(f64::from(ticks) * TICK);
             for (got, target) in arm.positions().iter().zip(target) {
                 assert!((got - target).abs() < 1e-9, "after {ticks} ticks {got} is not {target}");
             }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use protocol::skin::{ControllerKind, Skin};
 
-use crate::controller::{Controller, Hold, Kinesthetic, Sine};
+use crate::controller::{Controller, Kinesthetic, Planned};
 use crate::external::{External, SocketError};
 use model::scenario::{Motion, MotionKind};
 
@@ -13,12 +13,11 @@ use model::scenario::{Motion, MotionKind};
 /// # Errors
 /// When the skin's controller is another program, and there is no socket to listen on for it.
 pub fn controller_of(skin: &Skin, motion: &Motion) -> Result<Box<dyn Controller>, SocketError> {
-    let start = motion.start;
+    let motion = *motion;
     Ok(match (motion.kind, &skin.controller.kind) {
-        (MotionKind::Hold, _) => Box::new(Hold::new(skin, start)),
-        (MotionKind::Sine { amplitude, period_s }, _) => {
-            Box::new(Sine::new(skin, start, amplitude, period_s))
-        }
+        (MotionKind::Hold | MotionKind::Sine { .. }, _) => Box::new(Planned::new(skin, move |seconds| {
+            motion.state_at(seconds).map_or(motion.start, |state| state.position)
+        })),
         (MotionKind::Kinesthetic, ControllerKind::Kinesthetic { inertia, damping }) => {
             Box::new(Kinesthetic::with(skin, inertia, damping))
         }

@@ -10,8 +10,10 @@
 //! | [`commission`], [`listing`] | which cells are on a bus; node ids and configuration for them |
 //! | [`surface`] | the surface that a link's cells lie on, and that laid flat |
 //! | [`repeat`] | requests that are repeated until they are confirmed |
+//! | [`accelerometer`] | what the accelerometers of cells show while a robot moves |
 //! | [`scenario`], [`generate`] | what a run does, and skins made from a recipe |
 
+pub mod accelerometer;
 pub mod central;
 pub mod commission;
 pub mod decode;

@@ -1,4 +1,4 @@
-//! A small skin that the tests of these crates begin with.
+//! Skins that the tests of these crates begin with.
 
 use protocol::skin::Skin;
 
@@ -46,6 +46,40 @@ joint = 3
 position = [0.2, 0.01, 0.15]
 orientation = [0.7071068, 0.0, 0.0, 0.7071068]
 "#;
+
+/// The skin of the demo: 253 cells on two links of a UR5.
+pub const UR5: &str = include_str!("../../examples/ur5-253.toml");
+/// 126 cells on all links of an arm of seven joints, imported from its URDF.
+const PANDA: &str = include_str!("../tests/data/panda.toml");
+/// A cell on an arm on a lift.
+const LIFT: &str = include_str!("../tests/data/lift.toml");
+
+/// [`UR5`].
+///
+/// # Panics
+/// Never: the skin is sound, as the next two are.
+#[must_use]
+pub fn ur5() -> Skin {
+    Skin::parse("ur5-253.toml", UR5).expect("the tests' skin is sound")
+}
+
+/// Cells on all links of an arm of seven joints.
+///
+/// # Panics
+/// See [`ur5`].
+#[must_use]
+pub fn panda() -> Skin {
+    Skin::parse("panda.toml", PANDA).expect("the tests' skin is sound")
+}
+
+/// A cell on an arm on a lift.
+///
+/// # Panics
+/// See [`ur5`].
+#[must_use]
+pub fn lift() -> Skin {
+    Skin::parse("lift.toml", LIFT).expect("the tests' skin is sound")
+}
 
 /// [`SKIN`] with a second bus like the first one.
 ///

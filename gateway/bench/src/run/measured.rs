@@ -7,9 +7,11 @@ use hdrhistogram::Histogram;
 use protocol::skin::Skin;
 use protocol::time::Span;
 
+use super::accelerations::Moved;
 use super::halts::Halts;
 use crate::remote::Lateness;
 use control::cycle::turn::Timed;
+use model::accelerometer::RobotState;
 use model::quantiles::{Quantiles, histogram};
 use model::scenario::Mode;
 
@@ -27,6 +29,7 @@ pub(super) struct Measured {
     pub(super) missing: [u64; 32],
     pub(super) halts: Halts,
     last: Option<Timed>,
+    before: Option<Timed>,
     /// Since when ticks are recorded in `recent`, and how late they began.
     since: Instant,
     recent: Histogram<u64>,
@@ -48,6 +51,7 @@ impl Measured {
             missing: [0; 32],
             halts: Halts::default(),
             last: None,
+            before: None,
             since: Instant::now(),
             recent: histogram(),
             lateness: Lateness::default(),
@@ -76,7 +80,7 @@ impl Measured {
                 *self.bad.entry(bad.to_string()).or_default() += 1;
             }
             self.halts.take(&timed);
-            self.last = Some(timed);
+            self.before = self.last.replace(timed);
         }
         if self.since.elapsed() >= Duration::from_secs(1) {
             let [second, all] = [&self.recent, &self.late].map(|late| Quantiles::of(late, 1e-3));
@@ -84,6 +88,18 @@ impl Measured {
             self.since = Instant::now();
             self.recent.reset();
         }
+    }
+
+    /// How the robot moved in the last tick.
+    pub(super) fn moved(&self) -> Option<Moved> {
+        let [before, last] = [self.before?, self.last?].map(|timed| timed.record);
+        let [began, at_s] = [before, last].map(|record| Span(record.tick.time.0).seconds());
+        let mut state = RobotState { position: last.q, speed: last.qdot, ..RobotState::default() };
+        let speeds = last.qdot.iter().zip(before.qdot);
+        for (acceleration, (now, before)) in state.acceleration.iter_mut().zip(speeds) {
+            *acceleration = (now - before) / (at_s - began);
+        }
+        Some(Moved { at_s, state, is_halted: last.halted.is_some() })
     }
 
     /// The progress: the most important first, as a narrow terminal shows no more.

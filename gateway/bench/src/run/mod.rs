@@ -11,6 +11,7 @@
 //!       └─ progress line, summary              recorder: writes what all of them hand over
 //! ```
 
+mod accelerations;
 mod begin;
 mod bench;
 mod commanded;
@@ -37,7 +38,6 @@ mod watch;
 use std::path::PathBuf;
 
 use calibration::motion::Motion;
-use calibration::simulate::Accelerometers;
 use protocol::bus::Kinds;
 use protocol::skin::Skin;
 
@@ -80,17 +80,8 @@ pub struct Options {
     pub record: crate::record::Options,
     /// Whether progress is shown.
     pub quiet: bool,
-    /// What moves the robot in place of the scenario, and what cells then measure, if the run is for a calibration.
-    pub calibration: Option<Calibrating>,
-}
-
-/// A run from which cells are calibrated.
-#[derive(Clone, Debug)]
-pub struct Calibrating {
-    /// What the robot does; the run begins with it.
-    pub motion: Motion,
-    /// The accelerometers of simulated cells; real ones measure.
-    pub sensors: Option<Accelerometers>,
+    /// What moves the robot in place of the scenario.
+    pub planned: Option<Motion>,
 }
 
 /// Runs a bench to its end, or until SIGINT or SIGTERM. A run that fails has a summary too, with the reason. While the

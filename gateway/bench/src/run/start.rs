@@ -22,7 +22,7 @@ use super::network::Network;
 use super::receiver::{BusEvent, Receiver, look_at};
 use super::roots::{ReceiveFilter, Roots};
 use super::served::{ServedBus, Target, open_or_serve, open_or_serve_all};
-use super::{Calibrating, Options, RunError, realtime};
+use super::{Options, RunError, realtime};
 use crate::emulate::{self, Emulation, Emulator};
 use crate::record::feed::{self, Feed, Outlet};
 use crate::record::{Mcap, Outputs, Recorder, backlog, facts};
@@ -63,8 +63,8 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         say(&format!("frames are recorded in {}", log.display()));
     }
     // From now on an external controller can connect, so that it is ready when the loop begins.
-    let controller: Box<dyn Controller> = match &options.calibration {
-        Some(Calibrating { motion, .. }) => {
+    let controller: Box<dyn Controller> = match &options.planned {
+        Some(motion) => {
             let motion = motion.clone();
             Box::new(Planned::new(skin, move |seconds| motion.at(seconds).position))
         }

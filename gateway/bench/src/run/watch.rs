@@ -9,13 +9,13 @@ use std::time::{Duration, Instant};
 
 use protocol::bus::BusKind;
 use protocol::can::Frame;
-use protocol::fixed::Q3_12;
 use protocol::id::{CellId, Node};
 use protocol::message::{From, Message, SensorPage};
 use protocol::skin::Cell;
+use protocol::time::Span;
 
-use super::Calibrating;
 use super::RunError;
+use super::accelerations::{Accelerations, Moved};
 use super::begin::{Announced, SWITCH_AGAIN};
 use super::bench::Bench;
 use super::commanded::serve;
@@ -45,6 +45,7 @@ type Counts = BTreeMap<String, u64>;
 /// Faults and touches that are still to come.
 struct Script {
     touches: Touches,
+    accelerations: Option<Accelerations>,
     /// The next epoch whose stimuli are to be sent.
     epoch: u64,
     /// The next fault.
@@ -67,8 +68,9 @@ impl Bench<'_> {
         let turn = turn.recorded(self.recorded.take());
         let touches = Touches::new(&options.scenario, &options.skin);
         let (announced, started) = (Announced::new(SWITCH_AGAIN), Instant::now());
-        let mut script = Script { touches, epoch: 0, fault: 0, announced, started };
-        self.press(&mut script)?;
+        let accelerations = Accelerations::new(options);
+        let mut script = Script { touches, accelerations, epoch: 0, fault: 0, announced, started };
+        self.press(&mut script, None)?;
 
         let before = Spent::by(&self.processes, &self.served);
         script.started = Instant::now();
@@ -136,7 +138,7 @@ impl Bench<'_> {
         measured: &mut Measured,
         records: &mut rtrb::Consumer<Timed>,
     ) -> Result<(), RunError> {
-        self.press(script)?;
+        self.press(script, measured.moved())?;
         if self
             .bus_links
             .iter()
@@ -187,17 +189,33 @@ impl Bench<'_> {
     }
 
     /// Sends the stimuli of all epochs up to [`LEAD`] ahead.
-    fn press(&self, script: &mut Script) -> Result<(), RunError> {
+    fn press(&self, script: &mut Script, moved: Option<Moved>) -> Result<(), RunError> {
         let broadcasts = self.shared.broadcasts.load(Ordering::Acquire);
+        let seconds = |touches: &Touches, epoch| Span(touches.time_of(epoch).0).seconds();
         while script.epoch < broadcasts + LEAD {
             // Epochs that have passed while this thread was delayed cannot be made up for one by one.
             let epoch = script.epoch.max(broadcasts);
-            let from = From::Epoch(self.first_epoch.plus(epoch.to_le_bytes()[0]));
+            let numbered = self.first_epoch.plus(epoch.to_le_bytes()[0]);
             for stimulus in script.touches.changes(script.epoch.checked_sub(1), epoch) {
-                self.stimulate(&stimulus, from)?;
+                self.stimulate(&stimulus, From::Epoch(numbered))?;
             }
-            self.accelerate(script, epoch, from)?;
+            if let Some(accelerations) = &script.accelerations {
+                let now = seconds(&script.touches, epoch);
+                self.send_all(&accelerations.ahead(self.options, moved, (numbered, now)))?;
+            }
             script.epoch = epoch + 1;
+        }
+        if let Some(accelerations) = &mut script.accelerations {
+            let now = seconds(&script.touches, broadcasts);
+            self.send_all(&accelerations.latest(self.options, moved, (broadcasts, now)))?;
+        }
+        Ok(())
+    }
+
+    /// Sends messages, each on its bus.
+    fn send_all(&self, messages: &[(usize, Message)]) -> Result<(), RunError> {
+        for (bus, message) in messages {
+            self.bus_links.get(*bus).map_or(Ok(true), |bus_link| bus_link.send(message))?;
         }
         Ok(())
     }
@@ -217,25 +235,7 @@ impl Bench<'_> {
         let page = SensorPage::Skin(stimulus.sensors);
         let message = Message::Stimulus { to: Node::Cell(stimulus.node), from, page };
         // The cells' contact state follows what the bus carried.
-        self.bus_links.get(stimulus.bus).map_or(Ok(true), |bus_link| bus_link.send(&message))?;
-        Ok(())
-    }
-
-    /// Sends what the accelerometers of simulated cells measure in an epoch.
-    fn accelerate(&self, script: &Script, epoch: u64, from: From) -> Result<(), RunError> {
-        let Some(Calibrating { motion, sensors: Some(sensors) }) = &self.options.calibration else {
-            return Ok(());
-        };
-        let skin = &self.options.skin;
-        #[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
-        let now = script.touches.time_of(epoch).0 as f64 * 1e-6;
-        let readings = sensors.readings(skin, motion, now, |_, force| *force);
-        for (&Cell { bus, node, .. }, reading) in skin.cells.iter().zip(readings) {
-            let page = SensorPage::Acceleration([reading.x, reading.y, reading.z].map(Q3_12::nearest));
-            let message = Message::Stimulus { to: Node::Cell(node), from, page };
-            self.bus_links.get(bus).map_or(Ok(true), |bus_link| bus_link.send(&message))?;
-        }
-        Ok(())
+        self.send_all(&[(stimulus.bus, message)])
     }
 
     /// Injects the scenario's faults into processes at their times.

@@ -5,15 +5,16 @@
 //!   force, neighbours ─> hysteresis ─> + creep ─> * gain(T) ─> + zero(T) + random walk + noise ─> contact words
 //! ```
 
-use core::f64::consts::TAU;
-
 use protocol::fixed::Q9_6;
 use protocol::message::SkinSensors;
 use protocol::skin::Skin;
 use protocol::time::Micros;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
 
 use super::sensors::{ForceErrors, REFERENCE_C, Sensors};
 use super::touches::contact_words;
+use crate::accelerometer::sensor::normal;
 
 /// Time constants of creep in s: together they are nearly a logarithm of time.
 const CREEP_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
@@ -55,7 +56,7 @@ struct CellSensors {
     read_n: f64,
     creep_n: [f64; CREEP_S.len()],
     walk_n: f64,
-    dice: Dice,
+    dice: Pcg64Mcg,
 }
 
 impl Measured {
@@ -121,9 +122,9 @@ impl Measured {
 
 impl CellSensors {
     fn new(neighbours: Vec<usize>, seed: u64, index: u64) -> Self {
-        let mut dice = Dice::new(seed, index);
+        let mut dice = Pcg64Mcg::seed_from_u64(seed ^ index.wrapping_mul(0x9e37_79b9_7f4a_7c15));
         let [offset, gain, temperature_n, temperature_gain] =
-            core::array::from_fn(|_| 2.0 * dice.part() - 1.0);
+            core::array::from_fn(|_| dice.random_range(-1.0..=1.0));
         Self {
             neighbours,
             offset,
@@ -146,44 +147,13 @@ impl CellSensors {
             *creep += (force_n - *creep) * -(-period_s / time_s).exp_m1();
         }
         if errors.drift_n > 0.0 {
-            self.walk_n += errors.drift_n * (period_s / 3_600.0).sqrt() * self.dice.normal();
+            self.walk_n += errors.drift_n * (period_s / 3_600.0).sqrt() * normal(&mut self.dice);
         }
-        let noise = if errors.noise_n > 0.0 { errors.noise_n * self.dice.normal() } else { 0.0 };
+        let noise = if errors.noise_n > 0.0 { errors.noise_n * normal(&mut self.dice) } else { 0.0 };
         let gain =
             1.0 + errors.gain * self.gain + errors.temperature_gain_per_c * self.temperature_gain * degrees;
         let zero = errors.offset_n * self.offset + errors.temperature_n_per_c * self.temperature_n * degrees;
         gain * (self.read_n + errors.creep * self.creep_n.iter().sum::<f64>()) + zero + self.walk_n + noise
-    }
-}
-
-/// Random numbers of one cell (SplitMix64).
-#[derive(Clone, Debug)]
-struct Dice(u64);
-
-impl Dice {
-    fn new(seed: u64, index: u64) -> Self {
-        let mut dice = Self(seed);
-        let mixed = dice.next();
-        Self(mixed ^ index.wrapping_mul(0xD1B5_4A32_D192_ED03))
-    }
-
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
-        let mixed = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-        let mixed = (mixed ^ (mixed >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-        mixed ^ (mixed >> 31)
-    }
-
-    /// 0 to 1.
-    #[expect(clippy::cast_precision_loss, reason = "53 bits")]
-    fn part(&mut self) -> f64 {
-        (self.next() >> 11) as f64 / (1_u64 << 53) as f64
-    }
-
-    /// Of mean 0 and standard deviation 1.
-    fn normal(&mut self) -> f64 {
-        let radius = (-2.0 * (1.0 - self.part()).ln()).sqrt();
-        radius * (TAU * self.part()).cos()
     }
 }
 

@@ -12,6 +12,7 @@ mod remarks;
 mod sensors;
 mod touches;
 
+use core::f64::consts::TAU;
 use std::path::Path;
 
 use protocol::document::{self, DocumentError};
@@ -19,6 +20,8 @@ use protocol::fixed::{Q1_14, Q9_6};
 use protocol::skin::{KEYS, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::{Micros, Span};
 use serde::{Deserialize, Serialize};
+
+use crate::accelerometer::RobotState;
 
 pub use sensors::{ForceErrors, REFERENCE_C, Sensors};
 pub use touches::{MAX_FORCE_N, Stimulus, Touches, contact_words};
@@ -69,6 +72,30 @@ pub enum MotionKind {
     },
     /// `kinesthetic`: the skin's controller moves it, whichever that is.
     Kinesthetic,
+}
+
+impl Motion {
+    /// Where the joints are `seconds` after the run's start, and how they move; `None` of a motion that is not known
+    /// beforehand.
+    #[must_use]
+    pub fn state_at(&self, seconds: f64) -> Option<RobotState> {
+        let mut state = RobotState { position: self.start, ..RobotState::default() };
+        match self.kind {
+            MotionKind::Hold => Some(state),
+            MotionKind::Sine { amplitude, period_s } => {
+                let rate = TAU / period_s;
+                let (sin, cos) = (rate * seconds).sin_cos();
+                let joints = state.position.iter_mut().zip(&mut state.speed).zip(&mut state.acceleration);
+                for (((position, speed), acceleration), amplitude) in joints.zip(amplitude) {
+                    *position += amplitude * sin;
+                    *speed = amplitude * rate * cos;
+                    *acceleration = -amplitude * rate * rate * sin;
+                }
+                Some(state)
+            }
+            MotionKind::Kinesthetic => None,
+        }
+    }
 }
 
 impl MotionKind {

@@ -4,6 +4,7 @@ use serde::Deserialize;
 
 use super::check::LONGEST_S;
 use super::{IDLE, MotionKind, Profile};
+use crate::accelerometer::sensor::Given;
 
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -119,6 +120,7 @@ pub(super) struct Sensors {
     /// Times in s and temperatures in °C.
     pub(super) temperature_c: Vec<[f64; 2]>,
     pub(super) force: Option<ForceErrors>,
+    pub(super) acceleration: Option<Given>,
 }
 
 #[derive(Debug, Default, Deserialize)]

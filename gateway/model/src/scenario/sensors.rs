@@ -6,6 +6,7 @@ use protocol::time::Micros;
 
 use super::check::{Checked, EndS};
 use super::raw;
+use crate::accelerometer::sensor::DataSheet;
 
 /// Data sheets state errors at this temperature, in °C.
 pub const REFERENCE_C: f64 = 25.0;
@@ -19,6 +20,8 @@ pub struct Sensors {
     pub temperature: Vec<(Micros, f64)>,
     /// The errors of force sensors.
     pub force: ForceErrors,
+    /// What kind of accelerometers the cells have. Without one they measure nothing.
+    pub acceleration: Option<DataSheet>,
 }
 
 /// The errors of force sensors; all are zero of perfect ones.
@@ -46,12 +49,13 @@ pub struct ForceErrors {
 
 impl Sensors {
     /// Sensors that read what is there.
-    pub const PERFECT: Self = Self { temperature: Vec::new(), force: ForceErrors::PERFECT };
+    pub const PERFECT: Self =
+        Self { temperature: Vec::new(), force: ForceErrors::PERFECT, acceleration: None };
 
-    /// Whether they read what is there, and no temperature.
+    /// Whether force sensors read what is there, and there is no temperature.
     #[must_use]
-    pub fn are_perfect(&self) -> bool {
-        *self == Self::PERFECT
+    pub fn is_force_perfect(&self) -> bool {
+        self.force == ForceErrors::PERFECT && self.temperature.is_empty()
     }
 
     /// The temperature of all cells at a time, if it is simulated.
@@ -106,7 +110,8 @@ pub(super) fn sensors(raw: &raw::Sensors, end: EndS) -> Checked<Sensors> {
     let at = Place::named("sensors");
     let temperature = temperature(&at.key("temperature_c"), &raw.temperature_c, end)?;
     let force = raw.force.as_ref().map_or(Ok(ForceErrors::PERFECT), |raw| force(&at.key("force"), raw))?;
-    Ok(Sensors { temperature, force })
+    let acceleration = raw.acceleration.as_ref().map(|raw| raw.sheet(&at.key("acceleration"))).transpose()?;
+    Ok(Sensors { temperature, force, acceleration })
 }
 
 fn temperature(at: &Place, points: &[[f64; 2]], end: EndS) -> Checked<Vec<(Micros, f64)>> {
@@ -168,12 +173,21 @@ mod tests {
     #[test]
     fn sensors_are_perfect_unless_the_scenario_says_how_bad_they_are() {
         for text in ["", "[sensors]\n", "[sensors.force]\nkind = \"perfect\"\n"] {
-            assert!(read(text).unwrap().are_perfect(), "{text}");
+            assert!(read(text).unwrap().is_force_perfect(), "{text}");
         }
         assert_eq!(read("[sensors.force]\n").unwrap().force, ForceErrors::PIEZORESISTIVE);
         let given =
             read("[sensors.force]\nkind = \"resistive\"\ncreep = 0.0\noffset_n = 0.25\n").unwrap().force;
         assert_eq!(given, ForceErrors { creep: 0.0, offset_n: 0.25, ..ForceErrors::RESISTIVE });
+    }
+
+    #[test]
+    fn cells_have_accelerometers_if_the_scenario_says_which() {
+        assert_eq!(read("[sensors.force]\n").unwrap().acceleration, None);
+        assert_eq!(read("[sensors.acceleration]\n").unwrap().acceleration, Some(DataSheet::BMA250));
+        let given =
+            read("[sensors.acceleration]\nkind = \"perfect\"\nnoise_g = 0.01\n").unwrap().acceleration;
+        assert_eq!(given, Some(DataSheet { noise_g: 0.01, ..DataSheet::PERFECT }));
     }
 
     #[test]
@@ -195,6 +209,11 @@ mod tests {
             ("[sensors.force]\nkind = \"good\"\n", "\"perfect\", \"piezoresistive\" or \"resistive\""),
             ("[sensors.force]\ngain = 1.0\n", "sensors.force.gain = 1: 0 to 0.9 are possible"),
             ("[sensors.force]\nnoise_n = nan\n", "sensors.force.noise_n = NaN: 0 to 1 are possible"),
+            ("[sensors.acceleration]\nkind = \"good\"\n", "\"perfect\" or \"bma250\""),
+            (
+                "[sensors.acceleration]\nrange_g = 1.0\n",
+                "sensors.acceleration.range_g = 1: 1.2 to 8 are possible",
+            ),
             ("[sensors]\noffset = 1\n", "unknown field `offset`"),
         ];
         for (text, why) in cases {

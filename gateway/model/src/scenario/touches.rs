@@ -91,8 +91,8 @@ impl Touches {
                 }
             }
         }
-        let measured =
-            (!scenario.sensors.are_perfect()).then(|| Measured::new(&scenario.sensors, scenario.seed, skin));
+        let measured = (!scenario.sensors.is_force_perfect())
+            .then(|| Measured::new(&scenario.sensors, scenario.seed, skin));
         if measured.is_none() {
             cells.retain(|touched| !touched.touches.is_empty() || !touched.faults.is_empty());
         }

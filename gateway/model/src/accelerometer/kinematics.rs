@@ -9,13 +9,15 @@
 //!
 //! The second part holds the tangential and the centripetal acceleration. All of it is in units of g.
 
-use model::central::Central;
+use crate::central::Central;
 use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
 use protocol::skin::Skin;
 
 /// Standard gravity in m/s2.
 pub const G: f64 = 9.806_65;
+/// Gravity seen from the base of a robot that stands upright, in m/s2.
+pub const UPRIGHT: [f64; 3] = [0.0, 0.0, -G];
 
 /// Positions, speeds and accelerations of the joints of a chain, in rad or m and seconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -98,7 +100,8 @@ impl Arm {
     }
 
     /// From the frame of one row to that of another one of the same link.
-    pub(crate) fn between(&self, from: u8, to: u8) -> Isometry3<f64> {
+    #[must_use]
+    pub fn between(&self, from: u8, to: u8) -> Isometry3<f64> {
         let frames = self.central.frames_at(&[]);
         let (Some(from), Some(to)) = (frames.row(from.into()), frames.row(to.into())) else {
             return Isometry3::identity();
@@ -139,7 +142,7 @@ mod tests {
     #[test]
     fn the_force_is_the_second_difference_of_the_place_less_gravity() {
         for skin in [testing::ur5(), testing::panda(), testing::lift()] {
-            let arm = Arm::new(&skin, 0, [0.0, 0.0, -G]);
+            let arm = Arm::new(&skin, 0, UPRIGHT);
             let joints = skin.chain(0).joints.len();
             let (t, step) = (0.37, 1e-4);
             let position = Vector3::new(0.03, -0.05, 0.11);

@@ -13,12 +13,7 @@ use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
 
 /// What the data sheet of an accelerometer says of all of its kind.
-///
-/// The default is a Bosch BMA250, which is on the published hexagonal skin cells, at a range of 2 g and a bandwidth of
-/// 62.5 Hz. From its data sheet (BST-BMA250-DS002): offset at zero g 80 mg, tolerance of sensitivity 4 %, cross-axis
-/// sensitivity 1 %, noise 0.8 mg/sqrt(Hz), 10 bits. Delay and the tolerance of the clock are of the cell.
-#[derive(Clone, Copy, Debug, Deserialize, PartialEq, Serialize)]
-#[serde(default, deny_unknown_fields)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct DataSheet {
     /// The largest offset of an axis, in g.
     pub bias_g: f64,
@@ -28,7 +23,7 @@ pub struct DataSheet {
     pub cross_axis: f64,
     /// Noise of a sample, root mean square, in g.
     pub noise_g: f64,
-    /// Samples in a second.
+    /// Samples in a second; 0: samples are taken when they are read.
     pub rate_hz: f64,
     /// The largest error of that rate, as a part of it.
     pub rate_error: f64,
@@ -40,23 +35,74 @@ pub struct DataSheet {
     pub step_g: f64,
 }
 
+/// A data sheet as a file has it: a kind, and what is different.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Given {
+    kind: Option<String>,
+    bias_g: Option<f64>,
+    gain: Option<f64>,
+    cross_axis: Option<f64>,
+    noise_g: Option<f64>,
+    rate_hz: Option<f64>,
+    rate_error: Option<f64>,
+    delay_s: Option<f64>,
+    range_g: Option<f64>,
+    step_g: Option<f64>,
+}
+
+impl Given {
+    /// The data sheet, if its values can be.
+    ///
+    /// # Errors
+    /// The first value that cannot be.
+    pub fn sheet(&self, at: &Place) -> Result<DataSheet, Fault> {
+        let kinds = [("perfect", DataSheet::PERFECT), ("bma250", DataSheet::BMA250)];
+        let mut sheet = at.key("kind").word(self.kind.as_deref().unwrap_or("bma250"), &kinds)?;
+        let all = [
+            ("bias_g", self.bias_g, &mut sheet.bias_g, [0.0, 1.0]),
+            ("gain", self.gain, &mut sheet.gain, [0.0, 0.5]),
+            ("cross_axis", self.cross_axis, &mut sheet.cross_axis, [0.0, 0.2]),
+            ("noise_g", self.noise_g, &mut sheet.noise_g, [0.0, 1.0]),
+            ("rate_hz", self.rate_hz, &mut sheet.rate_hz, [0.0, 1e5]),
+            ("rate_error", self.rate_error, &mut sheet.rate_error, [0.0, 0.5]),
+            ("delay_s", self.delay_s, &mut sheet.delay_s, [0.0, 0.1]),
+            ("range_g", self.range_g, &mut sheet.range_g, [1.2, 8.0]),
+            ("step_g", self.step_g, &mut sheet.step_g, [0.0, 0.1]),
+        ];
+        for (key, given, value, [min, max]) in all {
+            let Some(given) = given else { continue };
+            if !(min..=max).contains(&given) {
+                return Err(at.key(key).fault(given, format_args!("{min} to {max} are possible")));
+            }
+            *value = given;
+        }
+        Ok(sheet)
+    }
+}
+
 impl Default for DataSheet {
     fn default() -> Self {
-        Self {
-            bias_g: 0.08,
-            gain: 0.04,
-            cross_axis: 0.01,
-            noise_g: 0.0063,
-            rate_hz: 125.0,
-            rate_error: 0.01,
-            delay_s: 0.005,
-            range_g: 2.0,
-            step_g: 1.0 / 256.0,
-        }
+        Self::BMA250
     }
 }
 
 impl DataSheet {
+    /// A Bosch BMA250, which is on the published hexagonal skin cells, at a range of 2 g and a bandwidth of 62.5 Hz. From
+    /// its data sheet (BST-BMA250-DS002): offset at zero g 80 mg, tolerance of sensitivity 4 %, cross-axis sensitivity
+    /// 1 %, noise 0.8 mg/sqrt(Hz), 10 bits. Delay and the tolerance of the clock are of the cell.
+    pub const BMA250: Self = Self {
+        bias_g: 0.08,
+        gain: 0.04,
+        cross_axis: 0.01,
+        noise_g: 0.0063,
+        rate_hz: 125.0,
+        rate_error: 0.01,
+        delay_s: 0.005,
+        range_g: 2.0,
+        step_g: 1.0 / 256.0,
+    };
+
     /// A sensor without any error, whose samples are taken with the joints.
     pub const PERFECT: Self = Self {
         bias_g: 0.0,
@@ -69,30 +115,6 @@ impl DataSheet {
         range_g: 8.0,
         step_g: 0.0,
     };
-
-    /// The same, if its values can be.
-    ///
-    /// # Errors
-    /// The first value that cannot be.
-    pub fn checked(self) -> Result<Self, Fault> {
-        let all = [
-            ("bias_g", self.bias_g, 0.0, 1.0),
-            ("gain", self.gain, 0.0, 0.5),
-            ("cross_axis", self.cross_axis, 0.0, 0.2),
-            ("noise_g", self.noise_g, 0.0, 1.0),
-            ("rate_hz", self.rate_hz, 0.0, 1e5),
-            ("rate_error", self.rate_error, 0.0, 0.5),
-            ("delay_s", self.delay_s, 0.0, 0.1),
-            ("range_g", self.range_g, 1.2, 8.0),
-            ("step_g", self.step_g, 0.0, 0.1),
-        ];
-        for (key, got, min, max) in all {
-            if !(min..=max).contains(&got) {
-                return Err(Place::named(key).fault(got, format_args!("{min} to {max} is allowed")));
-            }
-        }
-        Ok(self)
-    }
 
     /// Mean and standard deviation of the age of a reading, in s.
     #[must_use]
@@ -187,7 +209,8 @@ impl Accelerometer {
 }
 
 /// A number of the standard normal distribution, by Box and Muller.
-pub(crate) fn normal(dice: &mut Pcg64Mcg) -> f64 {
+#[must_use]
+pub fn normal(dice: &mut Pcg64Mcg) -> f64 {
     let [u, v]: [f64; 2] = [dice.random(), dice.random()];
     (-2.0 * (1.0 - u).ln()).sqrt() * (TAU * v).cos()
 }

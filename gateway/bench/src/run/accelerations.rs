@@ -1,0 +1,112 @@
+//! What the accelerometers of simulated cells measure, as the robot is commanded to move.
+//!
+//! Of a motion that is known beforehand the stimuli are sent ahead of their epochs, as those of touches are. Of any other
+//! one, and while the robot is halted, they say how the robot moved in the last tick, and cells latch them with the next
+//! joints: they are a broadcast late.
+
+use model::accelerometer::kinematics::UPRIGHT;
+use model::accelerometer::{Accelerometers, RobotState};
+use protocol::fixed::Q3_12;
+use protocol::id::Node;
+use protocol::message::{From, Message, SensorPage};
+use protocol::packet::Epoch;
+use protocol::skin::Cell;
+
+use super::Options;
+
+/// How the robot moved in a tick.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Moved {
+    /// When the tick began, in s since the loop's start.
+    pub(super) at_s: f64,
+    pub(super) state: RobotState,
+    pub(super) is_halted: bool,
+}
+
+impl Moved {
+    /// How it moved a moment before.
+    fn before(&self, seconds: f64) -> RobotState {
+        let mut state = self.state;
+        let dt = (seconds - self.at_s).clamp(-0.1, 0.0);
+        let joints = state.position.iter_mut().zip(&mut state.speed).zip(&state.acceleration);
+        for ((position, speed), acceleration) in joints {
+            *position += dt * (*speed + dt / 2.0 * acceleration);
+            *speed += dt * acceleration;
+        }
+        state
+    }
+}
+
+/// The accelerometers of a run.
+#[derive(Debug)]
+pub(super) struct Accelerations {
+    sensors: Accelerometers,
+    /// The broadcasts when the last tick's motion was sent.
+    broadcasts: u64,
+}
+
+impl Accelerations {
+    /// Those of the scenario, if it has any.
+    pub(super) fn new(options: &Options) -> Option<Self> {
+        let sheet = options.scenario.sensors.acceleration?;
+        let sensors = Accelerometers::new(&options.skin, &sheet, options.scenario.seed, UPRIGHT);
+        Some(Self { sensors, broadcasts: 0 })
+    }
+
+    /// The stimuli of an epoch to come, `now` s after the loop's start, for each bus; none if the motion is not known.
+    pub(super) fn ahead(
+        &self,
+        options: &Options,
+        moved: Option<Moved>,
+        (epoch, now): (Epoch, f64),
+    ) -> Vec<(usize, Message)> {
+        if moved.is_some_and(|moved| moved.is_halted) {
+            return Vec::new();
+        }
+        match (&options.planned, options.scenario.motion) {
+            (Some(planned), _) => {
+                self.stimuli(options, |seconds| planned.at(seconds), now, From::Epoch(epoch))
+            }
+            (None, motion) if motion.state_at(now).is_some() => {
+                let state = |seconds| motion.state_at(seconds).unwrap_or_default();
+                self.stimuli(options, state, now, From::Epoch(epoch))
+            }
+            (None, _) => Vec::new(),
+        }
+    }
+
+    /// The stimuli after the newest of some broadcasts, at `now`, once; none if they were sent ahead.
+    pub(super) fn latest(
+        &mut self,
+        options: &Options,
+        moved: Option<Moved>,
+        (broadcasts, now): (u64, f64),
+    ) -> Vec<(usize, Message)> {
+        let is_known = options.planned.is_some() || options.scenario.motion.state_at(now).is_some();
+        match moved {
+            Some(moved) if self.broadcasts != broadcasts && (moved.is_halted || !is_known) => {
+                self.broadcasts = broadcasts;
+                self.stimuli(options, |seconds| moved.before(seconds), now, From::Next)
+            }
+            _ => Vec::new(),
+        }
+    }
+
+    fn stimuli(
+        &self,
+        options: &Options,
+        state: impl Fn(f64) -> RobotState,
+        now: f64,
+        from: From,
+    ) -> Vec<(usize, Message)> {
+        let readings = self.sensors.readings(&options.skin, state, now, |_, force| *force);
+        let cells = options.skin.cells.iter().zip(readings);
+        cells
+            .map(|(&Cell { bus, node, .. }, reading)| {
+                let words: [f64; 3] = reading.into();
+                let page = SensorPage::Acceleration(words.map(Q3_12::nearest));
+                (bus, Message::Stimulus { to: Node::Cell(node), from, page })
+            })
+            .collect()
+    }
+}

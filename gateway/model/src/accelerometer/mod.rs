@@ -1,0 +1,93 @@
+//! What the accelerometers of cells show while a robot moves.
+//!
+//! | module | what |
+//! |---|---|
+//! | [`kinematics`] | what an accelerometer at a place of the robot feels |
+//! | [`sensor`] | an accelerometer with the errors of its data sheet |
+
+pub mod kinematics;
+pub mod sensor;
+
+use nalgebra::Vector3;
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
+
+use kinematics::{Arm, JointState};
+use sensor::{Accelerometer, DataSheet, rotation};
+
+/// Positions, speeds and accelerations of all joints of a robot.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct RobotState {
+    /// The positions, in rad or m.
+    pub position: [f64; MAX_ROBOT_JOINTS],
+    /// The speeds.
+    pub speed: [f64; MAX_ROBOT_JOINTS],
+    /// The accelerations.
+    pub acceleration: [f64; MAX_ROBOT_JOINTS],
+}
+
+impl RobotState {
+    /// Those of a chain, given the robot's joints in it.
+    #[must_use]
+    pub fn of_chain(&self, joints: &[usize]) -> JointState {
+        let pick = |from: &[f64; MAX_ROBOT_JOINTS]| {
+            let mut to = [0.0; MAX_JOINTS];
+            for (to, &joint) in to.iter_mut().zip(joints) {
+                *to = from.get(joint).copied().unwrap_or_default();
+            }
+            to
+        };
+        JointState {
+            position: pick(&self.position),
+            speed: pick(&self.speed),
+            acceleration: pick(&self.acceleration),
+        }
+    }
+}
+
+/// The accelerometers of a skin.
+#[derive(Clone, Debug)]
+pub struct Accelerometers {
+    arms: Vec<Option<Arm>>,
+    /// By cell.
+    sensors: Vec<Accelerometer>,
+}
+
+impl Accelerometers {
+    /// One for each cell, drawn from a data sheet and a seed; gravity is seen from the robot's base, in m/s2.
+    #[must_use]
+    pub fn new(skin: &Skin, sheet: &DataSheet, seed: u64, gravity: [f64; 3]) -> Self {
+        let arm = |bus: usize| skin.cells_of(bus).next().map(|_| Arm::new(skin, bus, gravity));
+        let sensors = skin.cells.iter().map(|cell| {
+            let stream = u64::from(cell.serial).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+            Accelerometer::new(sheet, seed ^ stream)
+        });
+        Self { arms: (0..skin.buses.len()).map(arm).collect(), sensors: sensors.collect() }
+    }
+
+    /// The sensor of a cell.
+    #[must_use]
+    pub fn sensor(&self, cell: usize) -> Option<&Accelerometer> {
+        self.sensors.get(cell)
+    }
+
+    /// What each cell of the skin shows at a time in s, in g; `state` is the robot's at a time, `tilt` turns what a cell
+    /// feels.
+    pub fn readings<'a>(
+        &'a self,
+        skin: &'a Skin,
+        state: impl Fn(f64) -> RobotState + 'a,
+        now: f64,
+        tilt: impl Fn(usize, &Vector3<f64>) -> Vector3<f64> + 'a,
+    ) -> impl Iterator<Item = Vector3<f64>> + 'a {
+        skin.cells.iter().zip(&self.sensors).enumerate().map(move |(index, (cell, sensor))| {
+            let moment = state(sensor.sampled(now));
+            let state = moment.of_chain(&skin.chain(cell.bus).joints);
+            let rows = self.arms.get(cell.bus).and_then(Option::as_ref).map(|arm| arm.rows(&state));
+            let row = rows.and_then(|rows| rows.get(usize::from(cell.row)).copied()).unwrap_or_default();
+            let force = row.at(&cell.position.into());
+            let local = rotation(cell.orientation, cell.normal).inverse() * force;
+            sensor.reading(now, &tilt(index, &local))
+        })
+    }
+}
