@@ -226,7 +226,7 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> R
                     NoteKind::Dropped(lost) => {
                         show.dropped(note.interface, lost);
                         output::note(format_args!(
-                            "{place}: {lost} frames are missing here: candump lost them"
+                            "{place}: {lost} frames are missing here: the recorder lost them"
                         ));
                     }
                     NoteKind::Unreadable(why) if strict => {

@@ -114,7 +114,7 @@ fn a_capture_in_numbers_is_a_table_or_an_object() {
                (1.000000) can1 12345678#\n";
     std::fs::write(folder.join("small.log"), log).unwrap();
     let Output { status, stdout, stderr } = gateway(folder, "dump small.log --stats --json");
-    let complaint = "small.log:4: 12 frames are missing here: candump lost them\n";
+    let complaint = "small.log:4: 12 frames are missing here: the recorder lost them\n";
     assert_eq!((status.code(), std::str::from_utf8(&stderr)), (Some(0), Ok(complaint)));
     let numbers: serde_json::Value = serde_json::from_slice(&stdout).unwrap();
     assert_eq!((&numbers["format"], &numbers["frames"]), (&"candump log".into(), &5.into()));

@@ -127,7 +127,7 @@ fn lines_that_cannot_be_read_are_named_and_the_others_shown() {
     let name = file.display();
     let expected = format!(
         "{name}:2: column 18: an identifier of 3 or 8 hexadecimal digits\n\
-         {name}:3: 12 frames are missing here: candump lost them\n\
+         {name}:3: 12 frames are missing here: the recorder lost them\n\
          {name}:4: column 18: an identifier of 3 or 8 hexadecimal digits\n\
          {name}: 2 of 6 lines could not be read\n\
          {name}: CAN XL frames are not shown: 1\n"
