@@ -114,8 +114,10 @@ pub struct Cycle {
     controller: Box<dyn Controller>,
     robot: Box<dyn Robot + Send>,
     central: Vec<Central>,
-    /// By bus.
+    /// Each once, though several buses may have it.
     chains: Vec<Chain>,
+    /// By bus, which of them it has.
+    chain_of: Vec<usize>,
     tick_seconds: f64,
     ticks_per_broadcast: u64,
     safety: Safety,
@@ -147,11 +149,20 @@ impl Cycle {
     /// A loop that has not begun; the first epoch will be 0.
     #[must_use]
     pub fn new(skin: &Skin, controller: Box<dyn Controller>, robot: Box<dyn Robot + Send>) -> Self {
+        let (mut chains, mut chain_of) = (Vec::<Chain>::new(), Vec::new());
+        for chain in (0..skin.buses.len()).map(|bus| Chain::new(skin, bus)) {
+            let known = chains.iter().position(|known| *known == chain);
+            chain_of.push(known.unwrap_or(chains.len()));
+            if known.is_none() {
+                chains.push(chain);
+            }
+        }
         Self {
             controller,
             robot,
             central: (0..skin.buses.len()).map(|bus| Central::new(&skin.part_on(bus))).collect(),
-            chains: (0..skin.buses.len()).map(|bus| Chain::new(skin, bus)).collect(),
+            chains,
+            chain_of,
             tick_seconds: 1.0 / skin.timing.control_hz,
             ticks_per_broadcast: u64::from(skin.timing.ticks_per_broadcast),
             safety: skin.safety,
@@ -211,7 +222,8 @@ impl Cycle {
         };
         let (mut stale, mut dead, mut halts, mut resumes) = (0, 0, 0, 0);
         let mut some_bus_works = false;
-        let chains = self.carried.iter_mut().zip(&self.chains);
+        let chains = self.chain_of.iter().filter_map(|&chain| self.chains.get(chain));
+        let chains = self.carried.iter_mut().zip(chains);
         for (index, (Heard { sums: bus, works }, (carried, chain))) in
             buses.into_iter().zip(chains).enumerate()
         {
@@ -282,7 +294,8 @@ impl Cycle {
     #[must_use]
     pub fn central<'a>(&self, buses: impl IntoIterator<Item = &'a Snapshot>) -> Reference {
         let mut reference = Reference::default();
-        for ((central, chain), bus) in self.central.iter().zip(&self.chains).zip(buses) {
+        let chains = self.chain_of.iter().filter_map(|&chain| self.chains.get(chain));
+        for ((central, chain), bus) in self.central.iter().zip(chains).zip(buses) {
             let part = central.total(&central.frames(&chain.said().positions), &bus.sensors);
             chain.add(1.0, &part.torque, &mut reference.torque);
             reference.active += part.active;
@@ -290,16 +303,22 @@ impl Cycle {
         reference
     }
 
-    /// The joints of a bus' chain as they were last broadcast.
+    /// The chain of a bus; buses with the same one have the same joints.
     #[must_use]
-    pub fn joints(&self, bus: usize) -> Joints {
-        self.chains.get(bus).map_or_else(Joints::default, Chain::said)
+    pub fn chain_of(&self, bus: usize) -> usize {
+        self.chain_of.get(bus).copied().unwrap_or(usize::MAX)
     }
 
-    /// What the newest broadcast said of a bus' chain, before it was rounded to words.
+    /// The joints of a chain as they were last broadcast.
     #[must_use]
-    pub fn positions_of(&self, bus: usize) -> [f64; MAX_JOINTS] {
-        self.chains.get(bus).map_or([0.0; MAX_JOINTS], |chain| chain.positions(&self.robot.positions()))
+    pub fn joints(&self, chain: usize) -> Joints {
+        self.chains.get(chain).map_or_else(Joints::default, Chain::said)
+    }
+
+    /// What the newest broadcast said of a chain, before it was rounded to words.
+    #[must_use]
+    pub fn positions_of(&self, chain: usize) -> [f64; MAX_JOINTS] {
+        self.chains.get(chain).map_or([0.0; MAX_JOINTS], |chain| chain.positions(&self.robot.positions()))
     }
 
     /// Halts and resumes that others sent; a halt takes precedence over a resume. Returns what has to be sent on

@@ -5,8 +5,8 @@ use protocol::message::Joints;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{JointKind, MAX_ROBOT_JOINTS, Skin};
 
-/// The joints of a bus' chain, and what was last said of them.
-#[derive(Clone, Debug)]
+/// The joints of a chain, and what was last said of them.
+#[derive(Clone, Debug, PartialEq)]
 pub(super) struct Chain {
     /// Each joint by its place among those of the robot.
     joints: Vec<(usize, JointKind)>,

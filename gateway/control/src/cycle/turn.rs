@@ -172,15 +172,20 @@ impl Turn {
                 self.owed.fill(Some(Message::Halt));
             }
             self.say_what_is_owed(&mut send);
+            // Many buses have the same joints: they are encoded once.
+            let mut said: Option<(usize, Format, Encoded, [f64; MAX_JOINTS])> = None;
             for (bus, line) in self.lines.iter_mut().enumerate() {
+                let chain = self.cycle.chain_of(bus);
+                let same = said.as_ref().filter(|(of, format, ..)| (*of, *format) == (chain, line.format));
+                if same.is_none() {
+                    let joints = Message::Joints { epoch, joints: self.cycle.joints(chain) };
+                    let encoded = Encoded::new(&joints.encode(), line.format);
+                    said = Some((chain, line.format, encoded, self.cycle.positions_of(chain)));
+                }
+                let Some((_, _, encoded, positions)) = &said else { continue };
                 // A full queue costs the receiver the unrounded positions, and nothing else.
-                let _ = line.positions.push((epoch, self.cycle.positions_of(bus)));
-                line.say(
-                    bus,
-                    &Message::Joints { epoch, joints: self.cycle.joints(bus) },
-                    &self.shared,
-                    &mut send,
-                );
+                let _ = line.positions.push((epoch, *positions));
+                line.give(bus, encoded, &self.shared, &mut send);
             }
             self.shared.broadcasts.fetch_add(1, Ordering::Release);
             self.shared.broadcasts_skipped.fetch_add(outcome.broadcasts_skipped, Ordering::Relaxed);
@@ -244,8 +249,18 @@ impl Line {
         shared: &Shared,
         send: &mut impl FnMut(usize, &[Frame]) -> bool,
     ) -> bool {
-        let (frames, count) = frames(&message.encode(), self.format);
-        let frames = frames.get(..count).unwrap_or_default();
+        self.give(bus, &Encoded::new(&message.encode(), self.format), shared, send)
+    }
+
+    /// The same with its frames.
+    fn give(
+        &self,
+        bus: usize,
+        encoded: &Encoded,
+        shared: &Shared,
+        send: &mut impl FnMut(usize, &[Frame]) -> bool,
+    ) -> bool {
+        let frames = encoded.frames();
         let taken = send(bus, frames);
         if taken {
             self.state.commands.fetch_add(1, Ordering::Relaxed);
@@ -257,12 +272,23 @@ impl Line {
 }
 
 /// A packet's frames in place: an array, and how many of it are used.
-fn frames(packet: &Packet, format: Format) -> ([Frame; Length::MAX_SEGMENTS], usize) {
-    let mut frames = [Frame::EMPTY; Length::MAX_SEGMENTS];
-    let mut count = 0;
-    for (place, frame) in frames.iter_mut().zip(packet.frames(format)) {
-        *place = frame;
-        count += 1;
+#[derive(Clone, Copy, Debug)]
+struct Encoded {
+    all: [Frame; Length::MAX_SEGMENTS],
+    count: usize,
+}
+
+impl Encoded {
+    fn new(packet: &Packet, format: Format) -> Self {
+        let mut encoded = Self { all: [Frame::EMPTY; Length::MAX_SEGMENTS], count: 0 };
+        for (place, frame) in encoded.all.iter_mut().zip(packet.frames(format)) {
+            *place = frame;
+            encoded.count += 1;
+        }
+        encoded
     }
-    (frames, count)
+
+    fn frames(&self) -> &[Frame] {
+        self.all.get(..self.count).unwrap_or_default()
+    }
 }
