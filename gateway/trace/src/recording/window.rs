@@ -20,7 +20,7 @@ pub const WINDOW_NS: u64 = 40_000_000;
 const MESSAGES: usize = 65_536;
 /// Their bytes at most.
 const BYTES: usize = 16 << 20;
-/// The bytes that a buffer keeps; what it grew by while a file stood still is given back.
+/// The bytes of each buffer from the beginning on; what it grew by while a file stood still is given back.
 const KEPT: usize = 1 << 20;
 
 /// A message that waits.
@@ -39,7 +39,7 @@ struct Waiting {
 }
 
 /// The messages that wait to be written, of one file after the other.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Window {
     waiting: Vec<Waiting>,
     bytes: Vec<u8>,
@@ -52,6 +52,30 @@ pub struct Window {
     /// Messages that came when the file was past their time.
     late: u64,
     buffers: (Vec<u8>, Vec<u8>),
+}
+
+impl Default for Window {
+    /// Without a message. Its memory is used once, so that a recorder takes all of it from its start on, and not when
+    /// it is late for the first time.
+    fn default() -> Self {
+        let bytes = || {
+            let mut bytes = vec![1; KEPT];
+            bytes.clear();
+            bytes
+        };
+        let none = Waiting { at: 1, nanos: 1, begin: 0, end: 0, channel: 0, sequence: 0, is_frame: false };
+        let mut waiting = vec![none; KEPT / size_of::<Waiting>()];
+        waiting.clear();
+        Self {
+            waiting,
+            bytes: bytes(),
+            latest: Vec::new(),
+            now: 0,
+            released: 0,
+            late: 0,
+            buffers: (Vec::new(), bytes()),
+        }
+    }
 }
 
 impl Window {
