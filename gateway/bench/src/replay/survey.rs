@@ -1,7 +1,7 @@
 //! What a capture holds, found in a first reading: its buses and their cells, what it lacks by the cells' own
 //! counters, and the state where the replay begins.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 
 use model::tracker::{Account, DEAD_AFTER, LATEST, Tracked, Word};
 use protocol::can::Format;
@@ -19,8 +19,11 @@ use trace::capture::{BusNote, Latched, Note};
 /// A cell that sends nothing for so long is absent, in ns.
 const SILENT_NS: u64 = DEAD_AFTER.0 * 1_000;
 
-/// So many joints at most pass a page of counters on its way.
-const PASSED: u64 = 64;
+/// A cell that starts hears joints for so long at most before its first heartbeat, in ns.
+const STARTS_NS: u64 = 100_000_000;
+
+/// A page of counters is on its way for so many joints at most.
+const PASSED: usize = 64;
 
 /// A part of a capture, in ns after its first frame.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -61,12 +64,8 @@ pub struct Bus {
     pub format: Option<Format>,
     /// Joint broadcasts on it.
     pub joints: u64,
-    /// When the last of them was on it, in ns since 1970.
-    last_joints: u64,
-    /// Of these, those before the last request for a report; none if there was no request.
-    at_report: Option<(u64, u64)>,
-    /// When the joints came that may still be answered, newest first.
-    recent_joints: [u64; LATEST + 1],
+    /// The newest of them, newest last.
+    recent_joints: VecDeque<Broadcast>,
     /// Whether a cell reported its counters, or something was latched when the capture began: then a part of a
     /// recording, or a truncated one, may lack what its counters would account for.
     is_accounted: bool,
@@ -82,6 +81,16 @@ pub struct Bus {
     pub cells: BTreeMap<CellId, Cell>,
     /// What is known of cells from before the capture.
     before: BTreeMap<CellId, Before>,
+}
+
+/// A broadcast of joints.
+#[derive(Clone, Copy, Debug)]
+struct Broadcast {
+    epoch: Epoch,
+    /// The joints until then, it among them.
+    number: u64,
+    /// When, in ns since 1970.
+    nanos: u64,
 }
 
 /// What is known of a cell from before the capture.
@@ -209,7 +218,9 @@ impl Survey {
     pub fn note(&mut self, note: &Note<'_>) {
         let Some((name, BusNote::Lost)) = BusNote::of(note) else { return };
         let Some(bus) = self.bus_named(name).and_then(|at| self.buses.get_mut(at)) else { return };
-        let since = bus.recent_joints.into_iter().filter(|at| *at > 0).min().unwrap_or(note.nanos);
+        // Those that may still be answered.
+        let recent = bus.recent_joints.iter().rev().take(LATEST + 1);
+        let since = recent.map(|joints| joints.nanos).min().unwrap_or(note.nanos);
         for cell in bus.cells.values_mut() {
             cell.away.get_or_insert(since);
         }
@@ -280,21 +291,17 @@ impl Bus {
         }
         self.is_accounted |= matches!(message, Message::Network { page: NetworkPage::Heard(_), .. });
         self.sums += u64::from(matches!(message, Message::Sum { .. }));
-        let joints = (self.joints, self.last_joints);
         if let Some(cell) = from.and_then(|from| self.cells.get_mut(&from)) {
-            cell.take(message, nanos, place, joints, self.at_report);
+            cell.take(message, nanos, place, &self.recent_joints);
         } else if let Message::Joints { epoch, joints } = *message {
             self.joints += 1;
-            self.last_joints = self.last_joints.max(nanos);
-            self.recent_joints.rotate_right(1);
-            if let Some(newest) = self.recent_joints.first_mut() {
-                *newest = nanos;
+            self.recent_joints.push_back(Broadcast { epoch, number: self.joints, nanos });
+            if self.recent_joints.len() > PASSED {
+                self.recent_joints.pop_front();
             }
             if place == Place::In {
                 self.first_joints.get_or_insert((epoch, joints));
             }
-        } else if *message == Message::Report {
-            self.at_report = Some(joints);
         }
     }
 
@@ -352,27 +359,26 @@ impl Cell {
         }
     }
 
-    /// Takes in a message of it, after so many joints of which the last was at some time; a report was requested last
-    /// after others.
-    fn take(
-        &mut self,
-        message: &Message,
-        nanos: u64,
-        place: Place,
-        joints: (u64, u64),
-        at_report: Option<(u64, u64)>,
-    ) {
+    /// Takes in a message of it, after some joints.
+    fn take(&mut self, message: &Message, nanos: u64, place: Place, joints: &VecDeque<Broadcast>) {
         let word = self.tracked.hear(Micros(nanos / 1_000), message, None).word;
         if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
             match word {
                 Some(Word::Claimant | Word::Outsider | Word::Overtaken) | None => return,
-                // After a start its counters begin again.
-                Some(Word::Started { .. }) => self.report = Some((Heard::default(), joints.0, joints.1)),
+                // After a start its counters begin again, with joints that it took before this heartbeat.
+                Some(Word::Started { .. }) => {
+                    let last = joints.back().map(|last| (last.number, last.nanos)).unwrap_or_default();
+                    let may_count = |joints: &&Broadcast| nanos <= joints.nanos.saturating_add(STARTS_NS);
+                    let early = joints.iter().rev().take_while(may_count).count() as u64;
+                    self.report = Some((Heard::default(), last.0.saturating_sub(early), last.1));
+                }
                 Some(Word::First | Word::Known | Word::Shared) => {}
             }
             self.heartbeat(heartbeat, nanos, place);
-        } else if let Message::Network { page: NetworkPage::Heard(heard), .. } = *message {
-            self.report(heard, at_report);
+        } else if let Message::Network { page: NetworkPage::Heard(heard), epoch, .. } = *message {
+            // The page has the epoch of the last joints that its counters have.
+            let at = joints.iter().rev().find(|joints| joints.epoch == epoch);
+            self.report(heard, at.map(|joints| (joints.number, joints.nanos)));
         } else if let Message::Configured { answer: Answer::Value { number, written: true, .. }, .. } =
             *message
             && number == Parameter::Commit.number()
@@ -401,17 +407,16 @@ impl Cell {
         self.measured |= place == Place::In && !heartbeat.state.has(Flags::TEST_MODE);
     }
 
-    /// Counters that were requested at some joints. If that was before the capture, it is unknown which joints they
-    /// account for.
-    fn report(&mut self, heard: Heard, requested: Option<(u64, u64)>) {
-        let Some((joints, last)) = requested else { return };
+    /// Counters up to some joints. If these were before the capture, it is unknown which joints they account for.
+    fn report(&mut self, heard: Heard, at: Option<(u64, u64)>) {
+        let Some((joints, last)) = at else { return };
         if let Some((before, joints_before, from)) = self.report {
             let taken = heard.joints.wrapping_sub(before.joints);
             let repeated = heard.joints_repeated.wrapping_sub(before.joints_repeated);
             let known = u64::from(taken) + u64::from(repeated);
             let between = joints.saturating_sub(joints_before);
             // More than there were are not of one life: what seemed a start was none.
-            if known <= between + PASSED {
+            if known <= between + PASSED as u64 {
                 self.untaken += between.saturating_sub(known);
                 match self.accounted.last_mut() {
                     Some((_, until)) if *until == from => *until = last,
@@ -449,44 +454,4 @@ pub fn is_joints(id: Id) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
-    use protocol::candump::Timestamp;
-
-    use super::*;
-
-    #[test]
-    fn counters_that_cannot_be_of_one_life_account_for_no_joints() {
-        let mut cell = Cell::new(0, None);
-        let mut report = |joints, after, last| {
-            cell.report(Heard { joints, ..Heard::default() }, Some((after, last)));
-            (cell.untaken, cell.accounted.clone())
-        };
-        assert_eq!(report(0, 100, 10), (0, vec![]));
-        // An old heartbeat seemed a start, and then its own counters came.
-        assert_eq!(report(2_000, 150, 20), (0, vec![]));
-        assert_eq!(report(2_040, 200, 30), (10, vec![(20, 30)]));
-        assert_eq!(report(2_090, 250, 40), (10, vec![(20, 40)]));
-    }
-
-    #[test]
-    fn a_part_has_counters_elsewhere_though_one_of_its_buses_began_lost() {
-        let torque =
-            Message::Torque { from: CellId::new(1).unwrap(), epoch: Epoch(3), torque: [0; 6].into() };
-        let frames: Vec<_> = torque.encode().frames(Format::Fd).collect();
-        let time = Timestamp { nanos: 5, nine_digits: true, min_digits: 0 };
-        let of = |latched: &[Latched]| {
-            let mut survey = Survey::new(Part::default());
-            survey.begin(latched);
-            for interface in ["vcan0", "vcan1"] {
-                survey.take(&Record { time, interface, frame: frames[0], direction: None });
-            }
-            survey.finish();
-            let buses = survey.buses.iter().filter(|bus| !bus.cells.is_empty());
-            buses.map(|bus| bus.cells.values().next().unwrap().is_counted_at(5)).collect::<Vec<_>>()
-        };
-        assert_eq!(of(&[]), [true, true], "a log of a bench that has no counters");
-        let frame = Message::Resume.encode().frames(Format::Fd).next().unwrap();
-        let latched = Latched { bus: "vcan0".into(), own: true, frame, nanos: 1 };
-        assert_eq!(of(&[latched]), [false, false]);
-    }
-}
+mod tests;

@@ -442,7 +442,8 @@ pub(super) fn explain_extra(
     is_last: bool,
     is_end: bool,
 ) -> bool {
-    let may_answer = round.may_answer(cell);
+    // After what seemed a start nothing is known of its contact, and it may go on.
+    let is_free = round.touched.iter().all(|touched| touched.is(cell) == Some(false));
     let Some(known_cell) = known_cell else {
         // A cell that the recording does not have.
         lacking.silent += 1;
@@ -457,7 +458,7 @@ pub(super) fn explain_extra(
         lacking.silent += 1;
     } else if is_last && !is_counted {
         lacking.ended += 1;
-    } else if may_answer && !is_counted {
+    } else if !is_free && !is_counted {
         lacking.uncounted += 1;
     } else if cell.untaken > 0 {
         cell.untaken -= 1;

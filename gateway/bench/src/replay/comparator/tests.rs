@@ -24,9 +24,9 @@ fn heartbeat(node: i64, epoch: u8, sent: u16, state: Flags) -> Message {
     Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(epoch), page }
 }
 
-fn heard(node: i64, joints: u16) -> Message {
+fn heard(node: i64, epoch: u8, joints: u16) -> Message {
     let page = NetworkPage::Heard(Heard { joints, ..Heard::default() });
-    Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(0), page }
+    Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(epoch), page }
 }
 
 fn sum(node: i64, epoch: u8, bits: i16, count: u8) -> Message {
@@ -165,9 +165,8 @@ fn what_the_recording_lost_is_not_blamed_on_the_cell() {
 fn joints_that_a_cell_did_not_take_then_explain_an_answer_now() {
     // It did not take joints 3, and so sent the end of the contact one later.
     let recording = [
-        Message::Report,
-        heard(1, 100),
         joints(0),
+        heard(1, 0, 101),
         joints(1),
         torque(1, 1, 5),
         joints(2),
@@ -176,14 +175,13 @@ fn joints_that_a_cell_did_not_take_then_explain_an_answer_now() {
         joints(4),
         torque(1, 4, 0),
         joints(5),
-        Message::Report,
-        heard(1, 105),
+        heard(1, 5, 105),
     ];
     let comparator = rated(&recording, &run());
     let Lacking { untaken, said_later, .. } = comparator.tally.lacking;
     assert_eq!((counts(&comparator), untaken, said_later), ([2, 0, 0, 0], 1, 1));
     let mut knows = recording;
-    knows[12] = heard(1, 106);
+    knows[10] = heard(1, 5, 106);
     assert_eq!(counts(&rated(&knows, &run())), [2, 0, 1, 1], "it took all, by its own counters");
 }
 
@@ -256,7 +254,7 @@ fn the_contact_of_a_cell_before_its_first_joints_belongs_to_no_joints() {
     };
     // A report that was requested before the first joints, and answered when they were on the bus already.
     let mut recording = run();
-    recording.splice(2..2, [heard(1, 0), sensors(0)]);
+    recording.splice(2..2, [heard(1, 0, 0), sensors(0)]);
     assert_eq!(counts(&rated(&recording, &run())), [3, 0, 0, 0]);
     let late = |said: &[Message]| {
         let mut recording = recording.clone();
@@ -264,12 +262,12 @@ fn the_contact_of_a_cell_before_its_first_joints_belongs_to_no_joints() {
         counts(&rated(&recording, &run()))
     };
     // Its counters, its torque and another epoch show that it has taken joints since.
-    assert_eq!(late(&[heard(1, 1), sensors(0)]), [3, 0, 1, 0]);
+    assert_eq!(late(&[heard(1, 0, 1), sensors(0)]), [3, 0, 1, 0]);
     assert_eq!(late(&[torque(1, 0, 0), sensors(0)]), [3, 0, 2, 0]);
     assert_eq!(late(&[heartbeat(1, 1, 12, Flags::TEST_MODE), sensors(1)]), [3, 0, 1, 0]);
     // For a cell that had taken joints before, nothing changes.
     let mut recording = run();
-    recording.splice(2..2, [heard(1, 7), sensors(0)]);
+    recording.splice(2..2, [heard(1, 0, 7), sensors(0)]);
     assert_eq!(counts(&rated(&recording, &run())), [3, 0, 1, 0]);
 }
 

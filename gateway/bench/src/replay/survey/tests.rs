@@ -1,0 +1,95 @@
+use protocol::candump::Timestamp;
+
+use super::*;
+
+#[test]
+fn counters_that_cannot_be_of_one_life_account_for_no_joints() {
+    let mut cell = Cell::new(0, None);
+    let mut report = |joints, after, last| {
+        cell.report(Heard { joints, ..Heard::default() }, Some((after, last)));
+        (cell.untaken, cell.accounted.clone())
+    };
+    assert_eq!(report(0, 100, 10), (0, vec![]));
+    // An old heartbeat seemed a start, and then its own counters came.
+    assert_eq!(report(2_000, 150, 20), (0, vec![]));
+    assert_eq!(report(2_040, 200, 30), (10, vec![(20, 30)]));
+    assert_eq!(report(2_090, 250, 40), (10, vec![(20, 40)]));
+}
+
+#[test]
+fn a_part_has_counters_elsewhere_though_one_of_its_buses_began_lost() {
+    let torque = Message::Torque { from: CellId::new(1).unwrap(), epoch: Epoch(3), torque: [0; 6].into() };
+    let frames: Vec<_> = torque.encode().frames(Format::Fd).collect();
+    let time = Timestamp { nanos: 5, nine_digits: true, min_digits: 0 };
+    let of = |latched: &[Latched]| {
+        let mut survey = Survey::new(Part::default());
+        survey.begin(latched);
+        for interface in ["vcan0", "vcan1"] {
+            survey.take(&Record { time, interface, frame: frames[0], direction: None });
+        }
+        survey.finish();
+        let buses = survey.buses.iter().filter(|bus| !bus.cells.is_empty());
+        buses.map(|bus| bus.cells.values().next().unwrap().is_counted_at(5)).collect::<Vec<_>>()
+    };
+    assert_eq!(of(&[]), [true, true], "a log of a bench that has no counters");
+    let frame = Message::Resume.encode().frames(Format::Fd).next().unwrap();
+    let latched = Latched { bus: "vcan0".into(), own: true, frame, nanos: 1 };
+    assert_eq!(of(&[latched]), [false, false]);
+}
+
+/// A bus on which one cell sends a page of counters after some joints, all 16 ms apart.
+struct Counting(Survey, u64);
+
+impl Counting {
+    fn take(&mut self, message: &Message) {
+        for frame in message.encode().frames(Format::Fd) {
+            let time = Timestamp { nanos: self.1, nine_digits: true, min_digits: 0 };
+            self.0.take(&Record { time, interface: "vcan0", frame, direction: None });
+        }
+    }
+
+    fn joints(&mut self, epochs: core::ops::RangeInclusive<u8>) {
+        for epoch in epochs {
+            self.1 += 16_000_000;
+            self.take(&Message::Joints {
+                epoch: Epoch(epoch),
+                joints: Joints { in_use: 6, ..Joints::default() },
+            });
+        }
+    }
+
+    fn page(&mut self, epoch: u8, page: NetworkPage) -> u64 {
+        let from = CellId::new(1).unwrap();
+        self.take(&Message::Network { from: Node::Cell(from), epoch: Epoch(epoch), page });
+        self.0.buses[0].cells[&from].untaken
+    }
+
+    fn heard(&mut self, epoch: u8, joints: u16) -> u64 {
+        self.page(epoch, NetworkPage::Heard(Heard { joints, ..Heard::default() }))
+    }
+}
+
+#[test]
+fn a_page_counts_up_to_the_joints_that_it_names() {
+    let mut bus = Counting(Survey::new(Part::default()), 0);
+    bus.joints(1..=10);
+    assert_eq!(bus.heard(8, 700), 0);
+    bus.joints(11..=20);
+    assert_eq!(bus.heard(20, 712), 0, "of the twelve after epoch 8 it took all");
+    bus.joints(21..=30);
+    assert_eq!(bus.heard(29, 720), 1, "of the nine until epoch 29 it took eight");
+    assert_eq!(bus.heard(30, 721), 1);
+}
+
+#[test]
+fn a_cell_may_have_taken_joints_before_its_first_heartbeat() {
+    let mut bus = Counting(Survey::new(Part::default()), 0);
+    let heartbeat = |sent, state| NetworkPage::Heartbeat(Heartbeat { sent, state, ..Heartbeat::default() });
+    bus.joints(1..=10);
+    bus.page(10, heartbeat(900, Flags::default()));
+    bus.joints(11..=20);
+    bus.page(20, heartbeat(0, Flags::CLAIMING));
+    bus.joints(21..=30);
+    // It began with epoch 15, and took all but three: which of them it did not take is not known.
+    assert_eq!(bus.heard(30, 13), 4);
+}
