@@ -143,6 +143,32 @@ fn cells_whose_sensors_drift_feel_what_touches_them_and_nothing_else() {
     assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
 }
 
+/// Of a robot that stands and of one that a controller moves, and that nothing touches.
+#[test]
+fn accelerometers_of_a_robot_at_rest_show_gravity_in_the_frames_of_their_cells() {
+    for motion in ["hold", "kinesthetic"] {
+        let place = place(
+            "sensing = \"continuous\"\nsensing_hz = 20.0",
+            &format!("[motion]\nkind = \"{motion}\"\n[sensors.acceleration]\nkind = \"perfect\"\n"),
+        );
+        place.bench(2.0, "").end().well();
+        place.is_left_clean();
+        let log = Log::read(&place.read("run.log"), Format::Fd);
+        let mut shown = std::collections::BTreeMap::new();
+        for (message, _) in &log.messages {
+            if let Message::Sensors { from, page: SensorPage::Acceleration(words), .. } = message {
+                shown.insert(from.get(), words.map(|word| word.to_f64()));
+            }
+        }
+        assert_eq!(shown.len(), usize::from(CELLS), "{motion}: {shown:?}");
+        let size = |[x, y, z]: &[f64; 3]| (x * x + y * y + z * z).sqrt();
+        assert!(shown.values().all(|it| (size(it) - 1.0).abs() < 1e-3), "{motion}: {shown:?}");
+        let same = shown.values().filter(|it| **it == shown[&1]).count();
+        assert_eq!(same, 1, "{motion}: they face in other directions: {shown:?}");
+        place.summary().adds_up();
+    }
+}
+
 #[test]
 fn an_invalid_request_is_refused_in_one_line() {
     let place = Place::new();

@@ -110,3 +110,20 @@ impl Accelerations {
             .collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_before_a_tick_follows_from_its_speeds_and_what_comes_after_it_is_unknown() {
+        let mut state = RobotState::default();
+        (state.position[1], state.speed[1], state.acceleration[1]) = (0.5, 1.0, -10.0);
+        let moved = Moved { at_s: 2.0, state, is_halted: false };
+        let before = moved.before(1.99);
+        // q - v t + a t^2 / 2, v - a t.
+        assert!((before.position[1] - (0.5 - 0.01 - 0.000_5)).abs() < 1e-12, "{before:?}");
+        assert!((before.speed[1] - 1.1).abs() < 1e-12);
+        assert_eq!(moved.before(2.5), state);
+    }
+}

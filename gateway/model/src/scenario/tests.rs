@@ -74,6 +74,30 @@ fn says(from: &str, to: &str) -> String {
 }
 
 #[test]
+fn speeds_and_accelerations_of_a_motion_are_the_differences_of_its_positions() {
+    let motion = good().motion;
+    let step = 1e-4;
+    for at in 0..50 {
+        let seconds = f64::from(at) * 0.1;
+        let [before, now, after] =
+            [seconds - step, seconds, seconds + step].map(|seconds| motion.state_at(seconds).unwrap());
+        for joint in 0..6 {
+            let [before, position, after] = [before, now, after].map(|state| state.position[joint]);
+            assert!(((after - before) / (2.0 * step) - now.speed[joint]).abs() < 1e-6, "{seconds}");
+            let acceleration = (after - 2.0 * position + before) / (step * step);
+            assert!((acceleration - now.acceleration[joint]).abs() < 1e-5, "{seconds}");
+        }
+    }
+    let unknown = Motion { kind: MotionKind::Kinesthetic, ..motion };
+    assert_eq!(unknown.state_at(1.0), None);
+    let hold = Motion { kind: MotionKind::Hold, ..motion };
+    assert_eq!(
+        hold.state_at(1.0).map(|state| (state.position, state.speed)),
+        Some((motion.start, [0.0; MAX_ROBOT_JOINTS]))
+    );
+}
+
+#[test]
 fn a_good_scenario_is_read() {
     let scenario = good();
     assert_eq!((scenario.duration, scenario.seed), (Span(12_000_000), 7));
