@@ -6,6 +6,7 @@ mod process;
 use process::log::Log;
 use process::{PRESSED, Place, Running, skin};
 use protocol::can::Format;
+use protocol::fixed::Q;
 use protocol::id::CellId;
 use protocol::message::{Answer, Message, SensorPage};
 use protocol::touch::contact;
@@ -157,11 +158,12 @@ fn accelerometers_of_a_robot_at_rest_show_gravity_in_the_frames_of_their_cells()
         let mut shown = std::collections::BTreeMap::new();
         for (message, _) in &log.messages {
             if let Message::Sensors { from, page: SensorPage::Acceleration(words), .. } = message {
-                shown.insert(from.get(), words.map(|word| word.to_f64()));
+                shown.insert(from.get(), *words);
             }
         }
         assert_eq!(shown.len(), usize::from(CELLS), "{motion}: {shown:?}");
-        let size = |[x, y, z]: &[f64; 3]| (x * x + y * y + z * z).sqrt();
+        let size =
+            |words: &[Q<12>; 3]| words.map(Q::to_f64).map(|word| word * word).iter().sum::<f64>().sqrt();
         assert!(shown.values().all(|it| (size(it) - 1.0).abs() < 1e-3), "{motion}: {shown:?}");
         let same = shown.values().filter(|it| **it == shown[&1]).count();
         assert_eq!(same, 1, "{motion}: they face in other directions: {shown:?}");
