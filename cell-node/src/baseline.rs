@@ -107,6 +107,7 @@ impl Baseline {
     }
 
     /// Begins as after a start; the rule and the count of refused tares stay.
+    #[inline(never)]
     pub fn forget(&mut self) {
         let Self { rule, refused, changes, pace, .. } = *self;
         let n_per_c = if let Rule::On(zeroing) = rule { zeroing.n_per_c } else { Q1_14::ZERO };
@@ -116,6 +117,7 @@ impl Baseline {
     }
 
     /// Joints were taken with these readings, in this period.
+    #[inline(never)]
     pub fn take(&mut self, raw: &SkinSensors, period_us: u16) {
         let Rule::On(rule) = self.rule else { return };
         if self.pace.period_us != period_us {

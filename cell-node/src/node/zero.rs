@@ -39,6 +39,7 @@ impl Node {
     }
 
     /// Reports the zero, if there is a baseline.
+    #[inline(never)]
     pub(super) fn push_zero(&mut self) {
         self.reported.status = self.baseline.status();
         let (Some(from), Some(page)) = (self.identity.cell, self.baseline.page()) else { return };
