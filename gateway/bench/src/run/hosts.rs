@@ -76,6 +76,12 @@ impl Hosts {
         changes
     }
 
+    /// Whether a cell is on a host that is gone or not reached: what still comes of it was on its way.
+    pub(super) fn is_away(&self, cell: CellId) -> bool {
+        let mut away = self.known.hosts.values().filter(|of| !of.newest.is_there);
+        away.any(|of| of.newest.nodes.contains(&cell.get()))
+    }
+
     /// Frames that did not get through between the hosts.
     pub(super) fn lost(&self) -> u64 {
         self.known.hosts.values().map(|of| of.lost.iter().sum::<u64>()).sum()
@@ -201,7 +207,9 @@ mod tests {
         let (notes, in_doubt, reached) = of.take(&[("b", false, 1, 0, 0), ("c", true, 1, 0, 0)]);
         assert_eq!(notes, ["host 'b' of vcan0 is gone, or not reached (cells 7, 9)"]);
         assert_eq!((in_doubt, reached), (2, 0));
+        assert!(of.0.is_away(CellId::new(7).unwrap()) && !of.0.is_away(CellId::new(8).unwrap()));
         let (notes, in_doubt, reached) = of.take(&[("b", true, 2, 0, 0), ("c", true, 1, 0, 0)]);
+        assert!(!of.0.is_away(CellId::new(7).unwrap()));
         assert_eq!(notes, ["host 'b' of vcan0 is reached again (cells 7, 9)"]);
         assert_eq!((in_doubt, reached), (2, 2));
         assert_eq!(
@@ -221,6 +229,7 @@ mod tests {
         let mut changes = Changes::default();
         of.0.known.end("vcan0", "end of file", of.1 + Duration::from_secs(3), &mut changes);
         assert_eq!((changes.in_doubt.len(), changes.reached.len()), (2, 0));
+        assert!(of.0.is_away(CellId::new(9).unwrap()), "its heartbeats may still be on their way");
         let (notes, _, reached) = of.take(&[("b", true, 1, 2, 0)]);
         assert_eq!((notes.len(), reached), (1, 2));
         assert_eq!(of.0.lost(), 7);

@@ -308,7 +308,12 @@ impl Bench<'_> {
                     self.remind(script, |it| it.bus == bus && it.node == cell)?;
                 }
                 BusEvent::Notice(Notice::Returned(cell)) => {
-                    returned.insert((bus, cell));
+                    // A heartbeat that was on its way when its host was gone is no return: it is told nothing until the
+                    // host is reached.
+                    let is_away = self.bus_links.get(bus).is_some_and(|it| it.hosts.is_away(cell));
+                    if !is_away {
+                        returned.insert((bus, cell));
+                    }
                 }
                 BusEvent::Notice(Notice::Duplicate(cell)) => {
                     progress.note(&format!(
@@ -333,11 +338,7 @@ impl Bench<'_> {
             }
         }
         if !returned.is_empty() {
-            // Changes during their absence have not reached them.
-            self.remind(script, |it| returned.contains(&(it.bus, it.node)))?;
-            for bus_link in returned.iter().filter_map(|&(bus, _)| self.bus_links.get(bus)) {
-                bus_link.link.state.returned.store(true, Ordering::Relaxed);
-            }
+            self.tell_again(script, &returned)?;
         }
         for ((bus, how), cells) in changed {
             let first: Vec<_> = cells.iter().take(6).map(ToString::to_string).collect();
@@ -369,7 +370,16 @@ impl Bench<'_> {
         if reached.is_empty() {
             return Ok(());
         }
-        self.remind(script, |it| reached.contains(&(it.bus, it.node)))
+        self.tell_again(script, &reached)
+    }
+
+    /// Changes during the absence of these cells have not reached them.
+    fn tell_again(&self, script: &Script, cells: &BTreeSet<(usize, CellId)>) -> Result<(), RunError> {
+        self.remind(script, |it| cells.contains(&(it.bus, it.node)))?;
+        for bus_link in cells.iter().filter_map(|&(bus, _)| self.bus_links.get(bus)) {
+            bus_link.link.state.returned.store(true, Ordering::Relaxed);
+        }
+        Ok(())
     }
 
     /// Serves embedded buses again that were ours and whose processes have ended, unless a command has taken them down.
