@@ -78,7 +78,7 @@ pub(crate) struct Calibrate {
     /// Also estimate what has to be added to the positions of each joint
     #[arg(long)]
     zero_offsets: bool,
-    /// What the data sheet of the accelerometers says, as TOML; with the keys of a scenario's [sensors.acceleration]. Else a BMA250
+    /// What the data sheet of the accelerometers says, as TOML, with the keys of a scenario's [sensors.acceleration]. Else a BMA250
     #[arg(long, value_name = "FILE")]
     data_sheet: Option<PathBuf>,
     /// Which accelerometers simulated cells have

@@ -57,7 +57,7 @@ fn what_cannot_be_calibrated_is_refused_in_one_line() {
     place.write("sheet.toml", "noise_g = 3.0\n");
     assert_eq!(
         refused("--data-sheet sheet.toml --dry-run"),
-        "gateway: sheet.toml:1:11: noise_g = 3: 0 to 1 is allowed\n"
+        "gateway: sheet.toml:1:11: noise_g = 3: 0 to 1 are possible\n"
     );
     place.write("empty.log", "(1.000000) vcan0 080##1\n");
     let said = refused("--from empty.log");

@@ -429,6 +429,8 @@ normal = [0.0, 0.6, 0.8]
     let mut long = Skin::parse("skin.toml", &format!("{head}{long}")).unwrap();
     let (given, same) = (short.cells[0].normal, long.cells[0].normal);
     assert!(given.iter().zip(same).all(|(given, same)| (given - same).abs() < 1e-12), "{same:?}");
+    // Of an orientation it has more than the normal.
+    assert!(long.cells[0].orientation.take().is_some() && short.cells[0].orientation.is_none());
     long.cells[0].normal = given;
     assert_eq!(short, long);
 
