@@ -165,8 +165,8 @@ fn accelerometers_of_a_robot_at_rest_show_gravity_in_the_frames_of_their_cells()
         let size =
             |words: &[Q<12>; 3]| words.map(Q::to_f64).map(|word| word * word).iter().sum::<f64>().sqrt();
         assert!(shown.values().all(|it| (size(it) - 1.0).abs() < 1e-3), "{motion}: {shown:?}");
-        let same = shown.values().filter(|it| **it == shown[&1]).count();
-        assert_eq!(same, 1, "{motion}: they face in other directions: {shown:?}");
+        let ways: std::collections::BTreeSet<_> = shown.values().collect();
+        assert!(ways.len() > 5, "{motion}: most face in other directions: {shown:?}");
         place.summary().adds_up();
     }
 }
