@@ -13,7 +13,7 @@
 //! | [`zero`] | zero offsets of the robot's joints |
 //! | [`help`] | which motion would tell what was not determined |
 //! | [`neighbors`] | positions made better by the distance of neighbours |
-//! | [`result`], [`write`] | what came out, and a skin file with it |
+//! | [`result`], [`mod@write`] | what came out, and a skin file with it |
 
 pub mod calibrate;
 mod cell;
