@@ -43,6 +43,10 @@ def on_axes(name, text):
 def sensors_of(fields):
     if "acceleration" in fields:
         return {"page": 1} | on_axes("acceleration", fields["acceleration"])
+    if "zero" in fields:
+        said = {"page": 3} | {f"baseline_{key}": float(fields[key]) for key in ("zero", "n_per_c", "found_at", "refused")}
+        flags = fields["flags"].split("+")
+        return said | {f"baseline_{flag}": int(flag in flags) for flag in ("tared", "touched", "limited")}
     return (
         {"page": 0, "proximity": float(fields["proximity"])}
         | numbered("contact", fields["contact"])
@@ -80,7 +84,7 @@ def ports(fields):
 
 
 def switch(fields):
-    """What is written of parameters 6 to 9."""
+    """What is written of parameters 6 to 9, 11 and 12."""
     if "reply" in fields:
         said = {"reply": int(fields["reply"] == "sum")}
         keys = {"slot_us": "reply_slot", "deepest": "reply_deepest", "carry": "reply_carry"}
@@ -89,6 +93,11 @@ def switch(fields):
         keys = {"period_ms": "sensing_period"}
     elif "deaf" in fields:
         return {f"link_down_port_{port}": int(port in bits(fields["deaf"])) for port in range(5)}
+    elif "baseline" in fields:
+        said = {"baseline": ["off", "hold", "follow"].index(fields["baseline"])}
+        keys = {key: f"baseline_{key}" for key in ("threshold", "hysteresis", "rate_un_per_s", "limit", "n_per_c")}
+    elif "tare" in fields:
+        return {"tare": int(fields["tare"])}
     elif "hysteresis" in fields:
         said = {}
         keys = {key: f"events_{key}" for key in ("contact", "proximity", "temperature", "acceleration", "hysteresis")}
@@ -99,7 +108,7 @@ def switch(fields):
 
 def parameter(fields):
     number = int(fields["parameter"])
-    if 6 <= number <= 9:
+    if 6 <= number <= 9 or number in (11, 12):
         return {"parameter": number, "tag": int(fields["tag"])} | switch(fields)
     said = {"parameter": number, "tag": int(fields["tag"])}
     for key, text in fields.items():
