@@ -15,9 +15,9 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use process::{Ended, PRESSED, Place, Running, program, skin, until};
+use process::{Ended, PRESSED, Place, Running, program, skin};
 use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
 use protocol::can::Frame;
 use proxy::Proxy;
@@ -135,7 +135,7 @@ impl Pair {
             let of = |key: &str| heard[key].as_u64().unwrap();
             let missing = of("before") + of("dropped_there") + of("lost");
             assert_eq!(of("numbered"), missing + of("taken"), "{report:#}");
-            assert_eq!(of("taken"), of("sent") + of("dropped_here") + of("refused"), "{report:#}");
+            assert_eq!(of("taken"), of("sent") + of("dropped_here") + of("refused"), "no copies: {report:#}");
             assert_eq!(report["returned"], 0, "{report:#}");
         }
     }
@@ -217,7 +217,7 @@ fn a_connection_that_falls_silent_is_noticed_and_made_again() {
 #[ignore = "tests/hosts runs it"]
 fn links_that_are_killed_are_joined_again() {
     let mut pair = Pair::new();
-    let (ended, bus) = pair.bench(12, |pair, bench| {
+    let (_, bus) = pair.bench(12, |pair, bench| {
         bench.hears("host 'cells' of vcan0 is linked");
         pair.cells_link.signal(Signal::KILL);
         bench.hears("host 'cells' of vcan0 is gone, or not reached");
@@ -225,7 +225,6 @@ fn links_that_are_killed_are_joined_again() {
         bench.hears("host 'cells' of vcan0 is reached again");
     });
     assert_eq!(bus["hosts"][0]["gone"], 1, "{bus:#}");
-    assert!(ended.stderr.contains("come back") || bus["uplink"]["outage"] != 0, "{bus:#}\n{}", ended.stderr);
     pair.end();
 }
 
@@ -286,21 +285,22 @@ fn in_a_ring_of_three_hosts_no_frame_comes_twice() {
         }
         thread::sleep(Duration::from_millis(1));
     }
-    for (at, client) in clients.iter().enumerate() {
-        let mut came = Vec::new();
-        until("all frames of the other two", || {
-            came.extend(client.received());
-            (came.len() >= 2 * count as usize).then_some(())
-        });
+    let mut all = vec![Vec::new(); 3];
+    let give_up = Instant::now() + Duration::from_secs(10);
+    while all.iter().any(|came| came.len() < 2 * count as usize) && Instant::now() < give_up {
+        clients.iter().zip(&mut all).for_each(|(client, came)| came.extend(client.received()));
+        thread::sleep(Duration::from_millis(5));
+    }
+    let reports: Vec<_> = links.into_iter().map(ended_link).collect();
+    for (at, came) in all.iter().enumerate() {
         for from in (0..3_u32).filter(|&from| from as usize != at) {
             let of_it = came.iter().filter(|frame| frame.id() == 0x100 * from);
             let numbers: Vec<_> = of_it.map(|frame| frame.data().to_vec()).collect();
             let expected: Vec<_> = (0..count).map(|number| number.to_le_bytes().to_vec()).collect();
-            assert_eq!(numbers, expected, "from {from} at {at}: each once, in order");
+            assert_eq!(numbers, expected, "from {from} at {at}: each once, in order: {reports:#?}");
         }
     }
-    for link in links {
-        let report = ended_link(link);
+    for report in reports {
         assert_eq!(report["returned"], 0, "{report:#}");
         for (_, host) in report["hosts"].as_object().unwrap() {
             assert_eq!(

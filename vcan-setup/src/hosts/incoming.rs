@@ -14,7 +14,7 @@ pub const QUEUE: usize = 8_192;
 pub const SOURCES: usize = 256;
 
 /// What has become of the frames of one source. `numbered` is always `before`, `dropped_there`, `lost` and `taken`; `taken`
-/// is always `sent`, `dropped_here`, `refused` and those that wait.
+/// is always `sent`, `copies`, `dropped_here`, `refused` and those that wait.
 #[derive(Clone, Copy, Debug, Default, Deserialize, Eq, PartialEq, Serialize)]
 pub struct Heard {
     /// Numbers that the source has given, of all its lives.
@@ -29,6 +29,9 @@ pub struct Heard {
     pub taken: u64,
     /// Handed to the bus.
     pub sent: u64,
+    /// Not handed to the bus: copies of frames that went around a circle.
+    #[serde(default)]
+    pub copies: u64,
     /// Dropped here: the queue to the bus was full.
     pub dropped_here: u64,
     /// Refused by the bus.
@@ -171,6 +174,11 @@ impl Incoming {
     /// The bus has taken so many of the first ones.
     pub fn sent(&mut self, count: usize) {
         self.gone(count, |account, count| account.sent += count);
+    }
+
+    /// So many of the first ones are copies, and not for the bus.
+    pub fn copies(&mut self, count: usize) {
+        self.gone(count, |account, count| account.copies += count);
     }
 
     /// The bus has refused so many of the first ones.
@@ -323,12 +331,16 @@ mod tests {
             for (life, first, dropped, missed, count, gone) in messages {
                 let head = Head { life, first, dropped: dropped.min(first), missed };
                 incoming.take("b", &message(head, count)).unwrap();
-                if gone % 2 == 0 { incoming.sent(gone) } else { incoming.refused(gone) }
+                match gone % 3 {
+                    0 => incoming.sent(gone),
+                    1 => incoming.copies(gone),
+                    _ => incoming.refused(gone),
+                }
             }
             for (_, it, _) in incoming.accounts() {
                 prop_assert_eq!(it.numbered, it.before + it.dropped_there + it.lost + it.taken);
                 let waiting = incoming.waiting.len() as u64;
-                prop_assert_eq!(it.taken, it.sent + it.dropped_here + it.refused + waiting);
+                prop_assert_eq!(it.taken, it.sent + it.copies + it.dropped_here + it.refused + waiting);
             }
         }
     }

@@ -330,8 +330,12 @@ impl Link {
         let now = nanos(self.began.elapsed());
         let mut incoming = self.shared.incoming();
         while !incoming.waiting().is_empty() {
-            let sent = bus.send(incoming.waiting());
-            let count = sent.as_ref().map_or_else(|error| error.sent, |()| incoming.waiting().len());
+            let returned = &mut self.returned;
+            let copies = incoming.waiting().iter().take_while(|frame| returned.is_copy(now, frame)).count();
+            incoming.copies(copies);
+            let frames = incoming.waiting().iter().take_while(|frame| !returned.is_copy(now, frame)).count();
+            let sent = bus.send(incoming.waiting().get(..frames).unwrap_or_default());
+            let count = sent.as_ref().map_or_else(|error| error.sent, |()| frames);
             for frame in incoming.waiting().iter().take(count) {
                 self.returned.put(now, frame);
             }

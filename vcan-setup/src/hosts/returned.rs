@@ -1,58 +1,107 @@
 //! Frames of other hosts that come back: from a second link of the bus, an adapter or a bridge that makes a circle.
 //!
 //! A bus gives a sender's own frames to all others. So a frame that this link has put on the bus, and that it then
-//! receives from there, was sent once more by somebody else.
+//! receives from there, was sent once more by somebody else: there is a circle. A link of the other side would never see a
+//! frame of its own in it. So after that, for a second, a frame passes this link in either direction only once in 100 ms.
 
 use std::collections::{HashMap, VecDeque};
 use std::hash::{BuildHasher, RandomState};
 
 use protocol::can::Frame;
 
-/// How long after a frame was put on the bus the same one counts as returned, in ns.
+/// How long after a frame has passed the same one counts as returned, in ns.
 pub const WITHIN_NS: u64 = 100_000_000;
-/// Frames that are remembered at most.
+/// How long after a frame of this link has returned a circle is expected, in ns.
+const CIRCLE_NS: u64 = 1_000_000_000;
+/// Frames that are remembered at most in each direction.
 const REMEMBERED: usize = 16_384;
 
-/// The frames that were put on the bus of late.
+/// The frames that passed of late.
 #[derive(Debug, Default)]
 pub struct Returned {
     hasher: RandomState,
-    /// In order, and when.
-    order: VecDeque<(u64, u64)>,
-    /// How often each of them is in it.
-    times: HashMap<u64, u32>,
+    put: Recent,
+    /// Only while there is a circle.
+    taken: Recent,
+    /// When the last one that was put on the bus came from there.
+    noticed: Option<u64>,
     count: u64,
 }
 
 impl Returned {
     /// A frame was put on the bus, at a time of a clock that only goes forward.
     pub fn put(&mut self, now: u64, frame: &Frame) {
-        self.forget(now);
-        if self.order.len() >= REMEMBERED {
-            self.forget_one();
-        }
         let hash = self.hash(frame);
-        self.order.push_back((now, hash));
-        *self.times.entry(hash).or_default() += 1;
+        self.put.insert(now, hash);
     }
 
-    /// Whether a frame that came from the bus is one that was put there.
+    /// Whether a frame that is to be put on the bus is a copy that went around a circle.
+    pub fn is_copy(&mut self, now: u64, frame: &Frame) -> bool {
+        self.is_circle(now) && self.put.contains(now, self.hash(frame))
+    }
+
+    /// Whether a frame that came from the bus is one that was put there, or in a circle one that came before.
     pub fn is_returned(&mut self, now: u64, frame: &Frame) -> bool {
-        self.forget(now);
+        let is_circle = self.is_circle(now);
         // Most of the time nothing is remembered of a bus that only sends.
-        let is_returned = !self.times.is_empty() && self.times.contains_key(&self.hash(frame));
+        if self.put.is_empty(now) && !is_circle {
+            return false;
+        }
+        let hash = self.hash(frame);
+        let was_put = self.put.contains(now, hash);
+        if was_put {
+            self.noticed = Some(now);
+        }
+        let is_returned = was_put || is_circle && self.taken.contains(now, hash);
+        if is_circle && !is_returned {
+            self.taken.insert(now, hash);
+        }
         self.count += u64::from(is_returned);
         is_returned
     }
 
-    /// How many were.
+    /// How many of those that came from the bus were returned.
     #[must_use]
     pub const fn count(&self) -> u64 {
         self.count
     }
 
+    fn is_circle(&self, now: u64) -> bool {
+        self.noticed.is_some_and(|at| now.saturating_sub(at) <= CIRCLE_NS)
+    }
+
     fn hash(&self, frame: &Frame) -> u64 {
         self.hasher.hash_one((frame.to_bytes(), frame.format()))
+    }
+}
+
+/// Frames of the last 100 ms, by their hashes.
+#[derive(Debug, Default)]
+struct Recent {
+    /// In order, and when.
+    order: VecDeque<(u64, u64)>,
+    /// How often each of them is in it.
+    times: HashMap<u64, u32>,
+}
+
+impl Recent {
+    fn insert(&mut self, now: u64, hash: u64) {
+        self.forget(now);
+        if self.order.len() >= REMEMBERED {
+            self.forget_one();
+        }
+        self.order.push_back((now, hash));
+        *self.times.entry(hash).or_default() += 1;
+    }
+
+    fn contains(&mut self, now: u64, hash: u64) -> bool {
+        self.forget(now);
+        self.times.contains_key(&hash)
+    }
+
+    fn is_empty(&mut self, now: u64) -> bool {
+        self.forget(now);
+        self.order.is_empty()
     }
 
     fn forget(&mut self, now: u64) {
@@ -95,7 +144,7 @@ mod tests {
             "as often as it goes around"
         );
         assert!(!returned.is_returned(102 * MS, &it), "a torque may be the same again");
-        assert_eq!((returned.count(), returned.times.len()), (2, 0));
+        assert_eq!((returned.count(), returned.put.times.len()), (2, 0));
     }
 
     #[test]
@@ -104,8 +153,32 @@ mod tests {
         for number in 0..2 * REMEMBERED as u64 {
             returned.put(0, &frame(0x201, &(number / 3).to_le_bytes()));
         }
-        assert_eq!(returned.order.len(), REMEMBERED);
-        let sum: u32 = returned.times.values().sum();
+        assert_eq!(returned.put.order.len(), REMEMBERED);
+        let sum: u32 = returned.put.times.values().sum();
         assert_eq!(sum as usize, REMEMBERED);
+    }
+    /// A bridge that sends on the first bus what comes on the second: of the first one's frames it makes a circle in which
+    /// no link sees what it has put on its bus, until one of the second's goes around.
+    #[test]
+    fn in_a_circle_that_was_noticed_a_frame_passes_once_in_100_ms() {
+        let (it, other) = (frame(0x201, &[1]), frame(0x202, &[2]));
+        let mut first = Returned::default();
+        for at in 0..50 {
+            assert!(!first.is_returned(at * MS, &it), "it could be sent again and again");
+        }
+        first.put(50 * MS, &other);
+        assert!(first.is_returned(51 * MS, &other));
+        assert!(!first.is_returned(52 * MS, &it));
+        assert!(first.is_returned(53 * MS, &it) && first.is_returned(152 * MS, &it));
+        assert!(!first.is_returned(153 * MS, &it), "whoever sends it means it");
+
+        let mut second = Returned::default();
+        second.put(0, &it);
+        assert!(!second.is_copy(MS, &it), "no circle");
+        assert!(second.is_returned(2 * MS, &it));
+        assert!(second.is_copy(3 * MS, &it) && !second.is_copy(3 * MS, &other));
+        assert!(!second.is_copy(101 * MS, &it));
+        second.put(2_000 * MS, &it);
+        assert!(!second.is_copy(2_001 * MS, &it), "the circle is gone");
     }
 }
