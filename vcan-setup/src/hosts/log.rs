@@ -18,6 +18,8 @@ use super::session::plain;
 /// Where failed connections are logged, at level debug because they are tried again.
 const CONNECTIONS: &str = "zenoh::net::runtime::orchestrator";
 const FAILED: &str = "Unable to connect to configured peer ";
+/// Warnings about what is as it should be: nobody is searched for, and a host may be alone at the start.
+const EXPECTED: [&str; 2] = ["Gossip is disabled", "Scouting delay elapsed"];
 /// For so long the same is said once.
 const ONCE: Duration = Duration::from_secs(60);
 /// Texts that are told apart.
@@ -54,7 +56,9 @@ fn said(is_warning: bool, text: &str) -> Option<String> {
         let (endpoint, why) = failed.split_once("! ").unwrap_or((failed, ""));
         return Some(format!("cannot connect to {endpoint}, and tries again: {}", plain(why)));
     }
-    is_warning.then(|| plain(text.trim_end_matches(". Hint: increase the system open file limit.")))
+    let is_expected = EXPECTED.iter().any(|expected| text.starts_with(expected));
+    (is_warning && !is_expected)
+        .then(|| plain(text.trim_end_matches(". Hint: increase the system open file limit.")))
 }
 
 impl Log {
@@ -117,6 +121,7 @@ mod tests {
              [[Connection refused (os error 111)]]"
         );
         assert_eq!(said(false, "Try to connect: tcp/10.0.0.1:7447"), None);
+        assert_eq!(said(true, "Scouting delay elapsed before start conditions are met."), None);
         let refused = "received fatal alert: UnknownCA. Hint: increase the system open file limit.";
         assert_eq!(said(true, refused).unwrap(), "received fatal alert: UnknownCA");
     }
