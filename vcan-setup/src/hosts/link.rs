@@ -119,7 +119,6 @@ impl Link {
             .declare_publisher(own)
             .congestion_control(CongestionControl::Drop)
             .priority(Priority::RealTime)
-            .express(true)
             .allowed_destination(Locality::Remote)
             .wait()
             .map_err(LinkError::zenoh)?;

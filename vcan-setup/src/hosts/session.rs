@@ -121,8 +121,7 @@ pub(super) fn config(settings: &Settings) -> Result<Config, LinkError> {
         set("connect/exit_on_failure", "false")?;
         set("connect/retry", "{ period_init_ms: 100, period_max_ms: 1000, period_increase_factor: 2 }")?;
     }
-    // Each message that is on its way to the network takes one of these; with two, the usual number, a network thread
-    // that waits 1 ms for a processor costs frames.
+    // Batches of 64 KiB that wait for the network, of at most 16: what finds no room in them within 1 ms is lost.
     set("transport/link/tx/queue/size/real_time", "16")?;
     // A link that says nothing for so long is lost.
     set("transport/link/tx/lease", "1000")?;
