@@ -208,7 +208,12 @@ impl Baseline {
             limited: self.is_limited,
             refused: self.refused,
         };
-        (self.rule != Rule::Off).then_some(page)
+        self.is_on().then_some(page)
+    }
+
+    /// Whether a zero is subtracted.
+    pub(crate) fn is_on(&self) -> bool {
+        self.rule != Rule::Off
     }
 
     /// What makes page 3 worth sending when it changes.

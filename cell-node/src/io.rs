@@ -12,14 +12,14 @@ use protocol::bus::{BusError, Options, Received};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Kind};
 use protocol::packet;
-use protocol::time::Micros;
+use protocol::time::{Micros, Span};
 use protocol::wire::{LinkId, PORTS};
 
 use crate::flash::Flash;
 use crate::identity::Identity;
 use crate::node::Node;
 use clock::Clock;
-use sockets::Hearing;
+use sockets::{Arrived, Hearing};
 use subscriptions::Subscriptions;
 
 pub use flash_file::FlashFile;
@@ -127,14 +127,13 @@ impl Cells {
     /// When it cannot be used as requested.
     pub fn open(&mut self, line: &Line) -> Result<Sockets, Stopped> {
         self.listen();
-        let wired = self.cells.iter().any(|hosted_cell| hosted_cell.link_ids.iter().any(Option::is_some));
         let options = Options {
             filters: self.hearing.at_once.clone(),
             fd: self.format == Format::Fd,
-            own_frames: wired && self.cells.len() > 1,
+            own_frames: line.wires && self.cells.len() > 1,
             ..Options::default()
         };
-        Sockets::open(line, &options, wired.then_some(&self.hearing.deferred))
+        Sockets::open(line, &options, &self.hearing.deferred)
     }
 
     /// Opens it as soon as it is there.
@@ -185,17 +184,25 @@ impl Cells {
                 Err(error) => return Err(error),
             }
             now = self.clock.now();
-            for received in sockets.frames() {
-                self.take(received, sockets.name(), now)?;
+            for &Arrived { ref received, waited } in sockets.frames() {
+                let age = self.clock.age(now, received.at_nanos);
+                // What a resting cell need only count is taken as if it had been woken for each. A sum's epoch is as
+                // old as its joints.
+                let (now, age) = if waited && !line.wires { (now - age, Span(0)) } else { (now, age) };
+                self.take(received, age, sockets.name(), now)?;
             }
         }
     }
 
     /// Lets time pass, sends, and waits for frames.
     fn turn(&mut self, sockets: &mut Sockets, now: Micros) -> Result<(), Stopped> {
-        let due = self.cells.iter().any(|hosted_cell| hosted_cell.node.poll_timeout() <= now);
+        let timeouts = self.cells.iter().map(|hosted_cell| hosted_cell.node.poll_timeout());
+        let due = timeouts.min().filter(|&due| due <= now);
         // What arrived before a timer was due is processed first, once.
-        if due && !core::mem::replace(&mut self.heard_first, true) && sockets.look()? {
+        if let Some(due) = due
+            && !core::mem::replace(&mut self.heard_first, true)
+            && sockets.look(self.clock.wall_nanos(due))?
+        {
             return Ok(());
         }
         self.heard_first = false;
@@ -224,8 +231,8 @@ impl Cells {
     }
 
     /// Passes a frame to the cells that receive it, and takes their answers at once.
-    fn take(&mut self, received: &Received, bus: &str, now: Micros) -> Result<(), Stopped> {
-        let (frame, age) = (&received.frame, self.clock.age(now, received.at_nanos));
+    fn take(&mut self, received: &Received, age: Span, bus: &str, now: Micros) -> Result<(), Stopped> {
+        let frame = &received.frame;
         if let Some(link_id) = LinkId::from_raw_id(frame.raw_id()) {
             if let Some((place, port)) = self.subscriptions.of_link_id(link_id)
                 && let (Some(hosted_cell), Some(message)) = (self.cells.get_mut(place), link_id.read(frame))

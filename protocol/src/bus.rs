@@ -24,7 +24,7 @@
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
 use std::path::PathBuf;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -109,11 +109,13 @@ pub struct Bus {
     /// A send failed because the interface is down, and the next receive will report it: the kernel reports to a
     /// socket once.
     down: AtomicBool,
+    /// The socket's `SO_RCVTIMEO`, in ms; 0 before it is set.
+    receive_timeout: AtomicU32,
 }
 
 impl Bus {
-    /// How long [`Bus::receive_one_patiently`] waits.
-    pub const TIMEOUT: Duration = Duration::from_millis(100);
+    /// How long [`Bus::wait_and_receive`] waits with the socket's own timeout, which is set only when it changes.
+    const WAITS: [Duration; 2] = [Duration::from_millis(25), Duration::from_millis(100)];
 
     /// Opens a bus. When this returns, the filters are set.
     ///
@@ -125,9 +127,6 @@ impl Bus {
         let kind = choice.resolve();
         let (socket, receive_buffer) = kind.carrier().open(name, options)?;
         let Options { fd, send_timeout, .. } = *options;
-        sockopt::set_socket_timeout(&socket, Timeout::Recv, Some(Self::TIMEOUT)).map_err(|errno| {
-            BusError::Io { name: name.to_owned(), doing: "set the timeout of", source: errno.into() }
-        })?;
         Ok(Self {
             name: name.to_owned(),
             kind,
@@ -136,6 +135,7 @@ impl Bus {
             fd,
             send_timeout,
             down: AtomicBool::new(false),
+            receive_timeout: AtomicU32::new(0),
         })
     }
 
@@ -188,6 +188,18 @@ impl Bus {
         self.poll(PollFlags::IN, timeout).map_err(|errno| self.error("wait for", errno))
     }
 
+    /// Waits until there is something to receive here or on another bus. `false` when the time is over or a signal came.
+    ///
+    /// # Errors
+    /// When the system cannot wait.
+    pub fn wait_with(&self, other: &Self, timeout: Duration) -> Result<bool, BusError> {
+        if self.down.load(Ordering::Relaxed) || other.down.load(Ordering::Relaxed) {
+            return Ok(true);
+        }
+        let mut both = [self, other].map(|bus| PollFd::new(&bus.socket, PollFlags::IN));
+        wait_on(&mut both, Some(timeout)).map_err(|errno| self.error("wait for", errno))
+    }
+
     /// Receives what has come, at most 64 frames, and forgets what was in `inbox`; how many frames there
     /// are now. Never waits and never allocates. 0 when nothing has come.
     ///
@@ -198,12 +210,23 @@ impl Bus {
         self.take(inbox, |batch, socket| batch.receive(socket))
     }
 
-    /// The same, but waits up to [`Bus::TIMEOUT`] for one frame, and takes only this one: one system call
-    /// instead of two for a receiver that has nothing else to do and is woken for each frame.
+    /// The same, but waits up to `timeout` for the first frame; it may return earlier without any. One system call
+    /// instead of two, which then takes one frame, when the time is 25 ms or more: for a receiver that has nothing else
+    /// to do and is woken for each frame.
     ///
     /// # Errors
-    /// As [`Bus::receive`].
-    pub fn receive_one_patiently(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
+    /// As [`Bus::wait`] and [`Bus::receive`].
+    pub fn wait_and_receive(&self, inbox: &mut Inbox, timeout: Duration) -> Result<usize, BusError> {
+        let Some(wait) = Self::WAITS.into_iter().rfind(|&wait| wait <= timeout) else {
+            inbox.clear();
+            let comes = timeout.is_zero() || self.wait(Some(timeout))?;
+            return if comes { self.receive(inbox) } else { Ok(0) };
+        };
+        let millis = u32::try_from(wait.as_millis()).unwrap_or(u32::MAX);
+        if self.receive_timeout.swap(millis, Ordering::Relaxed) != millis {
+            sockopt::set_socket_timeout(&self.socket, Timeout::Recv, Some(wait))
+                .map_err(|errno| self.error("set the timeout of", errno))?;
+        }
         self.take(inbox, |batch, socket| batch.receive_one_patiently(socket))
     }
 

@@ -42,6 +42,11 @@ impl Clock {
         self.measured = now;
     }
 
+    /// The wall's time in ns at a time of this clock.
+    pub(super) const fn wall_nanos(&self, at: Micros) -> u64 {
+        (self.wall + at.0).saturating_mul(1_000)
+    }
+
     /// How long before `now` a wall's time in ns was.
     pub(super) const fn age(&self, now: Micros, at_nanos: u64) -> Span {
         Span((self.wall + now.0).saturating_sub(at_nanos / 1_000))

@@ -1,6 +1,6 @@
 //! The sockets of a process: one wakes it, the other is only read while it is awake (deferred receive).
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, BusError, Filter, Inbox, Options, Received};
 use protocol::can::Frame;
@@ -17,35 +17,52 @@ pub(super) struct Hearing {
     pub(super) deferred: Vec<Filter>,
 }
 
-/// The open bus; a second socket where some frames are deferred.
+/// How long after a filter was taken from the second socket frames may still come there.
+const SETTLED: Duration = Duration::from_millis(50);
+
+/// The open bus, and a second socket for deferred frames.
 ///
-/// Waking a process costs more than processing a frame, so a frame that is only needed together with a later one
-/// does not wake it.
+/// Waking a process costs more than processing a frame, so a frame that is only needed together with a later one, or
+/// need only be counted, does not wake it.
 #[derive(Debug)]
 pub struct Sockets {
     bus: Bus,
-    deferred: Option<Bus>,
+    deferred: Bus,
+    /// The second socket has filters.
+    keeps: bool,
+    /// There may be frames in the second socket.
+    defers: bool,
+    /// Until then they may belong to those that wake, because a filter was moved.
+    settled: Option<Instant>,
     /// Received deferred.
     waited: Inbox,
     /// Received by the socket that wakes the process.
     woke: Inbox,
     /// Both, in the order of the kernel's time stamps.
-    came: Vec<Received>,
+    came: Vec<Arrived>,
+}
+
+/// A frame that was received.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Arrived {
+    pub(super) received: Received,
+    /// It was deferred, and came before anything that woke the process: it waited because it could.
+    pub(super) waited: bool,
 }
 
 impl Sockets {
-    /// Opens the bus; `deferred` are the filters of the second socket.
+    /// Opens the bus.
     ///
     /// # Errors
     /// When it cannot be used as requested.
-    pub(super) fn open(line: &Line, options: &Options, deferred: Option<&[Filter]>) -> Result<Self, Stopped> {
-        let bus = line.open(options)?;
-        let open = |filters: &[Filter]| {
-            line.open(&Options { filters: filters.to_vec(), own_frames: false, ..options.clone() })
-        };
+    pub(super) fn open(line: &Line, options: &Options, deferred: &[Filter]) -> Result<Self, Stopped> {
+        let second = Options { filters: deferred.to_vec(), own_frames: false, ..options.clone() };
         Ok(Self {
-            bus,
-            deferred: deferred.map(open).transpose()?,
+            bus: line.open(options)?,
+            deferred: line.open(&second)?,
+            keeps: !deferred.is_empty(),
+            defers: !deferred.is_empty(),
+            settled: None,
             waited: Inbox::new(),
             woke: Inbox::new(),
             came: Vec::new(),
@@ -57,19 +74,22 @@ impl Sockets {
     }
 
     /// Replaces the filters `before` by `hearing`.
-    pub(super) fn set_filters(&self, hearing: &Hearing, before: &Hearing) -> Result<(), BusError> {
+    pub(super) fn set_filters(&mut self, hearing: &Hearing, before: &Hearing) -> Result<(), BusError> {
         // A filter that moves between the sockets is set on both for a moment, so that no frame is lost.
         let (update, old) =
             (only_in(&hearing.deferred, &before.deferred), only_in(&before.deferred, &hearing.deferred));
-        if let (Some(deferred), true) = (&self.deferred, !update.is_empty()) {
-            deferred.set_filters(&[&before.deferred[..], &update].concat())?;
+        if !update.is_empty() {
+            self.deferred.set_filters(&[&before.deferred[..], &update].concat())?;
+            self.defers = true;
         }
         if hearing.at_once != before.at_once {
             self.bus.set_filters(&hearing.at_once)?;
         }
-        if let (Some(deferred), true) = (&self.deferred, !old.is_empty()) {
-            deferred.set_filters(&hearing.deferred)?;
+        if !old.is_empty() {
+            self.deferred.set_filters(&hearing.deferred)?;
+            self.settled = Some(Instant::now() + SETTLED);
         }
+        self.keeps = !hearing.deferred.is_empty();
         Ok(())
     }
 
@@ -77,48 +97,71 @@ impl Sockets {
         self.bus.send(frames).map_err(|error| error.cause)
     }
 
-    /// Drops the last frames and receives those that are there; whether there are any.
-    pub(super) fn look(&mut self) -> Result<bool, BusError> {
-        self.wait(Duration::ZERO)?;
-        if self.came.is_empty() {
-            self.take_deferred()?;
-        }
+    /// Drops the last frames and receives those that are there, for a timer that was due at a wall's time in ns; whether
+    /// there are any.
+    pub(super) fn look(&mut self, due_nanos: u64) -> Result<bool, BusError> {
+        self.clear();
+        self.bus.receive(&mut self.woke)?;
+        // Also what a late server put there after it was settled.
+        self.defers = true;
+        self.take_deferred(due_nanos)?;
+        self.defers = self.keeps || self.settled.is_some();
         Ok(!self.came.is_empty())
     }
 
     /// Drops the last frames and waits for one that wakes; the deferred ones are received with it.
     pub(super) fn wait(&mut self, wait: Duration) -> Result<(), BusError> {
-        self.waited.clear();
-        self.woke.clear();
-        self.came.clear();
-        if wait >= Bus::TIMEOUT {
-            self.bus.receive_one_patiently(&mut self.woke)?;
+        self.clear();
+        if let Some(settled) = self.settled {
+            let left = settled.saturating_duration_since(Instant::now());
+            if self.bus.wait_with(&self.deferred, wait.min(left))? {
+                self.bus.receive(&mut self.woke)?;
+                self.take_deferred(0)?;
+            }
+            if left.is_zero() {
+                self.settled = None;
+                self.defers = self.keeps;
+            }
+            return Ok(());
+        }
+        if !self.keeps {
+            self.bus.wait_and_receive(&mut self.woke, wait)?;
         } else if self.bus.wait(Some(wait))? {
             self.bus.receive(&mut self.woke)?;
         }
         if self.woke.frames().len() > 0 {
-            self.take_deferred()?;
+            self.take_deferred(u64::MAX)?;
         }
         Ok(())
     }
 
-    fn take_deferred(&mut self) -> Result<(), BusError> {
-        if let Some(deferred) = &self.deferred {
-            deferred.receive(&mut self.waited)?;
+    fn clear(&mut self) {
+        self.waited.clear();
+        self.woke.clear();
+        self.came.clear();
+    }
+
+    /// Takes the deferred frames too. Those before the first that woke the process, and before `until`, waited because
+    /// they could.
+    fn take_deferred(&mut self, until: u64) -> Result<(), BusError> {
+        if self.defers {
+            self.deferred.receive(&mut self.waited)?;
         }
+        let until = self.woke.frames().next().map_or(until, |first| first.at_nanos.min(until));
         let mut waited = self.waited.frames().peekable();
+        let deferred = |received: Received| Arrived { received, waited: received.at_nanos < until };
         for received in self.woke.frames() {
             while let Some(earlier) = waited.next_if(|waited| waited.at_nanos < received.at_nanos) {
-                self.came.push(earlier);
+                self.came.push(deferred(earlier));
             }
-            self.came.push(received);
+            self.came.push(Arrived { received, waited: false });
         }
-        self.came.extend(waited);
+        self.came.extend(waited.map(deferred));
         Ok(())
     }
 
     /// The frames received last.
-    pub(super) fn frames(&self) -> &[Received] {
+    pub(super) fn frames(&self) -> &[Arrived] {
         &self.came
     }
 }

@@ -14,6 +14,7 @@ mod claim;
 mod configuration;
 mod parameters;
 mod receiver;
+mod rest;
 mod sensing;
 mod stimuli;
 mod summing;
@@ -38,6 +39,7 @@ use claim::AddressClaim;
 use configuration::{Configuration, InUse};
 use parameters::{Storing, Switches};
 use receiver::Receiver;
+use rest::Rest;
 use sensing::{Pages, Sensing};
 use stimuli::{Arrival, Stimuli};
 use summing::Summing;
@@ -70,6 +72,7 @@ pub struct Node {
     /// The last joints taken.
     epoch: Option<Epoch>,
     active: bool,
+    rest: Rest,
     storing: Option<Storing>,
     outbox: Deque<Message, OUTBOX>,
     sent: u16,
@@ -105,6 +108,7 @@ impl Node {
             flags: State::default().with(State::TEST_MODE, test_mode),
             epoch: None,
             active: false,
+            rest: Rest::default(),
             storing: None,
             outbox: Deque::new(),
             sent: 0,
@@ -139,9 +143,10 @@ impl Node {
         self.summing.network.poll_transmit()
     }
 
-    /// Whether the identifiers that it receives have changed since the last call.
+    /// Whether the identifiers that it receives, or those that wake it, have changed since the last call.
     pub fn poll_hears(&mut self) -> bool {
-        self.summing.poll_hears()
+        let rest = self.rest.poll();
+        self.summing.poll_hears() || rest
     }
 
     /// Its identity.
@@ -191,11 +196,11 @@ impl Node {
 
     /// Whether it need not be woken for one of them (deferred receive), as long as it gets it before whatever comes
     /// next: the parent's sum, which only shows that the parent is there; and joints while it would only wait for its
-    /// children's sums, which come after them.
+    /// children's sums, which come after them, or while nothing touches it.
     #[must_use]
     pub fn defers(&self, id: Id) -> bool {
         if id == Id::command(Command::Joints) {
-            return self.summing.waits_for_children;
+            return self.summing.waits_for_children || self.rest.rests();
         }
         self.summing.heard_parent().is_some_and(|parent| id == Id::new(Kind::Sum, Address::Cell(parent)))
     }
@@ -237,6 +242,9 @@ impl Node {
     }
 
     fn handle_message(&mut self, now: Micros, age: Span, message: Message) {
+        if !matches!(message, Message::Joints { .. } | Message::Sync | Message::Report) {
+            self.rest.end();
+        }
         match message {
             Message::Joints { epoch, joints } => {
                 let taken = self.heard.joints;
@@ -315,6 +323,7 @@ impl Node {
         }
         if in_use.is_some_and(|in_use| age > in_use.period()) {
             count(&mut self.heard.joints_late);
+            self.rest.end();
             return self.summing.sum.skip();
         }
         count(&mut self.heard.joints);
@@ -347,7 +356,11 @@ impl Node {
                 torque.words_by(in_use.kernel.rounding())
             }
             None if core::mem::take(&mut self.active) => Default::default(),
-            None => return,
+            // A stimulus that waits, or a zero that follows the sensor, changes the contact state at some joints.
+            None if self.stimuli.are_pending() || self.baseline.is_on() => return,
+            // A cell of a network is awake for its neighbours.
+            None if self.summing.network.exists() => return,
+            None => return self.rest.lengthen(),
         };
         let torque = packet::Words::new(in_use.length(), torque);
         self.mark_saturated(torque.is_saturated());

@@ -70,6 +70,11 @@ impl Stimuli {
         });
     }
 
+    /// Whether some wait for their epoch.
+    pub(super) fn are_pending(&self) -> bool {
+        !self.pending.is_empty()
+    }
+
     /// Forgets everything: nothing touches the cell.
     pub(super) fn clear(&mut self) {
         *self = Self::default();

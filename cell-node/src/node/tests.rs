@@ -444,6 +444,29 @@ fn skipped_joints_leave_active_as_it_is() {
 }
 
 #[test]
+fn joints_need_not_wake_a_cell_that_nothing_touches() {
+    let rests = |node: &Node| node.defers(Id::command(Command::Joints));
+    let mut node = settled(Flash::Sound(wheel()));
+    let mut epochs = 0..;
+    let mut hear = |node: &mut Node, count| {
+        for epoch in epochs.by_ref().take(count) {
+            tell(node, &joints(epoch));
+        }
+        (node.poll_hears(), rests(node))
+    };
+    assert_eq!(hear(&mut node, 15), (false, false));
+    assert_eq!(hear(&mut node, 1), (true, true));
+    assert_eq!(hear(&mut node, 30), (false, true));
+    tell(&mut node, &press(4.0, From::Next));
+    assert_eq!((node.poll_hears(), rests(&node)), (true, false), "before the joints that it answers");
+    assert_eq!(hear(&mut node, 40), (false, false), "touched");
+    tell(&mut node, &press(0.0, From::Next));
+    assert_eq!(hear(&mut node, 17), (true, true), "one answer of zero, and 16 joints");
+    tell(&mut node, &press(4.0, From::Epoch(Epoch(130))));
+    assert_eq!(hear(&mut node, 20), (true, false), "a stimulus waits");
+}
+
+#[test]
 fn no_frame_makes_a_cell_panic() {
     use proptest::prelude::*;
     let frames =
