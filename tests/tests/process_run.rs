@@ -13,7 +13,7 @@ use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, Request, State};
 use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
-use rustix::process::Signal;
+use rustix::process::{Pid, Signal};
 
 /// Every frame on the buses is in the log: packets by their kinds, as both sides counted them, and what was
 /// no packet.
@@ -263,4 +263,43 @@ fn a_gateway_without_cells_names_the_missing_ones() {
     summary.all_were_due(6, &ended.stderr);
     drop((cells, server));
     until("the server's end", || place.processes().is_empty().then_some(()));
+}
+
+/// The times that a process waited, so that it was woken.
+fn wakes(pid: Pid) -> u64 {
+    let status = fs::read_to_string(format!("/proc/{}/status", pid.as_raw_nonzero())).unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"));
+    line.unwrap().trim().parse().unwrap()
+}
+
+#[test]
+fn joints_wake_the_cells_that_are_touched() {
+    let place = Place::new();
+    place.skin(3);
+    let held = PRESSED.replace("all = true", "cells = [1]");
+    let often: String = (0..8)
+        .map(|number| {
+            let at_s = 1.0 + 0.5 * f64::from(number);
+            format!(
+                "[[touch]]\nat_s = {at_s:.1}\nfor_s = 0.1\ncells = [3]\nforce_n = 2.0\nprofile = \"step\"\n\n"
+            )
+        })
+        .collect();
+    place.scenario(&format!("{held}\n{often}"));
+    let bench = place.running_bench(6.0, "");
+    let client = place.test_client();
+    client.waits_for_epoch(60);
+    let [touched, untouched] = [1, 2].map(|node| bench.cell(node));
+    let before = [touched, untouched].map(wakes);
+    client.waits_for_epoch(240);
+    let [of_touched, of_untouched] = [wakes(touched) - before[0], wakes(untouched) - before[1]];
+    assert!(of_untouched >= 4 && of_untouched * 3 < of_touched, "{of_untouched} beside {of_touched}");
+    bench.end().well();
+    let summary = place.summary();
+    summary.adds_up();
+    // A touch makes joints wake the cell again: no reply of any of the eight is missing.
+    let of = |key: &str| summary.of_bus(&format!("/replies/{key}"));
+    assert_eq!(of("due"), of("in_time") + of("late") + of("skipped") + of("too_late"), "{:#}", summary.0);
+    assert!(of("due") > summary.number("/loop/broadcasts"), "{:#}", summary.0);
+    assert_eq!((&summary.cells()[1]["due"], summary.odd(0)), (&0.into(), 0), "{:#}", summary.0);
 }

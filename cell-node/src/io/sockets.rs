@@ -1,7 +1,9 @@
 //! The sockets of a process: one wakes it, the other is only read while it is awake (deferred receive).
 
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+use protocol::bus::batch::BATCH;
 use protocol::bus::{Bus, BusError, Filter, Inbox, Options, Received};
 use protocol::can::Frame;
 
@@ -19,6 +21,8 @@ pub(super) struct Hearing {
 
 /// How long after a filter was taken from the second socket frames may still come there.
 const SETTLED: Duration = Duration::from_millis(50);
+/// Batches that are read from the second socket at once: what its buffer holds.
+const BATCHES: usize = 16;
 
 /// The open bus, and a second socket for deferred frames.
 ///
@@ -34,8 +38,9 @@ pub struct Sockets {
     defers: bool,
     /// Until then they may belong to those that wake, because a filter was moved.
     settled: Option<Instant>,
-    /// Received deferred.
-    waited: Inbox,
+    /// Received deferred, and not taken yet.
+    deferred_frames: VecDeque<Received>,
+    inbox: Inbox,
     /// Received by the socket that wakes the process.
     woke: Inbox,
     /// Both, in the order of the kernel's time stamps.
@@ -63,7 +68,8 @@ impl Sockets {
             keeps: !deferred.is_empty(),
             defers: !deferred.is_empty(),
             settled: None,
-            waited: Inbox::new(),
+            deferred_frames: VecDeque::new(),
+            inbox: Inbox::new(),
             woke: Inbox::new(),
             came: Vec::new(),
         })
@@ -136,7 +142,6 @@ impl Sockets {
     }
 
     fn clear(&mut self) {
-        self.waited.clear();
         self.woke.clear();
         self.came.clear();
     }
@@ -144,19 +149,29 @@ impl Sockets {
     /// Takes the deferred frames too. Those before the first that woke the process, and before `until`, waited because
     /// they could.
     fn take_deferred(&mut self, until: u64) -> Result<(), BusError> {
-        if self.defers {
-            self.deferred.receive(&mut self.waited)?;
+        let batches = if self.defers { BATCHES } else { 0 };
+        for _ in 0..batches {
+            let count = self.deferred.receive(&mut self.inbox)?;
+            self.deferred_frames.extend(self.inbox.frames());
+            if count < BATCH {
+                break;
+            }
         }
         let until = self.woke.frames().next().map_or(until, |first| first.at_nanos.min(until));
-        let mut waited = self.waited.frames().peekable();
-        let deferred = |received: Received| Arrived { received, waited: received.at_nanos < until };
-        for received in self.woke.frames() {
-            while let Some(earlier) = waited.next_if(|waited| waited.at_nanos < received.at_nanos) {
-                self.came.push(deferred(earlier));
+        let mut earlier = |than: u64, came: &mut Vec<Arrived>| {
+            while let Some(&received) = self.deferred_frames.front().filter(|first| first.at_nanos < than) {
+                self.deferred_frames.pop_front();
+                came.push(Arrived { received, waited: received.at_nanos < until });
             }
+        };
+        for received in self.woke.frames() {
+            earlier(received.at_nanos, &mut self.came);
             self.came.push(Arrived { received, waited: false });
         }
-        self.came.extend(waited.map(deferred));
+        // When more of those that wake are waiting, they come first.
+        if self.woke.frames().len() < BATCH {
+            earlier(u64::MAX, &mut self.came);
+        }
         Ok(())
     }
 
