@@ -114,7 +114,7 @@ fn speed(skin: &Skin, folder: &std::path::Path, frames: &[Seen]) -> Result<(), B
         Mcap { path: path.clone(), split, attachments: Vec::new(), robot: None, command_line: Vec::new() };
     let options = Options { mcap: Some(mcap), force: true, ..Options::default() };
     let outputs = Outputs::claim(&options, &AtomicBool::new(false), |line| println!("{line}"))?;
-    let (mut outlet, bus_feed) = feed::bus_feed(true, Arc::default(), Arc::default());
+    let (mut outlet, bus_feed) = feed::bus_feed(1, true, Arc::default(), Arc::default());
     let feed = Feed { bus_feeds: vec![bus_feed], ticks: None };
     let recorder = outputs.start(feed, Layout::new(skin), Head::default())?;
     let began = Instant::now();

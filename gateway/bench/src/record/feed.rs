@@ -11,8 +11,18 @@ use control::cycle::turn::{BusState, Timed};
 use model::table::Status;
 use trace::capture::BusNote;
 
-/// Frames of a bus that may wait: more than a second of a full bus.
-pub const FRAMES: usize = 65_536;
+/// Frames of a bus that may wait; of many buses together no more than four times that, so that their memory has a limit,
+/// but of each more than a second of a full bus.
+const FRAMES: usize = 65_536;
+/// See [`FRAMES`].
+const FRAMES_OF_MANY: usize = 16_384;
+
+/// How many frames of each of so many buses may wait.
+#[must_use]
+pub fn frames(buses: usize) -> usize {
+    (4 * FRAMES / buses.max(1)).clamp(FRAMES_OF_MANY, FRAMES)
+}
+
 /// Ticks that may wait: more than a second.
 pub const TICKS: usize = 1_024;
 /// Epochs of a bus that may wait: more than a second.
@@ -151,10 +161,10 @@ pub struct BusFeed {
     pub(super) state: Arc<BusState>,
 }
 
-/// The queues of a bus, both ends; `all` if more than frames is recorded.
+/// The queues of one of so many buses, both ends; `all` if more than frames is recorded.
 #[must_use]
-pub fn bus_feed(all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, BusFeed) {
-    let (frames, taken) = rtrb::RingBuffer::new(FRAMES);
+pub fn bus_feed(buses: usize, all: bool, view: Arc<Mutex<View>>, state: Arc<BusState>) -> (Outlet, BusFeed) {
+    let (frames, taken) = rtrb::RingBuffer::new(frames(buses));
     let (touched, states) = all.then(|| rtrb::RingBuffer::new(EPOCHS)).unzip();
     let outlet = Outlet { frames, touched, unrecorded: 0, unreported: 0, untouched: 0 };
     (outlet, BusFeed { frames: taken, touched: states, view, state })
@@ -175,8 +185,13 @@ mod tests {
     use protocol::can::Frame;
 
     #[test]
+    fn forty_buses_take_ten_times_the_memory_of_one() {
+        assert_eq!([0, 1, 4, 8, 16, 40].map(frames), [65_536, 65_536, 65_536, 32_768, 16_384, 16_384]);
+    }
+
+    #[test]
     fn what_does_not_fit_is_reported_where_it_is_missing() {
-        let (mut outlet, mut bus_feed) = bus_feed(false, Arc::default(), Arc::default());
+        let (mut outlet, mut bus_feed) = bus_feed(1, false, Arc::default(), Arc::default());
         let frame = |at_nanos| Seen { at_nanos, own: false, frame: Frame::EMPTY };
         let all = FRAMES as u64;
         (0..all + 7).for_each(|at| outlet.frame(frame(at)));

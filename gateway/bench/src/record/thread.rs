@@ -12,7 +12,7 @@ use rustix::time::{ClockId, clock_gettime};
 
 use super::backlog;
 use super::facts::realtime_minus_monotonic;
-use super::feed::{BusFeed, Captured, FRAMES, Feed};
+use super::feed::{BusFeed, Captured, Feed, frames};
 use super::force::Latched;
 use super::text::Text;
 use super::topics::{OF_ROBOT, Topics};
@@ -130,6 +130,7 @@ impl Work {
         }
         let (mut flush, mut request, mut diagnose) =
             (Every::new(FLUSH), Every::new(REQUEST), Every::new(DIAGNOSE));
+        let many = frames(self.feed.bus_feeds.len()) / 8;
         loop {
             let ended = stop.now.load(Ordering::Acquire);
             let taken = self.take();
@@ -149,7 +150,7 @@ impl Work {
             if ended {
                 break;
             }
-            if taken < FRAMES / 8 {
+            if taken < many {
                 thread::sleep(LOOK);
             }
         }

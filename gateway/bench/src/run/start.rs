@@ -94,8 +94,14 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
     let (mut bus_links, mut feeds) = (Vec::new(), Vec::new());
     for (index, (receive_end, slot)) in opened.into_iter().enumerate() {
         let view = Arc::new(Mutex::new(View::default()));
-        let recorded =
-            || feed::bus_feed(outputs.wants_all(), Arc::clone(&view), Arc::clone(&receive_end.link.state));
+        let recorded = || {
+            feed::bus_feed(
+                skin.buses.len(),
+                outputs.wants_all(),
+                Arc::clone(&view),
+                Arc::clone(&receive_end.link.state),
+            )
+        };
         let (outlet, feed) = (!outputs.is_empty()).then(recorded).unzip();
         feeds.extend(feed);
         bus_links.push(listen(options, index, (receive_end, slot), view, outlet, &shared, tell.clone())?);
