@@ -7,13 +7,11 @@ use std::time::{Duration, Instant};
 use protocol::bus::BusKind;
 use protocol::message::Message;
 use protocol::skin::Cell;
-use protocol::time::Micros;
 use protocol::usage::say;
 
 use super::RunError;
 use super::bench::{Bench, BusLink};
 use super::measured::Measured;
-use super::realtime::wall;
 use super::receiver::ReceiverResult;
 use super::watch::LOOK;
 use crate::record::feed::Unrecorded;
@@ -180,9 +178,8 @@ impl Bench<'_> {
         backlog_dropped: Option<u64>,
         measured: &Measured,
     ) -> Vec<BusSummary> {
-        let now = Micros(wall() / 1_000);
         let summary = |(index, (bus_link, received)): (usize, (&BusLink, &Option<ReceiverResult>))| {
-            let ReceiverResult { table, outages, dropped, .. } = received.as_ref()?;
+            let &ReceiverResult { ref table, ref outages, dropped, ended, .. } = received.as_ref()?;
             let link = &bus_link.link;
             let network = bus_link.network.as_ref().map(|network| NetworkSummary {
                 tree_ready_s: network.tree_ready.map(protocol::time::Span::seconds),
@@ -199,7 +196,7 @@ impl Bench<'_> {
                 ticks: measured.missing.get(index.min(31)).copied().unwrap_or(0),
             };
             let kind = link.kind.to_string();
-            let summary = BusSummary::new(&link.name, &kind, link.receive_buffer, table, *dropped, now);
+            let summary = BusSummary::new(&link.name, &kind, link.receive_buffer, table, dropped, ended);
             let mut summary = BusSummary { outages, network, hosts: bus_link.hosts.summary(), ..summary };
             summary.uplink.explain_by_hosts(bus_link.hosts.lost());
             Some(summary)

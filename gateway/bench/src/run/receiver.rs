@@ -98,6 +98,8 @@ pub struct ReceiverResult {
     pub unrecorded: Unrecorded,
     /// How often the bus was lost, and for how long.
     pub outages: Outages,
+    /// When it ended: what its cells are is of then, however long a recording takes to be complete.
+    pub ended: Micros,
 }
 
 /// What came through the sockets of a bus so far.
@@ -160,10 +162,11 @@ impl Receiver {
                 std::thread::sleep(self.gather);
             }
         }
+        let ended = Micros(wall() / 1_000);
         self.table.finish();
         let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, last_words);
         let dropped = account.dropped_before + u64::from(inbox.dropped());
-        ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages }
+        ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages, ended }
     }
 
     /// How often to look now: until the loop begins the main thread waits for what cells say.
