@@ -7,7 +7,7 @@ use analysis::paper;
 use bench::summary::{BusSummary, CellSummary, Halted, Outcome, Processor, Summary};
 use model::table::Errors;
 
-use crate::print::{Rows, count, list, or, quantiles, words};
+use crate::print::{Rows, count, list, or, quantiles, ranges, words};
 
 /// Halts that are listed one by one.
 const HALTS: usize = 10;
@@ -122,7 +122,7 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
         rows.row(format!("host {}", it.name), list([cells].into_iter().chain(gone).chain(end)), lost);
     }
     if !bus.silent_cells.is_empty() {
-        rows.row("silent cells", words(&bus.silent_cells), "");
+        rows.row("silent cells", list(ranges(&bus.silent_cells)), "");
     }
     let complete = format!("{} of {} epochs complete", bus.epochs_complete, bus.epochs_due);
     if let Some(sums) = &bus.sums {
