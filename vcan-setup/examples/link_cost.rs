@@ -66,12 +66,12 @@ fn main() -> Outcome<()> {
     println!("added, p50               {:.0?}", linked[0].saturating_sub(one_bus[0]));
 
     let far = open(&there)?;
-    let answer = |cell, epoch| -> Outcome<Frame> {
-        Ok(Frame::fd(0x200 + u32::try_from(cell)?, 1, &usize::to_le_bytes(epoch))?)
+    let answer = |node, epoch| -> Outcome<Frame> {
+        Ok(Frame::fd(0x200 + u32::try_from(node)?, 1, &usize::to_le_bytes(epoch))?)
     };
     let (before, began, mut inbox, mut received) = (links.processor(), Instant::now(), Inbox::new(), 0);
     for number in 1..=EPOCHS {
-        far.send(&(1..=CELLS).map(|cell| answer(cell, number)).collect::<Outcome<Vec<_>>>()?)?;
+        far.send(&(1..=CELLS).map(|node| answer(node, number)).collect::<Outcome<Vec<_>>>()?)?;
         let due = began + EPOCH * u32::try_from(number)?;
         while near.wait(Some(due.saturating_duration_since(Instant::now())))? && Instant::now() < due {
             received += near.receive(&mut inbox)?;
