@@ -31,6 +31,9 @@ const AGAIN: Duration = Duration::from_millis(100);
 /// Waits while an interface is down before it is tried again.
 const DOWN: Duration = Duration::from_millis(100);
 
+/// Cells in a process that may rest: more are woken as often by their heartbeats as by joints.
+const RESTING: usize = 8;
+
 /// Link ids that a cell sends with, by port; the last one leads to the gateway's side.
 pub type LinkIds = [Option<LinkId>; PORTS + 1];
 
@@ -49,8 +52,9 @@ pub struct Cells {
     outbox: Vec<Frame>,
 }
 
-/// One cell and what is its own.
+/// One cell and what is its own. What is used together lies in the same cache lines in each of many.
 #[derive(Debug)]
+#[repr(align(64))]
 struct HostedCell {
     node: Node,
     file: FlashFile,
@@ -155,9 +159,10 @@ impl Cells {
         if !core::mem::take(&mut self.hears_changed) {
             return None;
         }
-        let cells = self.cells.iter().enumerate();
-        self.subscriptions.listen(cells.flat_map(|(place, hosted_cell)| {
-            hosted_cell.node.hears().map(move |id| (place, id, hosted_cell.node.defers(id)))
+        let (cells, rest) = (self.cells.iter().enumerate(), self.cells.len() <= RESTING);
+        self.subscriptions.listen(cells.flat_map(|(place, HostedCell { node, link_ids, .. })| {
+            let may_defer = rest || link_ids.iter().any(Option::is_some);
+            node.hears().map(move |id| (place, id, may_defer && node.defers(id)))
         }));
         let hearing = self.subscriptions.hearing();
         (hearing != self.hearing).then(|| core::mem::replace(&mut self.hearing, hearing))
