@@ -51,8 +51,10 @@ pub struct Heard {
 impl Heard {
     /// Frames that did not get through, wherever they were lost.
     #[must_use]
-    pub const fn missing(&self) -> u64 {
-        self.dropped_there + self.lost + self.missed_there + self.dropped_here + self.refused
+    pub fn missing(&self) -> u64 {
+        [self.dropped_there, self.lost, self.missed_there, self.dropped_here, self.refused]
+            .into_iter()
+            .fold(0, u64::saturating_add)
     }
 }
 
@@ -79,6 +81,11 @@ impl Nodes {
     }
 }
 
+/// Counts what a host says, which may be anything.
+const fn add(counter: &mut u64, more: u64) {
+    *counter = counter.saturating_add(more);
+}
+
 #[derive(Debug, Default)]
 struct Source {
     head: Head,
@@ -96,8 +103,8 @@ impl Source {
         let account = &mut self.account;
         if account.lives == 0 || self.head.life != head.life {
             account.lives += 1;
-            account.numbered += head.first;
-            account.before += head.first;
+            add(&mut account.numbered, head.first);
+            add(&mut account.before, head.first);
             account.shared += u64::from(self.before == Some(head.life));
             self.before = (account.lives > 1).then_some(self.head.life);
             (self.head, self.next) = (*head, head.first);
@@ -110,11 +117,11 @@ impl Source {
         }
         let missing = head.first.saturating_sub(self.next);
         let there = head.dropped.saturating_sub(self.head.dropped).min(missing);
-        account.dropped_there += there;
-        account.lost += missing - there;
-        account.missed_there += head.missed.saturating_sub(self.head.missed);
+        add(&mut account.dropped_there, there);
+        add(&mut account.lost, missing - there);
+        add(&mut account.missed_there, head.missed.saturating_sub(self.head.missed));
         account.taken += count - again;
-        account.numbered += end - self.next;
+        add(&mut account.numbered, end - self.next);
         (self.head, self.next) = (*head, end);
         again
     }
@@ -322,6 +329,19 @@ mod tests {
             incoming.take(&host.to_string(), &message(Head::default(), 1)).unwrap();
         }
         assert_eq!((incoming.accounts().count(), incoming.unknown_hosts()), (SOURCES, 3));
+    }
+
+    #[test]
+    fn a_host_that_says_impossible_numbers_is_counted_up_to_the_end() {
+        let mut incoming = Incoming::default();
+        for life in 0..4 {
+            let head = Head { life, first: u64::MAX / 2, dropped: u64::MAX / 2, missed: u64::MAX };
+            incoming.take("b", &message(head, 1)).unwrap();
+            let head = Head { first: u64::MAX - 5_000, dropped: u64::MAX - 5_000, ..head };
+            incoming.take("b", &message(head, 1)).unwrap();
+        }
+        let [(_, heard, _)] = incoming.accounts().collect::<Vec<_>>()[..] else { panic!("one host") };
+        assert_eq!((heard.numbered, heard.taken, heard.missing()), (u64::MAX, 8, u64::MAX));
     }
 
     proptest! {

@@ -258,7 +258,10 @@ impl Link {
             }
             let losses = self.losses();
             if losses != said && say_at <= Instant::now() {
-                report(Event::Lost { from_here: losses.0 - said.0, from_others: losses.1 - said.1 });
+                report(Event::Lost {
+                    from_here: losses.0 - said.0,
+                    from_others: losses.1.saturating_sub(said.1),
+                });
                 (said, say_at) = (losses, Instant::now() + SAY);
             }
             self.watchers.accept();
@@ -399,7 +402,9 @@ impl Link {
     /// Frames lost: from here, and of others.
     fn losses(&self) -> (u64, u64) {
         let Sent { dropped, missed, .. } = self.outgoing.account();
-        (dropped + missed, self.shared.incoming().accounts().map(|(_, heard, _)| heard.missing()).sum())
+        let incoming = self.shared.incoming();
+        let of_others = incoming.accounts().map(|(_, heard, _)| heard.missing()).fold(0, u64::saturating_add);
+        (dropped + missed, of_others)
     }
 
     fn report(&self) -> Report {

@@ -84,7 +84,7 @@ impl Hosts {
 
     /// Frames that did not get through between the hosts.
     pub(super) fn lost(&self) -> u64 {
-        self.known.hosts.values().map(|of| of.lost.iter().sum::<u64>()).sum()
+        self.known.hosts.values().flat_map(|of| of.lost).fold(0, u64::saturating_add)
     }
 
     /// What was known of each host; none where nothing linked the bus.
@@ -116,7 +116,7 @@ impl Known {
                 known.outages = Outages::default();
             } else {
                 for (lost, (was, is)) in known.lost.iter_mut().zip(was.into_iter().zip(is)) {
-                    *lost += is.saturating_sub(was);
+                    *lost = lost.saturating_add(is.saturating_sub(was));
                 }
             }
             let cells: Vec<_> =
