@@ -32,6 +32,8 @@ const BATCHES: usize = 16;
 pub struct Sockets {
     bus: Bus,
     deferred: Bus,
+    /// In a network a frame comes before most timers; a cell that rests is woken by timers alone.
+    is_network: bool,
     /// The second socket has filters.
     keeps: bool,
     /// There may be frames in the second socket.
@@ -65,6 +67,7 @@ impl Sockets {
         Ok(Self {
             bus: line.open(options)?,
             deferred: line.open(&second)?,
+            is_network: line.wires,
             keeps: !deferred.is_empty(),
             defers: !deferred.is_empty(),
             settled: None,
@@ -130,7 +133,7 @@ impl Sockets {
             }
             return Ok(());
         }
-        if !self.keeps {
+        if self.is_network || !self.keeps {
             self.bus.wait_and_receive(&mut self.woke, wait)?;
         } else if self.bus.wait(Some(wait))? {
             self.bus.receive(&mut self.woke)?;
