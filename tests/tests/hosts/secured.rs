@@ -138,6 +138,8 @@ fn a_host_that_access_control_does_not_name_is_not_heard() {
     });
     // It is connected, and learns of nobody: nothing is there to wait for. One that is named joins in less than a second.
     thread::sleep(Duration::from_secs(3));
+    let said = secured.links[1].stderr();
+    assert!(!said.contains("cannot connect"), "its certificate is a good one: {said}");
     is_refused(secured);
 }
 
