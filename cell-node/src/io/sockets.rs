@@ -36,8 +36,6 @@ pub struct Sockets {
     is_network: bool,
     /// The second socket has filters.
     keeps: bool,
-    /// There may be frames in the second socket.
-    defers: bool,
     /// Until then they may belong to those that wake, because a filter was moved.
     settled: Option<Instant>,
     /// Received deferred, and not taken yet.
@@ -69,7 +67,6 @@ impl Sockets {
             deferred: line.open(&second)?,
             is_network: line.wires,
             keeps: !deferred.is_empty(),
-            defers: !deferred.is_empty(),
             settled: None,
             deferred_frames: VecDeque::new(),
             inbox: Inbox::new(),
@@ -89,7 +86,6 @@ impl Sockets {
             (only_in(&hearing.deferred, &before.deferred), only_in(&before.deferred, &hearing.deferred));
         if !update.is_empty() {
             self.deferred.set_filters(&[&before.deferred[..], &update].concat())?;
-            self.defers = true;
         }
         if hearing.at_once != before.at_once {
             self.bus.set_filters(&hearing.at_once)?;
@@ -112,9 +108,8 @@ impl Sockets {
         self.clear();
         self.bus.receive(&mut self.woke)?;
         // Also what a late server put there after it was settled.
-        self.defers = true;
-        self.take_deferred(due_nanos)?;
-        self.defers = self.keeps || self.settled.is_some();
+        self.receive_deferred()?;
+        self.order(due_nanos);
         Ok(!self.came.is_empty())
     }
 
@@ -125,11 +120,11 @@ impl Sockets {
             let left = settled.saturating_duration_since(Instant::now());
             if self.bus.wait_with(&self.deferred, wait.min(left))? {
                 self.bus.receive(&mut self.woke)?;
-                self.take_deferred(0)?;
+                self.receive_deferred()?;
+                self.order(0);
             }
             if left.is_zero() {
                 self.settled = None;
-                self.defers = self.keeps;
             }
             return Ok(());
         }
@@ -139,7 +134,10 @@ impl Sockets {
             self.bus.receive(&mut self.woke)?;
         }
         if self.woke.frames().len() > 0 {
-            self.take_deferred(u64::MAX)?;
+            if self.keeps {
+                self.receive_deferred()?;
+            }
+            self.order(u64::MAX);
         }
         Ok(())
     }
@@ -149,17 +147,20 @@ impl Sockets {
         self.came.clear();
     }
 
-    /// Takes the deferred frames too. Those before the first that woke the process, and before `until`, waited because
-    /// they could.
-    fn take_deferred(&mut self, until: u64) -> Result<(), BusError> {
-        let batches = if self.defers { BATCHES } else { 0 };
-        for _ in 0..batches {
+    fn receive_deferred(&mut self) -> Result<(), BusError> {
+        for _ in 0..BATCHES {
             let count = self.deferred.receive(&mut self.inbox)?;
             self.deferred_frames.extend(self.inbox.frames());
             if count < BATCH {
                 break;
             }
         }
+        Ok(())
+    }
+
+    /// Puts the frames of both in order. Deferred ones from before the first that woke the process, and before `until`,
+    /// waited because they could.
+    fn order(&mut self, until: u64) {
         let until = self.woke.frames().next().map_or(until, |first| first.at_nanos.min(until));
         let mut earlier = |than: u64, came: &mut Vec<Arrived>| {
             while let Some(&received) = self.deferred_frames.front().filter(|first| first.at_nanos < than) {
@@ -175,7 +176,6 @@ impl Sockets {
         if self.woke.frames().len() < BATCH {
             earlier(u64::MAX, &mut self.came);
         }
-        Ok(())
     }
 
     /// The frames received last.
