@@ -31,7 +31,7 @@ pub struct Report {
     pub sent: Sent,
     /// Each other host.
     pub hosts: BTreeMap<String, Host>,
-    /// Frames of other hosts that came back from this bus, and were not sent once more.
+    /// Frames of other hosts that came back from this bus, or in a circle came again, and were not sent once more.
     pub returned: u64,
     /// Messages of hosts that were too many.
     pub unknown_hosts: u64,

@@ -157,6 +157,7 @@ mod tests {
         let sum: u32 = returned.put.times.values().sum();
         assert_eq!(sum as usize, REMEMBERED);
     }
+
     /// A bridge that sends on the first bus what comes on the second: of the first one's frames it makes a circle in which
     /// no link sees what it has put on its bus, until one of the second's goes around.
     #[test]
