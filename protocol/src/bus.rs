@@ -33,7 +33,7 @@ use rustix::net::sockopt::{self, Timeout};
 use socketcan::CanFdSocket;
 
 use crate::can::{Format, Frame};
-use batch::Batch;
+use batch::{BATCH, Batch, SMALL};
 use kinds::Carrier;
 
 pub mod batch;
@@ -338,11 +338,20 @@ impl Bus {
     }
 
     fn send_some(&self, frames: &[Frame]) -> io::Result<usize> {
-        if let [frame] = frames {
-            let (bytes, len) = (frame.to_bytes(), frame.byte_len());
-            return batch::send_one(&self.socket, bytes.get(..len).unwrap_or(&bytes));
+        match frames {
+            [frame] => {
+                let (bytes, len) = (frame.to_bytes(), frame.byte_len());
+                batch::send_one(&self.socket, bytes.get(..len).unwrap_or(&bytes))
+            }
+            few if few.len() <= SMALL => self.send_up_to::<SMALL>(few),
+            many => self.send_up_to::<BATCH>(many),
         }
-        let mut outgoing = batch::Outgoing::new();
+    }
+
+    // Not inlined: its stack depends on N.
+    #[inline(never)]
+    fn send_up_to<const N: usize>(&self, frames: &[Frame]) -> io::Result<usize> {
+        let mut outgoing = batch::Outgoing::<N>::new();
         for frame in frames {
             if !outgoing.push(&frame.to_bytes(), frame.byte_len()) {
                 break;

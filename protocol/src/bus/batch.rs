@@ -15,6 +15,8 @@ pub const BATCH: usize = 64;
 /// So many are requested first: most reads find one or two, and room for 64 costs more to lay out than a
 /// datagram to read.
 const FEW: usize = 4;
+/// Most sends are of so many at most; as with [`FEW`], room for 64 costs more.
+pub(super) const SMALL: usize = 8;
 
 /// Room for one datagram and the kernel's data about it.
 pub(super) struct Slot {
@@ -157,18 +159,18 @@ fn nanoseconds(timespec: &[u8]) -> Option<u64> {
     seconds.checked_mul(1_000_000_000)?.checked_add(nanos)
 }
 
-/// Datagrams on their way out: at most [`BATCH`] of at most 72 bytes.
-pub struct Outgoing {
-    bytes: [[u8; FD_BYTES]; BATCH],
-    lens: [usize; BATCH],
+/// Datagrams on their way out: at most N, and [`BATCH`] in one call, of at most 72 bytes.
+pub struct Outgoing<const N: usize = BATCH> {
+    bytes: [[u8; FD_BYTES]; N],
+    lens: [usize; N],
     count: usize,
 }
 
-impl Outgoing {
+impl<const N: usize> Outgoing<N> {
     /// Nothing to send yet.
     #[must_use]
     pub const fn new() -> Self {
-        Self { bytes: [[0; FD_BYTES]; BATCH], lens: [0; BATCH], count: 0 }
+        Self { bytes: [[0; FD_BYTES]; N], lens: [0; N], count: 0 }
     }
 
     /// Forgets what was put in.
@@ -197,7 +199,8 @@ impl Outgoing {
         match self.count {
             0 => Ok(0),
             1 => send_one(fd, datagrams.next().unwrap_or_default()),
-            _ => calls::send(fd.as_fd(), datagrams),
+            2..=SMALL => calls::send::<SMALL>(fd.as_fd(), datagrams),
+            _ => calls::send::<BATCH>(fd.as_fd(), datagrams),
         }
     }
 }
@@ -211,13 +214,13 @@ pub fn send_one(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
     Ok(1)
 }
 
-impl Default for Outgoing {
+impl<const N: usize> Default for Outgoing<N> {
     fn default() -> Self {
         Self::new()
     }
 }
 
-impl std::fmt::Debug for Outgoing {
+impl<const N: usize> std::fmt::Debug for Outgoing<N> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Outgoing").field("count", &self.count).finish_non_exhaustive()
     }
@@ -233,7 +236,7 @@ mod tests {
     fn a_batch_comes_in_order_with_its_lengths() {
         let (a, b) =
             socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
-        let mut outgoing = Outgoing::new();
+        let mut outgoing = <Outgoing>::new();
         for len in 1..=BATCH {
             assert!(outgoing.push(&[u8::try_from(len).unwrap(); FD_BYTES], len));
         }

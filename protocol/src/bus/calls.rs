@@ -5,7 +5,7 @@ use std::io;
 use std::mem;
 use std::os::fd::{AsRawFd, BorrowedFd};
 
-use super::batch::{BATCH, Slot};
+use super::batch::Slot;
 
 /// Asks for `SCHED_BATCH`; whether it was granted.
 pub(super) fn set_batch() -> bool {
@@ -16,6 +16,8 @@ pub(super) fn set_batch() -> bool {
 
 /// `recvmmsg`: how many slots were filled. It waits for the first datagram, as long as the socket's
 /// `SO_RCVTIMEO` says, or not at all.
+// Not inlined: a caller's stack would grow by the largest N, and each of its pages is touched.
+#[inline(never)]
 pub(super) fn receive<const N: usize>(
     fd: BorrowedFd<'_>,
     slots: &mut [Slot; N],
@@ -52,22 +54,24 @@ pub(super) fn receive<const N: usize>(
     Ok(count)
 }
 
-/// `sendmmsg`, without waiting: how many of the datagrams (at most [`BATCH`] are looked at) were sent.
-pub(super) fn send<'a>(
+/// `sendmmsg`, without waiting: how many of the datagrams (at most N are looked at) were sent.
+// Not inlined, as above.
+#[inline(never)]
+pub(super) fn send<'a, const N: usize>(
     fd: BorrowedFd<'_>,
     datagrams: impl ExactSizeIterator<Item = &'a [u8]>,
 ) -> io::Result<usize> {
-    let mut vectors = [libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 }; BATCH];
+    let mut vectors = [libc::iovec { iov_base: std::ptr::null_mut(), iov_len: 0 }; N];
     // SAFETY: an `mmsghdr` of zeros is a valid one: null pointers with zero lengths.
-    let mut headers: [libc::mmsghdr; BATCH] = unsafe { mem::zeroed() };
-    let target = datagrams.len().min(BATCH);
+    let mut headers: [libc::mmsghdr; N] = unsafe { mem::zeroed() };
+    let target = datagrams.len().min(N);
     for ((datagram, vector), header) in datagrams.zip(&mut vectors).zip(&mut headers) {
         vector.iov_base = datagram.as_ptr().cast_mut().cast();
         vector.iov_len = datagram.len();
         header.msg_hdr.msg_iov = vector;
         header.msg_hdr.msg_iovlen = 1;
     }
-    // SAFETY: the first `target` of the BATCH headers point to buffers of the lengths given, borrowed for
+    // SAFETY: the first `target` of the N headers point to buffers of the lengths given, borrowed for
     // longer than the call, which only reads them.
     let count = unsafe {
         libc::sendmmsg(
