@@ -111,10 +111,12 @@ pub struct Bus {
     down: AtomicBool,
     /// The socket's `SO_RCVTIMEO`, in ms; 0 before it is set.
     receive_timeout: AtomicU32,
+    /// The last wait that used it ended without a frame.
+    expired: AtomicBool,
 }
 
 impl Bus {
-    /// How long [`Bus::wait_and_receive`] waits with the socket's own timeout, which is set only when it changes.
+    /// How long [`Bus::wait_and_receive`] waits with the socket's own timeout.
     const WAITS: [Duration; 2] = [Duration::from_millis(25), Duration::from_millis(100)];
 
     /// Opens a bus. When this returns, the filters are set.
@@ -136,6 +138,7 @@ impl Bus {
             send_timeout,
             down: AtomicBool::new(false),
             receive_timeout: AtomicU32::new(0),
+            expired: AtomicBool::new(false),
         })
     }
 
@@ -223,11 +226,17 @@ impl Bus {
             return if comes { self.receive(inbox) } else { Ok(0) };
         };
         let millis = u32::try_from(wait.as_millis()).unwrap_or(u32::MAX);
-        if self.receive_timeout.swap(millis, Ordering::Relaxed) != millis {
+        // Setting it is a system call. Most waits end with a frame before, so a shorter one is kept until it ran out.
+        let set = self.receive_timeout.load(Ordering::Relaxed);
+        let is_kept = set == millis || (0 < set && set < millis && !self.expired.load(Ordering::Relaxed));
+        if !is_kept {
             sockopt::set_socket_timeout(&self.socket, Timeout::Recv, Some(wait))
                 .map_err(|errno| self.error("set the timeout of", errno))?;
+            self.receive_timeout.store(millis, Ordering::Relaxed);
         }
-        self.take(inbox, |batch, socket| batch.receive_one_patiently(socket))
+        let count = self.take(inbox, |batch, socket| batch.receive_one_patiently(socket))?;
+        self.expired.store(count == 0, Ordering::Relaxed);
+        Ok(count)
     }
 
     fn take(

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::io::{BufRead, BufReader, Read};
+use std::ops::{Deref, DerefMut};
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -11,15 +12,40 @@ use protocol::bus::embedded::{Answer, Hello, address, encode_dropped, seqpacket}
 use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{EXTENDED, Frame};
 use protocol::candump::{self, Line};
+use rustix::net::sockopt::{self, Timeout};
 use rustix::net::{RecvFlags, SendFlags, SocketFlags};
 use rustix::process::{Pid, Signal, kill_process};
 use tempfile::TempDir;
 
+/// A server, which ends with its test.
+struct Server(Child);
+
+impl Deref for Server {
+    type Target = Child;
+
+    fn deref(&self) -> &Child {
+        &self.0
+    }
+}
+
+impl DerefMut for Server {
+    fn deref_mut(&mut self) -> &mut Child {
+        &mut self.0
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
 /// A server that is ready.
-fn serve(directory: &Path, arguments: &[&str]) -> Child {
+fn serve(directory: &Path, arguments: &[&str]) -> Server {
     let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-setup"));
     command.args(["serve", "vcan0"]).args(arguments).env("SKINBUS_DIR", directory);
-    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let mut child = Server(command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap());
     assert_eq!(
         first_line(&mut child),
         format!("serving vcan0 at {}\n", directory.join("vcan0.bus").display())
@@ -37,7 +63,7 @@ fn signal(child: &Child, signal: Signal) {
     kill_process(Pid::from_child(child), signal).unwrap();
 }
 
-fn ended(mut child: Child, parent: &TempDir) -> ExitStatus {
+fn ended(mut child: Server, parent: &TempDir) -> ExitStatus {
     let status = child.wait().unwrap();
     assert_eq!(std::fs::read_dir(parent.path()).unwrap().count(), 0, "nothing is left behind");
     status
@@ -132,6 +158,36 @@ fn while_the_server_is_stopped_a_sender_waits_and_then_says_how_many_went_out() 
     }
     assert_eq!(heard, sent);
     a.send(&frames[..1]).unwrap();
+    signal(&child, Signal::TERM);
+    ended(child, &parent);
+}
+
+#[test]
+fn a_timeout_of_the_socket_is_set_when_it_is_too_long_or_ran_out() {
+    let parent = TempDir::new().unwrap();
+    let directory = parent.path().join("skinbus");
+    let child = serve(&directory, &[]);
+    let options = Options { directory: Some(directory), ..Options::default() };
+    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
+    let mut inbox = Inbox::new();
+    let mut wait = |millis, comes: bool| {
+        if comes {
+            a.send(&[Frame::classic(1, &[]).unwrap()]).unwrap();
+            assert!(b.wait(Some(Duration::from_secs(5))).unwrap());
+        }
+        let count = b.wait_and_receive(&mut inbox, Duration::from_millis(millis)).unwrap();
+        assert_eq!(count, usize::from(comes));
+        // The kernel rounds to its ticks, of 10 ms at most.
+        let set = sockopt::socket_timeout(&b, Timeout::Recv).unwrap().unwrap();
+        [25, 100].into_iter().find(|&millis| set.abs_diff(Duration::from_millis(millis)).as_millis() <= 10)
+    };
+    assert_eq!(wait(200, true), Some(100));
+    assert_eq!(wait(30, true), Some(25), "it may not be longer");
+    assert_eq!(wait(200, true), Some(25), "a frame came, so that a shorter one is kept");
+    assert_eq!(wait(200, false), Some(25));
+    assert_eq!(wait(200, false), Some(100), "it ran out");
+    assert_eq!(wait(200, true), Some(100));
+    assert_eq!(wait(2, false), Some(100), "not used");
     signal(&child, Signal::TERM);
     ended(child, &parent);
 }
