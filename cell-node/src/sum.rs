@@ -210,7 +210,7 @@ impl Sum {
     /// sent in the epoch before, as late as is still useful. What comes after that is sent in the next slot.
     fn plan(&mut self, now: Micros) {
         let Some(slots) = self.slots else { return };
-        if self.words().is_none() {
+        if !self.has_words() {
             return;
         }
         let width = u64::from(slots.slot_us);
@@ -294,6 +294,12 @@ impl Sum {
         self.said = Some((epoch, words));
         self.sent = self.sent.wrapping_add(1);
         Some((epoch, words, !goes_on))
+    }
+
+    /// Whether there is something to send in this epoch.
+    fn has_words(&self) -> bool {
+        let counts = |child: &Child| child.taken.is_some_and(|words| !words.is_end());
+        self.ends || self.own.is_some() || self.children.iter().any(counts)
     }
 
     /// All that is known of this epoch; `None` when there is nothing to send.

@@ -1,6 +1,6 @@
 //! Which cell of a process receives which frames.
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::bus::Filter;
 use protocol::can::{EXTENDED, REMOTE};
@@ -15,8 +15,8 @@ const ALL_WIRES: Filter = Filter { id: EXTENDED | FLAG, mask: EXTENDED | REMOTE 
 /// The receiving cells, as indices within the process, by identifier and by link id.
 #[derive(Debug, Default)]
 pub(super) struct Subscriptions {
-    by_id: HashMap<Id, Heard>,
-    by_link_id: HashMap<LinkId, (usize, usize)>,
+    by_id: BTreeMap<Id, Heard>,
+    by_link_id: BTreeMap<LinkId, (usize, usize)>,
 }
 
 /// The receivers of an identifier.
@@ -57,20 +57,16 @@ impl Subscriptions {
     /// One exact filter for each identifier and each link id. If these are more than a socket takes: one for each
     /// kind that is received, and one for all wires.
     pub(super) fn hearing(&self) -> Hearing {
-        let link_ids: BTreeSet<_> = self.by_link_id.keys().copied().collect();
-        let ids = |wakes| -> BTreeSet<_> {
-            self.by_id.iter().filter(|(_, heard)| heard.wakes == wakes).map(|(id, _)| *id).collect()
-        };
+        let ids = |wakes| self.by_id.iter().filter(move |(_, heard)| heard.wakes == wakes).map(|(id, _)| *id);
+        let link_ids = self.by_link_id.keys().copied();
         if self.by_id.len() + link_ids.len() <= Filter::MAX {
-            let at_once =
-                ids(true).into_iter().map(Filter::exact).chain(link_ids.into_iter().map(Filter::link_id));
             return Hearing {
-                at_once: at_once.collect(),
-                deferred: ids(false).into_iter().map(Filter::exact).collect(),
+                at_once: ids(true).map(Filter::exact).chain(link_ids.map(Filter::link_id)).collect(),
+                deferred: ids(false).map(Filter::exact).collect(),
             };
         }
         let kinds: BTreeSet<_> = self.by_id.keys().map(|id| id.kind).collect();
-        let wires = (!link_ids.is_empty()).then_some(ALL_WIRES);
+        let wires = (link_ids.len() > 0).then_some(ALL_WIRES);
         Hearing { at_once: kinds.into_iter().map(Filter::kind).chain(wires).collect(), deferred: Vec::new() }
     }
 }

@@ -191,7 +191,7 @@ impl Node {
 
     /// The identifiers that this cell receives now; a shell reads them again after [`Node::poll_hears`].
     pub fn hears(&self) -> impl Iterator<Item = Id> + use<'_> {
-        self.slots().into_iter().flatten()
+        self.slots().flatten()
     }
 
     /// Whether it need not be woken for one of them (deferred receive), as long as it gets it before whatever comes
@@ -210,11 +210,10 @@ impl Node {
         self.configuration.in_use().map(InUse::length)
     }
 
-    /// By slot of the reassembly.
-    fn slots(&self) -> [Option<Id>; HEARD] {
-        let sums = self.summing.heard.map(|cell| Some(Id::new(Kind::Sum, Address::Cell(cell?))));
-        let mut ids = self.identity.hears().into_iter().chain(sums);
-        core::array::from_fn(|_| ids.next().flatten())
+    /// By slot of the reassembly, [`HEARD`] of them.
+    fn slots(&self) -> impl Iterator<Item = Option<Id>> + use<'_> {
+        let sums = self.summing.heard.iter().map(|cell| Some(Id::new(Kind::Sum, Address::Cell((*cell)?))));
+        self.identity.hears().into_iter().chain(sums)
     }
 
     /// Takes in that time has passed. Harmless when called early.
@@ -232,7 +231,7 @@ impl Node {
             count(&mut self.receiver.refused.foreign);
             return;
         };
-        let Some(slot) = self.slots().iter().position(|&heard| heard == Some(id)) else { return };
+        let Some(slot) = self.slots().position(|heard| heard == Some(id)) else { return };
         let lengths = Lengths::of_chain(self.length());
         let Some(packet) = self.receiver.take(now - age, id, slot, lengths, frame) else { return };
         match Message::decode(&packet) {
