@@ -159,7 +159,7 @@ fn nanoseconds(timespec: &[u8]) -> Option<u64> {
     seconds.checked_mul(1_000_000_000)?.checked_add(nanos)
 }
 
-/// Datagrams on their way out: at most N, and [`BATCH`] in one call, of at most 72 bytes.
+/// Datagrams on their way out: at most N of at most 72 bytes.
 pub struct Outgoing<const N: usize = BATCH> {
     bytes: [[u8; FD_BYTES]; N],
     lens: [usize; N],
@@ -200,7 +200,7 @@ impl<const N: usize> Outgoing<N> {
             0 => Ok(0),
             1 => send_one(fd, datagrams.next().unwrap_or_default()),
             2..=SMALL => calls::send::<SMALL>(fd.as_fd(), datagrams),
-            _ => calls::send::<BATCH>(fd.as_fd(), datagrams),
+            _ => calls::send::<N>(fd.as_fd(), datagrams),
         }
     }
 }
@@ -248,6 +248,29 @@ mod tests {
         let lens: Vec<_> = batch.datagrams().map(|datagram| datagram.bytes().unwrap().len()).collect();
         assert_eq!(lens, (1..=BATCH).collect::<Vec<_>>());
         assert_eq!(batch.receive(&b).unwrap_err().kind(), io::ErrorKind::WouldBlock);
+    }
+
+    fn sent_whole_and_in_order<const N: usize>() {
+        let (a, b) =
+            socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
+        let (mut outgoing, mut batch) = (Outgoing::<N>::new(), Batch::new());
+        assert_eq!(outgoing.send(&a).unwrap(), 0);
+        for count in 1..=N {
+            outgoing.clear();
+            for len in 1..=count {
+                assert!(outgoing.push(&[u8::try_from(len).unwrap(); FD_BYTES], len));
+            }
+            assert_eq!(outgoing.send(&a).unwrap(), count);
+            assert_eq!(batch.receive(&b).unwrap(), count);
+            let bytes = batch.datagrams().map(|datagram| datagram.bytes().unwrap());
+            assert!(bytes.eq((1..=count).map(|len| vec![u8::try_from(len).unwrap(); len])), "{count}");
+        }
+    }
+
+    #[test]
+    fn each_number_of_datagrams_is_sent_whole_and_in_order() {
+        sent_whole_and_in_order::<SMALL>();
+        sent_whole_and_in_order::<BATCH>();
     }
 
     #[test]
