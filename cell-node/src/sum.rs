@@ -210,7 +210,7 @@ impl Sum {
     /// sent in the epoch before, as late as is still useful. What comes after that is sent in the next slot.
     fn plan(&mut self, now: Micros) {
         let Some(slots) = self.slots else { return };
-        if !self.has_words() {
+        if self.count() == 0 && !self.ends {
             return;
         }
         let width = u64::from(slots.slot_us);
@@ -296,25 +296,24 @@ impl Sum {
         Some((epoch, words, !goes_on))
     }
 
-    /// Whether there is something to send in this epoch.
-    fn has_words(&self) -> bool {
-        let counts = |child: &Child| child.taken.is_some_and(|words| !words.is_end());
-        self.ends || self.own.is_some() || self.children.iter().any(counts)
+    /// Cells in all that is known of this epoch.
+    fn count(&self) -> u32 {
+        let children = self.children.iter().filter_map(|child| child.taken);
+        u32::from(self.own.is_some()) + children.map(|words| u32::from(words.count)).sum::<u32>()
     }
 
     /// All that is known of this epoch; `None` when there is nothing to send.
     fn words(&self) -> Option<Words> {
+        let count = self.count();
+        if count == 0 {
+            return self.ends.then_some(Words::END);
+        }
         let mut sums = self.own.unwrap_or_default().map(|own| (i64::from(own), false));
-        let mut count = u32::from(self.own.is_some());
         for words in self.children.iter().filter_map(|child| child.taken) {
-            count += u32::from(words.count);
             for ((sum, saturated), word) in sums.iter_mut().zip(words.torque) {
                 *saturated |= word.is_saturated();
                 *sum += i64::from(word.to_bits());
             }
-        }
-        if count == 0 {
-            return self.ends.then_some(Words::END);
         }
         let torque = sums.map(|(sum, saturated)| {
             let fits = i16::try_from(sum).ok().filter(|_| !saturated);
