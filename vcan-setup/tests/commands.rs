@@ -2,15 +2,16 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
+mod served;
 
-use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::Command;
 
 use process::{Said, while_somebody_says};
 use protocol::bus::{Bus, BusKind, Choice, Options};
 use protocol::id::{CellId, Id, Kind, Node};
 use serde_json::Value;
+use served::Served;
 use tempfile::TempDir;
 
 /// A folder with a copy of the program, and nothing beside it unless it is put there.
@@ -52,20 +53,9 @@ impl Folder {
 
     /// Serves a bus, and returns when it is served.
     fn serve(&self, name: &str) -> Served {
-        let mut child = self.command(&format!("serve {name}")).stdout(Stdio::piped()).spawn().unwrap();
-        let mut line = String::new();
-        BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+        let (served, line) = Served::start(&mut self.command(&format!("serve {name}")));
         assert!(line.starts_with("serving "), "{line}");
-        Served(child)
-    }
-}
-
-struct Served(Child);
-
-impl Drop for Served {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
+        served
     }
 }
 

@@ -1,8 +1,9 @@
 //! `vcan-setup serve` as a process.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
+mod served;
+
 use std::io::{BufRead, BufReader, Read};
-use std::ops::{Deref, DerefMut};
 use std::os::fd::OwnedFd;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
@@ -15,55 +16,23 @@ use protocol::candump::{self, Line};
 use rustix::net::sockopt::{self, Timeout};
 use rustix::net::{RecvFlags, SendFlags, SocketFlags};
 use rustix::process::{Pid, Signal, kill_process};
+use served::Served;
 use tempfile::TempDir;
 
-/// A server, which ends with its test.
-struct Server(Child);
-
-impl Deref for Server {
-    type Target = Child;
-
-    fn deref(&self) -> &Child {
-        &self.0
-    }
-}
-
-impl DerefMut for Server {
-    fn deref_mut(&mut self) -> &mut Child {
-        &mut self.0
-    }
-}
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
-    }
-}
-
 /// A server that is ready.
-fn serve(directory: &Path, arguments: &[&str]) -> Server {
+fn serve(directory: &Path, arguments: &[&str]) -> Served {
     let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-setup"));
     command.args(["serve", "vcan0"]).args(arguments).env("SKINBUS_DIR", directory);
-    let mut child = Server(command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap());
-    assert_eq!(
-        first_line(&mut child),
-        format!("serving vcan0 at {}\n", directory.join("vcan0.bus").display())
-    );
+    let (child, line) = Served::start(&mut command);
+    assert_eq!(line, format!("serving vcan0 at {}\n", directory.join("vcan0.bus").display()));
     child
-}
-
-fn first_line(child: &mut Child) -> String {
-    let mut line = String::new();
-    BufReader::new(child.stdout.take().unwrap()).read_line(&mut line).unwrap();
-    line
 }
 
 fn signal(child: &Child, signal: Signal) {
     kill_process(Pid::from_child(child), signal).unwrap();
 }
 
-fn ended(mut child: Server, parent: &TempDir) -> ExitStatus {
+fn ended(mut child: Served, parent: &TempDir) -> ExitStatus {
     let status = child.wait().unwrap();
     assert_eq!(std::fs::read_dir(parent.path()).unwrap().count(), 0, "nothing is left behind");
     status
@@ -364,16 +333,16 @@ fn what_was_ignored_is_said_at_the_end() {
     let directory = parent.path().join("skinbus");
     let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-setup"));
     command.args(["serve", "vcan0"]).env("SKINBUS_DIR", &directory);
-    let mut server = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-    first_line(&mut server);
+    let (mut server, _) = Served::start(command.stderr(Stdio::piped()));
     let options = Options { directory: Some(directory), ..Options::default() };
     let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
     rustix::net::send(&a, &[0; 13], SendFlags::empty()).unwrap();
     a.send(&[Frame::classic(1, &[]).unwrap()]).unwrap();
     assert!(b.wait(Some(Duration::from_secs(20))).unwrap(), "what came before has been read");
     signal(&server, Signal::TERM);
-    let output = server.wait_with_output().unwrap();
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert_eq!((output.status.code(), said.lines().count()), (Some(0), 1), "{said}");
+    let mut said = String::new();
+    server.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+    let status = server.wait().unwrap();
+    assert_eq!((status.code(), said.lines().count()), (Some(0), 1), "{said}");
     assert!(said.contains("vcan0: ignored 1 datagrams") && said.contains("refused 0 clients"), "{said}");
 }
