@@ -13,7 +13,7 @@ use process::{Ended, Place, Running, program};
 
 const README: &str = include_str!("../../README.md");
 const PICTURE: &str = include_str!("../../docs/explanation/report-torque.svg");
-/// What `cargo build --release` makes for the user. It is built already, so this one build is replaced.
+/// Programs that `cargo build --release` makes for the user. They are built already, so the build is replaced.
 const PROGRAMS: [&str; 3] = ["gateway", "cell-node", "vcan-setup"];
 /// The other programs that the commands may use. Nothing else is found.
 const TOOLS: [&str; 6] = ["ln", "mkdir", "python3", "sed", "sleep", "tac"];
@@ -51,14 +51,18 @@ fn in_background(command: &str) -> bool {
 fn script(commands: &[&str]) -> String {
     let programs = PROGRAMS.map(|name| quoted(&program(name).display().to_string())).join(" ");
     let tools = TOOLS.join(" ");
+    // `tests/run` runs this test: here its script is only parsed.
+    let tests_run = quoted(&root().join("tests/run").display().to_string());
     let mut script = format!(
         "set -eu -o pipefail\n\
          trap 'kill $(jobs -p) 2>/dev/null || true' EXIT\n\
-         mkdir tools\n\
+         mkdir tools tests\n\
          for tool in {tools}; do\n\
          printf '#!/bin/sh\\nPATH=%q exec %q \"$@\"\\n' \"$PATH\" \"$(type -P $tool)\" > tools/$tool\n\
          done\n\
-         chmod +x tools/*\n\
+         test -x {tests_run}\n\
+         printf '#!/bin/sh\\n%q -n %q\\n' \"$BASH\" {tests_run} > tests/run\n\
+         chmod +x tools/* tests/run\n\
          PATH=$PWD/tools background=()\n\
          cargo() {{\n\
          [ \"$*\" = 'build --release' ] || {{ echo \"cargo $*: not known how to replace\" >&2; return 1; }}\n\
@@ -82,9 +86,13 @@ fn script(commands: &[&str]) -> String {
     script
 }
 
+/// The folder of the workspace.
+fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap()
+}
+
 fn run(place: &Place, commands: &[&str]) -> Ended {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
-    symlink(root.join("gateway"), place.path("gateway")).unwrap();
+    symlink(root().join("gateway"), place.path("gateway")).unwrap();
     place.write("readme.sh", &script(commands));
     let words = format!("{} bash readme.sh", LIMIT.as_secs());
     Running::start(place.command_of(Path::new("timeout"), &words)).end_after(LIMIT)
@@ -100,7 +108,8 @@ fn printed<'a>(ended: &'a Ended, command: &str) -> &'a str {
 fn every_command_does_what_it_should() {
     let place = Place::new();
     let commands = commands(README);
-    assert!(commands.contains(&"cargo build --release"), "{commands:?}");
+    assert!(commands.iter().any(|command| command.starts_with("cargo build --release && ")), "{commands:?}");
+    assert!(commands.contains(&"tests/run"), "{commands:?}");
     let ended = run(&place, &commands).well();
     place.is_left_clean();
 
@@ -145,7 +154,7 @@ fn failing_and_unknown_commands_fail_here() {
         vec![build, path, "gateway skin check nothing.toml", version],
         vec![build, path, "gateway skin check nothing.toml & sleep 0", version],
         vec![build, path, "nothing.toml & sleep 0"],
-        vec![build, path, "tests/run"],
+        vec![build, path, "tests/nothing"],
         vec![build, path, "sudo vcan-setup status"],
         vec![build, path, "gateway skin generate | nothing"],
     ] {
