@@ -82,6 +82,62 @@ fn the_certificates_of_the_guide_are_taken() {
     secured.links.into_iter().for_each(|link| _ = ended_link(link));
 }
 
+/// The TCP ports at which a process listens, as the kernel has them.
+fn listening_ports(process: &Running) -> Vec<u16> {
+    let pid = process.pid().as_raw_nonzero();
+    let files = fs::read_dir(format!("/proc/{pid}/fd")).unwrap().map(|file| file.unwrap().path());
+    let sockets: Vec<_> = files.filter_map(|path| fs::read_link(path).ok()).collect();
+    let owns =
+        |inode: &str| sockets.iter().any(|socket| socket.as_os_str() == format!("socket:[{inode}]").as_str());
+    let mut ports = Vec::new();
+    for table in ["tcp", "tcp6"] {
+        let text = fs::read_to_string(format!("/proc/{pid}/net/{table}")).unwrap();
+        for line in text.lines().skip(1) {
+            let columns: Vec<_> = line.split_whitespace().collect();
+            // 0A: LISTEN.
+            if columns[3] == "0A" && owns(columns[9]) {
+                let (_, port) = columns[1].rsplit_once(':').unwrap();
+                ports.push(u16::from_str_radix(port, 16).unwrap());
+            }
+        }
+    }
+    ports
+}
+
+#[test]
+#[ignore = "tests/hosts runs it"]
+fn the_files_of_the_guide_open_one_port_with_tls() {
+    // Without the line that says so, the host of the cells listens nowhere either.
+    let changes: [fn(String) -> String; 2] =
+        [|text| text, |text| text.replace("  listen: { endpoints: [] },\n", "")];
+    for change in changes {
+        let secured = robot_and(|_, text| change(text));
+        secured.links[0].hears("host 'cells' has joined");
+        secured.links[1].hears("host 'robot' has joined");
+        let [robot, cells] = &secured.links;
+        let [port] = listening_ports(robot)[..] else { panic!("{:?}", listening_ports(robot)) };
+        assert_eq!(listening_ports(cells), Vec::<u16>::new());
+        let refused = Host::new("intruder", None).link(&format!("--connect tcp/127.0.0.1:{port}"));
+        refused.hears("cannot connect to tcp/127.0.0.1");
+        assert!(!robot.stderr().contains("intruder"), "{}", robot.stderr());
+        _ = ended_link(refused);
+        secured.links.into_iter().for_each(|link| _ = ended_link(link));
+    }
+}
+
+#[test]
+#[ignore = "tests/hosts runs it"]
+fn a_listener_without_tls_beside_the_files_of_the_guide_is_refused() {
+    let place = secured(port());
+    let host = Host::new("cells", None);
+    let config = place.path("cells.json5");
+    for option in ["--listen tcp/127.0.0.1:0", "--connect tcp/127.0.0.1:1 --listen tls/127.0.0.1:0"] {
+        let words = format!("link vcan0 --bus-kind embedded --config {} {option}", config.display());
+        let refusal = host.start(&link_program(), &words).end();
+        assert!(refusal.refusal(2).contains("would be open to everybody beside tls/"), "{refusal:#?}");
+    }
+}
+
 #[test]
 #[ignore = "tests/hosts runs it"]
 fn a_certificate_of_another_authority_is_refused_and_said_on_both_sides() {

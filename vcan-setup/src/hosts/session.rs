@@ -5,6 +5,7 @@ use std::io;
 use std::path::PathBuf;
 
 use protocol::bus::{BusError, Choice};
+use serde_json::Value;
 use thiserror::Error;
 use zenoh::Config;
 use zenoh::key_expr::KeyExpr;
@@ -43,14 +44,23 @@ pub enum LinkError {
     /// The configuration is wrong, or Zenoh cannot start with it.
     #[error("{0}")]
     Zenoh(String),
-    /// Nobody could find this link, and it could find nobody.
+    /// The link neither listens nor connects.
     #[error(
-        "no --connect, no --listen and no --config: say where the other hosts are, or where they find this one"
+        "no endpoint: say where the other hosts are (--connect), or where they find this one (--listen); or both in a \
+         file for --config"
     )]
     Alone,
-    /// An endpoint of another form.
+    /// An endpoint of an unsupported form, and the option or file that names it.
     #[error("{0} {1}: an endpoint is tcp/HOST:PORT or tls/HOST:PORT")]
-    Endpoint(&'static str, String),
+    Endpoint(String, String),
+    /// An endpoint without TLS beside one with TLS.
+    #[error("{plain} would be open to everybody beside {secure}: make all endpoints tls/, or none of them")]
+    PlainBesideTls {
+        /// The endpoint without TLS.
+        plain: String,
+        /// The endpoint with TLS.
+        secure: String,
+    },
     /// The bus or the host has a name that no key can have.
     #[error("'{0}' cannot be a part of a key of Zenoh: {1}")]
     Name(String, String),
@@ -74,7 +84,10 @@ impl LinkError {
     /// Whether the user has asked for what cannot be.
     #[must_use]
     pub const fn is_usage(&self) -> bool {
-        matches!(self, Self::Alone | Self::Endpoint(..) | Self::Name(..) | Self::Twice(_))
+        matches!(
+            self,
+            Self::Alone | Self::Endpoint(..) | Self::PlainBesideTls { .. } | Self::Name(..) | Self::Twice(_)
+        )
     }
 
     pub(super) fn zenoh(error: impl fmt::Display) -> Self {
@@ -89,31 +102,34 @@ pub(super) fn plain(error: &str) -> String {
     text.split(" at /").next().unwrap_or(text).trim_end_matches('.').to_owned()
 }
 
-/// Zenoh's configuration: what a file says, and for the rest nothing that others were not told of.
+/// Zenoh's configuration: that of the file, with the endpoints of the command line in place of the file's.
+///
+/// Zenoh's defaults open a listener without TLS, look for other hosts by multicast and tell hosts of each other. Each
+/// default on which it depends who can reach the bus is set here.
+///
+/// # Errors
+///
+/// The file cannot be read, an endpoint has an unsupported form or no TLS beside others with TLS, or there is none.
 pub(super) fn config(settings: &Settings) -> Result<Config, LinkError> {
-    for (option, endpoints) in [("--connect", &settings.connect), ("--listen", &settings.listen)] {
-        for endpoint in endpoints {
-            let known = ["tcp/", "tls/"].iter().any(|protocol| endpoint.starts_with(protocol));
-            if !known || !endpoint.contains(':') {
-                return Err(LinkError::Endpoint(option, endpoint.clone()));
-            }
-        }
-    }
     let mut config = match &settings.config {
         Some(path) => Config::from_file(path).map_err(|error| settings.blame(&error.to_string()))?,
-        None if settings.connect.is_empty() && settings.listen.is_empty() => return Err(LinkError::Alone),
         None => Config::default(),
     };
+    let mode = value(&config, "mode")?;
+    let mode = mode.as_str().unwrap_or("peer");
+    let endpoints = Endpoints::new(settings, &config, mode)?;
     let mut set = |key: &str, value: &str| config.insert_json5(key, value).map_err(LinkError::zenoh);
-    let list = |of: &[String]| serde_json::to_string(of).unwrap_or_default();
-    if settings.config.is_none() {
-        set("mode", "\"peer\"")?;
-        set("listen/endpoints", "[]")?;
-    }
-    set("scouting/multicast/enabled", "false")?;
-    set("scouting/gossip/enabled", "false")?;
-    if !settings.listen.is_empty() {
-        set("listen/endpoints", &list(&settings.listen))?;
+    set("mode", &format!("\"{mode}\""))?;
+    set("listen/endpoints", &list(&endpoints.listen))?;
+    set("transport/link/protocols", if endpoints.secure { "[\"tls\"]" } else { "[\"tcp\"]" })?;
+    for key in [
+        "scouting/multicast/enabled",
+        "scouting/gossip/enabled",
+        "adminspace/enabled",
+        "plugins_loading/enabled",
+        "transport/shared_memory/enabled",
+    ] {
+        set(key, "false")?;
     }
     if !settings.connect.is_empty() {
         set("connect/endpoints", &list(&settings.connect))?;
@@ -125,7 +141,89 @@ pub(super) fn config(settings: &Settings) -> Result<Config, LinkError> {
     set("transport/link/tx/queue/size/real_time", "16")?;
     // A link that says nothing for so long is lost.
     set("transport/link/tx/lease", "1000")?;
+    // Who connects by TLS proves who it is, unless the file says otherwise.
+    if endpoints.secure && !endpoints.listen.is_empty() {
+        set_unless_given(&mut config, "transport/link/tls/enable_mtls")?;
+    }
+    set_unless_given(&mut config, "transport/link/tls/verify_name_on_connect")?;
     Ok(config)
+}
+
+/// The endpoints of a link.
+struct Endpoints {
+    listen: Vec<String>,
+    /// All of them use TLS; otherwise none does.
+    secure: bool,
+}
+
+impl Endpoints {
+    fn new(settings: &Settings, config: &Config, mode: &str) -> Result<Self, LinkError> {
+        let file = settings.config.as_ref().map_or_else(String::new, |path| path.display().to_string());
+        let choose = |option: &str, given: &[String], key: &str| {
+            let (source, endpoints) = if given.is_empty() {
+                (format!("{file}: {key}"), configured(config, key, mode)?)
+            } else {
+                (option.to_owned(), given.to_vec())
+            };
+            for endpoint in &endpoints {
+                let known = ["tcp/", "tls/"].iter().any(|protocol| endpoint.starts_with(protocol));
+                if !known || !endpoint.contains(':') {
+                    return Err(LinkError::Endpoint(source, endpoint.clone()));
+                }
+            }
+            Ok(endpoints)
+        };
+        let listen = choose("--listen", &settings.listen, "listen/endpoints")?;
+        let connect = choose("--connect", &settings.connect, "connect/endpoints")?;
+        let all = || listen.iter().chain(&connect);
+        let secure = all().find(|endpoint| endpoint.starts_with("tls/"));
+        let plain = all().find(|endpoint| !endpoint.starts_with("tls/"));
+        match (plain, secure) {
+            (None, None) => Err(LinkError::Alone),
+            (Some(plain), Some(secure)) => {
+                Err(LinkError::PlainBesideTls { plain: plain.clone(), secure: secure.clone() })
+            }
+            (_, secure) => Ok(Self { secure: secure.is_some(), listen }),
+        }
+    }
+}
+
+/// Returns the endpoints that the file gives for this mode; none where they are Zenoh's defaults.
+fn configured(config: &Config, key: &str, mode: &str) -> Result<Vec<String>, LinkError> {
+    let given = value(config, key)?;
+    if given == value(&Config::default(), key)? {
+        return Ok(Vec::new());
+    }
+    let mut endpoints = Vec::new();
+    flatten(given.get(mode).unwrap_or(&given), &mut endpoints);
+    Ok(endpoints)
+}
+
+/// Collects the endpoints of a list and of its groups, each an object with `locators`.
+fn flatten(value: &Value, into: &mut Vec<String>) {
+    match value {
+        Value::String(endpoint) => into.push(endpoint.clone()),
+        Value::Array(values) => values.iter().for_each(|value| flatten(value, into)),
+        Value::Object(group) => group.get("locators").into_iter().for_each(|value| flatten(value, into)),
+        Value::Null | Value::Bool(_) | Value::Number(_) => {}
+    }
+}
+
+fn value(config: &Config, key: &str) -> Result<Value, LinkError> {
+    let text = config.get_json(key).map_err(LinkError::zenoh)?;
+    serde_json::from_str(&text).map_err(LinkError::zenoh)
+}
+
+fn list(endpoints: &[String]) -> String {
+    serde_json::to_string(endpoints).unwrap_or_default()
+}
+
+/// Sets an option that the file does not give.
+fn set_unless_given(config: &mut Config, key: &str) -> Result<(), LinkError> {
+    if value(config, key)?.is_null() {
+        config.insert_json5(key, "true").map_err(LinkError::zenoh)?;
+    }
+    Ok(())
 }
 
 pub(super) fn key(what: &str, bus: &str, host: &str) -> Result<KeyExpr<'static>, LinkError> {
@@ -150,5 +248,125 @@ pub(super) fn life() -> u64 {
     match rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty()) {
         Ok(8) => u64::from_ne_bytes(bytes),
         _ => u64::from(std::process::id()) << 32 ^ u64::from(std::process::id()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    /// The configuration of a file's text and options, or its refusal.
+    fn configured_by(text: &str, connect: &[&str], listen: &[&str]) -> Result<Config, LinkError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("link.json5");
+        fs::write(&path, text).unwrap();
+        let owned = |texts: &[&str]| texts.iter().map(|&text| text.to_owned()).collect();
+        config(&Settings {
+            bus: "vcan0".to_owned(),
+            choice: Choice::Auto,
+            directory: None,
+            host: "here".to_owned(),
+            config: (!text.is_empty()).then_some(path),
+            connect: owned(connect),
+            listen: owned(listen),
+        })
+    }
+
+    fn listeners(config: &Config) -> Value {
+        value(config, "listen/endpoints").unwrap()
+    }
+
+    #[test]
+    fn nothing_listens_but_what_is_named_in_any_mode() {
+        for mode in ["", "mode: \"peer\",", "mode: \"router\",", "mode: \"client\","] {
+            for connect in [
+                "[\"tls/robot:7447\"]",
+                "{ peer: [\"tls/robot:7447\"], router: [\"tls/robot:7447\"], client: [\"tls/robot:7447\"] }",
+            ] {
+                for rest in ["", "listen: {},", "listen: { timeout_ms: 1 },", "listen: { endpoints: {} },"] {
+                    let text = format!("{{ {mode} connect: {{ endpoints: {connect} }}, {rest} }}");
+                    let config = configured_by(&text, &[], &[]).unwrap();
+                    assert_eq!(listeners(&config), serde_json::json!([]), "{text}");
+                }
+            }
+            let named = format!("{{ {mode} connect: {{ endpoints: [\"tls/a:1\"] }} }}");
+            let config = configured_by(&named, &[], &["tls/0.0.0.0:7447"]).unwrap();
+            assert_eq!(listeners(&config), serde_json::json!(["tls/0.0.0.0:7447"]));
+        }
+        let config = configured_by("", &["tcp/robot:7447"], &[]).unwrap();
+        assert_eq!(listeners(&config), serde_json::json!([]));
+        let of_another_mode = "{ mode: \"router\", listen: { endpoints: { peer: [\"tls/a:1\"] } }, connect: { endpoints: [\"tls/b:1\"] } }";
+        assert_eq!(listeners(&configured_by(of_another_mode, &[], &[]).unwrap()), serde_json::json!([]));
+    }
+
+    #[test]
+    fn no_endpoint_lacks_tls_beside_one_with_tls() {
+        let listening = "{ listen: { endpoints: [\"tls/[::]:7447\"] } }";
+        let connecting = "{ connect: { endpoints: [\"tls/robot:7447\"] } }";
+        let both = "{ listen: { endpoints: [\"tls/[::]:7447\", \"tcp/[::]:7448\"] } }";
+        let nested = "{ connect: { endpoints: [{ strategy: \"allOf\", locators: [\"tls/robot:1\", \"tcp/robot:1\"] }] } }";
+        for (text, connect, listen) in [
+            (listening, &["tcp/robot:1"][..], &[][..]),
+            (connecting, &[], &["tcp/[::]:0"]),
+            (both, &[], &[]),
+            (nested, &[], &[]),
+            ("", &["tls/robot:1"], &["tcp/[::]:1"]),
+        ] {
+            let error = configured_by(text, connect, listen).unwrap_err();
+            assert!(
+                matches!(error, LinkError::PlainBesideTls { .. }),
+                "{text} {connect:?} {listen:?}: {error}"
+            );
+            assert!(error.is_usage());
+        }
+        let config = configured_by(connecting, &[], &[]).unwrap();
+        assert_eq!(value(&config, "transport/link/protocols").unwrap(), serde_json::json!(["tls"]));
+    }
+
+    #[test]
+    fn other_protocols_and_no_endpoint_are_refused() {
+        for text in [
+            "{ listen: { endpoints: [\"udp/[::]:1\"] } }",
+            "{ connect: { endpoints: [\"unixsock-stream/a\"] } }",
+        ] {
+            assert!(matches!(configured_by(text, &[], &[]), Err(LinkError::Endpoint(..))), "{text}");
+        }
+        for text in ["{}", "{ mode: \"router\" }", ""] {
+            assert!(matches!(configured_by(text, &[], &[]), Err(LinkError::Alone)), "{text}");
+        }
+    }
+
+    #[test]
+    fn who_connects_by_tls_has_to_prove_who_it_is() {
+        let mtls = "transport/link/tls/enable_mtls";
+        let listening = |tls: &str| {
+            format!(
+                "{{ listen: {{ endpoints: [\"tls/[::]:1\"] }}, transport: {{ link: {{ tls: {{ {tls} }} }} }} }}"
+            )
+        };
+        for (text, expected) in [
+            (listening(""), Value::Bool(true)),
+            (listening("enable_mtls: false"), Value::Bool(false)),
+            ("{ connect: { endpoints: [\"tls/a:1\"] } }".to_owned(), Value::Null),
+        ] {
+            assert_eq!(value(&configured_by(&text, &[], &[]).unwrap(), mtls).unwrap(), expected, "{text}");
+        }
+    }
+
+    #[test]
+    fn nobody_is_looked_for_or_told_of_others() {
+        let text = "{ connect: { endpoints: [\"tcp/a:1\"] }, scouting: { multicast: { enabled: true }, gossip: { enabled: true } }, \
+                    adminspace: { enabled: true } }";
+        let config = configured_by(text, &[], &[]).unwrap();
+        for key in [
+            "scouting/multicast/enabled",
+            "scouting/gossip/enabled",
+            "adminspace/enabled",
+            "plugins_loading/enabled",
+        ] {
+            assert_eq!(value(&config, key).unwrap(), Value::Bool(false), "{key}");
+        }
     }
 }
