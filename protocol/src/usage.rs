@@ -90,17 +90,33 @@ pub fn draw(text: &str) -> Result<(), Failure> {
 /// written like `\u{1b}`.
 #[must_use]
 pub fn shown(text: &str) -> Cow<'_, str> {
-    escaped(text, is_obeyed)
+    escaped(text, is_unprintable)
 }
 
 /// The same of a text of several lines: its line feeds and tabs stay.
 #[must_use]
 pub fn shown_lines(text: &str) -> Cow<'_, str> {
-    escaped(text, |letter| is_obeyed(letter) && !matches!(letter, '\n' | '\t'))
+    escaped(text, |letter| is_unprintable(letter) && !matches!(letter, '\n' | '\t'))
 }
 
-const fn is_obeyed(letter: char) -> bool {
-    matches!(letter, '\0'..='\u{1f}' | '\u{7f}'..='\u{9f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+/// Returns true for controls, marks and overrides of the direction of text, separators of lines, invisible characters that
+/// make two names look alike, and code points that are no characters (Unicode 16, 23.7 and 23.8).
+#[must_use]
+pub const fn is_unprintable(letter: char) -> bool {
+    matches!(
+        letter,
+        '\0'..='\u{1f}'
+            | '\u{7f}'..='\u{9f}'
+            | '\u{ad}'
+            | '\u{61c}'
+            | '\u{200b}'
+            | '\u{200e}'..='\u{200f}'
+            | '\u{2028}'..='\u{202e}'
+            | '\u{2060}'..='\u{206f}'
+            | '\u{fdd0}'..='\u{fdef}'
+            | '\u{feff}'
+            | '\u{fff0}'..='\u{fffb}'
+    ) || letter as u32 & 0xfffe == 0xfffe
 }
 
 fn escaped(text: &str, is_escaped: impl Fn(char) -> bool) -> Cow<'_, str> {
@@ -191,6 +207,8 @@ mod tests {
         assert_eq!(shown_lines("a\r\n\tb\u{9b}"), "a\\u{d}\n\tb\\u{9b}");
         assert_eq!(shown("\u{80}\u{9f}\u{a0}"), "\\u{80}\\u{9f}\u{a0}");
         assert_eq!(shown("\u{202a}\u{202e}\u{2066}\u{2069}"), r"\u{202a}\u{202e}\u{2066}\u{2069}");
+        assert_eq!(shown("\u{200f}\u{feff}\u{fffe}\u{1ffff}"), r"\u{200f}\u{feff}\u{fffe}\u{1ffff}");
+        assert!(matches!(shown("\u{200d}\u{fffd}\u{ffee}\u{10000}"), Cow::Borrowed(_)));
         // A name that was shown once is the same when it is shown again.
         assert_eq!(shown(&shown("\x1b")), shown("\x1b"));
     }

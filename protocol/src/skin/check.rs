@@ -1,7 +1,7 @@
 //! From the file's words to checked types.
 
 use super::{Bus, Cell, baseline, buses, cells};
-use super::{Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing, raw, robot, sensing};
+use super::{Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing, names, raw, robot, sensing};
 use crate::document::{Fault, Place, span};
 use crate::fixed::Q;
 use crate::parameters::Contact;
@@ -10,6 +10,13 @@ pub(super) type Checked<T> = Result<T, Fault>;
 
 /// A whole skin.
 pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
+    names::check(&raw)?;
+    checked(raw, |_| true)
+}
+
+/// A whole skin out of a recording, whose names are escaped instead of refused.
+pub(super) fn recorded_skin(mut raw: raw::Skin) -> Checked<Skin> {
+    names::escape(&mut raw);
     checked(raw, |_| true)
 }
 

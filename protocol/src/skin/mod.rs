@@ -7,6 +7,7 @@ mod baseline;
 mod buses;
 mod cells;
 mod check;
+mod names;
 mod part;
 mod raw;
 mod reach;
@@ -248,6 +249,16 @@ impl Skin {
         let what = "this is a scenario, not a skin: `gateway run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, check::skin)
             .map_err(|error: DocumentError| error.or_mistaken(text, SCENARIO_KEYS, KEYS, what))
+    }
+
+    /// Checks the text of a skin in a recording; `path` is what errors call it.
+    ///
+    /// Unprintable characters of its names are written like `\u{1b}`; [`Skin::parse`] refuses them.
+    ///
+    /// # Errors
+    /// The first thing that is wrong with it.
+    pub fn parse_recorded(path: &str, text: &str) -> Result<Self, DocumentError> {
+        document::parse(path, text, check::recorded_skin)
     }
 
     /// The words that a cell computes with.

@@ -162,6 +162,35 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
 }
 
 #[test]
+fn names_that_mislead_are_refused_and_escaped_in_recordings() {
+    let of_skin = GOOD.lines().find(|line| line.starts_with("name = ")).unwrap();
+    for (character, code) in
+        [("\\u001b", "1B"), ("\\n", "A"), ("\\u202e", "202E"), ("\\ufffe", "FFFE"), ("\\u0000", "0")]
+    {
+        for line in [of_skin, "name = \"elbow\""] {
+            let wrong = format!("{}{character}\"", line.strip_suffix('"').unwrap());
+            let error = says(line, &wrong);
+            let code = format!("U+{code:0>4} is not a printable character: remove it");
+            assert!(error.ends_with(&code), "{error}");
+            assert!(!error.contains(char::is_control), "{error:?}");
+            let recorded = Skin::parse_recorded("skin.toml", &GOOD.replacen(line, &wrong, 1)).unwrap();
+            let names = [recorded.name, recorded.robot.name].concat();
+            assert!(names.contains(r"\u{") && !names.contains(char::is_control), "{names:?}");
+        }
+    }
+    let long = format!("name = \"{}\"", "e".repeat(201));
+    assert_eq!(
+        says("name = \"elbow\"", &long),
+        "skin.toml:5: robot.name = 201 characters: a name has at most 200"
+    );
+    Skin::parse_recorded("skin.toml", &GOOD.replacen("name = \"elbow\"", &long, 1)).unwrap();
+    for name in ["Grüße 機器人", "a b", "\u{1f916}"] {
+        let said = GOOD.replacen("\"elbow\"", &format!("\"{name}\""), 1);
+        assert_eq!(Skin::parse("skin.toml", &said).unwrap().robot.name, name);
+    }
+}
+
+#[test]
 fn a_robot_may_say_where_its_urdf_is() {
     assert_eq!(Skin::parse("skin.toml", GOOD).unwrap().robot.urdf, None);
     let with = GOOD.replacen("name = \"elbow\"\n", "name = \"elbow\"\nurdf = \"../elbow.urdf\"\n", 1);

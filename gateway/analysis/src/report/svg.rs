@@ -18,6 +18,7 @@ use plotters::element::{Circle, PathElement, Polygon, Rectangle, Text};
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use plotters_svg::SVGBackend;
+use protocol::usage::is_unprintable;
 
 use super::figure::{Axis, Figure, Mark, On, Series, Shape, Size};
 use super::scale::Span;
@@ -147,8 +148,8 @@ pub fn escaped(text: &str) -> String {
             '>' => safe.push_str("&gt;"),
             '"' => safe.push_str("&quot;"),
             '\'' => safe.push_str("&#39;"),
-            // XML has no other control characters, not even escaped.
-            letter if letter.is_control() && !matches!(letter, '\n' | '\t') => {
+            // XML has no other control characters, not even escaped; nor has it U+FFFE.
+            letter if is_unprintable(letter) && !matches!(letter, '\n' | '\t') => {
                 safe.push(char::REPLACEMENT_CHARACTER)
             }
             letter => safe.push(letter),

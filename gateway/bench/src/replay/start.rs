@@ -134,7 +134,7 @@ pub(super) fn skin_override(
             return Err(ReplayError::NoSkin(file.to_owned()));
         };
         let text = String::from_utf8_lossy(bytes);
-        let skin = Skin::parse(&format!("the skin in {file}"), &text)?;
+        let skin = Skin::parse_recorded(&format!("the skin in {file}"), &text)?;
         let (memory, file) = in_memory(bytes)?;
         SkinOverride { skin, file, _memory: Some(memory) }
     };

@@ -47,7 +47,7 @@ impl Extras {
     #[must_use]
     pub fn skin(&self) -> Option<Result<Skin, DocumentError>> {
         let (_, text) = self.attachments.iter().find(|(name, _)| name == SKIN)?;
-        Some(Skin::parse(SKIN, &String::from_utf8_lossy(text)))
+        Some(Skin::parse_recorded(SKIN, &String::from_utf8_lossy(text)))
     }
 }
 
