@@ -7,9 +7,12 @@
 //!   d 123 9 (24 digits) CR, D    FD, one bit rate      DLC 9 A B C D E F: 12 16 20 24 32 48 64 bytes
 //!   b 123 9 (24 digits) CR, B    FD, bit rate switched
 //!   t 123 2 1122 0A51 CR         received, with time stamps on: 4 digits (ms), or 8 (µs)
+//!   b 123 2 1122 S CR            received, of an error passive sender (CANable 2.5)
+//!   b 123 2 1122 0A51 1 CR       received, behind a time stamp or without one: 1 error passive, 0 active (WeAct)
 //!
 //!   C  O  L  S6  Y5  V  N  F  Z1  M00000000  mFFFFFFFF  CR     from the host: [`Command`]
 //!   CR  z CR  Z CR  BEL                                        from the adapter: done, sent, refused
+//!   e1a CR  sp128057 CR  E2310800C CR  F80 CR                  from the adapter: faults, [`Report`]
 //! ```
 //!
 //! Spaces are for the reader only. The digits are hexadecimal, of either case when read, upper case when written.
@@ -18,15 +21,18 @@
 //! an acknowledgement, and who reads passes over lines that it does not know.
 
 mod decoder;
+mod report;
 #[cfg(test)]
 mod tests;
 
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, dlc_len, fd_dlc};
 
 pub use decoder::{Decoder, Line, Refusal, Refused};
+pub use report::{BusState, ErrorCounters, Fault, Report};
 
-/// Bytes of the longest line without its end: a switched FD frame of 64 bytes, 29 bits and 8 digits of time.
-pub const MAX_LINE: usize = 1 + 8 + 1 + 2 * 64 + 8;
+/// Bytes of the longest line without its end: a switched FD frame of 64 bytes, 29 bits, 8 digits of time and the state of
+/// its sender.
+pub const MAX_LINE: usize = 1 + 8 + 1 + 2 * 64 + 8 + 1;
 /// Ends each line in either direction.
 pub const CR: u8 = b'\r';
 /// The adapter refused a line.

@@ -1,7 +1,9 @@
 //! Bytes of a serial line become frames, commands and acknowledgements.
 
-use super::{BEL, CR, Command, MAX_LINE, digit, dlc_len, number};
-use crate::can::{BIT_RATE_SWITCH, EXTENDED, EXTENDED_MASK, FD_FORMAT, Format, Frame, STANDARD_MASK};
+use super::{BEL, CR, Command, MAX_LINE, Report, digit, dlc_len, number};
+use crate::can::{
+    BIT_RATE_SWITCH, ERROR_STATE, EXTENDED, EXTENDED_MASK, FD_FORMAT, Format, Frame, STANDARD_MASK,
+};
 
 /// What a line says.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -16,6 +18,8 @@ pub enum Line {
     Sent,
     /// BEL: the adapter refused a line.
     Failed,
+    /// A fault, or a state of the adapter's bus.
+    Reported(Report),
     /// A line of printable characters that is none of these, such as an adapter's version: to be passed over.
     Other,
     /// A line that cannot be used; [`Decoder::refused`] has counted it.
@@ -90,6 +94,43 @@ pub struct Decoder {
     /// The line is refused when it ends.
     fault: Option<Refusal>,
     refused: Refused,
+    endings: Endings,
+}
+
+/// Whether an adapter's frames end with a digit for the state of their sender. Either all of them do or none: so a line
+/// that lost a byte is not mistaken for one that ends otherwise.
+#[derive(Clone, Debug, Default)]
+struct Endings {
+    has_state: bool,
+    /// So many frames in succession ended in this way.
+    same: u8,
+    /// The last one ended in the other way.
+    other: bool,
+}
+
+impl Endings {
+    /// Frames after which one that ends otherwise is refused, unless another one follows it.
+    const SURE: u8 = 16;
+
+    const fn new() -> Self {
+        Self { has_state: false, same: 0, other: false }
+    }
+
+    /// Takes the end of a frame; whether it is to be believed.
+    const fn take(&mut self, has_state: bool) -> bool {
+        if self.has_state == has_state {
+            self.same = self.same.saturating_add(1);
+            self.other = false;
+            return true;
+        }
+        let is_sure = self.same >= Self::SURE && !self.other;
+        if is_sure {
+            self.other = true;
+        } else {
+            *self = Self { has_state, same: 1, other: false };
+        }
+        !is_sure
+    }
 }
 
 impl Decoder {
@@ -100,6 +141,7 @@ impl Decoder {
             line: heapless::Vec::new(),
             fault: None,
             refused: Refused { garbage: 0, long: 0, short: 0, dlc: 0, identifier: 0 },
+            endings: Endings::new(),
         }
     }
 
@@ -157,7 +199,8 @@ impl Decoder {
     }
 
     fn end(&mut self) -> Line {
-        let line = self.fault.map_or_else(|| read(&self.line), Line::Refused);
+        let endings = &mut self.endings;
+        let line = self.fault.map_or_else(|| read(&self.line, endings), Line::Refused);
         if let Line::Refused(refusal) = line {
             self.refused.count(refusal);
         }
@@ -167,24 +210,33 @@ impl Decoder {
 }
 
 /// What a line of printable characters, without its end, says.
-fn read(line: &[u8]) -> Line {
+fn read(line: &[u8], endings: &mut Endings) -> Line {
     let [kind, rest @ ..] = line else { return Line::Done };
     let flags = match kind.to_ascii_lowercase() {
         b't' | b'r' => None,
         b'd' => Some(FD_FORMAT),
         b'b' => Some(FD_FORMAT | BIT_RATE_SWITCH),
         b'z' if rest.is_empty() => return Line::Sent,
-        _ => return Command::decode(line).map_or(Line::Other, Line::Command),
+        _ => {
+            let command = || Command::decode(line).map_or(Line::Other, Line::Command);
+            return Report::read(line).map_or_else(command, Line::Reported);
+        }
     };
     let is_remote = kind.eq_ignore_ascii_case(&b'r');
-    match frame(rest, kind.is_ascii_uppercase(), flags, is_remote) {
+    match frame(rest, kind.is_ascii_uppercase(), flags, is_remote, endings) {
         Ok(frame) => Line::Frame(frame),
         Err(refusal) => Line::Refused(refusal),
     }
 }
 
 /// A frame from behind its letter; `flags` are those of an FD frame.
-fn frame(text: &[u8], is_extended: bool, flags: Option<u8>, is_remote: bool) -> Result<Frame, Refusal> {
+fn frame(
+    text: &[u8],
+    is_extended: bool,
+    flags: Option<u8>,
+    is_remote: bool,
+    endings: &mut Endings,
+) -> Result<Frame, Refusal> {
     let (digits, flag, max) = if is_extended { (8, EXTENDED, EXTENDED_MASK) } else { (3, 0, STANDARD_MASK) };
     let (id, rest) = text.split_at_checked(digits).ok_or(Refusal::Short)?;
     let id = number(id).ok_or(Refusal::Garbage)?;
@@ -198,7 +250,17 @@ fn frame(text: &[u8], is_extended: bool, flags: Option<u8>, is_remote: bool) -> 
         return Err(Refusal::Dlc);
     }
     let len = if is_remote { 0 } else { dlc_len(dlc) };
-    let (text, time) = rest.split_at_checked(2 * len).ok_or(Refusal::Short)?;
+    let (text, rest) = rest.split_at_checked(2 * len).ok_or(Refusal::Short)?;
+    let (time, state) = match rest {
+        [time @ .., b'S'] => (time, Some(b'S')),
+        // Whoever ends so writes capitals, and a small one may begin the next line, whose CR was lost.
+        [time @ .., state @ b'0'..=b'1']
+            if time.len().is_multiple_of(4) && !time.iter().any(u8::is_ascii_lowercase) =>
+        {
+            (time, Some(*state))
+        }
+        time => (time, None),
+    };
     if !matches!(time.len(), 0 | 4 | 8) {
         return Err(Refusal::Long);
     }
@@ -208,10 +270,16 @@ fn frame(text: &[u8], is_extended: bool, flags: Option<u8>, is_remote: bool) -> 
     for (byte, &[high, low]) in data.iter_mut().zip(pairs) {
         *byte = (digit(high).ok_or(Refusal::Garbage)? << 4) | digit(low).ok_or(Refusal::Garbage)?;
     }
+    // A letter cannot be a digit of what stands before it.
+    let has_state = matches!(state, Some(b'0' | b'1'));
+    if state != Some(b'S') && !endings.take(has_state) {
+        return Err(if has_state { Refusal::Long } else { Refusal::Short });
+    }
+    let passive = if matches!(state, Some(b'1' | b'S')) { ERROR_STATE } else { 0 };
     let frame = match flags {
         None if is_remote => Frame::remote(id, dlc),
         None => Frame::filled(id, Format::Classic, 0, data, len),
-        Some(flags) => Frame::filled(id, Format::Fd, flags, data, len),
+        Some(flags) => Frame::filled(id, Format::Fd, flags | passive, data, len),
     };
     frame.map_err(|_| Refusal::Dlc)
 }

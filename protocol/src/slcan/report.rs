@@ -1,0 +1,353 @@
+//! Faults that adapters report about themselves and their bus, and the kernel's error frame for each report.
+//!
+//! ```text
+//!   e 2 ab CR          bus errors: how many, then a letter each              firmware that Linux' slcan driver reads
+//!   s p 128 057 CR     state a w p b; receive errors, transmit errors        the same
+//!   E 2 3 10 80 0C CR  state, last error, flags, transmit errors, receive errors     CANable 2.5
+//!   F 80 CR            flags, the answer to F                                Lawicel, WeAct
+//! ```
+
+use super::{digit, number};
+use crate::can::{ERROR, Format, Frame};
+
+// Classes and bits of linux/can/error.h.
+const CLASS_TRANSMIT_TIMEOUT: u32 = 0x001;
+const CLASS_LOST_ARBITRATION: u32 = 0x002;
+const CLASS_CONTROLLER: u32 = 0x004;
+const CLASS_PROTOCOL: u32 = 0x008;
+const CLASS_ACK: u32 = 0x020;
+const CLASS_BUS_OFF: u32 = 0x040;
+const CLASS_BUS_ERROR: u32 = 0x080;
+const CLASS_COUNTERS: u32 = 0x200;
+const RECEIVE_OVERFLOW: u8 = 0x01;
+const TRANSMIT_OVERFLOW: u8 = 0x02;
+const RECEIVE_WARNING: u8 = 0x04;
+const TRANSMIT_WARNING: u8 = 0x08;
+const RECEIVE_PASSIVE: u8 = 0x10;
+const TRANSMIT_PASSIVE: u8 = 0x20;
+const ERROR_ACTIVE: u8 = 0x40;
+const ONE_BIT: u8 = 0x01;
+const FORM: u8 = 0x02;
+const STUFF: u8 = 0x04;
+const BIT_0: u8 = 0x08;
+const BIT_1: u8 = 0x10;
+const TRANSMITTING: u8 = 0x80;
+const AT_CRC: u8 = 0x08;
+const AT_ACK: u8 = 0x19;
+
+/// The state of a CAN controller by its error counters.
+#[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
+pub enum BusState {
+    /// Error active: it takes part without restriction.
+    #[default]
+    Active,
+    /// A counter has reached 96.
+    Warning,
+    /// Error passive: a counter has reached 128.
+    Passive,
+    /// Off the bus: the transmit counter has passed 255.
+    Off,
+}
+
+impl BusState {
+    /// All states, from the best to the worst.
+    pub const ALL: [Self; 4] = [Self::Active, Self::Warning, Self::Passive, Self::Off];
+
+    /// The state in words.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Active => "error active",
+            Self::Warning => "error warning",
+            Self::Passive => "error passive",
+            Self::Off => "bus off",
+        }
+    }
+
+    /// The bits of a controller of which the transmitter, the receiver, or both have this state.
+    const fn bits(self, transmits: bool, receives: bool) -> u8 {
+        let (transmit, receive) = match self {
+            Self::Active => (ERROR_ACTIVE, ERROR_ACTIVE),
+            Self::Warning => (TRANSMIT_WARNING, RECEIVE_WARNING),
+            Self::Passive => (TRANSMIT_PASSIVE, RECEIVE_PASSIVE),
+            Self::Off => (0, 0),
+        };
+        (if transmits { transmit } else { 0 }) | (if receives { receive } else { 0 })
+    }
+}
+
+/// A fault other than a state.
+#[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
+#[repr(u16)]
+pub enum Fault {
+    /// No receiver acknowledged a frame.
+    Ack = 0x001,
+    /// A dominant bit was sent and a recessive one read.
+    Bit0 = 0x002,
+    /// A recessive bit was sent and a dominant one read.
+    Bit1 = 0x004,
+    /// A wrong checksum.
+    Crc = 0x008,
+    /// A wrong bit where the format allows one value only.
+    Form = 0x010,
+    /// Six equal bits in succession.
+    Stuff = 0x020,
+    /// A bus error of an unknown kind.
+    Bus = 0x040,
+    /// Arbitration was lost.
+    Arbitration = 0x080,
+    /// Received frames were lost in the adapter.
+    ReceiveOverrun = 0x100,
+    /// Frames to be sent were lost in the adapter.
+    TransmitOverrun = 0x200,
+    /// A frame was not sent in time.
+    TransmitTimeout = 0x400,
+    /// The adapter failed to receive a frame.
+    ReceiveFailed = 0x800,
+    /// The adapter failed to send a frame.
+    TransmitFailed = 0x1000,
+}
+
+impl Fault {
+    /// All faults.
+    pub const ALL: [Self; 13] = [
+        Self::Ack,
+        Self::Bit0,
+        Self::Bit1,
+        Self::Crc,
+        Self::Form,
+        Self::Stuff,
+        Self::Bus,
+        Self::Arbitration,
+        Self::ReceiveOverrun,
+        Self::TransmitOverrun,
+        Self::TransmitTimeout,
+        Self::ReceiveFailed,
+        Self::TransmitFailed,
+    ];
+
+    /// The fault in words.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Ack => "no ACK",
+            Self::Bit0 => "bit 0 error",
+            Self::Bit1 => "bit 1 error",
+            Self::Crc => "CRC error",
+            Self::Form => "form error",
+            Self::Stuff => "stuff error",
+            Self::Bus => "bus error",
+            Self::Arbitration => "arbitration lost",
+            Self::ReceiveOverrun => "receive overrun",
+            Self::TransmitOverrun => "transmit overrun",
+            Self::TransmitTimeout => "transmit timeout",
+            Self::ReceiveFailed => "receive failed",
+            Self::TransmitFailed => "transmit failed",
+        }
+    }
+
+    /// Class, controller, protocol and location of an error frame.
+    const fn error(self) -> (u32, u8, u8, u8) {
+        const BUS: u32 = CLASS_PROTOCOL | CLASS_BUS_ERROR;
+        match self {
+            Self::Ack => (BUS | CLASS_ACK, 0, 0, AT_ACK),
+            Self::Bit0 => (BUS, 0, BIT_0, 0),
+            Self::Bit1 => (BUS, 0, BIT_1, 0),
+            Self::Crc => (BUS, 0, ONE_BIT, AT_CRC),
+            Self::Form => (BUS, 0, FORM, 0),
+            Self::Stuff => (BUS, 0, STUFF, 0),
+            Self::Bus | Self::ReceiveFailed => (BUS, 0, 0, 0),
+            Self::TransmitFailed => (BUS, 0, TRANSMITTING, 0),
+            Self::Arbitration => (CLASS_LOST_ARBITRATION, 0, 0, 0),
+            Self::ReceiveOverrun => (CLASS_CONTROLLER, RECEIVE_OVERFLOW, 0, 0),
+            Self::TransmitOverrun => (CLASS_CONTROLLER, TRANSMIT_OVERFLOW, 0, 0),
+            Self::TransmitTimeout => (CLASS_TRANSMIT_TIMEOUT, 0, 0, 0),
+        }
+    }
+}
+
+/// Error counters of a CAN controller.
+#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
+pub struct ErrorCounters {
+    /// When sending.
+    pub transmit: u16,
+    /// When receiving.
+    pub receive: u16,
+}
+
+/// One report of an adapter.
+#[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
+pub struct Report {
+    faults: u16,
+    state: Option<BusState>,
+    counters: Option<ErrorCounters>,
+    /// A line of bus errors, which is an error frame of its own class whatever else is in it.
+    is_bus_error: bool,
+}
+
+impl Report {
+    /// The faults in it.
+    pub fn faults(self) -> impl Iterator<Item = Fault> {
+        Fault::ALL.into_iter().filter(move |&fault| self.has(fault))
+    }
+
+    /// The state in it.
+    #[must_use]
+    pub const fn state(self) -> Option<BusState> {
+        self.state
+    }
+
+    /// The error counters in it.
+    #[must_use]
+    pub const fn counters(self) -> Option<ErrorCounters> {
+        self.counters
+    }
+
+    /// The error frame for it, as Linux' slcan driver makes it, when the controller was in the state `before`. `None` for
+    /// a report without a fault that states what is known.
+    #[must_use]
+    pub fn frame(self, before: BusState) -> Option<Frame> {
+        let bus_error = if self.is_bus_error { CLASS_PROTOCOL | CLASS_BUS_ERROR } else { 0 };
+        let (mut class, mut controller, mut protocol, mut location) = (bus_error, 0, 0, 0);
+        for error in self.faults().map(Fault::error) {
+            class |= error.0;
+            controller |= error.1;
+            protocol |= error.2;
+            location = if error.3 == 0 { location } else { error.3 };
+        }
+        let changed = self.state.filter(|&state| state != before);
+        let counters = self.counters;
+        match changed {
+            None => {}
+            Some(BusState::Off) => class |= CLASS_BUS_OFF,
+            Some(state) => {
+                class |= CLASS_CONTROLLER;
+                // The side with more errors has the state.
+                controller |= counters.map_or_else(
+                    || state.bits(true, true),
+                    |it| state.bits(it.transmit >= it.receive, it.receive >= it.transmit),
+                );
+            }
+        }
+        if class == 0 {
+            return None;
+        }
+        let byte = |count: u16| u8::try_from(count).unwrap_or(u8::MAX);
+        let (mut transmit, mut receive) = (0, 0);
+        if let Some(counters) = counters.filter(|_| changed != Some(BusState::Off)) {
+            class |= CLASS_COUNTERS;
+            (transmit, receive) = (byte(counters.transmit), byte(counters.receive));
+        }
+        let data = [0, controller, protocol, location, 0, 0, transmit, receive];
+        Frame::with_data(ERROR | class, Format::Classic, 0, &data).ok()
+    }
+
+    const fn has(self, fault: Fault) -> bool {
+        self.faults & fault as u16 != 0
+    }
+
+    const fn with(mut self, fault: Fault) -> Self {
+        self.faults |= fault as u16;
+        self
+    }
+
+    fn with_flags(self, flags: u8, meanings: &[(u8, Fault)]) -> Self {
+        let set = meanings.iter().filter(|(bit, _)| flags & bit != 0);
+        set.fold(self, |report, &(_, fault)| report.with(fault))
+    }
+
+    /// The report that a line without its end is.
+    pub(super) fn read(line: &[u8]) -> Option<Self> {
+        match line {
+            [b'e', count @ b'1'..=b'8', letters @ ..] => {
+                Self::bus_errors(letters.get(..usize::from(count - b'0'))?)
+            }
+            [b's', state, counters @ ..] => Self::state_line(*state, counters),
+            [b'E', state @ b'0'..=b'3', last @ b'0'..=b'6', digits @ ..] => {
+                let [flags, transmit, receive] = bytes(digits)?;
+                let counters = Some(ErrorCounters { transmit: transmit.into(), receive: receive.into() });
+                let state = BusState::ALL.get(usize::from(state - b'0')).copied();
+                Some(Self { state, counters, ..Self::default() }.with_last(last - b'0').with_flags(
+                    flags,
+                    &[
+                        (0x01, Fault::ReceiveFailed),
+                        (0x02, Fault::TransmitFailed),
+                        (0x04, Fault::TransmitOverrun),
+                        (0x08, Fault::ReceiveOverrun),
+                        (0x10, Fault::TransmitTimeout),
+                    ],
+                ))
+            }
+            &[b'F', high, low] => {
+                let flags = (digit(high)? << 4) | digit(low)?;
+                let state = [(0x10, BusState::Off), (0x20, BusState::Passive), (0x04, BusState::Warning)];
+                let state = state.into_iter().find(|(bit, _)| flags & bit != 0).map(|(_, state)| state);
+                Some(Self { state, ..Self::default() }.with_flags(
+                    flags,
+                    &[
+                        (0x01, Fault::ReceiveOverrun),
+                        (0x02, Fault::TransmitOverrun),
+                        (0x08, Fault::ReceiveOverrun),
+                        (0x40, Fault::Arbitration),
+                        (0x80, Fault::Bus),
+                    ],
+                ))
+            }
+            _ => None,
+        }
+    }
+
+    /// A letter that is none makes the whole line unknown.
+    fn bus_errors(letters: &[u8]) -> Option<Self> {
+        letters.iter().try_fold(Self { is_bus_error: true, ..Self::default() }, |report, letter| {
+            Some(report.with(match letter {
+                b'a' => Fault::Ack,
+                b'b' => Fault::Bit0,
+                b'B' => Fault::Bit1,
+                b'c' => Fault::Crc,
+                b'f' => Fault::Form,
+                b'o' => Fault::ReceiveOverrun,
+                b'O' => Fault::TransmitOverrun,
+                b's' => Fault::Stuff,
+                _ => return None,
+            }))
+        })
+    }
+
+    fn state_line(state: u8, counters: &[u8]) -> Option<Self> {
+        let state = match state {
+            b'a' => BusState::Active,
+            b'w' => BusState::Warning,
+            b'p' => BusState::Passive,
+            b'b' => BusState::Off,
+            _ => return None,
+        };
+        let &[r0, r1, r2, t0, t1, t2] = <&[u8; 6]>::try_from(counters).ok()?;
+        let count = |digits: [u8; 3]| {
+            digits.iter().try_fold(0_u16, |count, digit| {
+                digit.is_ascii_digit().then(|| count * 10 + u16::from(digit - b'0'))
+            })
+        };
+        let counters = ErrorCounters { receive: count([r0, r1, r2])?, transmit: count([t0, t1, t2])? };
+        Some(Self { state: Some(state), counters: Some(counters), ..Self::default() })
+    }
+
+    /// The last error of a controller, by its number.
+    const fn with_last(self, last: u8) -> Self {
+        match last {
+            1 => self.with(Fault::Stuff),
+            2 => self.with(Fault::Form),
+            3 => self.with(Fault::Ack),
+            4 => self.with(Fault::Bit1),
+            5 => self.with(Fault::Bit0),
+            6 => self.with(Fault::Crc),
+            _ => self,
+        }
+    }
+}
+
+/// Six hexadecimal digits as three bytes.
+fn bytes(digits: &[u8]) -> Option<[u8; 3]> {
+    let [_, bytes @ ..] = number(<&[u8; 6]>::try_from(digits).ok()?)?.to_be_bytes();
+    Some(bytes)
+}
