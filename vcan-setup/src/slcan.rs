@@ -12,13 +12,15 @@
 
 pub mod account;
 mod bridge;
+mod event;
 pub mod incoming;
 mod link;
 pub mod options;
 pub mod outgoing;
 mod participant;
+pub mod refusals;
 
 pub use account::Account;
 pub use bridge::{Bridge, BridgeError, Settings};
+pub use event::Event;
 pub use options::{Address, LineError, LineOptions};
-pub use participant::Event;

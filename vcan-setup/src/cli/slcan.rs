@@ -1,6 +1,7 @@
 //! `vcan-setup slcan`.
 
 use std::os::unix::net::UnixStream;
+use std::time::Duration;
 
 use clap::Args;
 use protocol::bus::Choice;
@@ -9,6 +10,7 @@ use protocol::usage::{Failure, print};
 use protocol::wire_time::BitRates;
 use serde::Serialize;
 use signal_hook::consts::{SIGINT, SIGTERM};
+use vcan_setup::slcan::options::{SETTLE, settle_time};
 use vcan_setup::slcan::{Account, Bridge, BridgeError, LineOptions, Settings};
 
 use super::{bus_name, json};
@@ -17,7 +19,7 @@ use super::{bus_name, json};
 ///
 /// A LINE is a terminal (/dev/ttyACM0), unix:PATH or tcp:HOST:PORT, and after commas what holds for it alone:
 /// cell=12 or cell=1-8 (only what these cells receive goes to the line), filter=100:700 (identifier and mask, as
-/// candump has them), rates=1M/5M, baud=115200, classic. Each line has a client of the bus of its own. A line
+/// candump has them), rates=1M/5M, baud=115200, classic, settle=2. Each line has a client of the bus of its own. A line
 /// that goes away is opened again when it is back. Nothing waits for a line: what it cannot carry is dropped, and
 /// counted by reason. Prints one line when all is open, and at the end what has become of every frame.
 #[derive(Args, Debug)]
@@ -46,6 +48,9 @@ pub(crate) struct Slcan {
     /// The adapters have no CAN FD: drop FD frames
     #[arg(long)]
     classic: bool,
+    /// Seconds from opening a line to setting its adapter: for boards that opening resets (Arduino, ESP32)
+    #[arg(long, value_name = "SECONDS", value_parser = settle)]
+    settle: Option<Duration>,
     /// Begin without lines that are away
     #[arg(long)]
     wait: bool,
@@ -60,6 +65,10 @@ pub(crate) struct Slcan {
 fn cell(word: &str) -> Result<CellId, String> {
     let number = word.parse().map_err(|_| "not a number".to_owned())?;
     CellId::new(number).map_err(|error| error.to_string())
+}
+
+fn settle(word: &str) -> Result<Duration, String> {
+    settle_time(word).ok_or_else(|| SETTLE.to_owned())
 }
 
 #[derive(Serialize)]
@@ -119,6 +128,7 @@ impl Slcan {
         for line in &mut lines {
             line.classic |= self.classic;
             line.baud = line.baud.or(self.baud);
+            line.settle = if line.settle.is_zero() { self.settle.unwrap_or_default() } else { line.settle };
             if let Some(rates) = self.bit_rates.filter(|_| line.bit_rates.is_none()) {
                 line.set_bit_rates(rates)
                     .map_err(|error| Failure::usage(format!("--bit-rates {rates}: {error}")))?;

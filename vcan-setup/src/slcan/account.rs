@@ -1,5 +1,6 @@
 //! What has become of every frame of a line.
 
+use std::collections::BTreeMap;
 use std::fmt;
 
 use protocol::slcan::Refused;
@@ -29,6 +30,8 @@ pub struct ToLineDropped {
     pub not_classic: u64,
     /// An error frame, which slcan does not have.
     pub error_frame: u64,
+    /// The adapter refused the frame (BEL).
+    pub refused: u64,
     /// The end came before its turn.
     pub ended: u64,
 }
@@ -36,7 +39,7 @@ pub struct ToLineDropped {
 /// Frames from the line to the bus. `received` is always `sent` and all of `dropped`, when nothing waits.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct ToBus {
-    /// Lines that were frames.
+    /// Lines that were frames, and error frames of the adapter's faults.
     pub received: u64,
     /// Frames that the bus took.
     pub sent: u64,
@@ -94,10 +97,27 @@ pub struct Account {
     pub opened: u64,
     /// How often it went away.
     pub lost: u64,
+    /// How often its adapter was opened again, because it refused frames.
+    pub reopened: u64,
     /// From the bus to the line.
     pub to_line: ToLine,
     /// From the line to the bus.
     pub to_bus: ToBus,
+    /// Faults and states that the adapter reported, by name.
+    pub faults: Faults,
+}
+
+/// Faults and changes of state that an adapter reported, by name.
+pub type Faults = BTreeMap<&'static str, u64>;
+
+/// Faults since `before` in words; nothing when there are none.
+pub(super) fn faults_since(before: &Faults, now: &Faults) -> String {
+    let more = now.iter().map(|(name, count)| (name, count - before.get(name).copied().unwrap_or(0)));
+    let words = more.filter(|(_, count)| *count > 0).map(|(name, count)| match count {
+        1 => (*name).to_owned(),
+        count => format!("{name} ({count} times)"),
+    });
+    words.collect::<Vec<_>>().join(", ")
 }
 
 impl ToLineDropped {
@@ -107,12 +127,13 @@ impl ToLineDropped {
         self.named().into_iter().map(|(count, _)| count).sum()
     }
 
-    const fn named(&self) -> [(u64, &'static str); 5] {
+    const fn named(&self) -> [(u64, &'static str); 6] {
         [
             (self.queue_full, "line too slow"),
             (self.line_away, "line away"),
             (self.not_classic, "FD frames for a classic adapter"),
             (self.error_frame, "error frames"),
+            (self.refused, "refused by the adapter"),
             (self.ended, "at the end"),
         ]
     }
@@ -187,10 +208,13 @@ fn times(count: u64) -> String {
 }
 
 impl fmt::Display for Account {
-    /// Three lines, without an end.
+    /// Three lines, or four when the adapter reported faults, without an end.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { line, opened, lost, to_line, to_bus } = self;
+        let Self { line, opened, lost, reopened, to_line, to_bus, faults } = self;
         write!(f, "{line}: opened {}, lost {}", times(*opened), times(*lost))?;
+        if *reopened > 0 {
+            write!(f, ", opened again after refusals {}", times(*reopened))?;
+        }
         write!(
             f,
             "\n  to the line: {} received, {} sent{}",
@@ -201,6 +225,9 @@ impl fmt::Display for Account {
         write!(f, "\n  to the bus:  {} received, {} sent{}", to_bus.received, to_bus.sent, to_bus.losses())?;
         if to_bus.bells > 0 {
             write!(f, ", {} times BEL", to_bus.bells)?;
+        }
+        if !faults.is_empty() {
+            write!(f, "\n  the adapter reported: {}", faults_since(&Faults::new(), faults))?;
         }
         Ok(())
     }
@@ -219,9 +246,16 @@ mod tests {
             "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 0 received, 0 sent\n  to the bus:  0 received, 0 sent"
         );
         account.to_line = ToLine {
-            received: 16,
+            received: 23,
             sent: 1,
-            dropped: ToLineDropped { queue_full: 1, line_away: 2, not_classic: 3, error_frame: 4, ended: 5 },
+            dropped: ToLineDropped {
+                queue_full: 1,
+                line_away: 2,
+                not_classic: 3,
+                error_frame: 4,
+                refused: 7,
+                ended: 5,
+            },
             dropped_by_bus: 6,
         };
         account.to_bus = ToBus {
@@ -234,11 +268,19 @@ mod tests {
         };
         assert_eq!(
             account.to_string(),
-            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 16 received, 1 sent, 15 dropped (1 line too \
-             slow, 2 line away, 3 FD frames for a classic adapter, 4 error frames, 5 at the end), 6 not received (6 \
+            "/dev/ttyACM0: opened 2 times, lost once\n  to the line: 23 received, 1 sent, 22 dropped (1 line too \
+             slow, 2 line away, 3 FD frames for a classic adapter, 4 error frames, 7 refused by the adapter, 5 at the \
+             end), 6 not received (6 \
              dropped by the bus)\n  to the bus:  11 received, 1 sent, 10 dropped (1 bus full, 2 bus away, 3 FD frames \
              for a classic bus, 4 at the end), 6 lines refused (1 garbage, 2 too short, 3 wrong identifier), 7 times BEL"
         );
+        (account.reopened, account.faults) = (1, Faults::from([("no ACK", 3), ("bus off", 1)]));
+        let text = account.to_string();
+        assert!(
+            text.starts_with("/dev/ttyACM0: opened 2 times, lost once, opened again after refusals once\n"),
+            "{text}"
+        );
+        assert!(text.ends_with(", 7 times BEL\n  the adapter reported: bus off, no ACK (3 times)"), "{text}");
         assert_eq!(account.to_line.dropped.total() + account.to_line.sent, account.to_line.received);
         assert_eq!(account.to_bus.dropped.total() + account.to_bus.sent, account.to_bus.received);
     }

@@ -11,8 +11,9 @@ use rustix::io::Errno;
 use thiserror::Error;
 
 use super::account::Account;
+use super::event::Event;
 use super::options::LineOptions;
-use super::participant::{Event, Participant, Ready, open};
+use super::participant::{Participant, Ready, open};
 
 /// How long a line may take at the end for what it has begun and for closing its adapter.
 const CLOSING: Duration = Duration::from_millis(500);

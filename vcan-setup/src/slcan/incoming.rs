@@ -3,9 +3,9 @@
 use std::collections::VecDeque;
 
 use protocol::can::{Format, Frame};
-use protocol::slcan::{Decoder, Line};
+use protocol::slcan::{BusState, Decoder, Fault, Line, Report};
 
-use super::account::ToBus;
+use super::account::{Faults, ToBus};
 
 /// Frames that wait for the bus at most.
 pub const QUEUE: usize = 1_024;
@@ -17,8 +17,27 @@ pub struct Incoming {
     /// The bus carries classic frames only.
     classic: bool,
     is_up: bool,
+    /// Real hardware would send an error frame as a data frame.
+    is_virtual: bool,
     frames: VecDeque<Frame>,
     account: ToBus,
+    replies: Replies,
+    /// The adapter's state, as last reported.
+    state: BusState,
+    faults: Faults,
+}
+
+/// What an adapter replied since it was opened.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Replies {
+    /// It acknowledged a line, or sent a frame.
+    pub accepted: bool,
+    /// So many refusals in succession.
+    pub refusals: u64,
+}
+
+impl Replies {
+    const ACCEPTED: Self = Self { accepted: true, refusals: 0 };
 }
 
 impl Incoming {
@@ -28,10 +47,14 @@ impl Incoming {
         Self::default()
     }
 
-    /// The bus is there; `classic` drops FD frames.
-    pub const fn up(&mut self, classic: bool) {
-        self.is_up = true;
-        self.classic = classic;
+    /// The bus is there; `classic` drops FD frames, and only a bus that `is_virtual` gets error frames.
+    pub const fn up(&mut self, classic: bool, is_virtual: bool) {
+        (self.is_up, self.classic, self.is_virtual) = (true, classic, is_virtual);
+    }
+
+    /// The adapter was opened: its replies are those to what follows, and its bus has no error.
+    pub fn opened(&mut self) {
+        (self.replies, self.state) = (Replies::default(), BusState::Active);
     }
 
     /// The bus is gone, and takes nothing of what waits.
@@ -44,12 +67,48 @@ impl Incoming {
     pub fn take(&mut self, bytes: &[u8]) {
         for &byte in bytes {
             match self.decoder.push(byte) {
-                Some(Line::Frame(frame)) => self.push(frame),
-                Some(Line::Failed) => self.account.bells += 1,
+                Some(Line::Frame(frame)) => {
+                    self.replies = Replies::ACCEPTED;
+                    self.push(frame);
+                }
+                Some(Line::Failed) => {
+                    self.account.bells += 1;
+                    self.replies.refusals += 1;
+                }
+                Some(Line::Done | Line::Sent) => self.replies = Replies::ACCEPTED,
+                Some(Line::Reported(report)) => self.report(report),
                 Some(Line::Other | Line::Command(_)) => self.account.other_lines += 1,
-                None | Some(Line::Done | Line::Sent | Line::Refused(_)) => {}
+                None | Some(Line::Refused(_)) => {}
             }
         }
+    }
+
+    /// What the adapter replied since it was opened.
+    #[must_use]
+    pub const fn replies(&self) -> Replies {
+        self.replies
+    }
+
+    /// Faults that the adapter reported.
+    #[must_use]
+    pub const fn faults(&self) -> &Faults {
+        &self.faults
+    }
+
+    /// Counts the faults of a report, and passes them on as an error frame.
+    fn report(&mut self, report: Report) {
+        let before = self.state;
+        self.state = report.state().unwrap_or(before);
+        let changed = (self.state != before).then_some(self.state.name());
+        let mut is_empty = true;
+        for name in report.faults().map(Fault::name).chain(changed) {
+            *self.faults.entry(name).or_default() += 1;
+            is_empty = false;
+        }
+        if let Some(frame) = report.frame(before).filter(|_| self.is_virtual) {
+            self.push(frame);
+        }
+        self.account.other_lines += u64::from(is_empty);
     }
 
     /// The line is gone, with what it had begun.
@@ -109,7 +168,7 @@ mod tests {
     fn frames_wait_in_order_and_the_rest_is_counted() {
         let mut incoming = Incoming::new();
         incoming.take(b"t1230\r");
-        incoming.up(true);
+        incoming.up(true, true);
         incoming.take(b"\rz\r\x07V1013\rt1240\rb1250\rt1239\rS8\rt12");
         incoming.take(b"60\r");
         assert_eq!(incoming.waiting().iter().map(Frame::id).collect::<Vec<_>>(), [0x124, 0x126]);
@@ -125,6 +184,41 @@ mod tests {
         assert_eq!((account.refused.dlc, account.refused.short, account.refused.total()), (1, 1, 2));
     }
 
+    #[test]
+    fn faults_are_counted_and_go_to_a_virtual_bus_as_error_frames() {
+        for (is_virtual, expected) in [(true, vec![0xA8, 0x40, 0x88, 0x204]), (false, vec![])] {
+            let mut incoming = Incoming::new();
+            incoming.up(true, is_virtual);
+            incoming.take(b"e1a\rsb256256\rsb256256\rF80\rF00\r");
+            incoming.opened();
+            incoming.take(b"sp128000\r");
+            let frames: Vec<_> = incoming.waiting().iter().map(Frame::id).collect();
+            assert_eq!(frames, expected);
+            assert!(incoming.waiting().iter().all(Frame::is_error));
+            let names = ["bus error", "bus off", "error passive", "no ACK"].map(|name| (name, 1));
+            assert_eq!(*incoming.faults(), Faults::from(names));
+            let account = incoming.account();
+            assert_eq!((account.received, account.other_lines), (expected.len() as u64, 2));
+        }
+    }
+
+    #[test]
+    fn refusals_in_succession_are_counted_from_the_last_acceptance() {
+        let mut incoming = Incoming::new();
+        let mut after = |bytes: &[u8]| {
+            incoming.take(bytes);
+            let Replies { accepted, refusals } = incoming.replies();
+            (accepted, refusals)
+        };
+        assert_eq!(after(b"\x07\x07V1013\r"), (false, 2));
+        assert_eq!(after(b"z\r\x07"), (true, 1));
+        assert_eq!(after(b"\r"), (true, 0));
+        assert_eq!(after(b"\x07t1230\r"), (true, 0));
+        incoming.opened();
+        assert_eq!(incoming.replies(), Replies::default());
+        assert_eq!(incoming.account().bells, 4);
+    }
+
     proptest! {
         #[test]
         fn every_frame_is_sent_or_dropped_for_a_reason(
@@ -133,10 +227,10 @@ mod tests {
             let mut incoming = Incoming::new();
             for (kind, amount) in steps {
                 match kind {
-                    0 => incoming.up(amount % 2 == 0),
+                    0 => incoming.up(amount % 2 == 0, amount % 3 == 0),
                     1 => incoming.down(),
                     2 => incoming.sent(amount),
-                    _ => (0..amount).for_each(|_| incoming.take(b"t1230\rb1230\r")),
+                    _ => (0..amount).for_each(|_| incoming.take(b"t1230\rb1230\re1a\rsp128000\r")),
                 }
                 let waiting = incoming.waiting().len();
                 prop_assert!(waiting <= QUEUE);

@@ -3,11 +3,12 @@
 use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
+use std::time::Duration;
 
 use protocol::bus::Filter;
 use protocol::can::{EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK};
 use protocol::id::{CellId, Id};
-use protocol::slcan::{Command, Text};
+use protocol::slcan::Command;
 use protocol::wire_time::BitRates;
 use thiserror::Error;
 
@@ -40,6 +41,8 @@ pub struct LineOptions {
     pub baud: Option<u32>,
     /// The adapter has no CAN FD: FD frames are dropped.
     pub classic: bool,
+    /// How long the adapter needs after its line was opened, before it takes commands: boards that opening resets.
+    pub settle: Duration,
 }
 
 /// A word that is no line.
@@ -51,7 +54,7 @@ pub enum LineError {
     Address(String),
     /// An option that no line has.
     #[error(
-        "{line}: {got:?} is no option of a line: cell=12, cell=1-8, filter=100:700, rates=1M/5M, baud=115200 and classic are"
+        "{line}: {got:?} is no option of a line: cell=12, cell=1-8, filter=100:700, rates=1M/5M, baud=115200, settle=2 and classic are"
     )]
     Unknown {
         /// The address.
@@ -71,15 +74,64 @@ pub enum LineError {
     },
 }
 
+/// The longest time that a board may need to start.
+const MAX_SETTLE: f64 = 60.0;
+/// From a command of the opening to the next: adapters handle one in a USB packet, and answer within this time.
+const COMMAND_GAP: Duration = Duration::from_millis(10);
+/// The same after the adapter was closed: its answer, a refusal when it was closed already, is one to no other command.
+const CLOSE_GAP: Duration = Duration::from_millis(30);
+
+/// A command of the opening.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct OpeningStep {
+    /// Its line.
+    pub bytes: Vec<u8>,
+    /// From it to the next line.
+    pub gap: Duration,
+    /// What the adapter is in from there on.
+    pub stage: Stage,
+}
+
+/// How far an adapter is opened.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub enum Stage {
+    /// Nothing was sent to it.
+    #[default]
+    Away,
+    /// It was closed, which it refuses if it was closed before.
+    Closed,
+    /// Its bit rates are being set.
+    Setting,
+    /// It takes part in its bus.
+    Open,
+}
+
 /// What a line's bit rates may be, in an error.
 const RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k, 125k, 250k, 500k, 750k or 800k, and 1M; \
                      for data 500k and whole Mbit/s up to 8M";
+
+/// What [`LineOptions::settle`] may be, in an error.
+pub const SETTLE: &str = "seconds from 0 to 60, such as 2 or 0.5";
+
+/// Reads [`LineOptions::settle`].
+#[must_use]
+pub fn settle_time(word: &str) -> Option<Duration> {
+    let seconds = word.parse().ok().filter(|seconds| (0.0..=MAX_SETTLE).contains(seconds))?;
+    Some(Duration::from_secs_f64(seconds))
+}
 
 impl LineOptions {
     /// A line to which all frames go, that keeps its own speed and bit rates.
     #[must_use]
     pub const fn new(address: Address) -> Self {
-        Self { address, filters: Vec::new(), bit_rates: None, baud: None, classic: false }
+        Self {
+            address,
+            filters: Vec::new(),
+            bit_rates: None,
+            baud: None,
+            classic: false,
+            settle: Duration::ZERO,
+        }
     }
 
     /// Only what a cell with this node id receives goes to the line, beside what its other filters let pass.
@@ -106,21 +158,32 @@ impl LineOptions {
         Ok(())
     }
 
-    /// What opens the adapter: ends whatever it has of a line, leaves the bus, sets the bit rates, joins the bus.
+    /// The commands that open the adapter: they end whatever it has of a line, leave the bus, set the bit rates, join the
+    /// bus. The data bit rate is stated even when it equals the nominal one, since adapters have another default.
     #[must_use]
-    pub fn opening(&self) -> Vec<u8> {
+    pub fn opening(&self) -> Vec<OpeningStep> {
         let rates = self.bit_rates;
-        let data = rates.map(BitRates::data).filter(|&data| rates.is_some_and(|it| it.nominal() != data));
-        let commands = [
-            Some(Command::Close),
-            rates.and_then(|rates| Command::nominal(rates.nominal())),
-            data.filter(|_| !self.classic).and_then(Command::data),
-            Some(Command::Open),
-        ];
-        let texts: Vec<Text> = commands.into_iter().flatten().map(Command::encode).collect();
-        let mut bytes = vec![protocol::slcan::CR];
-        texts.iter().for_each(|text| bytes.extend_from_slice(text.as_bytes()));
-        bytes
+        let data = rates.filter(|_| !self.classic).map(BitRates::data).and_then(Command::data);
+        let line = |command: Command| command.encode().as_bytes().to_vec();
+        let settings = [rates.and_then(|rates| Command::nominal(rates.nominal())), data];
+        let settings =
+            settings.into_iter().flatten().map(|command| (line(command), COMMAND_GAP, Stage::Setting));
+        [
+            (vec![protocol::slcan::CR], COMMAND_GAP, Stage::Away),
+            (line(Command::Close), CLOSE_GAP, Stage::Closed),
+        ]
+        .into_iter()
+        .chain(settings)
+        .chain([(line(Command::Open), COMMAND_GAP, Stage::Open)])
+        .map(|(bytes, gap, stage)| OpeningStep { bytes, gap, stage })
+        .collect()
+    }
+
+    /// Whether frames may switch to the data bit rate. Where it equals the nominal one they gain nothing by it, and would
+    /// lose by an adapter that does not have the command for it.
+    #[must_use]
+    pub fn switches_bit_rate(&self) -> bool {
+        self.bit_rates.is_none_or(|rates| rates.data() != rates.nominal())
     }
 
     fn take(&mut self, option: &str) -> Result<(), LineError> {
@@ -166,6 +229,9 @@ impl LineOptions {
             "baud" => {
                 let baud = value.parse().ok().filter(|baud| *baud > 0);
                 self.baud = Some(baud.ok_or_else(|| wrong(&"bits in a second: baud=115200"))?);
+            }
+            "settle" => {
+                self.settle = settle_time(value).ok_or_else(|| wrong(&SETTLE))?;
             }
             "classic" if option == "classic" => self.classic = true,
             _ => {
@@ -287,13 +353,41 @@ mod tests {
         assert!(passes(&extended, EXTENDED | 0x1FF) && !passes(&extended, 0x1FF));
     }
 
+    fn opening(text: &str) -> Vec<u8> {
+        line(text).opening().into_iter().flat_map(|step| step.bytes).collect()
+    }
+
     #[test]
     fn an_adapter_is_opened_with_what_is_given() {
-        assert_eq!(line("/dev/x").opening(), b"\rC\rO\r");
-        assert_eq!(line("/dev/x,rates=1M/5M").opening(), b"\rC\rS8\rY5\rO\r");
-        assert_eq!(line("/dev/x,rates=1M/5M,classic").opening(), b"\rC\rS8\rO\r");
-        assert_eq!(line("/dev/x,rates=500k").opening(), b"\rC\rS6\rO\r");
+        assert_eq!(opening("/dev/x"), b"\rC\rO\r");
+        assert_eq!(opening("/dev/x,rates=1M/5M"), b"\rC\rS8\rY5\rO\r");
+        assert_eq!(opening("/dev/x,rates=1M/5M,classic"), b"\rC\rS8\rO\r");
+        assert_eq!(opening("/dev/x,rates=500k,classic"), b"\rC\rS6\rO\r");
         assert_eq!(line("/dev/x,baud=57600").baud, Some(57_600));
+        assert_eq!(line("/dev/x,settle=2.5").settle, Duration::from_millis(2_500));
+        assert_eq!(line("/dev/x").settle, Duration::ZERO);
+    }
+
+    #[test]
+    fn a_data_bit_rate_is_stated_wherever_a_frame_may_switch_to_it() {
+        for (rates, expected) in [
+            ("1M/1M", "\rC\rS8\rY1\rO\r"),
+            ("1M", "\rC\rS8\rY1\rO\r"),
+            ("500k/500k", "\rC\rS6\rY0\rO\r"),
+            ("500k", "\rC\rS6\rY0\rO\r"),
+            ("500k/2M", "\rC\rS6\rY2\rO\r"),
+            ("250k", "\rC\rS5\rO\r"),
+            ("125k/500k", "\rC\rS4\rY0\rO\r"),
+        ] {
+            let with = format!("/dev/x,rates={rates}");
+            assert_eq!(opening(&with), expected.as_bytes(), "{rates}");
+            let line = line(&with);
+            let is_stated = line.opening().iter().any(|step| step.bytes.starts_with(b"Y"));
+            assert!(is_stated || !line.switches_bit_rate(), "{rates}");
+            let [nominal, data] = line.bit_rates.map(|rates| [rates.nominal(), rates.data()]).unwrap();
+            assert_eq!(line.switches_bit_rate(), nominal != data, "{rates}");
+        }
+        assert!(line("/dev/x").switches_bit_rate(), "the adapter has its own rates, which somebody has set");
     }
 
     #[test]
@@ -309,6 +403,8 @@ mod tests {
                 "/dev/x,filter=100",
                 "/dev/x: \"filter=100\": identifier and mask as candump has them: filter=100:700, or 8 digits each for 29 bits",
             ),
+            ("/dev/x,settle=-1", "/dev/x: \"settle=-1\": seconds from 0 to 60, such as 2 or 0.5"),
+            ("/dev/x,settle=NaN", "/dev/x: \"settle=NaN\": seconds from 0 to 60, such as 2 or 0.5"),
             ("/dev/x,baud=fast", "/dev/x: \"baud=fast\": bits in a second: baud=115200"),
             (
                 "/dev/x,rates=2M",

@@ -3,11 +3,12 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use protocol::can::{Format, Frame};
+use protocol::can::{BIT_RATE_SWITCH, Format, Frame};
 use protocol::slcan::{CR, encode};
 use protocol::wire_time::{BitRates, Bits};
 
 use super::account::ToLine;
+use super::options::{LineOptions, OpeningStep, Stage};
 
 /// Frames that wait at most: a tenth of a second of a line at 1 Mbaud.
 pub const QUEUE: usize = 256;
@@ -24,6 +25,12 @@ pub struct Pace {
 }
 
 impl Pace {
+    /// The pace of a line and of the bus behind it.
+    #[must_use]
+    pub const fn of(options: &LineOptions) -> Self {
+        Self { bit_rates: options.bit_rates, baud: options.baud }
+    }
+
     fn cost(self, frame: &Frame, bytes: usize) -> Duration {
         let bus = self.bit_rates.zip(Bits::of(frame)).map_or(0, |(rates, bits)| bits.nanoseconds(rates));
         let wire = self.baud.map_or(0, |baud| bytes as u64 * 10_000_000_000 / u64::from(baud.max(1)));
@@ -36,14 +43,29 @@ impl Pace {
 struct Entry {
     bytes: usize,
     cost: Duration,
-    /// A command is no frame of the bus, and not counted.
-    is_frame: bool,
+    kind: Kind,
+}
+
+/// What a text is.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Kind {
+    Frame,
+    /// A command, which is not counted; once it is written the adapter is in this stage.
+    Command(Stage),
+}
+
+impl Entry {
+    fn is_frame(&self) -> bool {
+        self.kind == Kind::Frame
+    }
 }
 
 /// The way of frames from the bus to a line.
 #[derive(Debug, Default)]
 pub struct Outgoing {
     classic: bool,
+    /// Frames that switch their bit rate are sent without.
+    one_rate: bool,
     pace: Pace,
     /// The text of all entries, from the first byte that is not written.
     text: VecDeque<u8>,
@@ -55,6 +77,9 @@ pub struct Outgoing {
     released_bytes: usize,
     busy_until: Duration,
     is_up: bool,
+    stage: Stage,
+    /// Frames that were sent since the adapter was opened, without those that it refused.
+    since_open: u64,
     /// What became of the frames.
     pub account: ToLine,
 }
@@ -66,11 +91,45 @@ impl Outgoing {
         Self { classic, pace, ..Self::default() }
     }
 
+    /// The same for a line with these options.
+    #[must_use]
+    pub fn of(options: &LineOptions) -> Self {
+        let one_rate = !options.switches_bit_rate();
+        Self { one_rate, ..Self::new(options.classic, Pace::of(options)) }
+    }
+
     /// The line is there; `opening` is written first.
-    pub fn up(&mut self, opening: &[u8]) {
+    pub fn up(&mut self, opening: &[OpeningStep]) {
         self.down();
         self.is_up = true;
-        self.push(opening, Duration::ZERO, false);
+        opening.iter().for_each(|step| self.push_step(step));
+    }
+
+    /// Opens the adapter again, before what waits and after what was begun.
+    pub fn reopen(&mut self, opening: &[OpeningStep]) {
+        let begun = usize::from(self.written > 0);
+        let rest = self.entries.front().filter(|_| begun > 0).map_or(0, |entry| entry.bytes - self.written);
+        let text = self.text.split_off(rest);
+        let entries = self.entries.split_off(begun);
+        (self.released, self.released_bytes) = (begun, rest);
+        self.stage = Stage::Away;
+        opening.iter().for_each(|step| self.push_step(step));
+        self.text.extend(text);
+        self.entries.extend(entries);
+    }
+
+    /// How far the adapter is opened.
+    #[must_use]
+    pub const fn stage(&self) -> Stage {
+        self.stage
+    }
+
+    /// The adapter refused so many lines; those that were frames were not sent.
+    pub fn refused(&mut self, lines: u64) {
+        let frames = lines.min(self.since_open);
+        self.since_open -= frames;
+        self.account.sent -= frames;
+        self.account.dropped.refused += frames;
     }
 
     /// The line is gone, with all that waited for it.
@@ -84,6 +143,9 @@ impl Outgoing {
     pub fn take(&mut self, frame: &Frame) {
         self.account.received += 1;
         let dropped = &mut self.account.dropped;
+        let one_rate = frame.flags() & BIT_RATE_SWITCH != 0 && self.one_rate;
+        let unswitched = one_rate.then(|| unswitched(frame)).flatten();
+        let frame = unswitched.as_ref().unwrap_or(frame);
         let Some(text) = encode(frame) else {
             dropped.error_frame += 1;
             return;
@@ -95,7 +157,7 @@ impl Outgoing {
         } else if self.entries.len() >= QUEUE {
             &mut dropped.queue_full
         } else {
-            self.push(text.as_bytes(), self.pace.cost(frame, text.as_bytes().len()), true);
+            self.push(text.as_bytes(), self.pace.cost(frame, text.as_bytes().len()), Kind::Frame);
             return;
         };
         *reason += 1;
@@ -124,7 +186,18 @@ impl Outgoing {
         self.written += bytes;
         while let Some(entry) = self.entries.front().filter(|entry| entry.bytes <= self.written) {
             self.written -= entry.bytes;
-            self.account.sent += u64::from(entry.is_frame);
+            match entry.kind {
+                Kind::Frame => {
+                    self.account.sent += 1;
+                    self.since_open += 1;
+                }
+                Kind::Command(stage) => {
+                    if stage == Stage::Open {
+                        self.since_open = 0;
+                    }
+                    self.stage = stage;
+                }
+            }
             self.entries.pop_front();
             self.released -= 1;
         }
@@ -133,7 +206,7 @@ impl Outgoing {
     /// The end: what was not begun is dropped, and `closing` follows what was.
     pub fn end(&mut self, closing: &[u8]) {
         let begun = usize::from(self.written > 0);
-        let dropped = self.entries.iter().skip(begun).filter(|entry| entry.is_frame).count();
+        let dropped = self.entries.iter().skip(begun).filter(|entry| entry.is_frame()).count();
         self.account.dropped.ended += dropped as u64;
         let rest = self.entries.front().filter(|_| begun > 0).map_or(0, |entry| entry.bytes - self.written);
         self.text.truncate(rest);
@@ -142,7 +215,7 @@ impl Outgoing {
         self.released_bytes = rest;
         self.busy_until = Duration::ZERO;
         if self.is_up {
-            self.push(closing, Duration::ZERO, false);
+            self.push(closing, Duration::ZERO, Kind::Command(Stage::Closed));
         }
     }
 
@@ -158,18 +231,29 @@ impl Outgoing {
         self.entries.is_empty()
     }
 
-    fn push(&mut self, text: &[u8], cost: Duration, is_frame: bool) {
+    fn push_step(&mut self, step: &OpeningStep) {
+        // What is written ahead of its time shortens no gap.
+        self.push(&step.bytes, step.gap + AHEAD, Kind::Command(step.stage));
+    }
+
+    fn push(&mut self, text: &[u8], cost: Duration, kind: Kind) {
         self.text.extend(text);
-        self.entries.push_back(Entry { bytes: text.len(), cost, is_frame });
+        self.entries.push_back(Entry { bytes: text.len(), cost, kind });
     }
 
     /// Forgets what waits; how many frames that were.
     fn clear(&mut self) -> u64 {
-        let frames = self.entries.iter().filter(|entry| entry.is_frame).count();
-        let (classic, pace, account) = (self.classic, self.pace, self.account);
-        *self = Self { account, ..Self::new(classic, pace) };
+        let frames = self.entries.iter().filter(|entry| entry.is_frame()).count();
+        let Self { classic, one_rate, pace, account, .. } = *self;
+        *self = Self { account, one_rate, ..Self::new(classic, pace) };
         frames as u64
     }
+}
+
+/// The same FD frame at one bit rate.
+fn unswitched(frame: &Frame) -> Option<Frame> {
+    let flags = frame.flags() & !BIT_RATE_SWITCH;
+    Frame::with_data(frame.raw_id(), frame.format(), flags, frame.data()).ok()
 }
 
 /// What closes an adapter.
@@ -192,6 +276,12 @@ mod tests {
         Frame::classic(0x123, &[number]).unwrap()
     }
 
+    /// An opening that is written at once.
+    fn opening(text: &[u8]) -> Vec<OpeningStep> {
+        vec![OpeningStep { bytes: text.to_vec(), gap: Duration::ZERO, stage: Stage::Open }]
+    }
+
+    /// What is written until nothing is left, or no more at once.
     fn drain(outgoing: &mut Outgoing, now: Duration) -> Vec<u8> {
         let mut all = Vec::new();
         loop {
@@ -209,7 +299,7 @@ mod tests {
     fn frames_follow_the_opening_in_order() {
         let mut outgoing = Outgoing::new(false, Pace::default());
         outgoing.take(&frame(0));
-        outgoing.up(b"\rC\rO\r");
+        outgoing.up(&opening(b"\rC\rO\r"));
         outgoing.take(&frame(1));
         outgoing.take(&Frame::fd(1, 1, &[2]).unwrap());
         outgoing.take(&Frame::classic(ERROR | 4, &[0; 8]).unwrap());
@@ -220,9 +310,77 @@ mod tests {
     }
 
     #[test]
+    fn the_commands_of_an_opening_leave_one_by_one() {
+        let options: LineOptions = "/dev/x,rates=1M/5M".parse().unwrap();
+        let mut outgoing = Outgoing::of(&options);
+        outgoing.up(&options.opening());
+        outgoing.take(&frame(1));
+        let (mut now, mut written) = (NOW, Vec::new());
+        loop {
+            let text = drain(&mut outgoing, now);
+            if !text.is_empty() {
+                written.push((text, now - NOW, outgoing.stage()));
+            }
+            let Some(again) = outgoing.ready(now).1 else { break };
+            now = again;
+        }
+        let millis = |at: u64| Duration::from_millis(at);
+        let expected = [
+            (b"\r".to_vec(), millis(0), Stage::Away),
+            (b"C\r".to_vec(), millis(10), Stage::Closed),
+            (b"S8\r".to_vec(), millis(40), Stage::Setting),
+            (b"Y5\r".to_vec(), millis(50), Stage::Setting),
+            (b"O\r".to_vec(), millis(60), Stage::Open),
+            (b"t123101\r".to_vec(), millis(70), Stage::Open),
+        ];
+        let at = |(text, at, stage): (Vec<u8>, Duration, Stage)| (text, at.as_millis() / 10, stage);
+        assert_eq!(written.into_iter().map(at).collect::<Vec<_>>(), expected.map(at));
+    }
+
+    #[test]
+    fn frames_switch_to_no_bit_rate_that_equals_the_nominal_one() {
+        let frames = [Frame::fd(0x123, 1, &[2]).unwrap(), Frame::fd(0x123, 0, &[2]).unwrap(), frame(3)];
+        for (rates, expected) in [
+            ("", "b123102\rd123102\rt123103\r"),
+            (",rates=1M/2M", "b123102\rd123102\rt123103\r"),
+            (",rates=1M/1M", "d123102\rd123102\rt123103\r"),
+            (",rates=250k", "d123102\rd123102\rt123103\r"),
+        ] {
+            let mut outgoing = Outgoing::of(&format!("/dev/x{rates}").parse().unwrap());
+            for _ in 0..2 {
+                outgoing.up(&[]);
+                frames.iter().for_each(|frame| outgoing.take(frame));
+                assert_eq!(drain(&mut outgoing, NOW), expected.as_bytes(), "{rates}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_frame_that_the_adapter_refused_was_not_sent() {
+        let mut outgoing = Outgoing::new(false, Pace::default());
+        outgoing.up(&opening(b"O\r"));
+        (0..5).for_each(|number| outgoing.take(&frame(number)));
+        drain(&mut outgoing, NOW);
+        outgoing.refused(2);
+        assert_eq!((outgoing.account.sent, outgoing.account.dropped.refused), (3, 2));
+        // What was begun is finished before the adapter is opened again, and what waits comes behind that.
+        (5..7).for_each(|number| outgoing.take(&frame(number)));
+        outgoing.ready(NOW);
+        outgoing.wrote(3);
+        outgoing.reopen(&opening(b"C\rO\r"));
+        assert_eq!(outgoing.stage(), Stage::Away);
+        assert_eq!(drain(&mut outgoing, NOW + AHEAD), b"3105\rC\rO\rt123106\r");
+        assert_eq!(outgoing.stage(), Stage::Open);
+        // More refusals than frames since then are of commands.
+        outgoing.refused(9);
+        let ToLine { received, sent, dropped, .. } = outgoing.account;
+        assert_eq!((received, sent, dropped.refused, dropped.total()), (7, 4, 3, 3));
+    }
+
+    #[test]
     fn a_classic_line_gets_no_fd_frames() {
         let mut outgoing = Outgoing::new(true, Pace::default());
-        outgoing.up(b"");
+        outgoing.up(&[]);
         outgoing.take(&Frame::fd(1, 1, &[2]).unwrap());
         outgoing.take(&frame(1));
         assert_eq!(drain(&mut outgoing, NOW), b"t123101\r");
@@ -232,7 +390,7 @@ mod tests {
     #[test]
     fn what_is_cut_off_is_not_sent_and_what_comes_back_begins_afresh() {
         let mut outgoing = Outgoing::new(false, Pace::default());
-        outgoing.up(b"O\r");
+        outgoing.up(&opening(b"O\r"));
         for number in 0..3 {
             outgoing.take(&frame(number));
         }
@@ -241,7 +399,7 @@ mod tests {
         assert_eq!(outgoing.account.sent, 1);
         outgoing.down();
         assert_eq!(outgoing.account.dropped.line_away, 2);
-        outgoing.up(b"\rO\r");
+        outgoing.up(&opening(b"\rO\r"));
         outgoing.take(&frame(9));
         assert_eq!(drain(&mut outgoing, NOW), b"\rO\rt123109\r");
     }
@@ -249,7 +407,7 @@ mod tests {
     #[test]
     fn the_end_finishes_the_line_that_was_begun_and_closes() {
         let mut outgoing = Outgoing::new(false, Pace::default());
-        outgoing.up(b"");
+        outgoing.up(&[]);
         outgoing.take(&frame(1));
         outgoing.take(&frame(2));
         outgoing.ready(NOW);
@@ -259,7 +417,7 @@ mod tests {
         assert_eq!((outgoing.account.sent, outgoing.account.dropped.ended), (1, 1));
         // What is never taken as a whole is not sent.
         let mut stuck = Outgoing::new(false, Pace::default());
-        stuck.up(b"");
+        stuck.up(&[]);
         stuck.take(&frame(1));
         stuck.ready(NOW);
         stuck.wrote(3);
@@ -276,7 +434,7 @@ mod tests {
     fn a_bus_at_125k_gets_no_more_than_it_carries() {
         let pace = Pace { bit_rates: Some("125k".parse().unwrap()), baud: None };
         let mut outgoing = Outgoing::new(true, pace);
-        outgoing.up(b"");
+        outgoing.up(&[]);
         // 34 + 8 + 13 bits, and stuff bits.
         let cost = Duration::from_nanos(Bits::of(&frame(0xAA)).unwrap().nanoseconds("125k".parse().unwrap()));
         let (mut now, mut sent) = (NOW, 0);
@@ -304,14 +462,14 @@ mod tests {
     proptest! {
         #[test]
         fn every_frame_is_sent_or_dropped_for_a_reason(
-            steps in proptest::collection::vec((0_u8..8, 0_usize..100), 0..100), slow: bool
+            steps in proptest::collection::vec((0_u8..10, 0_usize..100), 0..100), slow: bool
         ) {
             let pace = Pace { bit_rates: slow.then(|| "10k".parse().unwrap()), baud: None };
             let mut outgoing = Outgoing::new(false, pace);
             let mut now = NOW;
             for (kind, amount) in steps {
                 match kind {
-                    0 => outgoing.up(b"\rC\rO\r"),
+                    0 => outgoing.up(&opening(b"\rC\rO\r")),
                     1 => outgoing.down(),
                     2 => now += Duration::from_millis(amount as u64),
                     3 | 4 => {
@@ -320,7 +478,7 @@ mod tests {
                     }
                     _ => (0..amount).for_each(|_| outgoing.take(&frame(1))),
                 }
-                let waiting = outgoing.entries.iter().filter(|entry| entry.is_frame).count() as u64;
+                let waiting = outgoing.entries.iter().filter(|entry| entry.is_frame()).count() as u64;
                 let ToLine { received, sent, dropped, .. } = outgoing.account;
                 prop_assert_eq!(received, sent + dropped.total() + waiting);
                 let text: usize = outgoing.entries.iter().map(|entry| entry.bytes).sum();

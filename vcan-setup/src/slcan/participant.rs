@@ -1,18 +1,19 @@
 //! One line, and its client of the bus.
 
-use std::fmt;
 use std::io;
 use std::time::{Duration, Instant};
 
 use protocol::bus::{Bus, BusError, Filter, Inbox, Options};
 use rustix::event::PollFlags;
 
-use super::account::Account;
+use super::account::{Account, Faults, faults_since};
 use super::bridge::Settings;
+use super::event::Event;
 use super::incoming::Incoming;
 use super::link::{Opener, Port};
-use super::options::LineOptions;
-use super::outgoing::{Outgoing, Pace, closing};
+use super::options::{LineOptions, Stage};
+use super::outgoing::{Outgoing, closing};
+use super::refusals::{Action, Refusals};
 
 /// From one attempt to open what is away to the next.
 const AGAIN: Duration = Duration::from_millis(100);
@@ -22,53 +23,6 @@ const RETRY: Duration = Duration::from_millis(1);
 const REPORT: Duration = Duration::from_secs(1);
 /// Batches taken from a bus, and from a line, before the next line's turn.
 const TURNS: usize = 4;
-
-/// What happened to a line.
-#[derive(Clone, Debug, Eq, PartialEq)]
-pub enum Event {
-    /// The line is open.
-    LineUp,
-    /// The line is away, or cannot be opened, and why; it is tried again.
-    LineAway(String),
-    /// The bus is open again.
-    BusUp,
-    /// The bus is away, and why; it is tried again.
-    BusAway(String),
-    /// Frames were lost since the last report.
-    Lost {
-        /// Of those from the bus.
-        to_line: u64,
-        /// Of those from the line, and lines that could not be used.
-        to_bus: u64,
-        /// All so far.
-        account: Box<Account>,
-    },
-    /// At the end the line took nothing for so long that its adapter was not closed.
-    NotClosed,
-}
-
-impl fmt::Display for Event {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::LineUp => f.write_str("open"),
-            Self::LineAway(why) => write!(f, "away ({why}); it is opened when it is there"),
-            Self::BusUp => f.write_str("its bus is back"),
-            Self::BusAway(why) => write!(f, "its bus is away ({why}); it is opened when it is there"),
-            Self::Lost { to_line, to_bus, account } => {
-                let one = |count: u64, what, so_far: String| {
-                    let so_far = so_far.trim_start_matches(", ");
-                    (count > 0).then(|| format!("{count} more {what} lost, in all {so_far}"))
-                };
-                let lost = [
-                    one(*to_line, "frames to the line", account.to_line.losses()),
-                    one(*to_bus, "frames to the bus", account.to_bus.losses()),
-                ];
-                f.write_str(&lost.into_iter().flatten().collect::<Vec<_>>().join("; "))
-            }
-            Self::NotClosed => f.write_str("its adapter was not closed: it took nothing at the end"),
-        }
-    }
-}
 
 /// What can be read.
 #[derive(Clone, Copy, Debug)]
@@ -110,7 +64,11 @@ pub(super) struct Participant {
     lost: u64,
     dropped_before: u64,
     reported: (u64, u64),
+    reported_faults: Faults,
     report_at: Instant,
+    refusals: Refusals,
+    /// The adapter is set then: opening its line resets it.
+    settled_at: Option<Instant>,
     /// Why the line was away when that was last reported.
     reason: Option<io::Error>,
     began: Instant,
@@ -118,10 +76,9 @@ pub(super) struct Participant {
 
 impl Participant {
     pub(super) fn new(options: LineOptions, bus: Bus) -> io::Result<Self> {
-        let pace = Pace { bit_rates: options.bit_rates, baud: options.baud };
-        let outgoing = Outgoing::new(options.classic, pace);
+        let outgoing = Outgoing::of(&options);
         let mut incoming = Incoming::new();
-        incoming.up(!bus.carries_fd());
+        incoming.up(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
         let now = Instant::now();
         Ok(Self {
             opener: Opener::new(options)?,
@@ -134,7 +91,10 @@ impl Participant {
             lost: 0,
             dropped_before: 0,
             reported: (0, 0),
+            reported_faults: Faults::new(),
             report_at: now,
+            refusals: Refusals::new(),
+            settled_at: None,
             reason: None,
             began: now,
         })
@@ -152,7 +112,15 @@ impl Participant {
         let mut to_line = self.outgoing.account;
         to_line.dropped_by_bus = self.dropped_before + u64::from(self.inbox.dropped());
         let to_bus = self.incoming.account();
-        Account { line: self.name(), opened: self.opened, lost: self.lost, to_line, to_bus }
+        Account {
+            line: self.name(),
+            opened: self.opened,
+            lost: self.lost,
+            reopened: self.refusals.reopened(),
+            to_line,
+            to_bus,
+            faults: self.incoming.faults().clone(),
+        }
     }
 
     /// What to wait for at the line.
@@ -192,14 +160,17 @@ impl Participant {
             Client::Open(_) if !self.incoming.waiting().is_empty() => Some(now + RETRY),
             Client::Open(_) => None,
         };
-        let report = (self.losses() != self.reported).then_some(self.report_at);
-        [line, client, report].into_iter().flatten().min()
+        let report = self.has_more_to_report().then_some(self.report_at);
+        [line, client, report, self.settled_at].into_iter().flatten().min()
     }
 
     /// Moves what can be moved.
     pub(super) fn work(&mut self, settings: &Settings, ready: Ready, report: &mut impl FnMut(Event)) {
         let now = Instant::now();
         self.open_line(now, report);
+        if self.settled_at.is_some_and(|at| at <= now) {
+            self.set_adapter();
+        }
         if matches!(self.client, Client::Away(at) if at <= now) {
             self.open_client(settings, now, report);
         }
@@ -211,12 +182,34 @@ impl Participant {
             self.read_bus(now, report);
         }
         self.write_line(now, report);
+        let is_due = self.report_at <= now && self.has_more_to_report();
+        if is_due || self.has_new_fault() {
+            self.report(report);
+            self.report_at = now + REPORT;
+        }
+    }
+
+    fn has_more_to_report(&self) -> bool {
+        self.losses() != self.reported || *self.incoming.faults() != self.reported_faults
+    }
+
+    /// Whether there is a fault that was never reported before: it does not wait.
+    fn has_new_fault(&self) -> bool {
+        self.incoming.faults().len() > self.reported_faults.len()
+    }
+
+    /// Reports losses and faults since the last report.
+    fn report(&mut self, report: &mut impl FnMut(Event)) {
+        let faults = faults_since(&self.reported_faults, self.incoming.faults());
+        if !faults.is_empty() {
+            self.reported_faults = self.incoming.faults().clone();
+            report(Event::Reported(faults));
+        }
         let losses = self.losses();
-        if losses != self.reported && self.report_at <= now {
+        if losses != self.reported {
             let (to_line, to_bus) = (losses.0 - self.reported.0, losses.1 - self.reported.1);
             report(Event::Lost { to_line, to_bus, account: Box::new(self.account()) });
             self.reported = losses;
-            self.report_at = now + REPORT;
         }
     }
 
@@ -227,7 +220,7 @@ impl Participant {
             Line::Open(port) if port.is_connecting() => match port.connected() {
                 Ok(false) => return,
                 Ok(true) => {
-                    self.line_is_up(report);
+                    self.line_is_up(now, report);
                     return;
                 }
                 Err(error) => Err(error),
@@ -239,7 +232,7 @@ impl Participant {
                 let up = !port.is_connecting();
                 self.line = Line::Open(port);
                 if up {
-                    self.line_is_up(report);
+                    self.line_is_up(now, report);
                 }
             }
             Err(error) => {
@@ -259,16 +252,48 @@ impl Participant {
         self.reason.take()
     }
 
-    fn line_is_up(&mut self, report: &mut impl FnMut(Event)) {
+    fn line_is_up(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
         self.opened += 1;
-        self.outgoing.up(&self.opener.options().opening());
         self.reason = None;
+        let settle = self.opener.options().settle;
+        if settle.is_zero() {
+            self.set_adapter();
+        } else {
+            self.settled_at = Some(now + settle);
+        }
         report(Event::LineUp);
+    }
+
+    /// Opens the adapter, and lets frames follow.
+    fn set_adapter(&mut self) {
+        self.settled_at = None;
+        self.outgoing.up(&self.opener.options().opening());
+    }
+
+    /// Does what an adapter's refusals call for.
+    fn heed_refusals(&mut self, now: Instant, report: &mut impl FnMut(Event)) {
+        let (bells, replies) = (self.incoming.account().bells, self.incoming.replies());
+        match self.refusals.take(now - self.began, self.outgoing.stage(), bells, replies) {
+            Action::Nothing => {}
+            Action::Count(lines) => self.outgoing.refused(lines),
+            Action::ReportSettings => {
+                let opening = self.opener.options().opening();
+                let settings = opening.iter().filter(|step| step.stage == Stage::Setting);
+                let names = settings.map(|step| String::from_utf8_lossy(&step.bytes).trim_end().to_owned());
+                report(Event::SettingRefused(names.collect::<Vec<_>>().join(", ")));
+            }
+            Action::Reopen(lines) => {
+                self.outgoing.refused(lines);
+                self.outgoing.reopen(&self.opener.options().opening());
+                report(Event::Reopened);
+            }
+        }
     }
 
     fn line_lost(&mut self, error: io::Error, now: Instant, report: &mut impl FnMut(Event)) {
         self.outgoing.down();
         self.incoming.line_lost();
+        self.settled_at = None;
         self.line = Line::Away(now + AGAIN);
         self.lost += 1;
         self.report_away(error, report);
@@ -294,6 +319,7 @@ impl Participant {
                 Ok(count) => self.incoming.take(buffer.get(..count).unwrap_or_default()),
                 Err(error) => return self.line_lost(error, now, report),
             }
+            self.heed_refusals(now, report);
             self.write_bus(now, report);
         }
     }
@@ -310,7 +336,13 @@ impl Participant {
             }
             match port.write(bytes) {
                 Ok(0) => return,
-                Ok(count) => self.outgoing.wrote(count),
+                Ok(count) => {
+                    let before = self.outgoing.stage();
+                    self.outgoing.wrote(count);
+                    if before != Stage::Open && self.outgoing.stage() == Stage::Open {
+                        self.incoming.opened();
+                    }
+                }
                 Err(error) => return self.line_lost(error, now, report),
             }
         }
@@ -364,7 +396,7 @@ impl Participant {
     fn open_client(&mut self, settings: &Settings, now: Instant, report: &mut impl FnMut(Event)) {
         match open(settings, self.opener.options()) {
             Ok(bus) => {
-                self.incoming.up(!bus.carries_fd());
+                self.incoming.up(!bus.carries_fd(), bus.is_virtual().unwrap_or(false));
                 self.client = Client::Open(Box::new(bus));
                 report(Event::BusUp);
             }

@@ -1,0 +1,68 @@
+//! What happens to a line, as it is reported while it runs.
+
+use std::fmt;
+
+use super::account::Account;
+
+/// What happened to a line.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub enum Event {
+    /// The line is open.
+    LineUp,
+    /// The line is away, or cannot be opened, and why; it is tried again.
+    LineAway(String),
+    /// The bus is open again.
+    BusUp,
+    /// The bus is away, and why; it is tried again.
+    BusAway(String),
+    /// Frames were lost since the last report.
+    Lost {
+        /// Of those from the bus.
+        to_line: u64,
+        /// Of those from the line, and lines that could not be used.
+        to_bus: u64,
+        /// All so far.
+        account: Box<Account>,
+    },
+    /// The adapter refused some of these commands that set it.
+    SettingRefused(String),
+    /// The adapter refused lines, and is opened again.
+    Reopened,
+    /// The adapter reported these faults and states since the last report.
+    Reported(String),
+    /// At the end the line took nothing for so long that its adapter was not closed.
+    NotClosed,
+}
+
+impl fmt::Display for Event {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::LineUp => f.write_str("open"),
+            Self::LineAway(why) => write!(f, "away ({why}); it is opened when it is there"),
+            Self::BusUp => f.write_str("its bus is back"),
+            Self::BusAway(why) => write!(f, "its bus is away ({why}); it is opened when it is there"),
+            Self::Lost { to_line, to_bus, account } => {
+                let one = |count: u64, what, so_far: String| {
+                    let so_far = so_far.trim_start_matches(", ");
+                    (count > 0).then(|| format!("{count} more {what} lost, in all {so_far}"))
+                };
+                let lost = [
+                    one(*to_line, "frames to the line", account.to_line.losses()),
+                    one(*to_bus, "frames to the bus", account.to_bus.losses()),
+                ];
+                f.write_str(&lost.into_iter().flatten().collect::<Vec<_>>().join("; "))
+            }
+            Self::SettingRefused(commands) => write!(
+                f,
+                "its adapter refused a command of {commands} (BEL): its bit rates may be others; give rates that it has, and \
+                 classic if it has no CAN FD"
+            ),
+            Self::Reopened => f.write_str(
+                "its adapter refuses frames (BEL): it is closed, was reset, or its queue is full; it is opened again (a board \
+                 that is reset when its line is opened needs settle=2)",
+            ),
+            Self::Reported(faults) => write!(f, "its adapter reports {faults}"),
+            Self::NotClosed => f.write_str("its adapter was not closed: it took nothing at the end"),
+        }
+    }
+}

@@ -1,0 +1,130 @@
+//! When an adapter that refuses lines is opened again.
+
+use std::time::Duration;
+
+use super::incoming::Replies;
+use super::options::Stage;
+
+/// From one opening after a refusal to the next: it takes the adapter off its bus for a moment.
+const FIRST_PAUSE: Duration = Duration::from_secs(1);
+/// The same when opening it again does not help.
+const LONGEST_PAUSE: Duration = Duration::from_secs(30);
+/// Refusals in succession of an adapter that has accepted lines before: its queue may be full for a moment.
+const MANY: u64 = 8;
+
+/// What refused lines call for.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Action {
+    /// Nothing: there are none, or they are expected.
+    Nothing,
+    /// The adapter does not have a setting.
+    ReportSettings,
+    /// So many lines were refused by an adapter that was opened.
+    Count(u64),
+    /// The same, and the adapter is closed or was reset: open it again.
+    Reopen(u64),
+}
+
+/// What is remembered of an adapter's refusals. Takes counts and times, and touches nothing.
+#[derive(Debug)]
+pub struct Refusals {
+    seen: u64,
+    next: Duration,
+    pause: Duration,
+    reopened: u64,
+}
+
+impl Refusals {
+    /// Of an adapter that has refused nothing.
+    #[must_use]
+    pub const fn new() -> Self {
+        Self { seen: 0, next: Duration::ZERO, pause: FIRST_PAUSE, reopened: 0 }
+    }
+
+    /// How often it was opened again.
+    #[must_use]
+    pub const fn reopened(&self) -> u64 {
+        self.reopened
+    }
+
+    /// Takes the refusals so far, of an adapter in this stage with these replies since it was opened.
+    pub fn take(&mut self, now: Duration, stage: Stage, bells: u64, replies: Replies) -> Action {
+        let more = bells - std::mem::replace(&mut self.seen, bells);
+        if replies.accepted && replies.refusals == 0 {
+            self.pause = FIRST_PAUSE;
+        }
+        match stage {
+            _ if more == 0 => Action::Nothing,
+            // Of frames before it was opened again, or of the end of a line and of closing what is closed.
+            Stage::Away | Stage::Closed => Action::Count(more),
+            Stage::Setting => Action::ReportSettings,
+            Stage::Open if now < self.next || (replies.accepted && replies.refusals < MANY) => {
+                Action::Count(more)
+            }
+            Stage::Open => {
+                self.next = now + self.pause;
+                self.pause = LONGEST_PAUSE.min(2 * self.pause);
+                self.reopened += 1;
+                Action::Reopen(more)
+            }
+        }
+    }
+}
+
+impl Default for Refusals {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const fn at(millis: u64) -> Duration {
+        Duration::from_millis(millis)
+    }
+
+    #[test]
+    fn a_closed_adapter_is_opened_at_its_first_refusal_and_then_ever_less_often() {
+        let mut refusals = Refusals::new();
+        let replies = |refusals| Replies { accepted: false, refusals };
+        let mut times = Vec::new();
+        for number in 1..=100_000 {
+            if let Action::Reopen(1) = refusals.take(at(number), Stage::Open, number, replies(number)) {
+                times.push(number);
+            }
+        }
+        assert_eq!(times, [1, 1_001, 3_001, 7_001, 15_001, 31_001, 61_001, 91_001]);
+        assert_eq!(refusals.reopened(), 8);
+        // Once it has accepted something it is as new.
+        refusals.take(at(200_000), Stage::Open, 100_000, Replies { accepted: true, refusals: 0 });
+        for (now, expected) in [(200_001, true), (200_900, false), (201_001, true)] {
+            let action = refusals.take(at(now), Stage::Open, 100_000 + now, replies(1));
+            assert_eq!(matches!(action, Action::Reopen(_)), expected, "{now}");
+        }
+    }
+
+    #[test]
+    fn an_adapter_that_accepts_lines_is_not_opened_for_a_few_refusals() {
+        let mut refusals = Refusals::new();
+        for refused in 1..=MANY {
+            let replies = Replies { accepted: true, refusals: refused };
+            let expected = if refused < MANY { Action::Count(1) } else { Action::Reopen(1) };
+            assert_eq!(refusals.take(at(refused), Stage::Open, refused, replies), expected);
+        }
+        let accepted = Replies { accepted: true, refusals: 0 };
+        assert_eq!(refusals.take(at(9), Stage::Open, MANY, accepted), Action::Nothing);
+    }
+
+    #[test]
+    fn refusals_while_it_is_opened_are_no_reason_to_open_it() {
+        let mut refusals = Refusals::new();
+        let replies = Replies { accepted: false, refusals: 1 };
+        assert_eq!(refusals.take(at(1), Stage::Away, 1, replies), Action::Count(1));
+        assert_eq!(refusals.take(at(2), Stage::Closed, 2, replies), Action::Count(1));
+        assert_eq!(refusals.take(at(3), Stage::Setting, 3, replies), Action::ReportSettings);
+        assert_eq!(refusals.take(at(4), Stage::Setting, 3, replies), Action::Nothing);
+        assert_eq!(refusals.reopened(), 0);
+    }
+}
