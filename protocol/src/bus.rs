@@ -109,6 +109,8 @@ pub struct Bus {
     /// A send failed because the interface is down, and the next receive will report it: the kernel reports to a
     /// socket once.
     down: AtomicBool,
+    /// The next receive returns an error that came behind the frames of the last one.
+    failed: AtomicBool,
     /// The socket's `SO_RCVTIMEO`, in ms; 0 before it is set.
     receive_timeout: AtomicU32,
     /// The last wait that used it ended without a frame.
@@ -137,6 +139,7 @@ impl Bus {
             fd,
             send_timeout,
             down: AtomicBool::new(false),
+            failed: AtomicBool::new(false),
             receive_timeout: AtomicU32::new(0),
             expired: AtomicBool::new(false),
         })
@@ -185,7 +188,7 @@ impl Bus {
     /// # Errors
     /// When the system cannot wait.
     pub fn wait(&self, timeout: Option<Duration>) -> Result<bool, BusError> {
-        if self.down.load(Ordering::Relaxed) {
+        if self.has_error() {
             return Ok(true);
         }
         self.poll(PollFlags::IN, timeout).map_err(|errno| self.error("wait for", errno))
@@ -196,15 +199,21 @@ impl Bus {
     /// # Errors
     /// When the system cannot wait.
     pub fn wait_with(&self, other: &Self, timeout: Duration) -> Result<bool, BusError> {
-        if self.down.load(Ordering::Relaxed) || other.down.load(Ordering::Relaxed) {
+        if self.has_error() || other.has_error() {
             return Ok(true);
         }
         let mut both = [self, other].map(|bus| PollFd::new(&bus.socket, PollFlags::IN));
         wait_on(&mut both, Some(timeout)).map_err(|errno| self.error("wait for", errno))
     }
 
+    /// Whether the next receive reports an error that the kernel does not report again.
+    fn has_error(&self) -> bool {
+        self.down.load(Ordering::Relaxed) || self.failed.load(Ordering::Relaxed)
+    }
+
     /// Receives what has come, at most 64 frames, and forgets what was in `inbox`; how many frames there
-    /// are now. Never waits and never allocates. 0 when nothing has come.
+    /// are now. Never waits and never allocates, unless the system lacks memory for so long as 0.1 s. 0 when nothing
+    /// has come.
     ///
     /// # Errors
     /// [`BusError::Down`] and [`BusError::Gone`] for an interface, [`BusError::Closed`] for an embedded bus
@@ -248,15 +257,21 @@ impl Bus {
         if self.down.swap(false, Ordering::Relaxed) {
             return Err(BusError::Down(self.name.clone()));
         }
+        self.failed.store(false, Ordering::Relaxed);
+        let mut give_up = None;
         loop {
             match receive(&mut inbox.batch, &self.socket) {
                 Ok(_) => break,
                 // The server ended with frames of ours unread: what it had sent can still be read.
                 Err(error) if is(&error, Errno::CONNRESET) => {}
                 Err(error) if is(&error, Errno::AGAIN) || is(&error, Errno::INTR) => return Ok(0),
+                Err(error) if batch::is_shortage(&error) && is_before(&mut give_up, SHORTAGE) => {
+                    std::thread::sleep(RECHECK);
+                }
                 Err(error) => return Err(self.io_error("receive from", error)),
             }
         }
+        self.failed.store(inbox.batch.has_failed(), Ordering::Relaxed);
         let over = inbox.take(self.carrier());
         match inbox.frames().len() {
             0 if over => Err(BusError::Closed(self.name.clone())),
@@ -302,7 +317,8 @@ impl Bus {
 
     /// Waits for room, if that is what was missing, until it is time to give up.
     fn wait_for_room(&self, error: io::Error, give_up: &mut Option<Instant>) -> Result<(), BusError> {
-        let interface = is(&error, Errno::NOBUFS);
+        // A full queue of an interface, or no memory for the frame.
+        let interface = batch::is_shortage(&error);
         if !interface && !is(&error, Errno::AGAIN) {
             return Err(self.io_error("send to", error));
         }
@@ -394,14 +410,26 @@ impl AsFd for Bus {
 
 /// How long a full transmit queue is left alone: a few frames at 1 Mbit/s.
 const RECHECK: Duration = Duration::from_micros(500);
+/// How long the system may lack the memory to receive before that is an error.
+const SHORTAGE: Duration = Duration::from_millis(100);
 
 fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, Errno> {
     let timeout = timeout.and_then(|timeout| Timespec::try_from(timeout).ok());
     match poll(what, timeout.as_ref()) {
         Ok(ready) => Ok(ready > 0),
         Err(Errno::INTR) => Ok(false),
+        Err(Errno::NOMEM | Errno::AGAIN) => {
+            std::thread::sleep(RECHECK);
+            Ok(false)
+        }
         Err(errno) => Err(errno),
     }
+}
+
+/// Whether it is still before the time to give up, which is set at the first call.
+fn is_before(give_up: &mut Option<Instant>, after: Duration) -> bool {
+    let now = Instant::now();
+    now < *give_up.get_or_insert(now + after)
 }
 
 fn is(error: &io::Error, errno: Errno) -> bool {
@@ -432,53 +460,4 @@ pub fn is_plain(name: &str) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn names_are_those_that_an_interface_can_have() {
-        for name in ["vcan0", "can0", "a23456789012345"] {
-            check_name(name).unwrap();
-        }
-        for name in ["", "a234567890123456", ".", "..", "a/b", "a b", "a:b"] {
-            let error = check_name(name).unwrap_err().to_string();
-            let rest = "is no bus name: 1 to 15 bytes without spaces, '/' or ':', and not '.' or '..'";
-            assert_eq!(error, format!("{name:?} {rest}"));
-        }
-    }
-
-    #[test]
-    fn a_bus_that_nobody_serves_says_how_to_serve_it() {
-        let options = Options { directory: Some("/nowhere/skinbus".into()), ..Options::default() };
-        let error = Bus::open("vcan7", Choice::Only(BusKind::Embedded), &options).unwrap_err();
-        let expected = "no embedded bus vcan7 is served in /nowhere/skinbus: start `vcan-setup serve vcan7`, or \
-                        the gateway, which serves it";
-        assert_eq!(error.to_string(), expected);
-    }
-
-    #[test]
-    fn a_kernel_without_can_says_so_and_one_with_it_names_the_missing_interface() {
-        let error =
-            Bus::open("nosuchcan0", Choice::Only(BusKind::SocketCan), &Options::default()).unwrap_err();
-        if kernel::has_socketcan() {
-            let expected = "there is no interface nosuchcan0: make it with `vcan-setup up nosuchcan0`, or plug \
-                            it in if it is hardware";
-            assert_eq!(error.to_string(), expected);
-        } else {
-            assert!(matches!(error, BusError::NoSocketCan { .. }), "{error}");
-        }
-    }
-
-    #[test]
-    fn too_many_filters_are_refused_before_anything_is_opened() {
-        let options = Options { filters: vec![Filter::ALL; 513], ..Options::default() };
-        let error = Bus::open("vcan0", Choice::Auto, &options).unwrap_err();
-        assert_eq!(error.to_string(), "513 filters are too many for one socket on vcan0: at most 512");
-    }
-
-    #[test]
-    fn a_bus_is_shared_between_threads() {
-        const fn shared<T: Send + Sync>() {}
-        const { shared::<Bus>() };
-    }
-}
+mod tests;

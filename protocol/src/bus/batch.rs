@@ -5,6 +5,7 @@
 use std::io;
 use std::os::fd::AsFd;
 
+use rustix::io::Errno;
 use rustix::net::SendFlags;
 
 use super::calls;
@@ -32,6 +33,8 @@ pub(super) struct Slot {
 pub struct Batch {
     slots: Box<[Slot; BATCH]>,
     count: usize,
+    /// An error behind the datagrams, which the kernel reports once.
+    failed: Option<io::Error>,
 }
 
 impl Batch {
@@ -39,7 +42,7 @@ impl Batch {
     #[must_use]
     pub fn new() -> Self {
         let slot = || Slot { bytes: [0; FD_BYTES], control: [0; 8], len: 0, control_len: 0, flags: 0 };
-        Self { slots: Box::new(std::array::from_fn(|_| slot())), count: 0 }
+        Self { slots: Box::new(std::array::from_fn(|_| slot())), count: 0, failed: None }
     }
 
     /// Takes what is waiting in a socket, and forgets what was here. Never waits.
@@ -48,20 +51,38 @@ impl Batch {
     /// The error of `recvmmsg`; [`io::ErrorKind::WouldBlock`] when nothing is waiting.
     pub fn receive(&mut self, fd: impl AsFd) -> io::Result<usize> {
         self.count = 0;
+        if let Some(error) = self.failed.take() {
+            return Err(error);
+        }
         let (fd, slots) = (fd.as_fd(), self.slots.as_mut_slice());
         let Some((few, rest)) = slots.split_first_chunk_mut::<FEW>() else { return Ok(0) };
-        self.count = calls::receive(fd, few, false)?;
+        self.count = uninterrupted(|| calls::receive(fd, few, false))?;
         if let (FEW, Some(many)) = (self.count, rest.first_chunk_mut::<{ BATCH - FEW }>()) {
-            // Nothing more, or an error that the next call will meet again.
-            self.count += calls::receive(fd, many, false).unwrap_or(0);
+            match uninterrupted(|| calls::receive(fd, many, false)) {
+                Ok(count) => self.count += count,
+                Err(error) => self.failed = Some(error).filter(|it| it.kind() != io::ErrorKind::WouldBlock),
+            }
         }
         Ok(self.count)
+    }
+
+    /// Whether the next [`Batch::receive`] returns an error that the kernel does not report again.
+    pub(super) const fn has_failed(&self) -> bool {
+        self.failed.is_some()
+    }
+
+    #[cfg(test)]
+    pub(super) fn fail_next(&mut self, error: io::Error) {
+        self.failed = Some(error);
     }
 
     /// Waits for one datagram for at most the socket's `SO_RCVTIMEO`, and takes only this one: who is
     /// woken for each would look for a second in vain.
     pub(super) fn receive_one_patiently(&mut self, fd: impl AsFd) -> io::Result<usize> {
         self.count = 0;
+        if let Some(error) = self.failed.take() {
+            return Err(error);
+        }
         let Some((one, _)) = self.slots.split_first_chunk_mut::<1>() else { return Ok(0) };
         self.count = calls::receive(fd.as_fd(), one, true)?;
         Ok(self.count)
@@ -127,26 +148,57 @@ pub struct Notes {
 }
 
 impl Notes {
-    /// Walks the control messages: length, level, type, then the data, each padded to a word.
-    fn read(mut bytes: &[u8]) -> Self {
+    fn read(control: &[u8]) -> Self {
+        let mut notes = Self::default();
+        for ControlMessage { kind, data } in ControlMessages(control) {
+            if kind == libc::SCM_TIMESTAMPNS {
+                notes.at_nanos = nanoseconds(data);
+            } else if kind == libc::SO_RXQ_OVFL {
+                notes.dropped = data.first_chunk().map(|&bytes| u32::from_ne_bytes(bytes));
+            }
+        }
+        notes
+    }
+}
+
+/// A control message of the level `SOL_SOCKET`.
+struct ControlMessage<'a> {
+    kind: i32,
+    data: &'a [u8],
+}
+
+/// Walks control messages: length, level, type, then the data, each padded to a word.
+struct ControlMessages<'a>(&'a [u8]);
+
+impl<'a> Iterator for ControlMessages<'a> {
+    type Item = ControlMessage<'a>;
+
+    fn next(&mut self) -> Option<ControlMessage<'a>> {
         const WORD: usize = size_of::<usize>();
         const HEAD: usize = size_of::<libc::cmsghdr>();
-        let mut notes = Self::default();
-        while let Some((head, _)) = bytes.split_first_chunk::<HEAD>() {
+        loop {
+            let (head, _) = self.0.split_first_chunk::<HEAD>()?;
             let (len, rest) = head.split_at(WORD);
             let len = len.try_into().map_or(0, usize::from_ne_bytes);
             let number = |at| {
                 rest.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |&bytes| i32::from_ne_bytes(bytes))
             };
-            let Some(data) = bytes.get(HEAD..len) else { break };
-            if number(0) == libc::SOL_SOCKET && number(4) == libc::SCM_TIMESTAMPNS {
-                notes.at_nanos = nanoseconds(data);
-            } else if number(0) == libc::SOL_SOCKET && number(4) == libc::SO_RXQ_OVFL {
-                notes.dropped = data.first_chunk().map(|&bytes| u32::from_ne_bytes(bytes));
+            let data = self.0.get(HEAD..len)?;
+            self.0 = self.0.get(len.next_multiple_of(WORD)..).unwrap_or_default();
+            if number(0) == libc::SOL_SOCKET {
+                return Some(ControlMessage { kind: number(4), data });
             }
-            bytes = bytes.get(len.next_multiple_of(WORD)..).unwrap_or_default();
         }
-        notes
+    }
+}
+
+/// Hands out the descriptors that came with a datagram (`SCM_RIGHTS`).
+pub(super) fn each_passed(slot: &Slot, mut take: impl FnMut(i32)) {
+    let words = slot.control.map(u64::to_ne_bytes);
+    let messages = ControlMessages(words.as_flattened().get(..slot.control_len).unwrap_or_default());
+    for message in messages.filter(|message| message.kind == libc::SCM_RIGHTS) {
+        let (descriptors, _) = message.data.as_chunks();
+        descriptors.iter().for_each(|&bytes| take(i32::from_ne_bytes(bytes)));
     }
 }
 
@@ -199,8 +251,8 @@ impl<const N: usize> Outgoing<N> {
         match self.count {
             0 => Ok(0),
             1 => send_one(fd, datagrams.next().unwrap_or_default()),
-            2..=SMALL => calls::send::<SMALL>(fd.as_fd(), datagrams),
-            _ => calls::send::<N>(fd.as_fd(), datagrams),
+            2..=SMALL => uninterrupted(|| calls::send::<SMALL>(fd.as_fd(), datagrams.clone())),
+            _ => uninterrupted(|| calls::send::<N>(fd.as_fd(), datagrams.clone())),
         }
     }
 }
@@ -210,8 +262,26 @@ impl<const N: usize> Outgoing<N> {
 /// # Errors
 /// The error of `send`; [`io::ErrorKind::WouldBlock`] when the socket is full.
 pub fn send_one(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
-    rustix::net::send(fd, bytes, SendFlags::DONTWAIT | SendFlags::NOSIGNAL)?;
+    let flags = SendFlags::DONTWAIT | SendFlags::NOSIGNAL;
+    rustix::io::retry_on_intr(|| rustix::net::send(&fd, bytes, flags))?;
     Ok(1)
+}
+
+/// Whether the system lacks memory at the moment: an error that passes, and says nothing of the socket.
+#[must_use]
+pub fn is_shortage(error: &io::Error) -> bool {
+    let errno = error.raw_os_error().map(Errno::from_raw_os_error);
+    matches!(errno, Some(Errno::NOMEM | Errno::NOBUFS))
+}
+
+/// Repeats a call that does not wait, and that a signal interrupted.
+fn uninterrupted(mut call: impl FnMut() -> io::Result<usize>) -> io::Result<usize> {
+    loop {
+        match call() {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            done => return done,
+        }
+    }
 }
 
 impl<const N: usize> Default for Outgoing<N> {
@@ -283,6 +353,35 @@ mod tests {
         assert_eq!(batch.receive(&b).unwrap(), 2);
         let bytes: Vec<_> = batch.datagrams().map(Datagram::bytes).collect();
         assert_eq!(bytes, [None, Some(&[2; 72][..])]);
+    }
+
+    #[test]
+    fn passed_descriptors_are_closed_and_time_stamps_beside_them_read() {
+        use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, sendmsg};
+        use socketcan::SocketOptions;
+        use std::mem::MaybeUninit;
+
+        let (a, b) =
+            socketpair(AddressFamily::UNIX, SocketType::SEQPACKET, SocketFlags::CLOEXEC, None).unwrap();
+        let b = socketcan::CanFdSocket::from(b);
+        b.set_recv_timestamp(true).unwrap();
+        let mut batch = Batch::new();
+        for count in 1..=5 {
+            let (read, write) = io::pipe().unwrap();
+            rustix::io::ioctl_fionbio(&read, true).unwrap();
+            let passed = vec![write.as_fd(); count];
+            let mut space = [MaybeUninit::uninit(); 128];
+            let mut control = SendAncillaryBuffer::new(&mut space);
+            assert!(control.push(SendAncillaryMessage::ScmRights(&passed)));
+            sendmsg(&a, &[io::IoSlice::new(&[7; 16])], &mut control, SendFlags::empty()).unwrap();
+            drop(write);
+            assert_eq!(batch.receive(&b).unwrap(), 1);
+            let datagram = batch.datagrams().next().unwrap();
+            assert_eq!(datagram.bytes().unwrap(), [7; 16]);
+            assert!(datagram.notes().at_nanos.is_some());
+            // Nobody has the pipe's other end open.
+            assert_eq!(rustix::io::read(&read, &mut [0]).unwrap(), 0, "{count}");
+        }
     }
 
     proptest! {

@@ -3,9 +3,9 @@
 
 use std::io;
 use std::mem;
-use std::os::fd::{AsRawFd, BorrowedFd};
+use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
 
-use super::batch::Slot;
+use super::batch::{Slot, each_passed};
 
 /// Asks for `SCHED_BATCH`; whether it was granted.
 pub(super) fn set_batch() -> bool {
@@ -15,7 +15,7 @@ pub(super) fn set_batch() -> bool {
 }
 
 /// `recvmmsg`: how many slots were filled. It waits for the first datagram, as long as the socket's
-/// `SO_RCVTIMEO` says, or not at all.
+/// `SO_RCVTIMEO` says, or not at all. Descriptors that were passed along are closed.
 // Not inlined: a caller's stack would grow by the largest N, and each of its pages is touched.
 #[inline(never)]
 pub(super) fn receive<const N: usize>(
@@ -41,7 +41,7 @@ pub(super) fn receive<const N: usize>(
             fd.as_raw_fd(),
             headers.as_mut_ptr(),
             libc::c_uint::try_from(N).unwrap_or(0),
-            if wait { libc::MSG_WAITFORONE } else { libc::MSG_DONTWAIT },
+            libc::MSG_CMSG_CLOEXEC | if wait { libc::MSG_WAITFORONE } else { libc::MSG_DONTWAIT },
             std::ptr::null_mut(),
         )
     };
@@ -50,6 +50,10 @@ pub(super) fn receive<const N: usize>(
         slot.len = header.msg_len as usize;
         slot.control_len = header.msg_hdr.msg_controllen;
         slot.flags = header.msg_hdr.msg_flags;
+        each_passed(slot, |descriptor| {
+            // SAFETY: the kernel has just opened this descriptor for this process, and nothing else knows of it.
+            drop(unsafe { OwnedFd::from_raw_fd(descriptor) });
+        });
     }
     Ok(count)
 }

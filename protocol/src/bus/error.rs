@@ -104,6 +104,12 @@ pub enum BusError {
         /// How long it was waited for.
         waited: Duration,
     },
+    /// The server of the embedded bus has no room for another client.
+    #[error(
+        "the embedded bus {0} has no room for another client: its server may have no more files open; end other clients, or \
+         raise `ulimit -Hn` where it is started"
+    )]
+    TurnedAway(String),
     /// The server of the embedded bus has ended. The bus has to be opened again.
     #[error("the embedded bus {0} was closed: its server ended")]
     Closed(String),
@@ -153,6 +159,7 @@ impl BusError {
             self,
             Self::NotServed { .. }
                 | Self::NoAnswer { .. }
+                | Self::TurnedAway(_)
                 | Self::NoInterface(_)
                 | Self::ClassicOnly { .. }
                 | Self::Down(_)

@@ -49,6 +49,10 @@ impl Carrier for Embedded {
         let mut bytes = [0; 64];
         let (len, _) = rustix::net::recv(&socket, &mut bytes, RecvFlags::DONTWAIT).map_err(gone)?;
         sockopt::set_socket_timeout(&socket, sockopt::Timeout::Send, None).map_err(failed)?;
+        // A server that ends resets the connection; one that hangs up without an answer has no room.
+        if len == 0 {
+            return Err(BusError::TurnedAway(name.to_owned()));
+        }
         match Answer::decode(bytes.get(..len).unwrap_or_default()) {
             Some(Answer::Welcome { granted }) => Ok((socket, usize::try_from(granted).unwrap_or(usize::MAX))),
             Some(Answer::Refused { version }) => {
