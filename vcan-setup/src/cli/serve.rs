@@ -6,7 +6,7 @@ use std::os::unix::net::UnixStream;
 use anyhow::Context;
 use clap::Args;
 use protocol::usage::Failure;
-use rustix::process::Signal;
+use rustix::process::{Resource, Rlimit, Signal, getrlimit, setrlimit};
 use signal_hook::consts::{SIGINT, SIGTERM};
 use vcan_setup::embedded::{Server, Totals};
 
@@ -57,18 +57,41 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
     // not do this has a slower bus.
     let _ = rustix::process::setpriority_process(None, URGENT);
     protocol::bus::never_interrupt();
+    allow_files();
     let server = Server::bind(name)?;
     writeln!(std::io::stdout(), "serving {name} at {}", server.path().display())
         .and_then(|()| std::io::stdout().flush())
         .context("cannot write to standard output")?;
-    let Totals { garbage, refused, .. } = server.run(stopped)?;
+    let Totals { garbage, refused, turned_away, failed, failure, .. } = server.run(stopped)?;
+    // Only the server can report it: a client gets no error for what it sends.
     if garbage > 0 || refused > 0 {
-        // Only the server can report it: a client gets no error for what it sends. Without standard error there is no reader.
-        let _ = writeln!(
-            std::io::stderr(),
-            "vcan-setup: {name}: ignored {garbage} datagrams that were neither frames nor filters, and refused \
-             {refused} clients: check their program against docs/reference/embedded-bus.md"
-        );
+        say(&format!(
+            "{name}: ignored {garbage} datagrams that were neither frames nor filters, and refused {refused} clients: \
+             check their program against docs/reference/embedded-bus.md"
+        ));
+    }
+    if turned_away > 0 {
+        let limit =
+            getrlimit(Resource::Nofile).current.map_or_else(String::new, |limit| format!(" of {limit}"));
+        say(&format!(
+            "{name}: turned away {turned_away} clients for which there was no file{limit} or memory: end other clients, or \
+             raise `ulimit -Hn`"
+        ));
+    }
+    if let Some(failure) = failure {
+        say(&format!("{name}: gave up {failed} clients whose sockets failed, the last one with: {failure}"));
     }
     Ok(())
+}
+
+/// Lets as many files be open as the system allows: each client is one.
+fn allow_files() {
+    let Rlimit { maximum, .. } = getrlimit(Resource::Nofile);
+    // With fewer there is room for fewer clients, which are turned away.
+    let _ = setrlimit(Resource::Nofile, Rlimit { current: maximum, maximum });
+}
+
+/// Without standard error there is no reader.
+fn say(text: &str) {
+    let _ = writeln!(std::io::stderr(), "vcan-setup: {text}");
 }

@@ -3,7 +3,7 @@
 use std::os::fd::OwnedFd;
 
 use protocol::bus::Filter;
-use protocol::bus::batch::{BATCH, Outgoing};
+use protocol::bus::batch::{BATCH, Outgoing, is_shortage};
 use protocol::bus::embedded::encode_dropped;
 use protocol::can::FD_BYTES;
 use rustix::event::epoll::{self, EventData, EventFlags};
@@ -25,6 +25,19 @@ pub(super) struct Post {
     pub(super) totals: Totals,
 }
 
+/// What became of what waits for a client.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Sent {
+    /// It was sent, or waits until its socket has room, which `epoll` reports.
+    Done,
+    /// The system lacks memory: to be tried again soon.
+    Shortage,
+    /// It does not read any more.
+    Gone,
+    /// Its socket fails for a reason that does not pass.
+    Failed(Errno),
+}
+
 #[derive(Debug)]
 pub(super) struct Client {
     id: ClientId,
@@ -39,12 +52,24 @@ pub(super) struct Client {
     blocked: bool,
     /// It is in the list of clients with something to send.
     dirty: bool,
+    /// Receptions in succession that failed.
+    pub(super) failures: u32,
 }
 
 impl Client {
     pub(super) const fn new(id: ClientId, socket: OwnedFd) -> Self {
         let queue = Queue::new(QUEUE);
-        Self { id, socket, queue, greeted: false, fd: true, filters: None, blocked: false, dirty: false }
+        Self {
+            id,
+            socket,
+            queue,
+            greeted: false,
+            fd: true,
+            filters: None,
+            blocked: false,
+            dirty: false,
+            failures: 0,
+        }
     }
 
     /// Takes a frame that is to be sent to it; whether it has to be flushed from now on, and had not before.
@@ -61,10 +86,24 @@ impl Client {
         !self.blocked && !std::mem::replace(&mut self.dirty, true)
     }
 
-    /// Sends what waits for it, unless there is no room; whether it still listens.
-    pub(super) fn flush(&mut self, post: &mut Post) -> bool {
+    /// Sends what waits for it, unless there is no room.
+    pub(super) fn flush(&mut self, post: &mut Post) -> Sent {
         self.dirty = false;
-        self.blocked || self.send(post)
+        if self.blocked { Sent::Done } else { self.send(post) }
+    }
+
+    /// Takes its socket out of `epoll`, and sends nothing to it, until it is resumed.
+    pub(super) fn pause(&mut self, post: &Post) {
+        self.blocked = true;
+        let _ = epoll::delete(&post.epoll, &self.socket);
+    }
+
+    /// Ends a pause; whether the system allowed it.
+    pub(super) fn resume(&mut self, post: &Post) -> bool {
+        let data = EventData::new_u64(self.id.0 as u64);
+        let resumed = epoll::add(&post.epoll, &self.socket, data, EventFlags::IN).is_ok();
+        self.blocked = !resumed;
+        resumed
     }
 
     /// Whether it can be sent to again and could not before.
@@ -80,12 +119,12 @@ impl Client {
         self.queue = Queue::new(QUEUE);
     }
 
-    /// Sends what waits for it until it is all sent or its socket is full; whether it still listens.
-    fn send(&mut self, post: &mut Post) -> bool {
+    /// Sends what waits for it until it is all sent or its socket is full.
+    fn send(&mut self, post: &mut Post) -> Sent {
         loop {
             self.queue.report_dropped();
             if self.queue.is_empty() {
-                return true;
+                return Sent::Done;
             }
             post.outgoing.clear();
             for entry in self.queue.iter().take(BATCH) {
@@ -103,13 +142,16 @@ impl Client {
             }
             match post.outgoing.send(&self.socket) {
                 Ok(count) => post.totals.delivered += self.queue.sent(count) as u64,
-                Err(error) => match error.raw_os_error().map(Errno::from_raw_os_error) {
+                // Its socket may have room: that would be reported at once, again and again.
+                Err(error) if is_shortage(&error) => return Sent::Shortage,
+                Err(error) => match Errno::from_io_error(&error) {
                     Some(Errno::INTR) => {}
-                    Some(Errno::AGAIN | Errno::NOBUFS | Errno::NOMEM) => {
+                    Some(Errno::AGAIN) => {
                         self.blocked = self.watch(post, EventFlags::IN | EventFlags::OUT);
-                        return self.blocked;
+                        return if self.blocked { Sent::Done } else { Sent::Shortage };
                     }
-                    _ => return false,
+                    Some(Errno::PIPE | Errno::CONNRESET | Errno::NOTCONN) => return Sent::Gone,
+                    errno => return Sent::Failed(errno.unwrap_or(Errno::IO)),
                 },
             }
         }

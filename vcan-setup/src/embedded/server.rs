@@ -4,26 +4,33 @@ use std::collections::VecDeque;
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use protocol::bus::Filter;
-use protocol::bus::batch::{BATCH, Batch, send_one};
-use protocol::bus::embedded::{Answer, FilterPart, HELLO_MAX, Hello, VERSION, usual_directory};
+use protocol::bus::batch::{BATCH, Batch, Datagram, is_shortage};
+use protocol::bus::embedded::{FilterPart, usual_directory};
 use rustix::buffer::spare_capacity;
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
-use rustix::net::{RecvFlags, SocketFlags, sockopt};
+use rustix::net::{Shutdown, shutdown};
 use thiserror::Error;
 
-use super::client::{Client, Post};
+use super::client::{Client, Post, Sent};
 use super::parcel::Parcel;
 use super::place::{Place, PlaceError};
 use super::routing::{ClientId, Router};
 
+mod admission;
+#[cfg(test)]
+mod tests;
+
 /// Batches taken from one client before the next one's turn: what its send buffer holds, and more.
 const DRAIN: usize = 16;
-/// The most that a client's socket may hold, whatever it requests.
-const BUFFER_MAX: usize = 64 << 20;
+/// How long a socket is left alone after an error that may last, such as a lack of memory or of files.
+const PAUSE: Duration = Duration::from_millis(10);
+/// Receptions in succession that may fail before a client is given up: a second of them.
+const FAILURES: u32 = 100;
 const LISTENER: u64 = u64::MAX;
 const STOP: u64 = u64::MAX - 1;
 
@@ -52,8 +59,14 @@ pub enum ServeError {
 pub struct Totals {
     /// Clients that were let in.
     pub clients: u64,
-    /// Connections that were turned away: no hello, or one of another version.
+    /// Connections that were refused: no hello, or one of another version.
     pub refused: u64,
+    /// Connections that were turned away because there was no file or memory for them.
+    pub turned_away: u64,
+    /// Clients that were given up because their socket failed, and the last reason.
+    pub failed: u64,
+    /// See above.
+    pub failure: Option<Errno>,
     /// Frames taken from clients.
     pub frames: u64,
     /// Datagrams of clients that were neither a frame nor filters.
@@ -80,6 +93,27 @@ pub struct Server {
     dirty: VecDeque<ClientId>,
     router: Router,
     post: Post,
+    /// Tokens of sockets that are left alone until a time.
+    paused: Vec<u64>,
+    resume_at: Option<Instant>,
+}
+
+/// Where the server receives datagrams.
+trait Receive {
+    /// As [`Batch::receive`].
+    fn receive(&mut self, socket: &OwnedFd) -> io::Result<usize>;
+    /// As [`Batch::datagrams`].
+    fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>>;
+}
+
+impl Receive for Batch {
+    fn receive(&mut self, socket: &OwnedFd) -> io::Result<usize> {
+        self.receive(socket)
+    }
+
+    fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>> {
+        self.datagrams()
+    }
 }
 
 impl Server {
@@ -111,6 +145,8 @@ impl Server {
             dirty: VecDeque::new(),
             router: Router::new(),
             post: Post { epoll, outgoing: Box::default(), totals: Totals::default() },
+            paused: Vec::new(),
+            resume_at: None,
         })
     }
 
@@ -130,17 +166,23 @@ impl Server {
     ///
     /// # Errors
     /// When a system call fails; no client can cause that.
-    pub fn run(mut self, stop: impl AsFd) -> Result<Totals, ServeError> {
+    pub fn run(self, stop: impl AsFd) -> Result<Totals, ServeError> {
+        self.run_with(stop, Batch::new())
+    }
+
+    fn run_with(mut self, stop: impl AsFd, mut batch: impl Receive) -> Result<Totals, ServeError> {
         let name = self.name.clone();
         let failed = |doing, errno: Errno| ServeError::Io { name: name.clone(), doing, source: errno.into() };
         epoll::add(&self.post.epoll, &stop, EventData::new_u64(STOP), EventFlags::IN)
             .map_err(|errno| failed("wait for the end", errno))?;
         let mut events = Vec::with_capacity(256);
-        let mut batch = Batch::new();
         loop {
             events.clear();
-            match epoll::wait(&self.post.epoll, spare_capacity(&mut events), None) {
+            let pause = self.resume_at.map(|at| at.saturating_duration_since(Instant::now()));
+            let timeout = pause.and_then(|pause| Timespec::try_from(pause).ok());
+            match epoll::wait(&self.post.epoll, spare_capacity(&mut events), timeout.as_ref()) {
                 Ok(_) | Err(Errno::INTR) => {}
+                Err(errno) if is_shortage(&errno.into()) => std::thread::sleep(PAUSE),
                 Err(errno) => return Err(failed("wait", errno)),
             }
             for &epoll::Event { flags, data } in &events {
@@ -154,8 +196,50 @@ impl Server {
                     }
                 }
             }
+            if self.resume_at.is_some_and(|at| at <= Instant::now()) {
+                self.resume();
+            }
             while let Some(id) = self.dirty.pop_front() {
                 self.flush(id);
+            }
+        }
+    }
+
+    /// Leaves a socket alone for a while: what is wrong is a state, and would be reported again at once.
+    fn pause(&mut self, token: u64) {
+        let Self { post, place, .. } = self;
+        if token == LISTENER {
+            let none = EventFlags::empty();
+            let _ = epoll::modify(&post.epoll, &place.listener, EventData::new_u64(LISTENER), none);
+        } else if let Some(client) =
+            usize::try_from(token).ok().and_then(|index| client(&mut self.clients, index))
+        {
+            client.pause(post);
+        }
+        if !self.paused.contains(&token) {
+            self.paused.push(token);
+        }
+        self.resume_at.get_or_insert_with(|| Instant::now() + PAUSE);
+    }
+
+    /// Ends all pauses.
+    fn resume(&mut self) {
+        self.resume_at = None;
+        for token in std::mem::take(&mut self.paused) {
+            let Self { post, place, .. } = self;
+            if token == LISTENER {
+                let data = EventData::new_u64(LISTENER);
+                if epoll::modify(&post.epoll, &place.listener, data, EventFlags::IN).is_err() {
+                    self.pause(LISTENER);
+                }
+            } else if let Ok(index) = usize::try_from(token)
+                && let Some(client) = client(&mut self.clients, index)
+            {
+                if client.resume(post) {
+                    self.flush(ClientId(index));
+                } else {
+                    self.pause(token);
+                }
             }
         }
     }
@@ -167,39 +251,7 @@ impl Server {
         self.post.totals
     }
 
-    /// Lets waiting clients in.
-    fn accept(&mut self) {
-        loop {
-            let flags = SocketFlags::CLOEXEC | SocketFlags::NONBLOCK;
-            match rustix::net::accept_with(&self.place.listener, flags) {
-                Ok(socket) => self.admit(socket),
-                Err(Errno::INTR | Errno::CONNABORTED) => {}
-                Err(Errno::MFILE | Errno::NFILE) if self.spare.take().is_some() => {
-                    if rustix::net::accept_with(&self.place.listener, flags).is_ok() {
-                        self.post.totals.refused += 1;
-                    }
-                    self.spare = self.post.epoll.try_clone().ok();
-                }
-                Err(_) => break,
-            }
-        }
-    }
-
-    fn admit(&mut self, socket: OwnedFd) {
-        let index = self.clients.iter().position(Option::is_none).unwrap_or(self.clients.len());
-        let data = EventData::new_u64(index as u64);
-        if epoll::add(&self.post.epoll, &socket, data, EventFlags::IN).is_err() {
-            self.post.totals.refused += 1;
-            return;
-        }
-        let client = Some(Client::new(ClientId(index), socket));
-        match self.clients.get_mut(index) {
-            Some(slot) => *slot = client,
-            None => self.clients.push(client),
-        }
-    }
-
-    fn serve(&mut self, id: ClientId, flags: EventFlags, batch: &mut Batch) {
+    fn serve(&mut self, id: ClientId, flags: EventFlags, batch: &mut impl Receive) {
         if flags.contains(EventFlags::OUT) {
             self.unblock(id);
         }
@@ -213,47 +265,17 @@ impl Server {
     }
 
     fn client(&mut self, id: ClientId) -> Option<&mut Client> {
-        self.clients.get_mut(id.0).and_then(Option::as_mut)
-    }
-
-    /// Reads a client's first datagram and sets its filters.
-    fn greet(&mut self, id: ClientId) {
-        let Some(client) = self.client(id) else { return };
-        let mut bytes = [0; HELLO_MAX + 1];
-        let hello = match rustix::net::recv(&client.socket, &mut bytes, RecvFlags::DONTWAIT) {
-            Err(Errno::AGAIN | Errno::INTR) => return,
-            Ok((0, _)) | Err(_) => return self.forget(id),
-            Ok((len, _)) => Hello::decode(bytes.get(..len).unwrap_or_default()),
-        };
-        let Some(hello) = hello else {
-            // It may not wait for an answer at all.
-            let _ = send_one(&client.socket, &Answer::Refused { version: VERSION }.encode());
-            self.post.totals.refused += 1;
-            return self.forget(id);
-        };
-        let target = usize::try_from(hello.buffer).unwrap_or(BUFFER_MAX).min(BUFFER_MAX);
-        if sockopt::set_socket_send_buffer_size_force(&client.socket, target).is_err() {
-            // What was granted is reported, whatever it is.
-            let _ = sockopt::set_socket_send_buffer_size(&client.socket, target);
-        }
-        let granted = sockopt::socket_send_buffer_size(&client.socket).unwrap_or(0) as u64;
-        client.greeted = true;
-        client.fd = hello.fd;
-        if send_one(&client.socket, &Answer::Welcome { granted }.encode()).is_err() {
-            return self.forget(id);
-        }
-        self.post.totals.clients += 1;
-        self.router.insert(id, &hello);
+        client(&mut self.clients, id.0)
     }
 
     /// Routes what a client has sent. As much as a client can have under way is taken at once, so that what
     /// it sent before another began comes first; more than that waits, so that no client holds up the rest.
-    fn drain(&mut self, id: ClientId, batch: &mut Batch) {
+    fn drain(&mut self, id: ClientId, batch: &mut impl Receive) {
         for _ in 0..DRAIN {
             let Some(client) = self.client(id) else { return };
             let fd = client.fd;
             match batch.receive(&client.socket) {
-                Ok(_) => {}
+                Ok(_) => client.failures = 0,
                 // It went away with frames unread; what it had sent can still be read.
                 Err(error) if error.raw_os_error() == Some(Errno::CONNRESET.raw_os_error()) => continue,
                 Err(error)
@@ -261,13 +283,19 @@ impl Server {
                 {
                     return;
                 }
-                Err(_) => return self.forget(id),
+                Err(error) => {
+                    return self.fails(id, Errno::from_io_error(&error).unwrap_or(Errno::IO));
+                }
             }
             for datagram in batch.datagrams() {
                 let bytes = datagram.bytes();
                 // A closed socket reads as empty datagrams without end.
-                if bytes.is_some_and(<[u8]>::is_empty) && self.is_hung_up(id) {
-                    return self.forget(id);
+                if bytes.is_some_and(<[u8]>::is_empty) {
+                    match self.is_hung_up(id) {
+                        Ok(true) => return self.forget(id),
+                        Ok(false) => {}
+                        Err(errno) => return self.fails(id, errno),
+                    }
                 }
                 match bytes.and_then(|bytes| Parcel::accept(bytes, fd)) {
                     Some(parcel) => self.route(id, parcel),
@@ -299,12 +327,29 @@ impl Server {
         true
     }
 
-    fn is_hung_up(&mut self, id: ClientId) -> bool {
-        let Some(client) = self.client(id) else { return true };
+    fn is_hung_up(&mut self, id: ClientId) -> Result<bool, Errno> {
+        let Some(client) = self.client(id) else { return Ok(true) };
         let mut polled = [PollFd::new(&client.socket, PollFlags::RDHUP)];
-        match poll(&mut polled, Some(&Timespec::default())) {
-            Ok(ready) => ready > 0,
-            Err(_) => true,
+        let ready = rustix::io::retry_on_intr(|| poll(&mut polled, Some(&Timespec::default())))?;
+        Ok(ready > 0)
+    }
+
+    /// Tries later to receive from a client, until that has failed for too long.
+    fn fails(&mut self, id: ClientId, errno: Errno) {
+        let Some(client) = self.client(id) else { return };
+        client.failures += 1;
+        if client.failures < FAILURES {
+            return self.pause(id.0 as u64);
+        }
+        self.give_up(id, errno);
+        self.forget(id);
+    }
+
+    /// Counts a client whose socket fails.
+    fn give_up(&mut self, id: ClientId, errno: Errno) {
+        if self.client(id).is_some() {
+            self.post.totals.failed += 1;
+            self.post.totals.failure = Some(errno);
         }
     }
 
@@ -321,15 +366,23 @@ impl Server {
 
     fn flush(&mut self, id: ClientId) {
         let Self { clients, post, .. } = self;
-        let Some(client) = clients.get_mut(id.0).and_then(Option::as_mut) else { return };
-        if !client.flush(post) {
-            self.silence(id);
+        let Some(client) = client(clients, id.0) else { return };
+        match client.flush(post) {
+            Sent::Done => {}
+            Sent::Shortage => self.pause(id.0 as u64),
+            Sent::Gone => self.silence(id),
+            Sent::Failed(errno) => {
+                // It sees that it is hung up on and connects again; what it has sent is received until then.
+                let _ = shutdown(&client.socket, Shutdown::Write);
+                self.give_up(id, errno);
+                self.silence(id);
+            }
         }
     }
 
     fn unblock(&mut self, id: ClientId) {
         let Self { clients, post, .. } = self;
-        let Some(client) = clients.get_mut(id.0).and_then(Option::as_mut) else { return };
+        let Some(client) = client(clients, id.0) else { return };
         if client.unblock(post) {
             self.flush(id);
         }
@@ -350,4 +403,8 @@ impl Server {
             *slot = None;
         }
     }
+}
+
+fn client(clients: &mut [Option<Client>], index: usize) -> Option<&mut Client> {
+    clients.get_mut(index).and_then(Option::as_mut)
 }

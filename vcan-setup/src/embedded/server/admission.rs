@@ -1,0 +1,119 @@
+//! Letting clients in, and turning away those for whom there is no room.
+
+use std::io;
+use std::os::fd::OwnedFd;
+use std::time::Duration;
+
+use protocol::bus::batch::{is_shortage, send_one};
+use protocol::bus::embedded::{Answer, HELLO_MAX, Hello, VERSION};
+use rustix::event::epoll::{self, EventData, EventFlags};
+use rustix::io::Errno;
+use rustix::net::{RecvFlags, Shutdown, SocketFlags, shutdown, sockopt};
+
+use super::{LISTENER, Server};
+use crate::embedded::client::Client;
+use crate::embedded::routing::ClientId;
+
+/// The most that a client's socket may hold, whatever it requests.
+const BUFFER_MAX: usize = 64 << 20;
+
+impl Server {
+    /// Lets waiting clients in.
+    pub(super) fn accept(&mut self) {
+        loop {
+            match self.accepted() {
+                Ok(socket) => self.admit(socket),
+                Err(Errno::INTR | Errno::CONNABORTED) => {}
+                Err(Errno::AGAIN) => return,
+                // The system looks for a file before it looks whether anybody waits.
+                Err(Errno::MFILE | Errno::NFILE) => match self.turn_away() {
+                    Ok(()) => {}
+                    Err(Errno::AGAIN) => return,
+                    Err(_) => return self.pause(LISTENER),
+                },
+                Err(_) => return self.pause(LISTENER),
+            }
+        }
+    }
+
+    fn accepted(&self) -> Result<OwnedFd, Errno> {
+        rustix::net::accept_with(&self.place.listener, SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)
+    }
+
+    /// Hangs up on a client for which there is no file, with the file that is spared for this.
+    fn turn_away(&mut self) -> Result<(), Errno> {
+        drop(self.spare.take());
+        let accepted = self.accepted();
+        let turned_away = accepted.map(|socket| hang_up(&socket));
+        self.spare = self.post.epoll.try_clone().ok();
+        turned_away?;
+        self.post.totals.turned_away += 1;
+        Ok(())
+    }
+
+    fn admit(&mut self, socket: OwnedFd) {
+        let index = self.clients.iter().position(Option::is_none).unwrap_or(self.clients.len());
+        let data = EventData::new_u64(index as u64);
+        if epoll::add(&self.post.epoll, &socket, data, EventFlags::IN).is_err() {
+            self.post.totals.turned_away += 1;
+            return hang_up(&socket);
+        }
+        let client = Some(Client::new(ClientId(index), socket));
+        match self.clients.get_mut(index) {
+            Some(slot) => *slot = client,
+            None => self.clients.push(client),
+        }
+    }
+
+    /// Reads a client's first datagram and sets its filters.
+    pub(super) fn greet(&mut self, id: ClientId) {
+        let Some(client) = self.client(id) else { return };
+        let mut bytes = [0; HELLO_MAX + 1];
+        let hello = match rustix::net::recv(&client.socket, &mut bytes, RecvFlags::DONTWAIT) {
+            Err(Errno::AGAIN | Errno::INTR) => return,
+            Err(errno @ (Errno::NOMEM | Errno::NOBUFS)) => return self.fails(id, errno),
+            Ok((0, _)) | Err(_) => return self.forget(id),
+            Ok((len, _)) => Hello::decode(bytes.get(..len).unwrap_or_default()),
+        };
+        let Some(hello) = hello else {
+            // It may not wait for an answer at all.
+            let _ = send_one(&client.socket, &Answer::Refused { version: VERSION }.encode());
+            self.post.totals.refused += 1;
+            return self.forget(id);
+        };
+        let target = usize::try_from(hello.buffer).unwrap_or(BUFFER_MAX).min(BUFFER_MAX);
+        if sockopt::set_socket_send_buffer_size_force(&client.socket, target).is_err() {
+            // What was granted is reported, whatever it is.
+            let _ = sockopt::set_socket_send_buffer_size(&client.socket, target);
+        }
+        let granted = sockopt::socket_send_buffer_size(&client.socket).unwrap_or(0) as u64;
+        client.greeted = true;
+        client.fd = hello.fd;
+        if welcome(&client.socket, granted).is_err() {
+            return self.forget(id);
+        }
+        self.post.totals.clients += 1;
+        self.router.insert(id, &hello);
+    }
+}
+
+/// Ends a connection without an answer. What was sent is read, so that the other end sees an end and no reset, which
+/// would say that the server ended.
+fn hang_up(socket: &OwnedFd) {
+    let _ = rustix::net::recv(socket, &mut [0; HELLO_MAX + 1], RecvFlags::DONTWAIT);
+    let _ = shutdown(socket, Shutdown::Both);
+}
+
+/// Sends the answer, the first datagram in its socket. Only a lack of memory is in its way.
+fn welcome(socket: &OwnedFd, granted: u64) -> io::Result<usize> {
+    let answer = Answer::Welcome { granted }.encode();
+    let mut tries = 0..10;
+    loop {
+        match send_one(socket, &answer) {
+            Err(error) if is_shortage(&error) && tries.next().is_some() => {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            done => return done,
+        }
+    }
+}

@@ -1,0 +1,114 @@
+use std::collections::VecDeque;
+use std::os::unix::net::UnixStream;
+
+use protocol::bus::{Bus, Choice, Inbox, Options};
+use protocol::can::Frame;
+use tempfile::TempDir;
+
+use super::*;
+
+/// Receives what a socket has, after errors that are given.
+struct Faulty {
+    batch: Batch,
+    /// Before each reception one of these, if it is an error.
+    errors: VecDeque<Option<Errno>>,
+    /// After those it is always this one.
+    last: Option<Errno>,
+}
+
+impl Receive for Faulty {
+    fn receive(&mut self, socket: &OwnedFd) -> io::Result<usize> {
+        match self.errors.pop_front().unwrap_or(self.last) {
+            Some(errno) => Err(errno.into()),
+            None => self.batch.receive(socket),
+        }
+    }
+
+    fn datagrams(&self) -> impl ExactSizeIterator<Item = Datagram<'_>> {
+        self.batch.datagrams()
+    }
+}
+
+/// A bus that is served by a thread of this test.
+struct Bench {
+    directory: TempDir,
+    stop: UnixStream,
+    thread: std::thread::JoinHandle<Result<Totals, ServeError>>,
+}
+
+impl Bench {
+    fn new(errors: &[Option<Errno>], last: Option<Errno>) -> Self {
+        let directory = TempDir::new().unwrap();
+        let server = Server::bind_in(&directory.path().join("skinbus"), "vcan0").unwrap();
+        let faulty = Faulty { batch: Batch::new(), errors: errors.iter().copied().collect(), last };
+        let (stop, stopped) = UnixStream::pair().unwrap();
+        let thread = std::thread::spawn(move || server.run_with(stopped, faulty));
+        Self { directory, stop, thread }
+    }
+
+    fn open(&self) -> Bus {
+        let options = Options {
+            directory: Some(self.directory.path().join("skinbus")),
+            send_timeout: Duration::from_secs(20),
+            receive_buffer: 4 << 20,
+            ..Options::default()
+        };
+        Bus::open("vcan0", Choice::Only(protocol::bus::BusKind::Embedded), &options).unwrap()
+    }
+
+    fn end(self) -> Totals {
+        drop(self.stop);
+        self.thread.join().unwrap().unwrap()
+    }
+}
+
+/// Waits for so many frames: their identifiers.
+fn receives(bus: &Bus, count: usize) -> Vec<u32> {
+    let (mut inbox, mut ids) = (Inbox::new(), Vec::new());
+    while ids.len() < count {
+        bus.wait(None).unwrap();
+        bus.receive(&mut inbox).unwrap();
+        ids.extend(inbox.frames().map(|received| received.frame.id()));
+    }
+    ids
+}
+
+#[test]
+fn errors_of_a_reception_that_pass_cost_a_client_no_frame() {
+    let errors = [Errno::NOMEM, Errno::NOBUFS, Errno::INTR, Errno::CONNRESET, Errno::AGAIN, Errno::IO];
+    let errors: Vec<_> = (0..60).map(|at| (at % 3 == 0).then(|| errors[at / 3 % errors.len()])).collect();
+    let bench = Bench::new(&errors, None);
+    let [sender, receiver] = [bench.open(), bench.open()];
+    let frames: Vec<_> = (0..500).map(|id| Frame::classic(id, &[1]).unwrap()).collect();
+    // In pieces, so that every error meets some.
+    for piece in frames.chunks(5) {
+        sender.send(piece).unwrap();
+        let ids: Vec<_> = piece.iter().map(Frame::id).collect();
+        assert_eq!(receives(&receiver, piece.len()), ids);
+    }
+    let totals = bench.end();
+    assert_eq!((totals.frames, totals.delivered, totals.abandoned), (500, 500, 0));
+    assert_eq!((totals.failed, totals.failure, totals.garbage), (0, None, 0));
+}
+
+#[test]
+fn a_client_whose_socket_fails_for_good_is_hung_up_on_and_the_others_go_on() {
+    // Only the first client sends before all receptions fail.
+    let bench = Bench::new(&[None], Some(Errno::BADF));
+    let [sender, receiver] = [bench.open(), bench.open()];
+    sender.send(&[Frame::classic(1, &[1]).unwrap()]).unwrap();
+    assert_eq!(receives(&receiver, 1), [1]);
+    let _ = sender.send(&[Frame::classic(2, &[1]).unwrap()]);
+    let mut inbox = Inbox::new();
+    let error = loop {
+        sender.wait(None).unwrap();
+        if let Err(error) = sender.receive(&mut inbox) {
+            break error;
+        }
+    };
+    assert!(error.is_closed(), "it can connect again: {error}");
+    let again = bench.open();
+    let totals = bench.end();
+    assert_eq!((totals.clients, totals.failed, totals.failure), (3, 1, Some(Errno::BADF)));
+    drop((again, receiver));
+}
