@@ -346,3 +346,99 @@ fn what_was_ignored_is_said_at_the_end() {
     assert_eq!((status.code(), said.lines().count()), (Some(0), 1), "{said}");
     assert!(said.contains("vcan0: ignored 1 datagrams") && said.contains("refused 0 clients"), "{said}");
 }
+
+/// A server that may have this many files, by an option of `ulimit`.
+fn serve_with_files(directory: &Path, limit: &str) -> Served {
+    let mut command = Command::new("sh");
+    let line = format!("ulimit {limit} && exec \"$0\" serve vcan0");
+    command.args(["-c", &line, env!("CARGO_BIN_EXE_vcan-setup")]).env("SKINBUS_DIR", directory);
+    let (child, line) = Served::start(command.stderr(Stdio::piped()));
+    assert!(line.starts_with("serving vcan0 at "), "{line}");
+    child
+}
+
+/// Sends a frame from one client to another, which has nothing else waiting.
+fn passes(from: &Bus, to: &Bus) {
+    let frame = Frame::classic(0x123, &[5]).unwrap();
+    from.send(&[frame]).unwrap();
+    assert!(to.wait(Some(Duration::from_secs(20))).unwrap(), "no frame passes");
+    let mut inbox = Inbox::new();
+    assert_eq!(to.receive(&mut inbox).unwrap(), 1);
+    assert_eq!(inbox.frames().next().unwrap().frame, frame);
+}
+
+#[test]
+fn clients_for_which_there_is_no_file_are_turned_away_and_the_others_go_on() {
+    let parent = TempDir::new().unwrap();
+    let directory = parent.path().join("skinbus");
+    let mut server = serve_with_files(&directory, "-n 64");
+    let options = Options { directory: Some(directory), filters: vec![], ..Options::default() };
+    let open = |options: &Options| Bus::open("vcan0", Choice::Only(BusKind::Embedded), options);
+    let listening = Options { filters: vec![Filter::ALL], ..options.clone() };
+    let [a, b] = [(); 2].map(|()| open(&listening).unwrap());
+    passes(&a, &b);
+    let (others, refused): (Vec<_>, Vec<_>) = (0..100).map(|_| open(&options)).partition(Result::is_ok);
+    assert!((40..60).contains(&others.len()), "{}", others.len());
+    for error in refused {
+        let error = error.unwrap_err();
+        assert!(matches!(error, BusError::TurnedAway(_)) && error.may_open_later(), "{error}");
+        assert!(error.to_string().contains("no room for another client"), "{error}");
+    }
+    passes(&a, &b);
+    drop(others);
+    passes(&b, &a);
+    // There is room again as soon as the server has seen that they are gone.
+    let again = std::iter::repeat_with(|| open(&listening)).find_map(Result::ok).unwrap();
+    passes(&again, &a);
+    signal(&server, Signal::TERM);
+    let mut said = String::new();
+    server.stderr.take().unwrap().read_to_string(&mut said).unwrap();
+    assert!(said.starts_with("vcan-setup: vcan0: turned away ") && said.contains("no file of 64"), "{said}");
+    assert_eq!(ended(server, &parent).code(), Some(0));
+}
+
+#[test]
+fn a_server_lets_in_as_many_clients_as_the_system_allows() {
+    let parent = TempDir::new().unwrap();
+    let directory = parent.path().join("skinbus");
+    let server = serve_with_files(&directory, "-Sn 64");
+    let options = Options { directory: Some(directory), ..Options::default() };
+    let open = || Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap();
+    let clients: Vec<_> = (0..100).map(|_| open()).collect();
+    passes(&clients[0], &clients[99]);
+    signal(&server, Signal::TERM);
+    assert_eq!(ended(server, &parent).code(), Some(0));
+}
+
+#[test]
+fn descriptors_that_a_client_passes_along_are_closed() {
+    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, sendmsg};
+    use std::mem::MaybeUninit;
+    use std::os::fd::AsFd;
+
+    let parent = TempDir::new().unwrap();
+    let directory = parent.path().join("skinbus");
+    let server = serve(&directory, &[]);
+    let options = Options { directory: Some(directory), ..Options::default() };
+    let [a, b] = [(); 2].map(|()| Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap());
+    let (mut read, write) = std::io::pipe().unwrap();
+    let frame = Frame::classic(1, &[]).unwrap();
+    for count in 1..=100 {
+        let passed = vec![write.as_fd(); count % 4 + 1];
+        let mut space = [MaybeUninit::uninit(); 128];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        assert!(control.push(SendAncillaryMessage::ScmRights(&passed)));
+        let bytes = frame.to_bytes();
+        let bytes = std::io::IoSlice::new(&bytes[..frame.byte_len()]);
+        sendmsg(&a, &[bytes], &mut control, SendFlags::empty()).unwrap();
+    }
+    drop(write);
+    let (mut inbox, mut received) = (Inbox::new(), 0);
+    while received < 100 {
+        assert!(b.wait(Some(Duration::from_secs(20))).unwrap(), "{received} frames");
+        received += b.receive(&mut inbox).unwrap();
+    }
+    assert_eq!(read.read(&mut [0]).unwrap(), 0, "nobody has the other end");
+    signal(&server, Signal::TERM);
+    assert_eq!(ended(server, &parent).code(), Some(0));
+}

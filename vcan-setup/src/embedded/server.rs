@@ -88,6 +88,8 @@ pub struct Server {
     place: Place,
     /// Given up for a moment to turn a client away when there are no file descriptors left.
     spare: Option<OwnedFd>,
+    /// A client that is turned away and has not sent its hello.
+    parting: Option<OwnedFd>,
     clients: Vec<Option<Client>>,
     /// Clients with something to send at the end of the round.
     dirty: VecDeque<ClientId>,
@@ -141,6 +143,7 @@ impl Server {
             name: name.to_owned(),
             place,
             spare: epoll.try_clone().ok(),
+            parting: None,
             clients: Vec::new(),
             dirty: VecDeque::new(),
             router: Router::new(),
@@ -229,7 +232,11 @@ impl Server {
             let Self { post, place, .. } = self;
             if token == LISTENER {
                 let data = EventData::new_u64(LISTENER);
-                if epoll::modify(&post.epoll, &place.listener, data, EventFlags::IN).is_err() {
+                let resumed = epoll::modify(&post.epoll, &place.listener, data, EventFlags::IN).is_ok();
+                if self.parting.is_some() || self.spare.is_none() {
+                    self.part();
+                }
+                if !resumed {
                     self.pause(LISTENER);
                 }
             } else if let Ok(index) = usize::try_from(token)

@@ -40,15 +40,32 @@ impl Server {
         rustix::net::accept_with(&self.place.listener, SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)
     }
 
-    /// Hangs up on a client for which there is no file, with the file that is spared for this.
+    /// Hangs up on a client for which there is no file, with the file that is spared for this. A client that has not sent
+    /// its hello yet keeps that until [`Server::part`].
     fn turn_away(&mut self) -> Result<(), Errno> {
         drop(self.spare.take());
         let accepted = self.accepted();
-        let turned_away = accepted.map(|socket| hang_up(&socket));
-        self.spare = self.post.epoll.try_clone().ok();
-        turned_away?;
-        self.post.totals.turned_away += 1;
+        if let Ok(socket) = accepted {
+            self.post.totals.turned_away += 1;
+            let has_sent = hang_up(&socket);
+            self.parting = (!has_sent).then_some(socket);
+        } else {
+            self.part();
+            accepted?;
+        }
+        if self.parting.is_some() {
+            return Err(Errno::MFILE);
+        }
+        self.part();
         Ok(())
+    }
+
+    /// Closes the connection of a client that was turned away, and spares its file for the next one.
+    pub(super) fn part(&mut self) {
+        if let Some(socket) = self.parting.take() {
+            hang_up(&socket);
+        }
+        self.spare = self.post.epoll.try_clone().ok();
     }
 
     fn admit(&mut self, socket: OwnedFd) {
@@ -56,7 +73,8 @@ impl Server {
         let data = EventData::new_u64(index as u64);
         if epoll::add(&self.post.epoll, &socket, data, EventFlags::IN).is_err() {
             self.post.totals.turned_away += 1;
-            return hang_up(&socket);
+            hang_up(&socket);
+            return;
         }
         let client = Some(Client::new(ClientId(index), socket));
         match self.clients.get_mut(index) {
@@ -97,11 +115,11 @@ impl Server {
     }
 }
 
-/// Ends a connection without an answer. What was sent is read, so that the other end sees an end and no reset, which
-/// would say that the server ended.
-fn hang_up(socket: &OwnedFd) {
-    let _ = rustix::net::recv(socket, &mut [0; HELLO_MAX + 1], RecvFlags::DONTWAIT);
-    let _ = shutdown(socket, Shutdown::Both);
+/// Ends a connection without an answer; whether the other end had sent something. When that is read, the other end sees
+/// an end, and no reset, which would say that the server ended.
+fn hang_up(socket: &OwnedFd) -> bool {
+    let _ = shutdown(socket, Shutdown::Write);
+    rustix::net::recv(socket, &mut [0; HELLO_MAX + 1], RecvFlags::DONTWAIT).err() != Some(Errno::AGAIN)
 }
 
 /// Sends the answer, the first datagram in its socket. Only a lack of memory is in its way.
