@@ -6,7 +6,7 @@ mod line;
 mod sockets;
 mod subscriptions;
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use protocol::bus::{BusError, Options, Received};
 use protocol::can::{Format, Frame};
@@ -31,6 +31,9 @@ const AGAIN: Duration = Duration::from_millis(100);
 /// Waits while an interface is down before it is tried again.
 const DOWN: Duration = Duration::from_millis(100);
 
+/// How long frames are kept that a bus did not take. Epochs count modulo 256: older torques might be taken for others.
+const KEPT: Duration = Duration::from_millis(250);
+
 /// Cells in a process that may rest: more are woken as often by their heartbeats as by joints.
 const RESTING: usize = 8;
 
@@ -50,6 +53,8 @@ pub struct Cells {
     heard_first: bool,
     hearing: Hearing,
     outbox: Vec<Frame>,
+    /// Since when the bus has not taken what is in the outbox.
+    unsent_since: Option<Instant>,
 }
 
 /// One cell and what is its own. What is used together lies in the same cache lines in each of many.
@@ -104,6 +109,7 @@ impl Cells {
             heard_first: false,
             hearing: Hearing::default(),
             outbox: Vec::new(),
+            unsent_since: None,
         }
     }
 
@@ -177,14 +183,11 @@ impl Cells {
         loop {
             match self.turn(&mut sockets, now) {
                 Ok(()) => {}
-                // What was to be sent is lost, as on a microcontroller without a bus.
-                Err(Stopped::Bus(error)) if error.may_pass() => {
-                    self.outbox.clear();
-                    std::thread::sleep(DOWN);
-                }
-                Err(Stopped::Bus(error)) if line.reconnect && error.is_closed() => {
-                    self.outbox.clear();
-                    sockets = self.open_again(line)?;
+                // What was received before has been taken already.
+                Err(Stopped::Bus(error)) => {
+                    self.recover(error, &mut sockets, line)?;
+                    now = self.clock.now();
+                    continue;
                 }
                 Err(error) => return Err(error),
             }
@@ -197,6 +200,24 @@ impl Cells {
                 self.take(received, age, sockets.name(), now)?;
             }
         }
+    }
+
+    /// Waits for a bus that does not work, or opens it again. What it did not take is sent then, because it is counted as
+    /// sent; what is too old for that is lost, as on a microcontroller without a bus.
+    fn recover(&mut self, error: BusError, sockets: &mut Sockets, line: &Line) -> Result<(), Stopped> {
+        let since = *self.unsent_since.get_or_insert_with(Instant::now);
+        if line.reconnect && error.is_closed() {
+            *sockets = self.open_again(line)?;
+        } else if matches!(error, BusError::Down(_)) {
+            self.outbox.clear();
+            std::thread::sleep(DOWN);
+        } else if !error.may_pass() {
+            return Err(error.into());
+        }
+        if since.elapsed() > KEPT {
+            self.outbox.clear();
+        }
+        Ok(())
     }
 
     /// Lets time pass, sends, and waits for frames.
@@ -228,10 +249,10 @@ impl Cells {
             self.hears_changed = true;
             return Err(error.into());
         }
-        if !self.outbox.is_empty() {
-            sockets.send(&self.outbox)?;
-            self.outbox.clear();
-        }
+        let sent = sockets.send(&self.outbox);
+        self.outbox.drain(..sent.as_ref().map_or_else(|error| error.sent, |()| self.outbox.len()));
+        sent.map_err(|error| error.cause)?;
+        self.unsent_since = None;
         Ok(sockets.wait(Duration::from_micros(next.since(now).0))?)
     }
 

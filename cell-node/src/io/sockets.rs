@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use protocol::bus::batch::BATCH;
-use protocol::bus::{Bus, BusError, Filter, Inbox, Options, Received};
+use protocol::bus::{Bus, BusError, Filter, Inbox, Options, Received, SendError};
 use protocol::can::Frame;
 
 use super::Line;
@@ -98,8 +98,8 @@ impl Sockets {
         Ok(())
     }
 
-    pub(super) fn send(&self, frames: &[Frame]) -> Result<(), BusError> {
-        self.bus.send(frames).map_err(|error| error.cause)
+    pub(super) fn send(&self, frames: &[Frame]) -> Result<(), SendError> {
+        self.bus.send(frames)
     }
 
     /// Drops the last frames and receives those that are there, for a timer that was due at a wall's time in ns; whether
