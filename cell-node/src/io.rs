@@ -3,13 +3,14 @@
 mod clock;
 mod flash_file;
 mod line;
+mod outbox;
 mod sockets;
 mod subscriptions;
 
 use std::time::{Duration, Instant};
 
 use protocol::bus::{BusError, Options, Received};
-use protocol::can::{Format, Frame};
+use protocol::can::Format;
 use protocol::id::{CellId, Kind};
 use protocol::packet;
 use protocol::time::{Micros, Span};
@@ -19,6 +20,7 @@ use crate::flash::Flash;
 use crate::identity::Identity;
 use crate::node::Node;
 use clock::Clock;
+use outbox::Outbox;
 use sockets::{Arrived, Hearing};
 use subscriptions::Subscriptions;
 
@@ -52,7 +54,7 @@ pub struct Cells {
     /// What waits in the socket has been received since a timer was due.
     heard_first: bool,
     hearing: Hearing,
-    outbox: Vec<Frame>,
+    outbox: Outbox,
     /// Since when the bus has not taken what is in the outbox.
     unsent_since: Option<Instant>,
 }
@@ -108,7 +110,7 @@ impl Cells {
             hears_changed: false,
             heard_first: false,
             hearing: Hearing::default(),
-            outbox: Vec::new(),
+            outbox: Outbox::default(),
             unsent_since: None,
         }
     }
@@ -202,22 +204,31 @@ impl Cells {
         }
     }
 
-    /// Waits for a bus that does not work, or opens it again. What it did not take is sent then, because it is counted as
-    /// sent; what is too old for that is lost, as on a microcontroller without a bus.
+    /// Waits for a bus that does not work, or opens it again. What it did not take is sent then; what is too old for
+    /// that is lost, as on a microcontroller without a bus.
     fn recover(&mut self, error: BusError, sockets: &mut Sockets, line: &Line) -> Result<(), Stopped> {
         let since = *self.unsent_since.get_or_insert_with(Instant::now);
         if line.reconnect && error.is_closed() {
             *sockets = self.open_again(line)?;
         } else if matches!(error, BusError::Down(_)) {
-            self.outbox.clear();
+            self.lose_outbox();
             std::thread::sleep(DOWN);
         } else if !error.may_pass() {
             return Err(error.into());
         }
         if since.elapsed() > KEPT {
-            self.outbox.clear();
+            self.lose_outbox();
         }
         Ok(())
+    }
+
+    /// Drops what the bus did not take, and takes it back from what the cells have sent.
+    fn lose_outbox(&mut self) {
+        for place in self.outbox.lose() {
+            if let Some(hosted_cell) = self.cells.get_mut(place) {
+                hosted_cell.node.handle_unsent();
+            }
+        }
     }
 
     /// Lets time pass, sends, and waits for frames.
@@ -233,10 +244,10 @@ impl Cells {
         }
         self.heard_first = false;
         let mut next = Micros(u64::MAX);
-        for hosted_cell in &mut self.cells {
+        for (place, hosted_cell) in self.cells.iter_mut().enumerate() {
             if hosted_cell.node.poll_timeout() <= now {
                 hosted_cell.node.handle_timeout(now);
-                self.hears_changed |= hosted_cell.collect(self.format, &mut self.outbox);
+                self.hears_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
             }
             next = next.min(hosted_cell.node.poll_timeout());
         }
@@ -249,8 +260,10 @@ impl Cells {
             self.hears_changed = true;
             return Err(error.into());
         }
-        let sent = sockets.send(&self.outbox);
-        self.outbox.drain(..sent.as_ref().map_or_else(|error| error.sent, |()| self.outbox.len()));
+        let frames = self.outbox.frames();
+        let sent = sockets.send(frames);
+        let count = sent.as_ref().map_or_else(|error| error.sent, |()| frames.len());
+        self.outbox.sent(count);
         sent.map_err(|error| error.cause)?;
         self.unsent_since = None;
         Ok(sockets.wait(Duration::from_micros(next.since(now).0))?)
@@ -264,7 +277,7 @@ impl Cells {
                 && let (Some(hosted_cell), Some(message)) = (self.cells.get_mut(place), link_id.read(frame))
             {
                 hosted_cell.node.handle_port(now, age, port, message);
-                self.hears_changed |= hosted_cell.collect(self.format, &mut self.outbox);
+                self.hears_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
             }
             return Ok(());
         }
@@ -285,7 +298,7 @@ impl Cells {
                 let (bus, cell) = (bus.to_owned(), hosted_cell.node.identity().cell.map_or(0, CellId::get));
                 return Err(Stopped::Taken { bus, cell, serial });
             }
-            self.hears_changed |= hosted_cell.collect(self.format, &mut self.outbox);
+            self.hears_changed |= hosted_cell.collect(place, self.format, &mut self.outbox);
         }
         Ok(())
     }
@@ -293,16 +306,18 @@ impl Cells {
 
 impl HostedCell {
     /// Writes what the cell has for flash, and takes what it has to send; whether its subscriptions have changed.
-    fn collect(&mut self, format: Format, outbox: &mut Vec<Frame>) -> bool {
+    fn collect(&mut self, place: usize, format: Format, outbox: &mut Outbox) -> bool {
         if let Some(kept) = self.node.poll_store() {
             self.node.handle_stored(self.file.store(&kept).is_ok());
         }
         while let Some((port, message)) = self.node.poll_port_transmit() {
             let link_id = self.link_ids.get(port).copied().flatten();
-            outbox.extend(link_id.map(|link_id| link_id.frame(message)));
+            if let Some(link_id) = link_id {
+                outbox.push_uncounted(link_id.frame(message));
+            }
         }
         while let Some(packet) = self.node.poll_transmit() {
-            outbox.extend(packet.frames(format));
+            outbox.push_packet(place, packet.frames(format));
         }
         self.node.poll_hears()
     }

@@ -4,11 +4,22 @@
 
 mod process;
 
+use std::fs::{DirBuilder, Permissions};
+use std::os::fd::OwnedFd;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+
+use model::decode::{Decoded, Decoder};
 use model::generate::{Format as Wire, Reply, Target, generate};
 use process::buses::{carries, mixed_skin};
 use process::test_client::TestClient;
 use process::{PRESSED, Place, Running, signal, skin_of, until};
-use protocol::can::Format;
+use protocol::bus::embedded::{Answer, HELLO_MAX, address, seqpacket};
+use protocol::can::{Format, Frame};
+use protocol::id::Node;
+use protocol::message::{Message, NetworkPage, Request};
+use protocol::parameters::Parameter;
+use protocol::time::Micros;
+use rustix::net::{RecvFlags, SendFlags, Shutdown, SocketFlags};
 use rustix::process::{Pid, Signal};
 
 /// vcan0 and vcan2 carry CAN FD, vcan1 classic frames.
@@ -286,4 +297,77 @@ fn each_bus_has_the_requested_kind() {
     );
     run("--bus-kind vcan0=embedded --bus-kind vcan1=embedded --bus-kind vcan2=embedded").end().well();
     place.is_left_clean();
+}
+
+/// A server of vcan0 that this test plays.
+struct PlayedServer {
+    listener: OwnedFd,
+    decoder: Decoder,
+    /// Packets that came.
+    packets: u16,
+}
+
+impl PlayedServer {
+    fn at(place: &Place) -> Self {
+        let directory = place.buses();
+        DirBuilder::new().recursive(true).mode(0o700).create(&directory).unwrap();
+        std::fs::set_permissions(&directory, Permissions::from_mode(0o700)).unwrap();
+        let listener = seqpacket(SocketFlags::empty()).unwrap();
+        rustix::net::bind(&listener, &address(&directory, "vcan0").unwrap()).unwrap();
+        rustix::net::listen(&listener, 8).unwrap();
+        Self { listener, decoder: Decoder::new(None), packets: 0 }
+    }
+
+    /// Lets a client in.
+    fn admits(&self) -> OwnedFd {
+        let client = rustix::net::accept(&self.listener).unwrap();
+        rustix::net::recv(&client, &mut [0; HELLO_MAX], RecvFlags::empty()).unwrap();
+        let answer = Answer::Welcome { granted: 1 << 20 }.encode();
+        rustix::net::send(&client, &answer, SendFlags::NOSIGNAL).unwrap();
+        client
+    }
+
+    /// Waits for the next message of a cell; nothing when it has sent all that it can.
+    fn receives(&mut self, client: &OwnedFd) -> Option<Message> {
+        loop {
+            let mut bytes = [0; 72];
+            let (length, _) = rustix::net::recv(client, &mut bytes, RecvFlags::empty()).unwrap();
+            let frame = Frame::from_bytes(bytes.get(..length).filter(|bytes| !bytes.is_empty())?).unwrap();
+            let Decoded::Message(message) = self.decoder.decode(Micros(0), "vcan0", &frame) else { continue };
+            if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = &message {
+                assert_eq!(heartbeat.sent, self.packets, "what it counts as sent has come");
+            }
+            self.packets += 1;
+            return Some(message);
+        }
+    }
+}
+
+#[test]
+fn what_a_cell_counts_as_sent_was_taken_by_its_bus_however_often_it_is_hung_up_on() {
+    let place = Place::new();
+    let mut server = PlayedServer::at(&place);
+    let words = "--bus vcan0 --bus-kind embedded --node 5 --skin skin.toml --reconnect";
+    let cell = place.start("cell-node", words);
+    let request = Request::Read { number: Parameter::Reply.number() };
+    let request = Message::Configure { to: Node::Everyone, tag: 1, request }.encode();
+    for _ in 0..4 {
+        // The one that wakes it, and the one for what may wait.
+        let [bus, deferred] = [(); 2].map(|()| server.admits());
+        let mut heartbeats = 0;
+        while heartbeats < 3 {
+            let message = server.receives(&bus).unwrap();
+            heartbeats +=
+                u32::from(matches!(message, Message::Network { page: NetworkPage::Heartbeat(_), .. }));
+        }
+        // From here on it cannot send, and it does not know that before it answers.
+        rustix::net::shutdown(&bus, Shutdown::Read).unwrap();
+        while server.receives(&bus).is_some() {}
+        for frame in request.frames(Format::Fd) {
+            // Its heartbeat may have been first, and then it is gone.
+            let _ = rustix::net::send(&bus, &frame.to_bytes()[..frame.byte_len()], SendFlags::NOSIGNAL);
+        }
+        drop((bus, deferred));
+    }
+    drop(cell);
 }

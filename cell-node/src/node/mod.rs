@@ -172,6 +172,12 @@ impl Node {
         Some(message.encode())
     }
 
+    /// Takes back a packet that was never sent, because the shell has no bus; what was taken for sending after it was not
+    /// sent either.
+    pub const fn handle_unsent(&mut self) {
+        self.sent = self.sent.wrapping_sub(1);
+    }
+
     /// When [`Node::handle_timeout`] has something to do; calling it earlier does no harm.
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
