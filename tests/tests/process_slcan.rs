@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use process::{Place, Running, until};
 use protocol::bus::{Bus, Inbox, Options};
-use protocol::can::{EXTENDED, Frame};
+use protocol::can::{ERROR, ERROR_STATE, EXTENDED, EXTENDED_MASK, Frame};
 use rustix::process::Signal;
 use serde_json::Value;
 use slcan::{Peer, Pty, carry};
@@ -24,7 +24,12 @@ struct Bench {
 }
 
 fn client(place: &Place) -> Bus {
+    client_with(place, 0)
+}
+
+fn client_with(place: &Place, error_mask: u32) -> Bus {
     let options = Options {
+        error_mask,
         directory: Some(place.buses()),
         receive_buffer: 64 << 20,
         send_timeout: Duration::from_secs(20),
@@ -166,6 +171,107 @@ fn garbage_is_counted_and_what_follows_it_is_read() {
     let refused = serde_json::json!({"garbage": 1, "long": 1, "short": 1, "dlc": 1, "identifier": 1});
     assert_eq!(line["to_bus"]["refused"], refused);
     assert_eq!((&line["to_bus"]["bells"], &line["to_bus"]["other_lines"]), (&1.into(), &1.into()));
+}
+
+#[test]
+fn an_adapter_that_was_deaf_when_it_was_opened_is_opened_again_at_its_first_refusal() {
+    let bench = Bench::new();
+    let mut pty = Pty::new();
+    let bridge = bench.joined(&format!("{} --bit-rates 500k", pty.path.display()));
+    pty.peer.hears("\rC\rS6\rY0\rO\r");
+    pty.peer.bytes.clear();
+    let frames = [1, 2].map(|id| Frame::classic(id, &[]).unwrap());
+    bench.client.send(&frames[..1]).unwrap();
+    pty.peer.hears("t0010\r");
+    pty.peer.says(b"\x07");
+    pty.peer.hears("\rC\rS6\rY0\rO\r");
+    bridge.hears("its adapter refuses frames (BEL)");
+    bridge.hears("1 more frames to the line lost, in all 1 dropped (1 refused by the adapter)");
+    // It is open now.
+    pty.peer.says(b"\r\r\r");
+    bench.client.send(&frames[1..]).unwrap();
+    pty.peer.hears("t0020\r");
+    pty.peer.says(b"z\r\x07z\r");
+    pty.peer.sends(&frames);
+    assert_eq!(bench.receives(2), frames);
+    let [line] = ended(bridge).try_into().unwrap();
+    assert_eq!((&line["reopened"], &line["to_bus"]["bells"]), (&1.into(), &2.into()), "{line}");
+    assert_eq!(pty.peer.bytes.windows(2).filter(|bytes| bytes == b"O\r").count(), 1, "{line}");
+}
+
+#[test]
+fn a_bit_rate_that_an_adapter_does_not_have_is_reported() {
+    let bench = Bench::new();
+    let mut pty = Pty::new();
+    let bridge = bench.joined(&format!("{} --bit-rates 500k/2M", pty.path.display()));
+    // Closing what is closed is refused as well, and means nothing.
+    pty.peer.hears("C\r");
+    pty.peer.says(b"\x07");
+    pty.peer.hears("S6\r");
+    pty.peer.says(b"\x07");
+    bridge.hears("its adapter refused a command of S6, Y2 (BEL)");
+    pty.peer.hears("Y2\rO\r");
+    let [line] = ended(bridge).try_into().unwrap();
+    assert_eq!((&line["reopened"], &line["to_line"]["dropped"]["refused"]), (&0.into(), &0.into()), "{line}");
+}
+
+#[test]
+fn faults_of_an_adapter_are_reported_counted_and_error_frames_on_the_bus() {
+    let bench = Bench::new();
+    let mut pty = Pty::new();
+    let bridge = bench.joined(&pty.path.display().to_string());
+    pty.peer.hears("O\r");
+    let errors = client_with(&bench.place, EXTENDED_MASK);
+    pty.peer.says(b"e1a\rsb256256\rF80\r");
+    let expected = [(0xA8, [0, 0, 0, 0x19]), (0x40, [0; 4]), (0x88, [0; 4])]
+        .map(|(class, [a, b, c, d])| Frame::classic(ERROR | class, &[a, b, c, d, 0, 0, 0, 0]).unwrap());
+    let (mut inbox, mut frames) = (Inbox::new(), Vec::new());
+    until("error frames", || {
+        errors.receive(&mut inbox).unwrap();
+        frames.extend(inbox.frames().map(|received| received.frame));
+        (frames.len() >= 3).then_some(())
+    });
+    assert_eq!(frames, expected);
+    for fault in ["no ACK", "bus off", "bus error"] {
+        until(fault, || bridge.stderr().contains(fault).then_some(()));
+    }
+    assert!(bridge.stderr().contains(": its adapter reports "), "{}", bridge.stderr());
+    let [line] = ended(bridge).try_into().unwrap();
+    assert_eq!(line["faults"], serde_json::json!({"no ACK": 1, "bus off": 1, "bus error": 1}));
+    assert_eq!((&line["to_bus"]["sent"], &line["to_bus"]["other_lines"]), (&3.into(), &0.into()));
+}
+
+#[test]
+fn the_state_of_a_sender_behind_the_data_is_that_of_the_frame() {
+    let bench = Bench::new();
+    let mut pty = Pty::new();
+    let bridge = bench.joined(&pty.path.display().to_string());
+    pty.peer.says(b"t1232AABB0\rt1232AABB0A510\rt1232AABB0000000F1\rb1232AABBS\rd1232AABB1\r");
+    let data = [0xAA, 0xBB];
+    let classic = Frame::classic(0x123, &data).unwrap();
+    let fd = [1, 0].map(|flags| Frame::fd(0x123, flags | ERROR_STATE, &data).unwrap());
+    assert_eq!(bench.receives(5), [classic, classic, classic, fd[0], fd[1]]);
+    let [line] = ended(bridge).try_into().unwrap();
+    assert_eq!((&line["to_bus"]["sent"], &line["to_bus"]["refused"]["long"]), (&5.into(), &0.into()));
+}
+
+#[test]
+fn a_board_that_opening_its_line_resets_is_left_alone_until_it_has_started() {
+    let bench = Bench::new();
+    let [mut slow, mut quick] = [Pty::new(), Pty::new()];
+    let bridge =
+        bench.joined(&format!("{},settle=60 {},settle=0.01", slow.path.display(), quick.path.display()));
+    quick.peer.hears("\rC\rO\r");
+    let frame = Frame::classic(1, &[]).unwrap();
+    bench.client.send(&[frame]).unwrap();
+    assert_eq!(quick.peer.receives(1), [frame]);
+    let [first, second] = ended(bridge).try_into().unwrap();
+    slow.peer.look();
+    assert_eq!(slow.peer.bytes, b"", "nothing was written");
+    assert_eq!(
+        (&first["to_line"]["dropped"]["line_away"], &second["to_line"]["sent"]),
+        (&1.into(), &1.into())
+    );
 }
 
 /// A line goes and comes back; `connect` makes its other end. How many lines were cut off in the middle.
