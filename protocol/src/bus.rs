@@ -260,7 +260,8 @@ impl Bus {
         self.failed.store(false, Ordering::Relaxed);
         let mut give_up = None;
         loop {
-            match receive(&mut inbox.batch, &self.socket) {
+            let received = inbox.failure.take().map_or_else(|| receive(&mut inbox.batch, &self.socket), Err);
+            match received {
                 Ok(_) => break,
                 // The server ended with frames of ours unread: what it had sent can still be read.
                 Err(error) if is(&error, Errno::CONNRESET) => {}
@@ -271,7 +272,8 @@ impl Bus {
                 Err(error) => return Err(self.io_error("receive from", error)),
             }
         }
-        self.failed.store(inbox.batch.has_failed(), Ordering::Relaxed);
+        inbox.failure = inbox.batch.take_failure();
+        self.failed.store(inbox.failure.is_some(), Ordering::Relaxed);
         let over = inbox.take(self.carrier());
         match inbox.frames().len() {
             0 if over => Err(BusError::Closed(self.name.clone())),

@@ -33,8 +33,8 @@ pub(super) struct Slot {
 pub struct Batch {
     slots: Box<[Slot; BATCH]>,
     count: usize,
-    /// An error behind the datagrams, which the kernel reports once.
-    failed: Option<io::Error>,
+    /// An error behind the datagrams of the last reception, which the kernel reports once.
+    failure: Option<io::Error>,
 }
 
 impl Batch {
@@ -42,7 +42,7 @@ impl Batch {
     #[must_use]
     pub fn new() -> Self {
         let slot = || Slot { bytes: [0; FD_BYTES], control: [0; 8], len: 0, control_len: 0, flags: 0 };
-        Self { slots: Box::new(std::array::from_fn(|_| slot())), count: 0, failed: None }
+        Self { slots: Box::new(std::array::from_fn(|_| slot())), count: 0, failure: None }
     }
 
     /// Takes what is waiting in a socket, and forgets what was here. Never waits.
@@ -50,39 +50,33 @@ impl Batch {
     /// # Errors
     /// The error of `recvmmsg`; [`io::ErrorKind::WouldBlock`] when nothing is waiting.
     pub fn receive(&mut self, fd: impl AsFd) -> io::Result<usize> {
-        self.count = 0;
-        if let Some(error) = self.failed.take() {
-            return Err(error);
-        }
+        (self.count, self.failure) = (0, None);
         let (fd, slots) = (fd.as_fd(), self.slots.as_mut_slice());
         let Some((few, rest)) = slots.split_first_chunk_mut::<FEW>() else { return Ok(0) };
         self.count = uninterrupted(|| calls::receive(fd, few, false))?;
         if let (FEW, Some(many)) = (self.count, rest.first_chunk_mut::<{ BATCH - FEW }>()) {
             match uninterrupted(|| calls::receive(fd, many, false)) {
                 Ok(count) => self.count += count,
-                Err(error) => self.failed = Some(error).filter(|it| it.kind() != io::ErrorKind::WouldBlock),
+                Err(error) => self.failure = Some(error).filter(|it| it.kind() != io::ErrorKind::WouldBlock),
             }
         }
         Ok(self.count)
     }
 
-    /// Whether the next [`Batch::receive`] returns an error that the kernel does not report again.
-    pub(super) const fn has_failed(&self) -> bool {
-        self.failed.is_some()
+    /// The error behind what was received last, if there was one.
+    pub(super) const fn take_failure(&mut self) -> Option<io::Error> {
+        self.failure.take()
     }
 
     #[cfg(test)]
-    pub(super) fn fail_next(&mut self, error: io::Error) {
-        self.failed = Some(error);
+    pub(super) fn fail_behind(&mut self, error: io::Error) {
+        self.failure = Some(error);
     }
 
     /// Waits for one datagram for at most the socket's `SO_RCVTIMEO`, and takes only this one: who is
     /// woken for each would look for a second in vain.
     pub(super) fn receive_one_patiently(&mut self, fd: impl AsFd) -> io::Result<usize> {
-        self.count = 0;
-        if let Some(error) = self.failed.take() {
-            return Err(error);
-        }
+        (self.count, self.failure) = (0, None);
         let Some((one, _)) = self.slots.split_first_chunk_mut::<1>() else { return Ok(0) };
         self.count = calls::receive(fd.as_fd(), one, true)?;
         Ok(self.count)

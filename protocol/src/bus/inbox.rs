@@ -1,5 +1,7 @@
 //! Where received frames land.
 
+use std::io;
+
 use super::batch::{BATCH, Batch};
 use super::kinds::Carrier;
 use crate::can::Frame;
@@ -21,6 +23,8 @@ pub struct Received {
 #[derive(Debug)]
 pub struct Inbox {
     pub(super) batch: Batch,
+    /// An error behind the frames, for the next reception.
+    pub(super) failure: Option<io::Error>,
     frames: Vec<Received>,
     dropped: u32,
     unreadable: u64,
@@ -30,7 +34,13 @@ impl Inbox {
     /// Empty buffers for up to 64 frames.
     #[must_use]
     pub fn new() -> Self {
-        Self { batch: Batch::new(), frames: Vec::with_capacity(BATCH), dropped: 0, unreadable: 0 }
+        Self {
+            batch: Batch::new(),
+            failure: None,
+            frames: Vec::with_capacity(BATCH),
+            dropped: 0,
+            unreadable: 0,
+        }
     }
 
     /// The frames of the last [`super::Bus::receive`], in the order in which they came.
@@ -59,7 +69,7 @@ impl Inbox {
 
     /// Reads the batch's datagrams into frames; whether the other end is gone, after these.
     pub(super) fn take(&mut self, carrier: &dyn Carrier) -> bool {
-        let Self { batch, frames, dropped, unreadable } = self;
+        let Self { batch, frames, dropped, unreadable, failure: _ } = self;
         frames.clear();
         for datagram in batch.datagrams() {
             let bytes = datagram.bytes();

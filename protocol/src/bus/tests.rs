@@ -94,7 +94,7 @@ fn an_error_behind_frames_is_reported_by_the_next_receive_for_which_nothing_wait
     let mut inbox = Inbox::new();
     let count = bus.take(&mut inbox, |batch, socket| {
         let count = batch.receive(socket)?;
-        batch.fail_next(Errno::PIPE.into());
+        batch.fail_behind(Errno::PIPE.into());
         Ok(count)
     });
     assert_eq!(count.unwrap(), 1);

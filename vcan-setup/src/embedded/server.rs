@@ -28,9 +28,9 @@ mod tests;
 /// Batches taken from one client before the next one's turn: what its send buffer holds, and more.
 const DRAIN: usize = 16;
 /// How long a socket is left alone after an error that may last, such as a lack of memory or of files.
-const PAUSE: Duration = Duration::from_millis(10);
+const PAUSE: Duration = Duration::from_millis(1);
 /// Receptions in succession that may fail before a client is given up: a second of them.
-const FAILURES: u32 = 100;
+const FAILURES: u32 = 1_000;
 const LISTENER: u64 = u64::MAX;
 const STOP: u64 = u64::MAX - 1;
 
@@ -294,6 +294,7 @@ impl Server {
                     return self.fails(id, Errno::from_io_error(&error).unwrap_or(Errno::IO));
                 }
             }
+            let mut failure = None;
             for datagram in batch.datagrams() {
                 let bytes = datagram.bytes();
                 // A closed socket reads as empty datagrams without end.
@@ -301,7 +302,7 @@ impl Server {
                     match self.is_hung_up(id) {
                         Ok(true) => return self.forget(id),
                         Ok(false) => {}
-                        Err(errno) => return self.fails(id, errno),
+                        Err(errno) => failure = Some(errno),
                     }
                 }
                 match bytes.and_then(|bytes| Parcel::accept(bytes, fd)) {
@@ -309,6 +310,9 @@ impl Server {
                     None if bytes.is_some_and(|bytes| self.refilter(id, bytes)) => {}
                     None => self.post.totals.garbage += 1,
                 }
+            }
+            if let Some(errno) = failure {
+                return self.fails(id, errno);
             }
             if batch.datagrams().len() < BATCH {
                 return;
@@ -377,14 +381,20 @@ impl Server {
         match client.flush(post) {
             Sent::Done => {}
             Sent::Shortage => self.pause(id.0 as u64),
-            Sent::Gone => self.silence(id),
+            Sent::Gone => self.release(id),
             Sent::Failed(errno) => {
-                // It sees that it is hung up on and connects again; what it has sent is received until then.
-                let _ = shutdown(&client.socket, Shutdown::Write);
                 self.give_up(id, errno);
-                self.silence(id);
+                self.release(id);
             }
         }
+    }
+
+    /// Ends sending to a client: it sees that and may connect again, and what it has sent is received until it hangs up.
+    fn release(&mut self, id: ClientId) {
+        if let Some(client) = self.client(id) {
+            let _ = shutdown(&client.socket, Shutdown::Write);
+        }
+        self.silence(id);
     }
 
     fn unblock(&mut self, id: ClientId) {
@@ -406,6 +416,7 @@ impl Server {
 
     fn forget(&mut self, id: ClientId) {
         self.silence(id);
+        self.paused.retain(|token| *token != id.0 as u64);
         if let Some(slot) = self.clients.get_mut(id.0) {
             *slot = None;
         }

@@ -17,10 +17,13 @@ use crate::embedded::routing::ClientId;
 /// The most that a client's socket may hold, whatever it requests.
 const BUFFER_MAX: usize = 64 << 20;
 
+/// Clients taken before others have their turn.
+const ADMISSIONS: usize = 64;
+
 impl Server {
-    /// Lets waiting clients in.
+    /// Lets waiting clients in, or as many as may come before the next event.
     pub(super) fn accept(&mut self) {
-        loop {
+        for _ in 0..ADMISSIONS {
             match self.accepted() {
                 Ok(socket) => self.admit(socket),
                 Err(Errno::INTR | Errno::CONNABORTED) => {}
