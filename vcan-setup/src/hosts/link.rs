@@ -373,12 +373,10 @@ impl Link {
 
     /// Waits until there is something to do; whether it goes on.
     fn wait(&self, stop: &impl AsFd) -> io::Result<bool> {
+        let mut polled =
+            vec![PollFd::new(stop, PollFlags::IN), PollFd::new(&self.shared.wake, PollFlags::IN)];
         let listener = self.watchers.listener();
-        let mut polled = vec![
-            PollFd::new(stop, PollFlags::IN),
-            PollFd::new(&self.shared.wake, PollFlags::IN),
-            PollFd::new(&listener, PollFlags::IN),
-        ];
+        polled.extend(listener.map(|listener| PollFd::from_borrowed_fd(listener, PollFlags::IN)));
         polled.extend(self.bus.as_ref().map(|bus| PollFd::from_borrowed_fd(bus.as_fd(), PollFlags::IN)));
         let is_full = !self.shared.incoming().waiting().is_empty();
         let until_told = self.tell_at.saturating_duration_since(Instant::now());
@@ -389,6 +387,8 @@ impl Link {
         };
         match poll(&mut polled, Timespec::try_from(timeout).ok().as_ref()) {
             Ok(_) | Err(Errno::INTR) => {}
+            // No memory for a moment: everything is looked at.
+            Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(RETRY),
             Err(errno) => return Err(errno.into()),
         }
         let came = |at: usize| polled.get(at).is_some_and(|polled| !polled.revents().is_empty());

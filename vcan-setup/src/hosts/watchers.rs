@@ -1,6 +1,6 @@
 //! Programs of this machine that want to know what a link knows.
 
-use std::io::Write;
+use std::io::{ErrorKind, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::{UnixListener, UnixStream};
 
@@ -16,21 +16,31 @@ pub(super) struct Watchers {
     streams: Vec<UnixStream>,
     /// The newest report that all of them have, as a line.
     line: Vec<u8>,
+    /// Nobody can be taken now, whoever waits: there is no file.
+    is_full: bool,
 }
 
 impl Watchers {
     pub(super) const fn new(listener: UnixListener) -> Self {
-        Self { listener, streams: Vec::new(), line: Vec::new() }
+        Self { listener, streams: Vec::new(), line: Vec::new(), is_full: false }
     }
 
-    /// Readable when somebody connects.
-    pub(super) fn listener(&self) -> BorrowedFd<'_> {
-        self.listener.as_fd()
+    /// Readable when somebody connects; nothing to wait for while nobody can be taken.
+    pub(super) fn listener(&self) -> Option<BorrowedFd<'_>> {
+        (!self.is_full).then(|| self.listener.as_fd())
     }
 
     /// Takes those that connect, and gives them the newest report.
     pub(super) fn accept(&mut self) {
-        while let Ok((mut stream, _)) = self.listener.accept() {
+        loop {
+            let mut stream = match self.listener.accept() {
+                Ok((stream, _)) => stream,
+                Err(error) if error.kind() == ErrorKind::Interrupted => continue,
+                Err(error) => {
+                    self.is_full = error.kind() != ErrorKind::WouldBlock;
+                    return;
+                }
+            };
             let is_taken = self.streams.len() < WATCHERS
                 && stream.set_nonblocking(true).is_ok()
                 && stream.write_all(&self.line).is_ok();

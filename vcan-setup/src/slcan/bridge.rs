@@ -180,6 +180,8 @@ impl Bridge {
         let timeout = next.and_then(|next| Timespec::try_from(next.saturating_duration_since(now)).ok());
         match poll(&mut polled, timeout.as_ref()) {
             Ok(_) | Err(Errno::INTR) => {}
+            // No memory for a moment: everything is looked at.
+            Err(Errno::NOMEM | Errno::AGAIN) => std::thread::sleep(AGAIN),
             Err(errno) => return Err(errno.into()),
         }
         let mut came = polled.iter().map(|polled| !polled.revents().is_empty());
