@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use protocol::skin::Skin;
 use rustix::fs::{Mode, fchmod};
+use rustix::io::Errno;
 use rustix::net::SocketAddrUnix;
 use thiserror::Error;
 
@@ -111,7 +112,8 @@ impl External {
         let state = State { input: *input, joints: self.joints }.encode();
         let sent = match self.socket.send_to_addr(&state, peer) {
             Ok(_) => Sent::Taken,
-            Err(error) if error.kind() == ErrorKind::WouldBlock => Sent::QueueFull,
+            // None of these says that the peer has gone.
+            Err(error) if passes(&error) => Sent::QueueFull,
             Err(_) => Sent::NobodyThere,
         };
         if sent == Sent::NobodyThere {
@@ -177,6 +179,12 @@ fn bind_private(path: &Path) -> io::Result<UnixDatagram> {
     fchmod(&socket, Mode::RUSR | Mode::WUSR)?;
     rustix::net::bind(&socket, &SocketAddrUnix::new(path)?)?;
     Ok(socket)
+}
+
+/// Whether an error of a socket that does not wait may be gone at the next tick.
+fn passes(error: &io::Error) -> bool {
+    let errno = Errno::from_io_error(error);
+    matches!(errno, Some(Errno::AGAIN | Errno::INTR | Errno::NOMEM | Errno::NOBUFS))
 }
 
 /// Device and inode of a file.
