@@ -33,7 +33,7 @@ const AGAIN: Duration = Duration::from_millis(100);
 /// Waits while an interface is down before it is tried again.
 const DOWN: Duration = Duration::from_millis(100);
 
-/// How long frames are kept that a bus did not take. Epochs count modulo 256: older torques might be taken for others.
+/// Time for which frames are kept that a bus did not take. Epochs count modulo 256: older torques might be taken for others.
 const KEPT: Duration = Duration::from_millis(250);
 
 /// Cells in a process that may rest: more are woken as often by their heartbeats as by joints.

@@ -206,7 +206,7 @@ impl Bus {
         wait_on(&mut both, Some(timeout)).map_err(|errno| self.error("wait for", errno))
     }
 
-    /// Whether the next receive reports an error that the kernel does not report again.
+    /// Returns whether the next receive reports an error that the kernel does not report again.
     fn has_error(&self) -> bool {
         self.down.load(Ordering::Relaxed) || self.failed.load(Ordering::Relaxed)
     }
@@ -412,7 +412,7 @@ impl AsFd for Bus {
 
 /// How long a full transmit queue is left alone: a few frames at 1 Mbit/s.
 const RECHECK: Duration = Duration::from_micros(500);
-/// How long the system may lack the memory to receive before that is an error.
+/// Time for which the system may lack the memory to receive before that is an error.
 const SHORTAGE: Duration = Duration::from_millis(100);
 
 fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, Errno> {
@@ -428,7 +428,7 @@ fn wait_on(what: &mut [PollFd<'_>], timeout: Option<Duration>) -> Result<bool, E
     }
 }
 
-/// Whether it is still before the time to give up, which is set at the first call.
+/// Returns whether it is before the time to give up, which the first call sets.
 fn is_before(give_up: &mut Option<Instant>, after: Duration) -> bool {
     let now = Instant::now();
     now < *give_up.get_or_insert(now + after)

@@ -6,7 +6,7 @@ use protocol::can::Frame;
 #[derive(Debug, Default)]
 pub(super) struct Outbox {
     frames: Vec<Frame>,
-    /// Of the last frame of a packet, the place of the cell that counts it.
+    /// For the last frame of a packet: the place of the cell that counts it.
     ends: Vec<Option<usize>>,
 }
 

@@ -261,7 +261,7 @@ pub fn send_one(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
     Ok(1)
 }
 
-/// Whether the system lacks memory at the moment: an error that passes, and says nothing of the socket.
+/// Returns whether an error means that the system lacks memory: it passes, and says nothing about the socket.
 #[must_use]
 pub fn is_shortage(error: &io::Error) -> bool {
     let errno = error.raw_os_error().map(Errno::from_raw_os_error);

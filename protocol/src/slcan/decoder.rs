@@ -97,12 +97,12 @@ pub struct Decoder {
     endings: Endings,
 }
 
-/// Whether an adapter's frames end with a digit for the state of their sender. Either all of them do or none: so a line
-/// that lost a byte is not mistaken for one that ends otherwise.
+/// Tells by earlier frames whether an adapter's frames end with a digit for the state of their sender. Either all of them
+/// do or none: so a line that lost a byte is not mistaken for one that ends otherwise.
 #[derive(Clone, Debug, Default)]
 struct Endings {
     has_state: bool,
-    /// So many frames in succession ended in this way.
+    /// Number of frames in succession that ended in this way.
     same: u8,
     /// The last one ended in the other way.
     other: bool,

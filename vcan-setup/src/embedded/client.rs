@@ -25,7 +25,7 @@ pub(super) struct Post {
     pub(super) totals: Totals,
 }
 
-/// What became of what waits for a client.
+/// Outcome of sending what waits for a client.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Sent {
     /// It was sent, or waits until its socket has room, which `epoll` reports.

@@ -27,7 +27,7 @@ mod tests;
 
 /// Batches taken from one client before the next one's turn: what its send buffer holds, and more.
 const DRAIN: usize = 16;
-/// How long a socket is left alone after an error that may last, such as a lack of memory or of files.
+/// Time for which a socket is left alone after an error that may last, such as a lack of memory or of files.
 const PAUSE: Duration = Duration::from_millis(1);
 /// Receptions in succession that may fail before a client is given up: a second of them.
 const FAILURES: u32 = 1_000;

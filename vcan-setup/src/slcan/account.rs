@@ -97,7 +97,7 @@ pub struct Account {
     pub opened: u64,
     /// How often it went away.
     pub lost: u64,
-    /// How often its adapter was opened again, because it refused frames.
+    /// Number of times its adapter was opened again, because it refused frames.
     pub reopened: u64,
     /// From the bus to the line.
     pub to_line: ToLine,

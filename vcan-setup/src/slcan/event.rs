@@ -1,10 +1,10 @@
-//! What happens to a line, as it is reported while it runs.
+//! Events of a line, as they are reported while it runs.
 
 use std::fmt;
 
 use super::account::Account;
 
-/// What happened to a line.
+/// Event of a line.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Event {
     /// The line is open.
@@ -17,9 +17,9 @@ pub enum Event {
     BusAway(String),
     /// Frames were lost since the last report.
     Lost {
-        /// Of those from the bus.
+        /// Frames from the bus.
         to_line: u64,
-        /// Of those from the line, and lines that could not be used.
+        /// Frames from the line, and lines that could not be used.
         to_bus: u64,
         /// All so far.
         account: Box<Account>,

@@ -27,12 +27,12 @@ pub struct Incoming {
     faults: Faults,
 }
 
-/// What an adapter replied since it was opened.
+/// Replies of an adapter since it was opened.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Replies {
     /// It acknowledged a line, or sent a frame.
     pub accepted: bool,
-    /// So many refusals in succession.
+    /// Number of refusals in succession.
     pub refusals: u64,
 }
 
@@ -83,7 +83,7 @@ impl Incoming {
         }
     }
 
-    /// What the adapter replied since it was opened.
+    /// Returns the adapter's replies since it was opened.
     #[must_use]
     pub const fn replies(&self) -> Replies {
         self.replies

@@ -41,7 +41,7 @@ pub struct LineOptions {
     pub baud: Option<u32>,
     /// The adapter has no CAN FD: FD frames are dropped.
     pub classic: bool,
-    /// How long the adapter needs after its line was opened, before it takes commands: boards that opening resets.
+    /// Time that the adapter needs after its line was opened, before it takes commands: boards that opening resets.
     pub settle: Duration,
 }
 
@@ -78,7 +78,7 @@ pub enum LineError {
 const MAX_SETTLE: f64 = 60.0;
 /// From a command of the opening to the next: adapters handle one in a USB packet, and answer within this time.
 const COMMAND_GAP: Duration = Duration::from_millis(10);
-/// The same after the adapter was closed: its answer, a refusal when it was closed already, is one to no other command.
+/// Gap after closing the adapter: its answer, a refusal when it was closed already, comes before any other command.
 const CLOSE_GAP: Duration = Duration::from_millis(30);
 
 /// A command of the opening.
@@ -88,11 +88,11 @@ pub struct OpeningStep {
     pub bytes: Vec<u8>,
     /// From it to the next line.
     pub gap: Duration,
-    /// What the adapter is in from there on.
+    /// Stage of the adapter from there on.
     pub stage: Stage,
 }
 
-/// How far an adapter is opened.
+/// Stage of opening an adapter.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Stage {
     /// Nothing was sent to it.
@@ -110,7 +110,7 @@ pub enum Stage {
 const RATES: &str = "slcan has the bit rates 10k, 20k, 50k, 83.3k, 100k, 125k, 250k, 500k, 750k or 800k, and 1M; \
                      for data 500k and whole Mbit/s up to 8M";
 
-/// What [`LineOptions::settle`] may be, in an error.
+/// Values of [`LineOptions::settle`], for an error.
 pub const SETTLE: &str = "seconds from 0 to 60, such as 2 or 0.5";
 
 /// Reads [`LineOptions::settle`].
@@ -179,7 +179,7 @@ impl LineOptions {
         .collect()
     }
 
-    /// Whether frames may switch to the data bit rate. Where it equals the nominal one they gain nothing by it, and would
+    /// Returns whether frames may switch to the data bit rate. Where it equals the nominal one they gain nothing by it, and would
     /// lose by an adapter that does not have the command for it.
     #[must_use]
     pub fn switches_bit_rate(&self) -> bool {

@@ -46,7 +46,7 @@ struct Entry {
     kind: Kind,
 }
 
-/// What a text is.
+/// Kind of a text.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Kind {
     Frame,
@@ -91,7 +91,7 @@ impl Outgoing {
         Self { classic, pace, ..Self::default() }
     }
 
-    /// The same for a line with these options.
+    /// Builds the way to a line with these options.
     #[must_use]
     pub fn of(options: &LineOptions) -> Self {
         let one_rate = !options.switches_bit_rate();
@@ -118,7 +118,7 @@ impl Outgoing {
         self.entries.extend(entries);
     }
 
-    /// How far the adapter is opened.
+    /// Returns the stage of opening the adapter.
     #[must_use]
     pub const fn stage(&self) -> Stage {
         self.stage
@@ -250,7 +250,7 @@ impl Outgoing {
     }
 }
 
-/// The same FD frame at one bit rate.
+/// Returns an FD frame without its bit rate switch.
 fn unswitched(frame: &Frame) -> Option<Frame> {
     let flags = frame.flags() & !BIT_RATE_SWITCH;
     Frame::with_data(frame.raw_id(), frame.format(), flags, frame.data()).ok()
@@ -281,7 +281,7 @@ mod tests {
         vec![OpeningStep { bytes: text.to_vec(), gap: Duration::ZERO, stage: Stage::Open }]
     }
 
-    /// What is written until nothing is left, or no more at once.
+    /// Writes until nothing is left, or no more at once.
     fn drain(outgoing: &mut Outgoing, now: Duration) -> Vec<u8> {
         let mut all = Vec::new();
         loop {

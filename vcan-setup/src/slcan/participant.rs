@@ -193,7 +193,7 @@ impl Participant {
         self.losses() != self.reported || *self.incoming.faults() != self.reported_faults
     }
 
-    /// Whether there is a fault that was never reported before: it does not wait.
+    /// Returns whether there is a fault that was never reported before: it does not wait.
     fn has_new_fault(&self) -> bool {
         self.incoming.faults().len() > self.reported_faults.len()
     }

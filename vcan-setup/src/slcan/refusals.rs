@@ -7,25 +7,25 @@ use super::options::Stage;
 
 /// From one opening after a refusal to the next: it takes the adapter off its bus for a moment.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// The same when opening it again does not help.
+/// Longest pause, when opening it again does not help.
 const LONGEST_PAUSE: Duration = Duration::from_secs(30);
 /// Refusals in succession of an adapter that has accepted lines before: its queue may be full for a moment.
 const MANY: u64 = 8;
 
-/// What refused lines call for.
+/// Action that refused lines call for.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Action {
     /// Nothing: there are none, or they are expected.
     Nothing,
     /// The adapter does not have a setting.
     ReportSettings,
-    /// So many lines were refused by an adapter that was opened.
+    /// Count these refused lines of an adapter that was opened.
     Count(u64),
-    /// The same, and the adapter is closed or was reset: open it again.
+    /// Count them, and open the adapter again, which is closed or was reset.
     Reopen(u64),
 }
 
-/// What is remembered of an adapter's refusals. Takes counts and times, and touches nothing.
+/// Memory of an adapter's refusals. Takes counts and times, and touches nothing.
 #[derive(Debug)]
 pub struct Refusals {
     seen: u64,
@@ -35,13 +35,13 @@ pub struct Refusals {
 }
 
 impl Refusals {
-    /// Of an adapter that has refused nothing.
+    /// Starts with an adapter that has refused nothing.
     #[must_use]
     pub const fn new() -> Self {
         Self { seen: 0, next: Duration::ZERO, pause: FIRST_PAUSE, reopened: 0 }
     }
 
-    /// How often it was opened again.
+    /// Returns the number of times it was opened again.
     #[must_use]
     pub const fn reopened(&self) -> u64 {
         self.reopened

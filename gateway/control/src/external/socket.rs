@@ -181,7 +181,7 @@ fn bind_private(path: &Path) -> io::Result<UnixDatagram> {
     Ok(socket)
 }
 
-/// Whether an error of a socket that does not wait may be gone at the next tick.
+/// Returns whether an error of a socket that does not wait may be gone at the next tick.
 fn passes(error: &io::Error) -> bool {
     let errno = Errno::from_io_error(error);
     matches!(errno, Some(Errno::AGAIN | Errno::INTR | Errno::NOMEM | Errno::NOBUFS))
