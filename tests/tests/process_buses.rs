@@ -346,6 +346,7 @@ impl PlayedServer {
 #[test]
 fn what_a_cell_counts_as_sent_was_taken_by_its_bus_however_often_it_is_hung_up_on() {
     let place = Place::new();
+    place.write("skin.toml", &skin_of(CELLS, 1, Wire::Fd));
     let mut server = PlayedServer::at(&place);
     let words = "--bus vcan0 --bus-kind embedded --node 5 --skin skin.toml --reconnect";
     let cell = place.start("cell-node", words);
