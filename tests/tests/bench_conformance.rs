@@ -79,6 +79,30 @@ fn without_a_restart_what_shows_only_at_a_start_is_not_tested() {
     assert_eq!(untested, ["ID-3", "CLAIM-1", "CLAIM-2", "CLAIM-3", "CLAIM-4", "CLAIM-5", "CONF-8"]);
 }
 
+/// A restart may end the former life of a cell anywhere, also between the segments of an answer; nothing of it counts.
+#[test]
+fn a_right_cell_that_is_cut_off_anywhere_passes() {
+    let longest = Span(3_000);
+    let only = Only::new(&["SEND-1", "CLAIM", "CONF-8", "ID-3"].map(str::to_owned)).unwrap();
+    let runs =
+        std::env::var("SKINBUS_RESTARTS").map_or(8, |restarts| restarts.parse::<u64>().unwrap().div_ceil(13));
+    let (mut restarts, mut torn) = (0, 0);
+    for run in 0..runs {
+        // The last of the restarts of a run comes while a commit is answered: it is another place in each run.
+        let first = Span(run * longest.0 / runs);
+        let mut bus = Virtual::new(Format::Classic, 12, Box::new(Right)).cut(first, Span(233), longest);
+        let (findings, failed) = test(&mut bus, Format::Classic, 12, &only);
+        assert_eq!(failed, [""; 0], "run {run} of {runs}\n{}", failures(&findings));
+        let (now, torn_now) = bus.restarted();
+        (restarts, torn) = (restarts + now, torn + torn_now);
+    }
+    println!("{restarts} restarts, {torn} of them in the middle of what was sent");
+    assert!(
+        restarts >= 10 * usize::try_from(runs).unwrap() && torn > 0,
+        "{restarts} restarts, {torn} in the middle"
+    );
+}
+
 /// A cell that waits for a processor skips joints and is late, as it may: nothing but times is held against it.
 #[test]
 fn a_cell_that_waits_for_a_processor_is_not_blamed() {

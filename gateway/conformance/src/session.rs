@@ -5,14 +5,15 @@ mod beats;
 mod exchange;
 mod joints;
 mod known;
+mod life;
 mod receive;
 mod request;
 
 use protocol::can::{Format, Frame};
 use protocol::candump::{Record, Timestamp};
-use protocol::id::CellId;
+use protocol::id::{CellId, Id};
 use protocol::message::{Heartbeat, Joints, Message, NetworkPage, SensorPage};
-use protocol::packet::{Epoch, Segment, Words};
+use protocol::packet::{Epoch, Words};
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::{Micros, Span};
 
@@ -20,10 +21,10 @@ use crate::bus::{Bus, Seen, Stop};
 use crate::findings::Findings;
 use crate::timing::Timings;
 
-use accounts::Accounts;
 pub(crate) use exchange::Exchange;
 pub(crate) use joints::Step;
 pub(crate) use known::{About, Known};
+use life::Life;
 pub(crate) use request::Reply;
 
 /// Longer than any answer takes that comes at all.
@@ -74,16 +75,12 @@ struct Clock {
     /// The same since a group of checks began, and ever.
     worst: Span,
     longest: Span,
-    /// The last torque was saturated.
-    saturated: bool,
     /// Packets whose segments came too late after each other.
     torn: usize,
     /// Heartbeats do not have the epoch of the last joints.
     other_epochs: bool,
     /// The cell is put back, whoever else is there.
     finishing: bool,
-    /// A regular heartbeat that nothing asked for.
-    regular: Option<Micros>,
     /// The last joints were too old when the cell came to them.
     skipped: bool,
     /// What an answer takes, with the way there and back.
@@ -120,21 +117,16 @@ pub struct Session<'a> {
     pub(crate) from: usize,
     /// Up to where they were expected.
     consumed: usize,
-    /// Segments that wait for the others, by kind, and when the last one came.
-    segments: [(Segment, Micros); 8],
     /// Joints whose answers came so late that the cell may have skipped them.
     pub(crate) skips: u16,
-    /// What was counted of the bus.
-    accounts: Accounts,
+    life: Life,
+    /// Frames of the cell since a restart began: it is not known yet to which life they belong.
+    held: Option<Vec<(Seen, Id)>>,
     /// What was found.
     pub findings: Findings,
     pub(crate) known: Known,
     pub(crate) about: About,
     tag: u8,
-    /// Of each heartbeat's *sent*: that of the last heartbeat, and packets since.
-    sent: Option<(u16, u16)>,
-    /// The last heartbeat had CLAIMING.
-    claiming: bool,
     pub(crate) timings: Timings,
     clock: Clock,
 }
@@ -161,15 +153,13 @@ impl<'a> Session<'a> {
             heard: Vec::new(),
             from: 0,
             consumed: 0,
-            segments: [const { (Segment::NONE, Micros(0)) }; 8],
             skips: 0,
-            accounts: Accounts::default(),
+            life: Life::default(),
+            held: None,
             findings: Findings::default(),
             known: Known::default(),
             about: About::default(),
             tag: 0x50,
-            sent: None,
-            claiming: false,
             timings: Timings::default(),
             clock: Clock {
                 last: now,
@@ -177,11 +167,9 @@ impl<'a> Session<'a> {
                 late: Span(0),
                 worst: Span(0),
                 longest: Span(0),
-                saturated: false,
                 torn: 0,
                 other_epochs: false,
                 finishing: false,
-                regular: None,
                 skipped: false,
                 round_trip: Span(0),
             },
@@ -268,13 +256,6 @@ impl<'a> Session<'a> {
     /// Packets of the cell since the exchange began.
     pub(crate) fn answers(&self) -> &[Heard] {
         self.heard.get(self.from..).unwrap_or_default()
-    }
-
-    /// The cell has been switched off: its counts begin again.
-    pub(crate) fn forget_counts(&mut self) {
-        self.sent = None;
-        self.segments = [const { (Segment::NONE, Micros(0)) }; 8];
-        self.accounts = Accounts::default();
     }
 
     /// Nothing that was written is taken for granted any more.
@@ -372,15 +353,19 @@ impl<'a> Session<'a> {
         core::mem::take(&mut self.clock.worst)
     }
 
-    /// Whether segments followed each other: those of a few packets may wait for a processor.
-    pub(crate) fn check_segments(&mut self) {
+    /// Checks that segments followed each other: those of a few packets may wait for a processor.
+    pub(crate) fn check_segments(&mut self) -> Result<(), Stop> {
         const FEW: usize = 3;
         if self.format == Format::Classic {
+            if self.life.is_waiting() {
+                self.idle(Span(PATIENT.0 + 10_000))?;
+            }
             let torn = self.clock.torn;
             self.check("SEND-1", torn <= FEW, || {
                 format!("of {torn} packets a segment came too late after the one before")
             });
         }
+        Ok(())
     }
 
     /// Measures what an answer takes.
@@ -408,14 +393,6 @@ impl<'a> Session<'a> {
     pub(crate) fn note_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
         let late = self.lateness();
         self.timings.note(what, answered.since(asked), late);
-    }
-
-    pub(crate) fn begin_restart(&mut self) -> Result<(), Stop> {
-        self.bus.begin_restart()
-    }
-
-    pub(crate) fn is_restarting(&mut self) -> Result<bool, Stop> {
-        self.bus.is_restarting()
     }
 
     /// Joints of this chain.

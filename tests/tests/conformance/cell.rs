@@ -100,6 +100,25 @@ pub(crate) struct Virtual {
     restart: Option<Micros>,
     restarts: bool,
     starved: Option<Starved>,
+    /// Time from one frame on the bus to the next.
+    frame: Span,
+    /// Duration of a commit.
+    stores: Span,
+    cuts: Cuts,
+}
+
+/// Times at which restarts end a life of the cell: each a step later after its command than the one before.
+#[derive(Default)]
+struct Cuts {
+    step: Span,
+    /// Delay after which the steps begin again.
+    longest: Span,
+    next: Span,
+    /// End of the present life.
+    at: Option<Micros>,
+    restarts: usize,
+    /// Restarts that kept a frame of the cell from the bus.
+    torn: usize,
 }
 
 impl Virtual {
@@ -122,6 +141,9 @@ impl Virtual {
             restart: None,
             restarts: true,
             starved: None,
+            frame: FRAME,
+            stores: Span(0),
+            cuts: Cuts::default(),
         };
         bus.start();
         bus
@@ -150,6 +172,33 @@ impl Virtual {
         self.busy = self.busy.max(self.now + span);
     }
 
+    /// A bus on which a classic frame takes as long as at 1 Mbit/s, and a cell whose commits take 1 ms and which lives for a
+    /// while after the command of a restart: from `first` to `longest`, each time a `step` longer.
+    pub(crate) fn cut(mut self, first: Span, step: Span, longest: Span) -> Self {
+        self.frame = Span(120);
+        self.stores = Span(1_000);
+        self.cuts = Cuts { step, longest, next: first, ..Cuts::default() };
+        self
+    }
+
+    /// Returns how often it was restarted, and how often that kept a frame of the cell from the bus.
+    pub(crate) fn restarted(&self) -> (usize, usize) {
+        (self.cuts.restarts, self.cuts.torn)
+    }
+
+    /// The cell is switched off: what is not on the bus as a whole never will be.
+    fn cut_off(&mut self, at: Micros) {
+        self.now = self.now.max(at);
+        self.cuts.at = None;
+        self.cuts.restarts += 1;
+        self.node = None;
+        let before = self.wire.len() + self.later.len();
+        self.later.clear();
+        self.wire.retain(|seen| seen.own || seen.at <= at);
+        self.cuts.torn += usize::from(self.wire.len() < before);
+        self.restart = Some(at + OFF);
+    }
+
     pub(crate) fn without_restart(mut self) -> Self {
         self.restarts = false;
         self
@@ -165,10 +214,14 @@ impl Virtual {
     /// What the cell has to send goes onto the bus, and into flash what it keeps.
     fn collect(&mut self, at: Micros) {
         let Some(node) = &mut self.node else { return };
+        let mut stored = Span(0);
         if let Some(kept) = node.poll_store() {
             self.flash = self.mutant.stores(kept.parameters.map_or(Flash::Empty, Flash::Sound));
             node.handle_stored(true);
+            stored = self.stores;
         }
+        let at = at + stored;
+        self.busy = self.busy.max(at);
         let mut out = Vec::new();
         while let Some(packet) = node.poll_transmit() {
             out.extend(self.mutant.says(at, packet));
@@ -186,7 +239,7 @@ impl Virtual {
     }
 
     fn put(&mut self, at: Micros, frame: Frame, own: bool) {
-        let at = at.max(self.free + FRAME);
+        let at = at.max(self.free + self.frame);
         self.free = at;
         let place = self.wire.iter().rposition(|seen| seen.at <= at).map_or(0, |place| place + 1);
         self.wire.insert(place, Seen { at, frame, own });
@@ -204,7 +257,8 @@ impl Virtual {
             self.mutant.wakes().filter(|_| self.node.is_some()).map(|at| (at.max(self.busy), Event::Wakes));
         let start = self.restart.map(|at| (at, Event::Starts));
         let sends = self.later.first().map(|(at, _)| (*at, Event::Sends));
-        let all = [sends, heard, wake, own, start].into_iter().flatten();
+        let end = self.cuts.at.map(|at| (at, Event::Ends));
+        let all = [end, sends, heard, wake, own, start].into_iter().flatten();
         all.min_by_key(|(at, _)| *at).filter(|(at, _)| *at <= until)
     }
 
@@ -214,6 +268,7 @@ impl Virtual {
                 let (at, frame) = self.later.remove(0);
                 self.put(at, frame, false);
             }
+            Event::Ends => self.cut_off(at),
             Event::Starts => {
                 self.restart = None;
                 self.now = at;
@@ -246,6 +301,7 @@ enum Event {
     Hears,
     Wakes,
     Starts,
+    Ends,
 }
 
 impl Bus for Virtual {
@@ -297,13 +353,17 @@ impl Bus for Virtual {
     }
 
     fn begin_restart(&mut self) -> Result<(), Stop> {
-        self.node = None;
-        self.later.clear();
-        self.restart = Some(self.now + OFF);
+        let Cuts { step, longest, next, .. } = self.cuts;
+        self.cuts.at = Some(self.now + next);
+        self.cuts.next = if next.0 + step.0 > longest.0 {
+            Span(next.0 + step.0 - longest.0)
+        } else {
+            Span(next.0 + step.0)
+        };
         Ok(())
     }
 
     fn is_restarting(&mut self) -> Result<bool, Stop> {
-        Ok(self.restart.is_some())
+        Ok(self.cuts.at.is_some() || self.restart.is_some())
     }
 }

@@ -155,7 +155,7 @@ fn groups(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
         }
     }
     session.check_all_beats();
-    session.check_segments();
+    session.check_segments()?;
     if only.has("TIME-2") && session.about.committed { session.measure_times() } else { Ok(()) }
 }
 

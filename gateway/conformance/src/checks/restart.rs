@@ -1,5 +1,8 @@
 //! What shows only at a start: the address claim, and what survives.
 
+#[cfg(test)]
+mod tests;
+
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::{WORDS, Words, words};
@@ -63,7 +66,7 @@ fn restart(session: &mut Session<'_>) -> Result<Micros, Stop> {
 fn restart_with(
     session: &mut Session<'_>,
     longest: Span,
-    mut meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), Stop>,
+    meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), Stop>,
 ) -> Result<Option<Micros>, Stop> {
     let keep =
         Known { last_epoch: session.known.last_epoch, joints: session.known.joints, ..Known::default() };
@@ -71,35 +74,48 @@ fn restart_with(
     session.consume();
     session.begin_restart()?;
     session.known = Known { may_be_silent: true, ..keep };
-    // What was on its way is of its former life, up to 30 ms after the command began.
-    session.idle(Span::from_millis(1))?;
-    session.forget_counts();
     session.start();
-    let give_up = session.now() + longest;
-    let is_claim = |it: &Heard| it.beat().is_some_and(|(beat, _)| beat.state.has(State::CLAIMING));
-    while session.is_restarting()? || !session.answers().iter().any(is_claim) {
-        let until = session.now() + Span::from_millis(12);
-        session.wait(until, |heard| heard.last().is_some_and(is_claim))?;
-        if !session.answers().iter().any(is_claim) {
-            meanwhile(session)?;
-        }
-        if session.now() >= give_up {
-            return Ok(None);
-        }
-    }
-    let first = session.answers().iter().position(is_claim).unwrap_or(0);
-    // What came before it was sent before it was switched off: that cell was settled.
-    let before: Vec<_> = session.answers().iter().take(first).copied().collect();
-    let came = session.answers().get(first).map_or_else(|| session.now(), |it| it.at);
-    // So was the answer to the last request.
+    let done = await_claim(session, longest, meanwhile);
+    session.end_restart();
+    done?;
+    let Some(came) = session.claimed() else { return Ok(None) };
+    // Packets before it were sent before the cell was switched off: it was settled, and may have been asked something.
     let is_old = |it: &Heard| it.beat().is_some() || matches!(it.message, Message::Configured { .. });
-    let stray = !before.iter().all(is_old);
+    let stray = session.answers().iter().take_while(|it| it.at < came).any(|it| !is_old(it));
     session.check("CLAIM-1", !stray, || {
         "its first packet after a restart is no heartbeat with CLAIMING".to_owned()
     });
     session.known.parameters = parameters;
     session.known.staged = None;
     Ok(Some(came))
+}
+
+/// Waits for so long at most until the restart is done and a new life of the cell has begun.
+fn await_claim(
+    session: &mut Session<'_>,
+    longest: Span,
+    mut meanwhile: impl FnMut(&mut Session<'_>) -> Result<(), Stop>,
+) -> Result<(), Stop> {
+    const LOOK: Span = Span::from_millis(12);
+    let give_up = session.now() + longest;
+    let is_claim = |it: &Heard| it.beat().is_some_and(|(beat, _)| beat.state.has(State::CLAIMING));
+    loop {
+        let is_restarting = session.is_restarting()?;
+        if session.claimed().is_some() {
+            if !is_restarting {
+                return Ok(());
+            }
+            session.idle(LOOK)?;
+        } else if is_restarting || session.now() < give_up {
+            let until = session.now() + LOOK;
+            session.wait(until, |heard| heard.last().is_some_and(is_claim))?;
+            if session.claimed().is_none() {
+                meanwhile(session)?;
+            }
+        } else {
+            return Ok(());
+        }
+    }
 }
 
 /// Waits until its node id is settled: when the first heartbeat without CLAIMING came.

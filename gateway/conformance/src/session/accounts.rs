@@ -115,6 +115,11 @@ impl Accounts {
         }
     }
 
+    /// Returns the accounts of a cell that has been switched off and on: all its counts begin again.
+    pub(super) fn restarted(self) -> Self {
+        Self { segments: self.segments, ..Self::default() }
+    }
+
     /// The cell may have lost what came, and counts from here on.
     pub(super) const fn forget_counters(&mut self) {
         self.compared = None;

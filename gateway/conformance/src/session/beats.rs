@@ -19,8 +19,8 @@ impl Session<'_> {
         let came = self.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
         let at = self.answers().iter().find(|it| it.beat().is_some()).map(|it| it.at);
         self.check("BEAT-1", came, || "no heartbeat came for 300 ms".to_owned());
-        self.clock.regular = at;
-        if let Some((came, min, max)) = at.and_then(|at| self.accounts.regular(at)) {
+        self.life.regular = at;
+        if let Some((came, min, max)) = at.and_then(|at| self.life.accounts.regular(at)) {
             self.check("BEAT-1", (min..=max).contains(&came), || {
                 let due = if min == max { min.to_string() } else { format!("{min} to {max}") };
                 format!("{came} heartbeats came; {due} were due, every 250 ms and to each sync and claim")
@@ -33,7 +33,7 @@ impl Session<'_> {
 
     /// All heartbeats of the test together: a cell that is late leaves none out, unless it was for a whole 250 ms.
     pub(crate) fn check_all_beats(&mut self) {
-        let surplus = self.accounts.surplus();
+        let surplus = self.life.accounts.surplus();
         if self.clock.longest < BEAT {
             self.start();
             self.check("BEAT-1", surplus == 0, || {
@@ -46,7 +46,7 @@ impl Session<'_> {
     /// No regular heartbeat comes for so long, less than 200 ms.
     pub(crate) fn quiet(&mut self, span: Span) -> Result<(), Stop> {
         let now = self.now();
-        let is_free = self.clock.regular.is_some_and(|at| {
+        let is_free = self.life.regular.is_some_and(|at| {
             let since = now.since(at);
             since > EDGE && since.0 + span.0 + EDGE.0 < BEAT.0
         });

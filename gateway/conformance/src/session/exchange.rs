@@ -92,12 +92,12 @@ impl Session<'_> {
                 // One that was due before the cell came to the joints has the epoch before.
                 (any, right) = (true, right || epoch.is_none_or(|epoch| of.0 == epoch));
             }
-            if right && !self.accounts.is_one_missing(self.bus.now()) {
+            if right && !self.life.accounts.is_one_missing(self.bus.now()) {
                 return Ok(true);
             }
             if self.bus.now() >= until {
                 // Others are not waited for again.
-                self.accounts.give_up(self.bus.now());
+                self.life.accounts.give_up(self.bus.now());
                 self.clock.other_epochs |= any && !right;
                 return Ok(any);
             }

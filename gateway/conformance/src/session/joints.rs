@@ -201,14 +201,14 @@ impl Session<'_> {
         let beats = after(self.answers());
         if let [first, rest @ ..] = beats.as_slice() {
             // What was in the heartbeat before and stays is no matter of this torque.
-            let stays = *first && !expected && self.clock.saturated;
+            let stays = *first && !expected && self.life.saturated;
             self.check(if stays { "STATE-2" } else { "TORQUE-2" }, *first == expected, || {
                 let (set, words) = (if *first { "" } else { "not " }, arm::list(words.as_slice()));
                 format!("SATURATED is {set}set after a torque of {words}")
             });
             let again = expected && rest.contains(&true);
             self.check("STATE-2", !again, || "SATURATED is set in two heartbeats".to_owned());
-            self.clock.saturated = expected;
+            self.life.saturated = expected;
         }
     }
 

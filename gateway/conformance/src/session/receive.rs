@@ -4,22 +4,24 @@ use protocol::can::{BIT_RATE_SWITCH, Format};
 use protocol::id::Id;
 use protocol::message::{Heartbeat, Message, State};
 use protocol::packet::{self, Lengths, Packet, PacketError, Reassembly, Segment};
-use protocol::time::Micros;
+use protocol::time::{Micros, Span};
 
-use super::{Heard, SILENT, Session};
+use super::{Heard, PATIENT, SILENT, Session};
 use crate::bus::{Seen, Stop};
 
 impl Session<'_> {
     /// Takes the next frame, if one comes until then.
     pub(super) fn pump(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
         let Some(seen) = self.bus.receive(until)? else {
+            self.look_at_halves(self.bus.now());
             self.look_at_time()?;
             return Ok(None);
         };
+        self.look_at_halves(seen.at);
         if seen.own {
             self.log.frames.push(seen);
             let joints = (self.known.hash != Some(0)).then_some(self.known.joints);
-            self.accounts.own(&seen, self.cell, self.format, joints);
+            self.life.accounts.own(&seen, self.cell, self.format, joints);
             return Ok(Some(seen));
         }
         self.look_at_time()?;
@@ -30,7 +32,7 @@ impl Session<'_> {
         if id.node == self.cell.get() {
             self.log.frames.push(seen);
             self.clock.last = seen.at;
-            self.take(seen, id);
+            self.receive(seen, id);
         }
         Ok(Some(seen))
     }
@@ -44,8 +46,26 @@ impl Session<'_> {
         if is_silent { Err(Stop::Silent) } else { Ok(()) }
     }
 
+    /// Checks that no segment has waited longer for the others of its packet than any answer takes.
+    fn look_at_halves(&mut self, now: Micros) {
+        if self.held.is_some() {
+            // Of a life that was cut off.
+            return;
+        }
+        for place in 0..self.life.segments.len() {
+            let Some((segments, Some(last))) = self.life.segments.get_mut(place) else { continue };
+            if segments.is_waiting() && now.since(last.at) > PATIENT {
+                *segments = Segment::NONE;
+                let frame = last.frame;
+                self.check("SEND-1", false, || {
+                    format!("{frame} is no packet: no other segment within {} ms", PATIENT.0 / 1_000)
+                });
+            }
+        }
+    }
+
     /// Takes a frame under an identifier of the cell.
-    fn take(&mut self, seen: Seen, id: Id) {
+    pub(super) fn take(&mut self, seen: Seen, id: Id) {
         let frame = &seen.frame;
         if frame.format() != self.format {
             self.check("SEND-1", false, || format!("a {} frame on this bus", frame.format().name()));
@@ -58,10 +78,9 @@ impl Session<'_> {
                 Packet::from_fd(frame)
             }
             Format::Classic => {
-                let Some((segments, last)) = self.segments.get_mut(id.kind as usize) else { return };
-                let apart = seen.at.since(*last);
+                let Some((segments, last)) = self.life.segments.get_mut(id.kind as usize) else { return };
+                let apart = last.replace(seen).map_or(Span(0), |last| seen.at.since(last.at));
                 self.clock.torn += usize::from(segments.is_waiting() && apart > Segment::within(id));
-                *last = seen.at;
                 // Those that come late are counted, and belong together all the same.
                 match segments.push(Micros(0), id, Lengths::of(id), frame.data()) {
                     Ok(Reassembly::Waiting) => return,
@@ -92,19 +111,19 @@ impl Session<'_> {
 
     /// What holds of every packet: heartbeats know how many there were.
     fn look_at(&mut self, heard: &Heard) {
-        self.accounts.heard(&heard.message);
+        self.life.accounts.heard(&heard.message);
         if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.beat() {
             // It has been switched off and on.
-            let begins = state.has(State::CLAIMING) && !self.claiming;
-            self.claiming = state.has(State::CLAIMING);
+            let begins = state.has(State::CLAIMING) && !self.life.claiming;
+            self.life.claiming = state.has(State::CLAIMING);
             if begins {
-                self.sent = None;
+                self.life.sent = None;
             }
-            if let Some((last, packets)) = self.sent {
+            if let Some((last, packets)) = self.life.sent {
                 let expected = last.wrapping_add(packets);
                 self.check("BEAT-4", sent == expected, || format!("sent is {sent}, not {expected}"));
             }
-            self.sent = Some((sent, 0));
+            self.life.sent = Some((sent, 0));
             let version = state.version();
             self.check("STATE-3", version == 1, || format!("version {version}, not 1"));
             if let Some(expected) = self.about.serial {
@@ -113,7 +132,7 @@ impl Session<'_> {
                 });
             }
         }
-        if let Some((_, packets)) = &mut self.sent {
+        if let Some((_, packets)) = &mut self.life.sent {
             *packets = packets.wrapping_add(1);
         }
     }

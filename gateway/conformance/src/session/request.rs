@@ -270,7 +270,7 @@ impl Session<'_> {
         let whole = heard.zip(refused);
         self.check("CMD-4", whole.is_some(), || "network pages 1 and 2 did not come to a report".to_owned());
         if let Some((heard, refused)) = whole {
-            for (id, what) in self.accounts.compare(heard, refused) {
+            for (id, what) in self.life.accounts.compare(heard, refused) {
                 self.check(id, false, || what);
             }
         }
@@ -289,6 +289,6 @@ impl Session<'_> {
 
     /// The cell may have lost some of a burst, which its counters show.
     pub(crate) const fn forget_counters(&mut self) {
-        self.accounts.forget_counters();
+        self.life.accounts.forget_counters();
     }
 }
