@@ -278,12 +278,15 @@ impl<'a> Session<'a> {
     pub(crate) fn send_all(&mut self, frames: &[Frame]) -> Result<Vec<Micros>, Stop> {
         let Some(last) = frames.last() else { return Ok(Vec::new()) };
         let before = self.log.frames.len();
+        let sent = self.bus.now();
         self.bus.send(frames)?;
         let give_up = self.bus.now() + ON_BUS;
         loop {
             let own = self.log.frames.get(before..).unwrap_or_default().iter().filter(|seen| seen.own);
             let own: Vec<_> = own.map(|seen| seen.at).collect();
             if own.len() >= frames.len() {
+                let waited = own.last().map_or(Span(0), |at| at.since(sent));
+                self.clock.worst = self.clock.worst.max(waited);
                 return Ok(own);
             }
             if self.bus.now() >= give_up {

@@ -1,0 +1,263 @@
+//! A cell that claims its node id: what it takes, whom it gives way to, and whom it answers.
+
+use protocol::id::Node;
+use protocol::message::{Message, Request, SensorPage, State};
+use protocol::packet::words;
+use protocol::parameters::{MAX_JOINTS, Parameter};
+use protocol::time::{Micros, Span};
+
+use super::super::claims::twin;
+use super::{claim, restart, restart_with, settled};
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::{Heard, Session};
+
+/// Restarts for a check that a late bench has spoilt.
+const ATTEMPTS: usize = 4;
+/// A cell that waits for a processor comes to a frame so late at most, or the whole group is repeated.
+const MARGIN: Span = Span::from_millis(100);
+const LATE: &str = "the bench was late each time: the claim was over";
+
+/// Returns when the claim of a cell ends at the earliest, by the time of its first heartbeat.
+fn earliest_end(session: &Session<'_>, claimed: Micros) -> Micros {
+    let Span(whole) = claim(session);
+    claimed + Span(whole - whole / 100 - 2_000)
+}
+
+/// What a claiming cell takes, and what it ignores.
+pub(super) fn while_claiming(session: &mut Session<'_>, after_test_mode: bool) -> Result<(), Stop> {
+    // Test mode is as at any start, whether it was on or off before.
+    if session.about.test_mode {
+        session.test_mode(false)?;
+    }
+    for _ in 0..ATTEMPTS {
+        if ignores(session, after_test_mode)? {
+            return Ok(());
+        }
+    }
+    session.findings.not_tested("CLAIM-2", LATE);
+    session.idle(claim(session))?;
+    session.known.may_be_silent = false;
+    session.extend_life();
+    session.ready(&arm::document(2))?;
+    Ok(())
+}
+
+/// Sends a claiming cell what it has to ignore; whether all of it came to a claiming cell.
+fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Stop> {
+    let claimed = restart(session)?;
+    let end = earliest_end(session, claimed);
+    let state =
+        session.answers().last().and_then(Heard::beat).map(|(beat, _)| beat.state).unwrap_or_default();
+    let presses = state.has(State::TEST_MODE);
+    session.check("CONF-9", presses == after_test_mode || !session.about.test_mode, || {
+        "test mode after a restart is as it was before".to_owned()
+    });
+    session.start();
+    session.press(arm::press(4_096))?;
+    let first = session.next_epoch();
+    let second = session.next_epoch();
+    let own = Node::Cell(session.cell);
+    let request = |number, request| Message::Configure { to: own, tag: number, request };
+    let write = Request::Write { number: 1, words: words([999, 999]) };
+    let all = [
+        session.joints(first, &[0; MAX_JOINTS]),
+        Message::Sync,
+        Message::Report,
+        request(1, Request::Read { number: 0 }),
+        request(2, write),
+        request(3, Request::Read { number: 77 }),
+        request(4, Request::Write { number: Parameter::Mode.number(), words: words([(!presses).into()]) }),
+        request(5, Request::Write { number: Parameter::Sensing.number(), words: words([2]) }),
+        request(6, Request::Write { number: Parameter::Mode.number(), words: words([(!presses).into()]) }),
+        session.joints(second, &[0; MAX_JOINTS]),
+        Message::Halt,
+    ];
+    let mut last = claimed;
+    for message in all {
+        last = session.say(&[message])?;
+        session.idle(Span::from_millis(3))?;
+    }
+    if last + MARGIN >= end {
+        // It had to answer some of it, and may send sensor values from now on.
+        session.idle(Span::from_millis(200))?;
+        session.consume();
+        session.known.senses = true;
+        return Ok(false);
+    }
+    session.idle(Span::from_millis(20))?;
+    let came = session.answers().iter().filter(|it| it.at < end);
+    let came: Vec<_> = came.map(|it| it.message.id().kind.name()).collect();
+    session
+        .check("CLAIM-2", came.is_empty(), || format!("a claiming cell answered with {}", came.join(", ")));
+    let at = settled(session, claimed)?;
+    if at.is_none() {
+        return Ok(true);
+    }
+    session.known.epoch = Some(second);
+    session.known.halted = Some(true);
+    session.known.hash = session.known.parameters.map(|it| it.hash());
+    let is_on = session.exchange_all(&[])?.state().has(State::TEST_MODE);
+    session.check("CLAIM-2", is_on == presses, || "a claiming cell obeyed a write of parameter 5".to_owned());
+    let counters = session.counters()?;
+    let is_so = counters.heard.joints == 2 && counters.heard.torques == 0;
+    session.check("CLAIM-2", is_so, || format!("a claiming cell takes joints; of 2: {counters}"));
+    let refused = protocol::message::Refused { stimuli: u16::from(!presses), ..Default::default() };
+    session.check("CLAIM-2", counters.refused == refused, || {
+        format!("a claiming cell counted what it has to ignore: {counters}")
+    });
+    if presses {
+        let report = session.report()?;
+        let skin = report.iter().find_map(|it| match it.sensors() {
+            Some((_, SensorPage::Skin(skin))) => Some(*skin),
+            _ => None,
+        });
+        session.check("STIM-8", skin == Some(arm::press(4_096)), || {
+            format!("a claiming cell did not latch a stimulus: {}", arm::skin(skin))
+        });
+    }
+    session.ready(&arm::document(2))?;
+    Ok(true)
+}
+
+/// A claim with a higher serial number, before the first heartbeat and after it.
+pub(super) fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
+    let own = session.about.serial.unwrap_or_default();
+    let Some(higher) = own.checked_add(1) else {
+        session.findings.not_tested("CLAIM-3", "no serial number is higher than its own");
+        return Ok(());
+    };
+    let Some(claimed) = claimed_before_its_first(session, higher)? else { return Ok(()) };
+    let low_is_lower = if own & 0xFFFF > 0 { own.checked_add(0xFFFF) } else { None };
+    let end = earliest_end(session, claimed);
+    for serial in [Some(higher), low_is_lower, Some(u32::MAX)].into_iter().flatten() {
+        session.start();
+        let claim = twin(session, serial, true);
+        let at = session.say(&[claim])?;
+        if at + Span::from_millis(20) >= end {
+            session.findings.not_tested("CLAIM-3", "claims with a higher serial number: the claim was over");
+            break;
+        }
+        let came =
+            session.wait(at + Span::from_millis(100), |heard| heard.iter().any(|it| it.beat().is_some()))?;
+        let answer = session.answers().iter().find_map(|it| Some((it.at, it.beat()?.0.state)));
+        session.consume();
+        session.check("CLAIM-3", came, || {
+            format!("a claiming cell did not answer a claim with the higher serial number {serial}")
+        });
+        if let Some((answered, state)) = answer {
+            session.note_time("heartbeat to a claimant", at, answered);
+            let is_so = state.has(State::CLAIMING) || answered >= end;
+            session.check("CLAIM-3", is_so, || "its answer has no CLAIMING".to_owned());
+            session
+                .check("CLAIM-7", state.has(State::DUPLICATE), || "its answer has no DUPLICATE".to_owned());
+        }
+        session.idle(Span::from_millis(30))?;
+    }
+    session.start();
+    let at = settled(session, claimed)?;
+    session.check("CLAIM-3", at.is_some(), || "it gave way to a higher serial number".to_owned());
+    session.known.hash = None;
+    session.ready(&arm::document(2))?;
+    Ok(())
+}
+
+/// Claims with a higher serial number come all the time while it starts: when its first heartbeat came. That has DUPLICATE if
+/// one of them came before it, at some (serial mod 64) ms; a computer that is late may delay them.
+fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Option<Micros>, Stop> {
+    const ATTEMPTS: usize = 3;
+    let rest = twin(session, higher, true);
+    let is_long = session.about.serial.unwrap_or_default() % 64 >= 30;
+    let longest = Span::from_millis(3_000);
+    for attempt in 1..=ATTEMPTS {
+        // Not too often: each is answered only if the last answer was 10 ms ago.
+        let claimed = restart_with(session, longest, |session| session.say(&[rest]).map(|_| ()))?;
+        let Some(claimed) = claimed else {
+            session.check("CLAIM-3", false, || {
+                format!(
+                    "no heartbeat came while claims with the higher serial number {higher} did: it gave way to them"
+                )
+            });
+            return Ok(None);
+        };
+        // An answer, and then the heartbeat that nothing asked for.
+        session.idle(Span::from_millis(80))?;
+        let new = session.answers().iter().filter(|it| it.at >= claimed).filter_map(Heard::beat);
+        let is_set = new.clone().next().is_some_and(|(beat, _)| beat.state.has(State::DUPLICATE));
+        let is_answered = new.count() > 1;
+        if is_set && is_answered || !is_long || attempt == ATTEMPTS {
+            session.check("CLAIM-7", is_set || !is_long, || {
+                "DUPLICATE is not set in the first heartbeat after claims that came before it".to_owned()
+            });
+            session.check("CLAIM-3", is_answered || !is_long, || {
+                "claims that came before its first heartbeat were not answered".to_owned()
+            });
+            return Ok(Some(claimed));
+        }
+        settled(session, claimed)?;
+    }
+    Ok(None)
+}
+
+/// What is no valid 4nn changes nothing.
+pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), Stop> {
+    let claimed = restart(session)?;
+    session.start();
+    let mut packet = twin(session, 0, true).encode();
+    packet.count = 7;
+    let mut frames: Vec<_> = packet.frames(session.format).collect();
+    let mut other = twin(session, 0, true).encode();
+    other.count = 9;
+    frames.extend(other.frames(session.format));
+    session.send(&frames)?;
+    let at = settled(session, claimed)?;
+    session
+        .check("CLAIM-3", at.is_some(), || "it gave way to a 4nn of a page that does not exist".to_owned());
+    let is_set =
+        session.answers().iter().filter_map(Heard::beat).any(|(beat, _)| beat.state.has(State::DUPLICATE));
+    session
+        .check("COUNT-1", !is_set, || "DUPLICATE is set by a 4nn of a page that does not exist".to_owned());
+    session.known.hash = None;
+    Ok(())
+}
+
+/// A packet to which a claiming cell gives way, and then silence.
+pub(super) fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) -> Result<(), Stop> {
+    for _ in 0..ATTEMPTS {
+        let claimed = restart(session)?;
+        session.start();
+        let at = session.say(&[*other])?;
+        if at + MARGIN < earliest_end(session, claimed) {
+            return is_silent(session, claimed, what);
+        }
+    }
+    session.findings.not_tested("CLAIM-3", LATE);
+    Ok(())
+}
+
+/// A cell that gave way sends nothing any more.
+fn is_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(), Stop> {
+    session.idle(Span::from_millis(3))?;
+    session.consume();
+    session.start();
+    for message in [Message::Sync, Message::Report] {
+        session.say(&[message])?;
+    }
+    let claim = twin(session, u32::MAX, true);
+    session.say(&[claim])?;
+    let until = claimed + claim_end(session);
+    session.wait(until, |_| false)?;
+    let came = session.answers().len();
+    session.consume();
+    let serial = session.about.serial.unwrap_or_default();
+    session.check("CLAIM-3", came == 0, || {
+        format!("it (serial number {serial}) did not give way to {what}: {came} packets came after it")
+    });
+    session.check("CLAIM-4", came == 0, || format!("{came} packets came after it had to give way to {what}"));
+    Ok(())
+}
+
+/// Claiming is over by then, and a heartbeat more is due.
+fn claim_end(session: &Session<'_>) -> Span {
+    Span(claim(session).0 + 60_000)
+}
