@@ -21,8 +21,9 @@ use cell::{Mutant, Right, Virtual};
 use conformance::Session;
 use conformance::findings::{Finding, Only, Verdict};
 use conformance::survey::Survey;
-use protocol::can::Format;
+use protocol::can::{Format, Frame};
 use protocol::id::CellId;
+use protocol::packet::Packet;
 use protocol::time::Span;
 
 /// What came of a cell, and why the test ended early.
@@ -141,6 +142,59 @@ fn cells_with_less_pass() {
             assert_eq!(failed, [""; 0], "{name}, {format:?}\n{}", failures(&findings));
         }
     }
+}
+
+/// A cell none of whose frames is a packet is there all the same, and what is wrong with it is named.
+#[test]
+fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
+    type Put = fn(&mut wrong::Memory, &Packet, Format) -> Vec<Frame>;
+    let all: [(&str, Format, Put); 5] = [
+        ("its CRC has the high byte first", Format::Fd, |_, packet, format| {
+            spoilt(packet, format, |_, crc| crc.swap_bytes())
+        }),
+        ("its CRC leaves out the identifier", Format::Fd, |_, packet, format| {
+            spoilt(packet, format, |body, _| protocol::packet::crc16(&body[2..]))
+        }),
+        ("its CRC has the identifier with the high byte first", Format::Classic, |_, packet, format| {
+            spoilt(packet, format, |body, _| {
+                protocol::packet::crc16(&[&[body[1], body[0]], &body[2..]].concat())
+            })
+        }),
+        ("its segments come in the wrong order", Format::Classic, |_, packet, format| {
+            packet.frames(format).collect::<Vec<_>>().into_iter().rev().collect()
+        }),
+        ("docs/reference/protocol.md", Format::Classic, |_, packet, format| {
+            packet.frames(format).take(1).collect()
+        }),
+    ];
+    for (mistake, format, put) in all {
+        let mut wrong = wrong::Wrong::new(format, mutants::NODE);
+        wrong.put = put;
+        let mut bus = Virtual::new(format, mutants::NODE, Box::new(wrong));
+        let survey = Survey::take(&mut bus, "vcan0").unwrap();
+        let cell = CellId::new(mutants::NODE.into()).unwrap();
+        let why = survey.check(cell, "vcan0", None, false).unwrap_err();
+        assert!(why.starts_with("cell 12 on vcan0 fails SEND-1: of "), "{why}");
+        assert!(why.contains("none is a packet, as in 40C#") && why.contains(mistake), "{mistake}: {why}");
+    }
+}
+
+/// The frames of a packet with another CRC: of the identifier and the bytes before it, and of the right one.
+fn spoilt(packet: &Packet, format: Format, crc: fn(&[u8], u16) -> u16) -> Vec<Frame> {
+    let frames: Vec<_> = packet.frames(format).collect();
+    let mut bytes: Vec<u8> = frames.iter().flat_map(Frame::data).copied().collect();
+    let (body, right) = bytes.split_last_chunk::<2>().unwrap();
+    let id = u16::try_from(frames[0].id()).unwrap().to_le_bytes();
+    let crc = crc(&[&id, body].concat(), u16::from_le_bytes(*right)).to_le_bytes();
+    let end = bytes.len() - 2;
+    bytes[end..].copy_from_slice(&crc);
+    let size = bytes.len() / frames.len();
+    let parts = frames.iter().zip(bytes.chunks(size));
+    let made = parts.map(|(frame, part)| match format {
+        Format::Fd => Frame::fd(frame.id(), frame.flags(), part),
+        Format::Classic => Frame::classic(frame.id(), part),
+    });
+    made.map(Result::unwrap).collect()
 }
 
 /// Each wrong cell fails the requirement that it breaks.

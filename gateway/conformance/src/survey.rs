@@ -2,11 +2,11 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use model::decode::{Decoded, Decoder};
-use protocol::can::Format;
-use protocol::id::CellId;
+use model::decode::{Decoded, Decoder, Foreign};
+use protocol::can::{Format, Frame};
+use protocol::id::{CellId, Id};
 use protocol::message::{Message, NetworkPage};
-use protocol::packet;
+use protocol::packet::{self, Packet};
 use protocol::time::Span;
 
 use crate::bus::{Bus, Stop};
@@ -21,6 +21,19 @@ pub struct Survey {
     pub cells: BTreeMap<CellId, Present>,
     /// A frame that only gateways send.
     pub gateway: Option<String>,
+    /// Frames under the identifiers of a node id that are no packets.
+    damaged: BTreeMap<CellId, Damaged>,
+}
+
+/// Frames that are no packets.
+#[derive(Clone, Debug)]
+struct Damaged {
+    count: usize,
+    /// The identifier of the first one, and the first frames under it.
+    id: Id,
+    frames: Vec<Frame>,
+    /// Why the first one is no packet; `None` while others of its segments may come.
+    fault: Option<String>,
 }
 
 /// Who sends under a node id.
@@ -44,7 +57,23 @@ impl Survey {
         while bus.now() < until {
             let Some(seen) = bus.receive(until)? else { continue };
             let Ok(id) = packet::data_id(&seen.frame) else { continue };
-            let Decoded::Message(message) = decoder.decode(seen.at, name, &seen.frame) else { continue };
+            let message = match decoder.decode(seen.at, name, &seen.frame) {
+                Decoded::Message(message) => message,
+                // Before any packet came, frames may be those of others.
+                Decoded::Damaged { fault, .. } | Decoded::Foreign(Foreign::Data(fault)) => {
+                    survey.note_damaged(id, &seen.frame, Some(fault.to_string()));
+                    continue;
+                }
+                Decoded::Meaningless { error, .. } => {
+                    survey.note_damaged(id, &seen.frame, Some(error.to_string()));
+                    continue;
+                }
+                Decoded::Segment { .. } => {
+                    survey.note_damaged(id, &seen.frame, None);
+                    continue;
+                }
+                Decoded::Foreign(_) | Decoded::Wire(..) => continue,
+            };
             let Some(cell) = id.sender() else {
                 survey.gateway.get_or_insert_with(|| seen.frame.to_string());
                 continue;
@@ -56,6 +85,19 @@ impl Survey {
             }
         }
         Ok(survey)
+    }
+
+    /// Counts a frame that is no packet, or a segment that waits for the others.
+    fn note_damaged(&mut self, id: Id, frame: &Frame, fault: Option<String>) {
+        const KEPT: usize = 4;
+        let Some(cell) = id.sender() else { return };
+        let new = || Damaged { count: 0, id, frames: Vec::new(), fault: None };
+        let damaged = self.damaged.entry(cell).or_insert_with(new);
+        damaged.count += 1;
+        damaged.fault = damaged.fault.take().or(fault);
+        if damaged.id == id && damaged.frames.len() < KEPT {
+            damaged.frames.push(*frame);
+        }
     }
 
     /// Why the cell cannot be tested here, if so; other cells do not matter if they are `tolerated`.
@@ -77,6 +119,9 @@ impl Survey {
         let others: Vec<_> =
             self.cells.keys().filter(|other| **other != cell).map(ToString::to_string).collect();
         let Some(present) = self.cells.get(&cell) else {
+            if let Some(damaged) = self.damaged.get(&cell) {
+                return Err(format!("cell {cell} on {name} fails SEND-1: {damaged}"));
+            }
             let there = if others.is_empty() {
                 "nor any other".to_owned()
             } else {
@@ -110,5 +155,49 @@ impl Survey {
             )),
             (sent, asked) => Ok(asked.or(sent).unwrap_or(Format::Fd)),
         }
+    }
+}
+
+impl Damaged {
+    /// Returns the mistake of an author that explains the frames, if one of the usual ones does.
+    fn mistake(&self) -> Option<&'static str> {
+        let bytes = |frames: &[&Frame]| -> Vec<u8> {
+            frames.iter().flat_map(|frame| frame.data()).copied().collect()
+        };
+        let pairs: Vec<_> = self.frames.iter().zip(self.frames.iter().skip(1)).collect();
+        let whole: Vec<_> = match self.frames.first()?.format() {
+            Format::Fd => self.frames.iter().map(|frame| bytes(&[frame])).collect(),
+            Format::Classic => {
+                let mut swapped = pairs.iter().map(|(one, other)| bytes(&[other, one]));
+                if swapped.any(|bytes| Packet::decode(self.id, &bytes).is_ok()) {
+                    return Some("its segments come in the wrong order");
+                }
+                pairs.iter().map(|(one, other)| bytes(&[one, other])).collect()
+            }
+        };
+        let (low_first, high_first) = (self.id.to_bits().to_le_bytes(), self.id.to_bits().to_be_bytes());
+        whole.iter().find_map(|bytes| {
+            let (body, crc) = bytes.split_last_chunk()?;
+            let of = |id: &[u8]| packet::crc16(&[id, body].concat());
+            let mistakes = [
+                (of(&low_first).swap_bytes(), "its CRC has the high byte first"),
+                (of(&[]), "its CRC leaves out the identifier"),
+                (of(&high_first), "its CRC has the identifier with the high byte first"),
+            ];
+            let is_so = |(crc_of_it, _): &(u16, _)| *crc_of_it == u16::from_le_bytes(*crc);
+            mistakes.into_iter().find(is_so).map(|(_, mistake)| mistake)
+        })
+    }
+}
+
+impl core::fmt::Display for Damaged {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let frames: Vec<_> = self.frames.iter().map(ToString::to_string).collect();
+        let fault = self.fault.as_deref().unwrap_or("no other segment came");
+        write!(f, "of {} frames none is a packet, as in {}: {fault}", self.count, frames.join(" "))?;
+        if let Some(mistake) = self.mistake() {
+            write!(f, "; {mistake}")?;
+        }
+        f.write_str("; docs/reference/protocol.md has the layout and examples")
     }
 }
