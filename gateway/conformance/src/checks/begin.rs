@@ -32,7 +32,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     let document = arm::document(2);
     session.about.committed = session.commit(&document)?;
     session.known.halted = Some(false);
-    Ok(())
+    // Before it the hash may have been 0.
+    if session.about.committed { identity(session) } else { Ok(()) }
 }
 
 fn identity(session: &mut Session<'_>) -> Result<(), Stop> {

@@ -10,6 +10,7 @@ mod force;
 mod joints;
 mod kinematics;
 mod leaves;
+mod measuring;
 mod options;
 mod parameters;
 mod refusals;
@@ -72,6 +73,7 @@ const GROUPS: &[Group] = &[
     group(&["FORCE-1", "TORQUE-1", "TORQUE-2", "STATE-1"], Needs::Press, force::run),
     group(&["JOINTS-1", "JOINTS-2", "JOINTS-3", "JOINTS-5", "JOINTS-6"], Needs::Press, joints::run),
     group(&["JOINTS-4", "STIM-8"], Needs::Press, joints::old),
+    group(&["JOINTS-6"], Needs::Nothing, measuring::run),
     group(
         &["STIM-1", "STIM-2", "STIM-3", "STIM-4", "STIM-5", "STIM-6", "STIM-7", "STIM-8"],
         Needs::Press,

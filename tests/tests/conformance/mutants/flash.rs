@@ -21,6 +21,9 @@ fn loses(flash: Flash, lose: fn(&mut Parameters)) -> Flash {
 
 /// A restart after a commit.
 pub(crate) const FLASH: &[Spoilt] = &[
+    ("flash takes ten commits and no more", "CONF-8", |it| {
+        it.store = |memory, flash| memory.commits.get(9).copied().map_or(flash, Flash::Sound);
+    }),
     ("flash loses the threshold of the force", "CONF-8", |it| {
         it.store = |_, flash| loses(flash, |it| it.contact.force_threshold = Q::ZERO);
     }),

@@ -8,6 +8,16 @@ use crate::wrong::{fd, with};
 
 /// Joints and contacts.
 pub(crate) const JOINTS: &[Spoilt] = &[
+    ("a cell that measures answers everything with zeros", "JOINTS-6", |it| {
+        it.add = |memory| match memory.heard {
+            Some(Message::Joints { epoch, .. }) if !memory.test_mode && !memory.halted && memory.settled => {
+                let from = protocol::id::CellId::new(NODE.into()).unwrap();
+                let torque = Words::zeros(protocol::packet::Length::Six);
+                vec![Message::Torque { from, epoch, torque }]
+            }
+            _ => Vec::new(),
+        };
+    }),
     ("answers one epoch late", "JOINTS-6", |it| {
         it.say = |memory, message| match message {
             Message::Torque { .. } => {

@@ -8,6 +8,14 @@ use crate::wrong::{Memory, beat, fd, with};
 
 /// Parameters.
 pub(crate) const PARAMETERS: &[Spoilt] = &[
+    ("the identity has the hash with the high byte first", "CONF-1", |it| {
+        it.say = |_, mut message| {
+            if let Message::Configured { answer: Answer::Value { number: 0, words, .. }, .. } = &mut message {
+                words[3] = words[3].swap_bytes();
+            }
+            vec![(0, message)]
+        };
+    }),
     ("the hash of a commit is not looked at", "CONF-7", |it| {
         it.hear = |memory, message, frame| hashed(memory, message, frame, 0)
     }),

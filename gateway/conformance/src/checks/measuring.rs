@@ -1,0 +1,48 @@
+//! A cell that measures: its sensors are not known, and its answers have to agree with its ACTIVE all the same.
+
+use protocol::message::State;
+use protocol::parameters::MAX_JOINTS;
+
+use crate::arm;
+use crate::bus::Stop;
+use crate::session::Session;
+
+/// Joints that are sent.
+const JOINTS: i16 = 12;
+
+pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
+    if !session.ready(&arm::document(2))? {
+        return Ok(());
+    }
+    if session.about.test_mode {
+        session.test_mode(false)?;
+    }
+    session.known.active = None;
+    let mut before = None;
+    for number in 0..JOINTS {
+        let skips = session.skips;
+        let step = session.step(&[number << 9; MAX_JOINTS])?;
+        let Some((beat, _)) = step.exchange.beat.filter(|_| skips == session.skips) else {
+            before = None;
+            continue;
+        };
+        let is_active = beat.state.has(State::ACTIVE);
+        let wrong = match (step.torque, is_active, before) {
+            (None, true, _) => Some("ACTIVE is set, and no torque came"),
+            (None, false, Some(true)) => Some("ACTIVE went, and no torque of zeros came"),
+            (Some(_), false, Some(false)) => {
+                Some("a torque came, and ACTIVE was set neither before nor after it")
+            }
+            (Some(torque), false, _) if !torque.is_zero() => {
+                Some("a torque that is not of zeros came, and ACTIVE is not set")
+            }
+            (Some(_), ..) | (None, false, Some(false) | None) => None,
+        };
+        session.check("JOINTS-6", wrong.is_none(), || {
+            format!("a cell that measures: {}", wrong.unwrap_or_default())
+        });
+        before = Some(is_active);
+    }
+    session.ready(&arm::document(2))?;
+    Ok(())
+}
