@@ -20,6 +20,7 @@ use protocol::usage::{Failure, print, shown};
 use super::arguments::{FORMATS, Word, bus_names, one_of};
 use super::output::Force;
 use super::print::{count, list, or, words};
+use super::robot_file::{RobotOfSkin, urdf_of};
 pub(crate) use show::drawing;
 
 const ROBOTS: &[Word<Robot>] = &[("ur5", "Universal Robots UR5", Robot::Ur5)];
@@ -77,7 +78,8 @@ struct Generate {
 
 /// Check a skin's description, and summarise it in a few lines
 ///
-/// Exit code 2, and one line with the line, the key, the value and what is allowed, when something is wrong.
+/// The URDF that it names is read too. Exit code 2, and one line with the line, the key, the value and what is allowed,
+/// when something is wrong.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway skin check gateway/examples/ur5-253.toml
@@ -121,6 +123,10 @@ impl Generate {
 impl Check {
     fn run(self) -> Result<(), Failure> {
         let skin = Description::read(&self.file).map_err(Failure::usage)?;
+        // As a run that records does.
+        if let Some(urdf) = &skin.robot.urdf {
+            RobotOfSkin::read(&skin, Some(&urdf_of(&self.file, urdf)))?;
+        }
         let Some(node) = self.node else {
             return print(&if self.cells { describe(&skin) + &cells(&skin, None) } else { describe(&skin) });
         };

@@ -38,7 +38,14 @@ fn allowed(path: &str, message: &str) -> Option<String> {
     Some(match expected {
         "a sequence" if got == "map" => format!("it is a list of tables: write [[{path}]]"),
         "f64" => "a number is needed".to_owned(),
-        "i64" | "u64" | "u32" | "u8" => "a whole number is needed".to_owned(),
+        "i64" | "u64" | "u32" | "u8" if got.starts_with("integer ") => "the number is too large".to_owned(),
+        "i64" | "u64" | "u32" | "u8" => match cell_of_bus(got) {
+            Some((bus, node)) => {
+                format!("a whole number is needed: write {node}, and bus = \"{bus}\" as a key of its own")
+            }
+            None => "a whole number is needed".to_owned(),
+        },
+        table if table.starts_with("struct ") => format!("it is a table: write [{path}], and its keys below"),
         "a string" => "text in quotes is needed".to_owned(),
         "a boolean" => "true or false is needed".to_owned(),
         list if list == "a sequence" || list.starts_with("an array") || list.starts_with("a tuple") => {
@@ -46,6 +53,12 @@ fn allowed(path: &str, message: &str) -> Option<String> {
         }
         _ => return None,
     })
+}
+
+/// Returns the bus and the node id of a cell that is written as `string "BUS:NODE"`, as on the command line.
+fn cell_of_bus(got: &str) -> Option<(&str, u8)> {
+    let (bus, node) = got.strip_prefix("string \"")?.strip_suffix('"')?.rsplit_once(':')?;
+    Some((bus, node.parse().ok()?))
 }
 
 /// What is no TOML at all; the parser's advice fits texts only.

@@ -339,10 +339,12 @@ fn bit_rates_are_optional_and_checked() {
 fn a_broken_file_says_where_in_one_line() {
     let error = says("version = 1", "version = = 1");
     assert!(error.starts_with("skin.toml:1: ") && error.lines().count() == 1, "{error}");
-    let error = says("joint = 2", "joint = \"two\"");
-    assert_eq!(error, "skin.toml:33: cell[0].joint = \"two\": a whole number is needed");
     for (from, to, said) in [
         ("joint = 2\n", "", "skin.toml:30: cell[0].joint: which joint moves the cell? there are 1 to 2"),
+        ("joint = 2", "joint = \"two\"", "skin.toml:33: cell[0].joint = \"two\": a whole number is needed"),
+        ("joint = 2", "joint = 18446744073709551616", "= 18446744073709551616: the number is too large"),
+        ("joint = 2", "joint = \"vcan0:2\"", ": write 2, and bus = \"vcan0\" as a key of its own"),
+        ("version = 1", "version = 1\nevents = 5", ": it is a table: write [events], and its keys below"),
         ("joint = 2", "joint = 2.5", "skin.toml:33: cell[0].joint = 2.5: a whole number is needed"),
         ("control_hz = 500.0", "control_hz = \"500\"", "timing.control_hz = \"500\": a number is needed"),
         ("[[bus]]", "[bus]", "bus: it is a list of tables: write [[bus]]"),
