@@ -141,3 +141,21 @@ fn no_struct_has_more_than_20_fields_but_what_is_serialised() {
     }
     assert_eq!(found, Vec::<String>::new(), "give parts of them owners");
 }
+
+/// `std::thread::spawn` and a scope's `spawn` panic where the system has no thread: `thread::Builder` gives an error.
+#[test]
+fn programs_start_threads_where_the_error_can_be_told() {
+    let of_tests =
+        |name: &str| name.split('/').any(|part| ["tests", "tests.rs", "examples", "benches"].contains(&part));
+    let mut found = Vec::new();
+    for (name, text) in
+        sources().into_iter().filter(|(name, _)| !of_tests(name) && !name.starts_with("tests/"))
+    {
+        // Unit tests come last in a file.
+        let program = text.split("#[cfg(test)]\nmod tests {").next().unwrap_or_default();
+        let lines =
+            program.lines().filter(|line| line.contains("thread::spawn(") || line.contains("scope.spawn("));
+        found.extend(lines.map(|line| format!("{name}: {}", line.trim())));
+    }
+    assert_eq!(found, Vec::<String>::new());
+}

@@ -7,7 +7,7 @@ use std::collections::HashMap;
 use std::fs::File;
 use std::io;
 use std::os::fd::{AsFd, AsRawFd};
-use std::thread;
+use std::thread::{self, ScopedJoinHandle};
 
 use netlink_packet_core::{NLM_F_CREATE, NLM_F_DUMP, NLM_F_EXCL, NlasIterator, Parseable};
 use netlink_packet_route::RouteNetlinkMessage;
@@ -57,7 +57,7 @@ impl Netlink {
             move_into_link_name_space(namespace.as_fd(), Some(LinkNameSpaceType::Network))?;
             Self::open()
         };
-        thread::scope(|scope| scope.spawn(enter).join())
+        thread::scope(|scope| thread::Builder::new().spawn_scoped(scope, enter).map(ScopedJoinHandle::join))?
             .unwrap_or_else(|_| Err(io::Error::other("the thread that entered it panicked")))
     }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::thread;
+use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
 use model::commission::{Commission, Progress, Report, Wish};
@@ -83,19 +83,28 @@ pub fn commission(
     mut show: impl FnMut(&[Progress]),
 ) -> Vec<Done> {
     let far = Mutex::new(vec![None; benches.len()]);
+    let waiting: Vec<_> = benches.into_iter().map(|bench| Mutex::new(Some(bench))).collect();
+    let work = |(place, bench): (usize, &Mutex<Option<Bench>>)| {
+        let bench = bench.lock().ok()?.take()?;
+        Some(bench.work(skin, wish, stopped, |progress| {
+            if let Some(own) = far.lock().ok().as_mut().and_then(|far| far.get_mut(place)) {
+                *own = Some(progress);
+            }
+        }))
+    };
     thread::scope(|scope| {
-        let work = |(place, bench): (usize, Bench)| {
-            let far = &far;
-            scope.spawn(move || {
-                bench.work(skin, wish, stopped, |progress| {
-                    if let Some(own) = far.lock().ok().as_mut().and_then(|far| far.get_mut(place)) {
-                        *own = Some(progress);
-                    }
-                })
-            })
+        let start = |bench| thread::Builder::new().spawn_scoped(scope, move || work(bench)).ok();
+        let started: Vec<_> = waiting.iter().enumerate().map(|bench| (bench, start(bench))).collect();
+        // A bus for which the system has no thread is commissioned by this one.
+        let here = |(bench, thread)| match thread {
+            Some(thread) => (Some(thread), None),
+            None => (None, work(bench)),
         };
-        let threads: Vec<_> = benches.into_iter().enumerate().map(work).collect();
-        while threads.iter().any(|thread| !thread.is_finished()) {
+        let threads: Vec<_> = started.into_iter().map(here).collect();
+        let is_busy = |(thread, _): &(Option<ScopedJoinHandle<'_, _>>, _)| {
+            thread.as_ref().is_some_and(|thread| !thread.is_finished())
+        };
+        while threads.iter().any(is_busy) {
             let now: Vec<Progress> =
                 far.lock().map(|far| far.iter().copied().flatten().collect()).unwrap_or_default();
             if !now.is_empty() {
@@ -103,7 +112,7 @@ pub fn commission(
             }
             thread::sleep(TELL);
         }
-        threads.into_iter().filter_map(|thread| thread.join().ok()).collect()
+        threads.into_iter().filter_map(|(thread, done)| done.or_else(|| thread?.join().ok()?)).collect()
     })
 }
 

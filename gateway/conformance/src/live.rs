@@ -51,7 +51,12 @@ impl Live {
         let options = Options { own_frames: true, receive_buffer, ..Options::default() };
         let socket = listen::open(name, kind, None, options)?;
         let (inbox, waiting, late) = (Inbox::new(), VecDeque::new(), Span(0));
-        let probe = socket.is_virtual().unwrap_or(false).then(Probe::new);
+        let probe = socket.is_virtual().unwrap_or(false).then(Probe::new).transpose();
+        let probe = probe.map_err(|source| BusError::Io {
+            name: name.to_owned(),
+            doing: "start a thread beside",
+            source,
+        })?;
         Ok(Self { socket, inbox, waiting, stopped, obeys: true, late, probe, command, child: None })
     }
 

@@ -57,7 +57,8 @@ pub fn play(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Res
     says(&server.url());
     let (index, origin) = (player.index(), player.origin());
     thread::scope(|scope| {
-        scope.spawn(move || index.build(reader, skin, origin, stop));
+        let build = move || index.build(reader, skin, origin, stop);
+        thread::Builder::new().spawn_scoped(scope, build).map_err(ServeError::Thread)?;
         match at_s {
             Some(at_s) => player.seek(at_s).map_err(PlayError::from)?,
             None => player.play(1.0),

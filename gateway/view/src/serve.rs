@@ -69,6 +69,9 @@ pub enum ServeError {
     /// The recording cannot be played.
     #[error(transparent)]
     Play(#[from] PlayError),
+    /// The system has no thread for a bus or for the recording.
+    #[error("cannot start a thread: {0}")]
+    Thread(std::io::Error),
     /// The address cannot be listened on.
     #[error("--listen {listen}: {source}")]
     Listen {
@@ -125,10 +128,15 @@ pub fn serve(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Re
     thread::scope(|scope| {
         for (index, shared) in buses.iter().enumerate() {
             let (live, opened) = (&live, &opened);
-            scope.spawn(move || receive(index, shared, live, stop, opened));
+            let receive = move || receive(index, shared, live, stop, opened);
+            if let Err(error) = thread::Builder::new().spawn_scoped(scope, receive) {
+                stop.store(true, Ordering::Relaxed);
+                return Err(ServeError::Thread(error));
+            }
         }
         publish(&live, &buses, &server, bench, stop);
-    });
+        Ok(())
+    })?;
     Ok(server.counts())
 }
 

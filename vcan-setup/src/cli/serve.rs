@@ -34,8 +34,16 @@ pub(crate) struct Serve {
 
 impl Serve {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        serve(&self.name, self.until_eof).map_err(|error| Failure::run(format!("{error:#}")))
+        serve(&self.name, self.until_eof).map_err(|error| Failure::run(told(&error)))
     }
+}
+
+/// Returns an error with its causes, each once: some name their cause themselves.
+fn told(error: &anyhow::Error) -> String {
+    error.chain().skip(1).fold(error.to_string(), |text, cause| match cause.to_string() {
+        cause if text.contains(&cause) => text,
+        cause => format!("{text}: {cause}"),
+    })
 }
 
 fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
@@ -48,10 +56,13 @@ fn serve(name: &str, until_eof: bool) -> anyhow::Result<()> {
         // The system counts the thread that started this process as its parent.
         rustix::process::set_parent_process_death_signal(Some(Signal::TERM))
             .context("cannot follow the parent process")?;
-        std::thread::spawn(move || {
+        let follow = move || {
             let _ = std::io::copy(&mut std::io::stdin().lock().by_ref(), &mut std::io::sink());
             let _ = (&stop).write_all(b"end");
-        });
+        };
+        std::thread::Builder::new()
+            .spawn(follow)
+            .context("cannot start a thread to follow standard input")?;
     }
     // A kernel passes frames on at once; a process that waits its turn among hundreds of cells does not. Whoever may
     // not do this has a slower bus.

@@ -63,7 +63,8 @@ impl Bench<'_> {
 
     /// Waits for late replies, and requests all cells' counters and a last heartbeat.
     pub(super) fn last_words(&self, interrupted: bool) -> Result<(), RunError> {
-        thread::sleep(Duration::from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz()));
+        let two_periods = Duration::try_from_secs_f64(2.0 / self.options.skin.timing.broadcast_hz());
+        thread::sleep(two_periods.unwrap_or_default());
         self.wait_until(Self::has_caught_up);
         self.say(&Message::Report)?;
         self.wait_until(|bench| bench.has_caught_up() && bench.all_have(|said| said.counters));

@@ -87,7 +87,8 @@ pub(crate) fn idle_lateness(period_ns: u64) -> Histogram<u64> {
         }
         histogram
     };
-    thread::spawn(measure).join().unwrap_or_else(|_| histogram())
+    let measuring = thread::Builder::new().spawn(measure).ok();
+    measuring.and_then(|measuring| measuring.join().ok()).unwrap_or_else(histogram)
 }
 
 /// Runs ticks until there were `ticks` of them or it is stopped. Whole periods that were missed are

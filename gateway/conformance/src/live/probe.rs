@@ -1,6 +1,7 @@
 //! How late this computer is: a thread that sleeps and looks when it is woken. A cell that is a process here waits for a
 //! processor as that does.
 
+use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
@@ -26,11 +27,11 @@ struct Shared {
 pub(super) struct Probe(Arc<Shared>);
 
 impl Probe {
-    pub(super) fn new() -> Self {
+    pub(super) fn new() -> io::Result<Self> {
         let shared = Arc::new(Shared::default());
         shared.due.store(u64::MAX, Ordering::Relaxed);
         let own = Arc::clone(&shared);
-        thread::spawn(move || {
+        thread::Builder::new().spawn(move || {
             // As a cell does.
             protocol::bus::never_interrupt();
             while !own.over.load(Ordering::Relaxed) {
@@ -39,8 +40,8 @@ impl Probe {
                 thread::sleep(SLEEP);
                 own.late.fetch_max(now().0.saturating_sub(due), Ordering::Relaxed);
             }
-        });
-        Self(shared)
+        })?;
+        Ok(Self(shared))
     }
 
     /// By how much it was late at most since this was called last, or is now.
