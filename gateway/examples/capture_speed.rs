@@ -41,7 +41,7 @@ fn convert(gateway: &Path, from: &Path, to: &Path, lines: u64) -> (f64, f64) {
 }
 
 fn main() {
-    let mut arguments = std::env::args().skip(1);
+    let mut arguments = protocol::usage::command_line().into_iter().skip(1);
     let lines: u64 = arguments.next().map_or(10_000_000, |lines| lines.parse().expect("LINES is a number"));
     let folder = arguments.next().map_or_else(std::env::temp_dir, PathBuf::from);
 

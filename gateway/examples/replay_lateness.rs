@@ -16,7 +16,8 @@ use rustix::time::{ClockId, clock_gettime};
 use vcan_setup::embedded::Server;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let seconds: u32 = std::env::args().nth(1).map_or(Ok(10), |word| word.parse())?;
+    let seconds: u32 =
+        protocol::usage::command_line().into_iter().nth(1).map_or(Ok(10), |word| word.parse())?;
     let name = "lateness";
     let server = Server::bind(name)?;
     let (stop, stopped) = std::os::unix::net::UnixStream::pair()?;

@@ -62,7 +62,7 @@ fn write_epoch(log: &mut impl std::io::Write, line: &mut String, number: u64) ->
 }
 
 fn main() {
-    let mut arguments = std::env::args().skip(1);
+    let mut arguments = protocol::usage::command_line().into_iter().skip(1);
     let minutes: u64 = arguments.next().map_or(60, |minutes| minutes.parse().expect("MINUTES is a number"));
     let folder = arguments.next().map_or_else(std::env::temp_dir, PathBuf::from);
     let gateway = watched::gateway();

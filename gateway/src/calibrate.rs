@@ -130,10 +130,6 @@ impl Calibrate {
         } else {
             read(&self.from, &skin, &settings)?
         };
-        if let Some(path) = &self.page {
-            let page = picture::page(&self.skin, &skin, &self.packages, &calibration);
-            self.force.write("--page", path, &page)?;
-        }
         if let Some(path) = &self.output {
             let new = calibrated(&skin, &text, &calibration).map_err(Failure::usage)?;
             self.force.write("-o", path, &new)?;
@@ -142,6 +138,10 @@ impl Calibrate {
             print(&json(&calibration)?)?;
         } else {
             print(&report(&skin, &calibration))?;
+        }
+        if let Some(path) = &self.page {
+            let page = picture::page(&self.skin, &skin, &self.packages, &calibration);
+            self.force.write("--page", path, &page)?;
         }
         match calibration.summary.troubled {
             0 => Ok(()),
@@ -239,7 +239,7 @@ impl Calibrate {
         };
         let mut attachments = vec![attached("skin.toml", "application/toml", text.to_owned())];
         attachments.extend(robot.urdf.map(|text| attached("robot.urdf", "application/xml", text)));
-        let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+        let command_line = protocol::usage::command_line();
         let mcap = Mcap { path, split: Split::default(), attachments, robot: robot.robot, command_line };
         let length_us = (motion.length_s() * 1e6).round();
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "20 to 3600 s: checked")]

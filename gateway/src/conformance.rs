@@ -114,11 +114,12 @@ impl Conformance {
             session.findings.list(&only, stopped.as_ref()),
             stopped.as_ref(),
         );
-        if let Some((file, out)) = junit {
-            output::finish("--junit", file, out, &whole.junit())?;
-        }
-        print(&if self.json { super::print::json(&whole)? } else { whole.text() })?;
-        back?;
+        // None of them keeps the others from being written.
+        let shown =
+            super::print::json(&whole).and_then(|json| print(&if self.json { json } else { whole.text() }));
+        let reported =
+            junit.map_or(Ok(()), |(file, out)| output::finish("--junit", file, out, &whole.junit()));
+        back.and(shown).and(reported)?;
         match stopped {
             Some(Stop::Interrupted) => Err(Failure::run("interrupted; the cell has been put back")),
             Some(stopped) => Err(Failure::run(stopped)),

@@ -21,7 +21,7 @@ use paper::arm::Reply;
 use paper::moving::Run;
 use paper::scale::Bench;
 use paper::{Effort, Experiment as Named, Lab, Session, files};
-use protocol::usage::{Failure, print, quoted};
+use protocol::usage::{Failure, print, quoted_os};
 use serde_json::Value;
 
 use super::arguments::Programs;
@@ -34,8 +34,8 @@ use folder::Folder;
 /// Do the paper's experiments, and draw and rate the results
 ///
 /// DIR gets report.html, each figure as SVG and its data as CSV, results.json with every finding beside the paper's and
-/// its verdict, and the recordings of the benches, all at once when everything is done; nothing is written when it fails
-/// or is interrupted. A folder that is not empty needs --force. `gateway experiment list` lists the experiments.
+/// its verdict, and the recordings of the benches, when everything is measured; nothing is written when that fails or is
+/// interrupted. A folder that is not empty needs --force. `gateway experiment list` lists the experiments.
 ///
 /// The moving arm's benches are 253 processes on an embedded bus of their own; those of scale have up to 10 000 cells, a
 /// process a bus. All of it takes about five minutes, half of that scale.
@@ -100,8 +100,14 @@ impl Experiment {
         // Before anything is measured, so that a folder that cannot be written is reported first.
         let folder = Folder::create(output, self.force)?;
         let page = self.perform(&named, &folder, stop)?;
-        write(&page, &folder)?;
-        folder.finish()?;
+        keep(&page, &folder)?;
+        // What was measured stays when it cannot be drawn.
+        draw(&page, folder).map_err(|failure| {
+            failure.and(format_args!(
+                "{} has the results, the data of the figures and the recordings",
+                output.display()
+            ))
+        })?;
         if self.quiet { Ok(()) } else { tell(&page, &output.join("report.html")) }
     }
 
@@ -124,12 +130,10 @@ impl Experiment {
     }
 
     fn page(&self, sections: Vec<Section>, idle: Option<String>) -> Page {
-        let words: Vec<String> = std::env::args().collect();
-        let words = words.iter().enumerate().map(|(place, word)| {
+        let words = std::env::args_os().enumerate().map(|(place, word)| {
             // Without the folder of the program.
-            let name = Path::new(word).file_name().filter(|_| place == 0);
-            quoted(&name.map_or_else(|| word.clone(), |name| name.to_string_lossy().into_owned()))
-                .into_owned()
+            let name = Path::new(&word).file_name().filter(|_| place == 0);
+            quoted_os(name.unwrap_or(&word))
         });
         let command = words.collect::<Vec<_>>().join(" ");
         let about = facts::program(std::slice::from_ref(&command), 0);
@@ -216,14 +220,22 @@ fn list() -> Result<(), Failure> {
     print(&Named::ALL.into_iter().map(line).collect::<String>())
 }
 
-/// Writes the page, the figures and their data, and the findings.
-fn write(page: &Page, folder: &Folder) -> Result<(), Failure> {
+/// Writes the findings and the data of the figures, and gives them and the recordings their names.
+fn keep(page: &Page, folder: &Folder) -> Result<(), Failure> {
+    folder.write("results.json", &json(&files::results(page))?)?;
+    for figure in page.sections.iter().flat_map(|section| &section.figures) {
+        folder.write(&format!("{}.csv", figure.name), &files::csv(figure))?;
+    }
+    folder.publish()
+}
+
+/// Writes the page and the figures.
+fn draw(page: &Page, folder: Folder) -> Result<(), Failure> {
     folder.write("report.html", &page::html(page))?;
     for figure in page.sections.iter().flat_map(|section| &section.figures) {
         folder.write(&format!("{}.svg", figure.name), &svg::draw(figure))?;
-        folder.write(&format!("{}.csv", figure.name), &files::csv(figure))?;
     }
-    folder.write("results.json", &json(&files::results(page))?)
+    folder.finish()
 }
 
 /// Prints every finding, and where the page is.

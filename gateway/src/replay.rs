@@ -170,10 +170,9 @@ impl Replay {
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
         let json = json(&summary)?;
-        if let Some((whole, file)) = file {
-            output::finish("--summary", whole, file, &json)?;
-        }
-        print(&if self.shown.json { json } else { table(&summary) })?;
+        let write = |(whole, file)| output::finish("--summary", whole, file, &json);
+        let written = file.map_or(Ok(()), write);
+        print(&if self.shown.json { json } else { table(&summary) }).and(written)?;
         summary.verdict().map_or(Ok(()), |why| Err(Failure::run(why)))
     }
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use analysis::report::run::{self, ReportError};
 use analysis::report::{figure::Page, page, svg};
 use clap::Args;
-use protocol::usage::{Failure, print, shown};
+use protocol::usage::{Failure, command_line, print, shown};
 use protocol::wire_time::bit_rate;
 
 use super::output::{Force, apart, note};
@@ -51,8 +51,8 @@ impl Report {
             // What is read is looked at before what would be overwritten.
             return Err(run::check(&self.files).err().map_or(taken, refused));
         }
-        let command: Vec<_> = std::env::args().collect();
-        let options = run::Options { command: command.join(" "), nominal: self.nominal, data: self.data };
+        let options =
+            run::Options { command: command_line().join(" "), nominal: self.nominal, data: self.data };
         let report = run::report(&self.files, &options).map_err(refused)?;
         let mut files = vec![("-o", output.clone(), page::html(&report.page))];
         if let Some(folder) = &self.svg {

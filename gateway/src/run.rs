@@ -19,7 +19,7 @@ use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds};
 use protocol::document;
 use protocol::skin::Skin;
 use protocol::time::Span;
-use protocol::usage::{Failure, print, quoted};
+use protocol::usage::{Failure, command_line, print, quoted_os};
 use trace::recording::series::{Attached, Split};
 
 use super::arguments::{BusKinds, Named, Programs, bus_names, cell, seconds, time};
@@ -122,7 +122,7 @@ impl Recording {
             let mut attachments = vec![file("skin.toml", "application/toml", files.skin)];
             attachments.extend(files.scenario.map(|text| file("scenario.toml", "application/toml", text)));
             attachments.extend(files.robot.urdf.map(|text| file("robot.urdf", "application/xml", text)));
-            let command_line = std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect();
+            let command_line = command_line();
             record::Mcap { path, split, attachments, robot: files.robot.robot, command_line }
         });
         record::Options { candump, mcap, force: self.force.force }
@@ -204,10 +204,8 @@ impl Demo {
         let buses = own.then(|| buses::directory("demo")).transpose()?;
         options.directory = buses.as_ref().map(|buses| buses.path().to_owned()).or(given);
         if !options.quiet {
-            let place = options.directory.as_ref().map(|path| {
-                let path = path.to_string_lossy();
-                format!("SKINBUS_DIR={} ", quoted(&path))
-            });
+            let place = options.directory.as_ref();
+            let place = place.map(|path| format!("SKINBUS_DIR={} ", quoted_os(path.as_os_str())));
             let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
             note(format_args!("its frames in words: {place}gateway dump vcan0 --bus-kind {kind}"));
         }

@@ -37,7 +37,11 @@ fn row(name: &str, lengths: Lengths, min: usize, frames: u64) {
 }
 
 fn main() {
-    let million = std::env::args().nth(1).and_then(|text| text.parse().ok()).unwrap_or(100_u64);
+    let million = protocol::usage::command_line()
+        .into_iter()
+        .nth(1)
+        .and_then(|text| text.parse().ok())
+        .unwrap_or(100_u64);
     let frames = million.saturating_mul(1_000_000);
     println!("{frames} frames\nlength          bytes  packets    one of ambiguous");
     let known = [

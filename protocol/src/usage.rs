@@ -2,7 +2,8 @@
 //! terminal only shows, and words that can be typed again.
 
 use std::borrow::Cow;
-use std::fmt::{self, Display};
+use std::ffi::OsStr;
+use std::fmt::{self, Display, Write as _};
 use std::io::{self, ErrorKind, IsTerminal, Write};
 use std::process::ExitCode;
 
@@ -168,8 +169,33 @@ pub fn quoted(word: &str) -> Cow<'_, str> {
     Cow::Owned(format!("'{}'", word.replace('\'', quote)))
 }
 
+/// Returns any word as a shell takes it: one that is not UTF-8 as `$'...'`, which bash and zsh know.
+#[must_use]
+pub fn quoted_os(word: &OsStr) -> String {
+    if let Some(word) = word.to_str() {
+        return quoted(word).into_owned();
+    }
+    let mut whole = "$'".to_owned();
+    for chunk in word.as_encoded_bytes().utf8_chunks() {
+        whole += &chunk.valid().replace('\\', r"\\").replace('\'', r"\'");
+        for byte in chunk.invalid() {
+            // A string takes whatever is written.
+            let _ = write!(whole, r"\x{byte:02x}");
+        }
+    }
+    whole + "'"
+}
+
+/// Returns the words of the command line, the program's own name first. Bytes that are not UTF-8 are replaced.
+#[must_use]
+pub fn command_line() -> Vec<String> {
+    std::env::args_os().map(|word| word.to_string_lossy().into_owned()).collect()
+}
+
 #[cfg(test)]
 mod tests {
+    use std::os::unix::ffi::OsStrExt;
+
     use super::*;
 
     #[test]
@@ -220,5 +246,16 @@ mod tests {
         assert_eq!(quoted("a b.toml"), "'a b.toml'");
         assert_eq!(quoted("it's $HOME"), r"'it'\''s $HOME'");
         assert_eq!(quoted(""), "''");
+        assert_eq!(quoted_os(OsStr::new("a b")), "'a b'");
+        assert_eq!(quoted_os(OsStr::from_bytes(b"it's\\\xff\xc3\xa9")), r"$'it\'s\\\xffé'");
+    }
+    #[test]
+    fn the_shell_reads_a_quoted_word_as_it_was() {
+        for word in [b"n\xff.mcap".as_slice(), b"\xff\xfe'\\x41 $HOME", b"plain", b"two words"] {
+            let word = OsStr::from_bytes(word);
+            let script = format!("printf %s {}", quoted_os(word));
+            let read = std::process::Command::new("bash").args(["-c", &script]).output().unwrap();
+            assert_eq!(OsStr::from_bytes(&read.stdout), word, "{script}");
+        }
     }
 }

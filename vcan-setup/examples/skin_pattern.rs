@@ -19,7 +19,7 @@ use vcan_setup::embedded::Server;
 const PERIOD: Duration = Duration::from_millis(16);
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let mut arguments = std::env::args().skip(1);
+    let mut arguments = protocol::usage::command_line().into_iter().skip(1);
     let cells: u32 = arguments.next().map_or(Ok(253), |word| word.parse())?;
     let seconds: u32 = arguments.next().map_or(Ok(10), |word| word.parse())?;
     let share: usize = arguments.next().map_or(Ok(1), |word| word.parse())?;

@@ -16,7 +16,7 @@ const PERIOD: Duration = Duration::from_millis(16);
 const FRAME: [u8; 72] = [0; 72];
 
 fn main() -> Result<(), Box<dyn Error>> {
-    let mut arguments = std::env::args().skip(1);
+    let mut arguments = protocol::usage::command_line().into_iter().skip(1);
     let first = arguments.next();
     if first.as_deref() == Some("echo") {
         return Ok(echo()?);

@@ -3,13 +3,14 @@
 use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::thread;
+use std::thread::{self, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
 use protocol::bus::embedded::{address, open_directory, seqpacket, socket_name, usual_directory};
 use protocol::bus::{self, BusError, BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
 use protocol::can::Format;
 use protocol::id::{CellId, Command, Id, Kind, Node};
+use protocol::usage::quoted_os;
 use rustix::fs::Access;
 use rustix::net::{AddressFamily, SocketFlags, SocketType};
 use rustix::thread::{CapabilitySet, capabilities};
@@ -31,13 +32,12 @@ pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Int
     for bus in &mut buses {
         bus.interface = present.iter().find(|interface| interface.name == bus.target.name).cloned();
     }
-    thread::scope(|scope| {
-        for Bus { target, interface, heard, .. } in &mut buses {
-            if kind == BusKind::Embedded || interface.as_ref().is_some_and(|it| usable(target, it)) {
-                scope.spawn(|| *heard = listen(target, kind));
-            }
+    let all_heard = listen_to_all(&buses, kind);
+    for (bus, heard) in buses.iter_mut().zip(all_heard) {
+        if let Some(heard) = heard {
+            bus.heard = heard;
         }
-    });
+    }
     Facts {
         choice,
         no_spawn,
@@ -57,6 +57,26 @@ pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Int
 
 fn usable(target: &Target, interface: &Interface) -> bool {
     interface.is_can() && interface.up && target.carried_by(interface.mtu)
+}
+
+/// Listens on all buses at once that can be opened.
+fn listen_to_all(buses: &[Bus], kind: BusKind) -> Vec<Option<Result<Option<Heard>, String>>> {
+    let is_open = |bus: &&Bus| {
+        kind == BusKind::Embedded || bus.interface.as_ref().is_some_and(|it| usable(&bus.target, it))
+    };
+    thread::scope(|scope| {
+        let begin = |bus: &'_ Bus| {
+            let target = bus.target.clone();
+            is_open(&bus).then(|| thread::Builder::new().spawn_scoped(scope, move || listen(&target, kind)))
+        };
+        let begun: Vec<_> = buses.iter().map(begin).collect();
+        let end = |thread: io::Result<ScopedJoinHandle<'_, _>>| match thread.map(ScopedJoinHandle::join) {
+            Ok(Ok(heard)) => heard,
+            Ok(Err(_)) => Err("the thread that listened panicked".to_owned()),
+            Err(error) => Err(format!("cannot start a thread: {error}")),
+        };
+        begun.into_iter().map(|thread| thread.map(end)).collect()
+    })
 }
 
 /// Listens for other gateways and for cells; nothing when the bus is not served.
@@ -116,8 +136,8 @@ pub fn program() -> String {
     {
         return "vcan-setup".to_owned();
     }
-    let called = std::env::args().next().filter(|called| called.contains('/'));
-    called.unwrap_or_else(|| own.display().to_string())
+    let called = std::env::args_os().next().filter(|called| called.as_encoded_bytes().contains(&b'/'));
+    quoted_os(&called.unwrap_or_else(|| own.into_os_string()))
 }
 
 /// Whether this process may change interfaces.

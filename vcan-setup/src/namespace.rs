@@ -1,6 +1,7 @@
 //! Network namespaces, as people name them.
 
 use core::fmt;
+use std::ffi::OsStr;
 use std::fs::File;
 use std::io;
 use std::path::PathBuf;
@@ -54,10 +55,11 @@ pub enum NamespaceError {
 impl Namespace {
     /// What a word names: a path holds a `/`, a name comes before a process of the same number.
     #[must_use]
-    pub fn named(word: &str) -> Self {
-        if word.contains('/') {
-            return Self::Path(PathBuf::from(word));
-        }
+    pub fn named(word: &OsStr) -> Self {
+        let Some(word) = word.to_str().filter(|word| !word.contains('/')) else {
+            let is_path = word.as_encoded_bytes().contains(&b'/');
+            return Self::Path(if is_path { word.into() } else { PathBuf::from(NAMED).join(word) });
+        };
         match word.parse() {
             Ok(pid) if !PathBuf::from(NAMED).join(word).exists() => Self::Process(pid),
             Ok(_) | Err(_) => Self::Name(word.to_owned()),
@@ -120,7 +122,7 @@ mod tests {
             ("77", Namespace::Process(77), "/proc/77/ns/net", "nsenter -t 77 -n ip"),
             ("./ns", Namespace::Path("./ns".into()), "./ns", "nsenter --net=./ns ip"),
         ] {
-            assert_eq!(Namespace::named(word), namespace);
+            assert_eq!(Namespace::named(OsStr::new(word)), namespace);
             assert_eq!((namespace.path(), namespace.ip()), (PathBuf::from(path), ip.to_owned()));
             assert_eq!(namespace.to_string(), word);
         }
@@ -128,11 +130,11 @@ mod tests {
 
     #[test]
     fn one_that_is_not_there_says_how_to_make_it() {
-        let error = Namespace::named("nosuchspace").open().unwrap_err().to_string();
+        let error = Namespace::named(OsStr::new("nosuchspace")).open().unwrap_err().to_string();
         assert!(error.contains("`sudo ip netns add nosuchspace` makes it"), "{error}");
-        let error = Namespace::named("4294967295").open().unwrap_err().to_string();
+        let error = Namespace::named(OsStr::new("4294967295")).open().unwrap_err().to_string();
         assert!(error.contains("no process 4294967295"), "{error}");
-        let error = Namespace::named("/nowhere/ns").open().unwrap_err().to_string();
+        let error = Namespace::named(OsStr::new("/nowhere/ns")).open().unwrap_err().to_string();
         assert!(error.starts_with("cannot open the network namespace /nowhere/ns: No such file"), "{error}");
     }
 }

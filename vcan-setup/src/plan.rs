@@ -10,9 +10,11 @@
 //! A step makes an interface, or changes or removes one that this program has made. The one exception is
 //! [`Action::SetRates`], which is planned only when it was requested, and only for CAN hardware.
 
+use std::ffi::OsStr;
+
 use protocol::can::Format;
 use protocol::skin::Skin;
-use protocol::usage::quoted;
+use protocol::usage::quoted_os;
 
 use crate::link::{FD_MTU, Hardware, Interface, Kind, Rates};
 use crate::namespace::Namespace;
@@ -53,12 +55,12 @@ impl Target {
 
     /// The buses of a skin.
     #[must_use]
-    pub fn of_skin(file: &str, skin: &Skin) -> Vec<Self> {
+    pub fn of_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
         let target = |bus: &protocol::skin::Bus| Self {
             name: bus.name.clone(),
             format: bus.format,
             skin: Some(SkinBus {
-                file: quoted(file).into_owned(),
+                file: quoted_os(file),
                 rates: Rates { bitrate: bus.bitrate, data_bitrate: bus.data_bitrate },
             }),
         };

@@ -4,6 +4,8 @@
 mod process;
 mod served;
 
+use std::ffi::OsStr;
+use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -140,6 +142,56 @@ fn a_plan_is_said_in_words_and_as_commands_and_nothing_is_done() {
     );
     let said = folder.run("down skin.toml");
     assert_eq!((said.code, said.out.as_str()), (0, "nosuchcan1 is not there\n"), "so nothing was made");
+}
+
+#[test]
+fn a_cause_is_told_once() {
+    let folder = Folder::new();
+    folder.write("file", "");
+    let mut command = folder.command("serve vcan0");
+    let said = Said::by(command.env("SKINBUS_DIR", folder.0.path().join("file/buses")));
+    assert_eq!(said.err.matches("Not a directory").count(), 1, "{said:?}");
+}
+
+#[test]
+fn names_that_are_not_utf_8_are_files_and_no_buses() {
+    let folder = Folder::new();
+    let skin = folder.0.path().join(OsStr::from_bytes(b"n\xff.toml"));
+    std::fs::write(&skin, self::skin(&[])).unwrap();
+    for (words, codes) in [
+        ("status", [0, 1]),
+        ("doctor --bus-kind embedded", [0, 1]),
+        ("up --dry-run", [0, 1]),
+        ("down --dry-run", [0, 1]),
+    ] {
+        let file = Said::by(folder.command(words).arg(skin.file_name().unwrap()));
+        assert!(codes.contains(&file.code), "{words}: {file:?}");
+        let name = Said::by(folder.command(words).arg(OsStr::from_bytes(b"vcan\xff")));
+        let said = r"vcan-setup: $'vcan\xff' is no bus name: it is not UTF-8";
+        assert_eq!((name.code, name.err.trim_end()), (2, said), "{words}");
+    }
+    let space = Said::by(
+        folder
+            .command("up vcan0 --peer vcan1 --dry-run --namespace")
+            .arg(OsStr::from_bytes(b"/nowhere/\xff")),
+    );
+    assert!([1, 2].contains(&space.code) && !space.err.contains("panicked"), "{space:?}");
+}
+
+/// A stack for which no address space has room: the system starts no thread.
+#[test]
+fn without_threads_nothing_panics() {
+    let folder = Folder::new();
+    folder.write("skin.toml", &skin(&[]));
+    for (words, said) in [
+        ("serve vcan0 --until-eof", "cannot start a thread"),
+        ("doctor skin.toml --bus-kind embedded --json", "cannot start a thread"),
+    ] {
+        let ended = Said::by(folder.command(words).env("RUST_MIN_STACK", (1_u64 << 48).to_string()));
+        assert_eq!(ended.code, 1, "{words}: {ended:?}");
+        assert!(ended.out.contains(said) || ended.err.contains(said), "{words}: {ended:?}");
+        assert!(!ended.err.contains("panicked"), "{words}: {ended:?}");
+    }
 }
 
 #[test]

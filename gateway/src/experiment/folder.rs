@@ -55,12 +55,19 @@ impl Folder {
         write_whole(&self.inside.join(name), text, false).map_err(|error| self.failed(name, &error))
     }
 
-    /// Everything gets its name; files of the same names are replaced with `force` only.
+    /// Gives all files their names, in the order of these; files of the same names are replaced with `force` only.
     pub(super) fn finish(self) -> Result<(), Failure> {
+        self.publish()
+    }
+
+    /// Gives the files that have been written so far their names.
+    pub(super) fn publish(&self) -> Result<(), Failure> {
         let listed = fs::read_dir(&self.inside).and_then(Iterator::collect::<io::Result<Vec<_>>>);
-        for entry in listed.map_err(|error| self.failed("", &error))? {
-            let name = entry.file_name();
-            rename(&entry.path(), &self.path.join(&name), self.force.force)
+        let mut names: Vec<_> =
+            listed.map_err(|error| self.failed("", &error))?.iter().map(fs::DirEntry::file_name).collect();
+        names.sort();
+        for name in names {
+            rename(&self.inside.join(&name), &self.path.join(&name), self.force.force)
                 .map_err(|error| self.failed(&name.to_string_lossy(), &error))?;
         }
         sync_folder(&self.inside);
@@ -119,6 +126,20 @@ mod tests {
         drop(folder);
         assert_eq!(fs::read_to_string(path.join("report.html")).unwrap(), "second");
         assert_eq!(names(&path), ["report.html"]);
+    }
+
+    #[test]
+    fn what_is_measured_stays_when_what_is_drawn_cannot_be_written() {
+        let place = tempfile::tempdir().unwrap();
+        let path = place.path().join("out");
+        fs::create_dir_all(path.join("report.html")).unwrap();
+        let folder = Folder::create(&path, Force { force: true }).unwrap();
+        folder.write("results.json", "{}").unwrap();
+        folder.publish().unwrap();
+        folder.write("report.html", "page").unwrap();
+        let failed = folder.finish().unwrap_err();
+        assert!(failed.to_string().contains("out/report.html: "), "{failed}");
+        assert_eq!(names(&path), ["report.html", "results.json"]);
     }
 
     #[test]

@@ -1,7 +1,8 @@
 //! `gateway dump`, `frame`, `ack` and `skin` as processes.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod live;
+mod names;
 mod terminal;
 
 use std::io::{BufRead, BufReader, Write};
@@ -409,6 +410,23 @@ fn a_report_says_that_it_is_no_recording_before_that_the_page_is_there() {
 fn names(directory: &Path) -> Vec<String> {
     let entries = std::fs::read_dir(directory).unwrap();
     entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
+}
+
+/// The skin's URDF is looked at as a run that records looks at it.
+#[test]
+fn a_check_refuses_what_a_recorded_run_would_refuse() {
+    let folder = TempDir::new().unwrap();
+    let skin = folder.path().join("skin.toml");
+    let text = output(gateway("skin generate --cells 8"));
+    let with = |urdf: &str| text.replacen("[robot]\n", &format!("[robot]\nurdf = \"{urdf}\"\n"), 1);
+    std::fs::write(folder.path().join("empty.urdf"), "").unwrap();
+    for (urdf, why) in
+        [("/dev/zero", "it is a device"), ("nothing.urdf", "No such file"), ("empty.urdf", "empty.urdf")]
+    {
+        std::fs::write(&skin, with(urdf)).unwrap();
+        let said = refusal(&format!("skin check {}", skin.display()), 2);
+        assert!(said.starts_with("gateway: robot.urdf: ") && said.contains(why), "{said}");
+    }
 }
 
 #[test]

@@ -8,7 +8,7 @@ const MANIFEST: &str = include_str!("../../../Cargo.toml");
 /// Counts what `counted` does. Without `--bench`, which `cargo bench` says and `cargo test` does not, and with `--test`,
 /// everything is run `once` instead, which needs nothing that Rust does not bring.
 pub(crate) fn main(once: impl Fn(), counted: impl Fn()) {
-    let said = |word: &str| std::env::args().any(|said| said == word);
+    let said = |word: &str| std::env::args_os().any(|said| said == word);
     // The runner starts this program again for each benchmark, under valgrind.
     if said("--gungraun-run") {
         return counted();

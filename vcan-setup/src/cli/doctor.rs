@@ -1,5 +1,7 @@
 //! `vcan-setup doctor`.
 
+use std::ffi::OsString;
+
 use clap::Args;
 use protocol::bus::{BusKind, Choice};
 use protocol::usage::{Failure, print};
@@ -23,7 +25,7 @@ use super::{json, named, query};
 pub(crate) struct Doctor {
     /// Names of buses, or skins: what ends in .toml or holds a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
-    what: Vec<String>,
+    what: Vec<OsString>,
     /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
     #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
     bus_kind: Choice,

@@ -9,6 +9,7 @@ mod slcan;
 mod status;
 mod up;
 
+use std::ffi::{OsStr, OsString};
 use std::io;
 use std::path::Path;
 use std::process::ExitCode;
@@ -17,7 +18,7 @@ use clap::error::ErrorKind;
 use clap::{Parser, Subcommand};
 use protocol::bus::{BusError, check_name};
 use protocol::skin::Skin;
-use protocol::usage::{Failure, end, one_line};
+use protocol::usage::{Failure, end, one_line, quoted_os};
 use serde::Serialize;
 use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
@@ -95,18 +96,22 @@ enum Word {
     Name(String),
 }
 
-fn word(word: &str) -> Result<Word, Failure> {
-    if word.ends_with(".toml") || word.contains('/') {
+fn word(word: &OsStr) -> Result<Word, Failure> {
+    let bytes = word.as_encoded_bytes();
+    if bytes.ends_with(b".toml") || bytes.contains(&b'/') {
         let skin = Skin::read(Path::new(word)).map_err(Failure::usage)?;
         return Ok(Word::File(Box::new(skin)));
     }
-    bus_name(word).map(Word::Name).map_err(Failure::usage)
+    let name = word
+        .to_str()
+        .ok_or_else(|| Failure::usage(format!("{} is no bus name: it is not UTF-8", quoted_os(word))))?;
+    bus_name(name).map(Word::Name).map_err(Failure::usage)
 }
 
 /// What words on the command line name.
 fn named<T>(
-    words: &[String],
-    of_skin: impl Fn(&str, &Skin) -> Vec<T>,
+    words: &[OsString],
+    of_skin: impl Fn(&OsStr, &Skin) -> Vec<T>,
     named: impl Fn(&str) -> T,
 ) -> Result<Vec<T>, Failure> {
     let mut all = Vec::new();
@@ -120,7 +125,7 @@ fn named<T>(
 }
 
 /// The interfaces that words on the command line name.
-fn target(words: &[String]) -> Result<Vec<Target>, Failure> {
+fn target(words: &[OsString]) -> Result<Vec<Target>, Failure> {
     named(words, Target::of_skin, Target::named)
 }
 

@@ -1,6 +1,7 @@
 //! `vcan-setup status`.
 
 use std::collections::BTreeMap;
+use std::ffi::OsString;
 use std::time::Duration;
 
 use clap::Args;
@@ -27,7 +28,7 @@ const ANSWER: Duration = Duration::from_millis(500);
 pub(crate) struct Status {
     /// Only these: names, or skins, which end in .toml or hold a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
-    what: Vec<String>,
+    what: Vec<OsString>,
     /// Print JSON
     #[arg(long)]
     json: bool,

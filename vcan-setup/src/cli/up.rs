@@ -1,12 +1,13 @@
 //! `vcan-setup up` and `vcan-setup down`.
 
+use std::ffi::{OsStr, OsString};
 use std::fs::File;
 use std::io;
 use std::os::unix::fs::MetadataExt;
 
 use clap::Args;
 use protocol::bus::is_plain;
-use protocol::usage::{Failure, print, quoted};
+use protocol::usage::{Failure, print, quoted_os};
 use rustix::io::Errno;
 use vcan_setup::kernel::{Kernel, Module};
 use vcan_setup::look;
@@ -32,7 +33,7 @@ use super::{Word, query, target, unreadable, word};
 pub(crate) struct Up {
     /// Names of interfaces, or skins: what ends in .toml or holds a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
-    what: Vec<String>,
+    what: Vec<OsString>,
     /// Print what would be done, and do nothing
     #[arg(long)]
     dry_run: bool,
@@ -41,7 +42,7 @@ pub(crate) struct Up {
     peer: Option<String>,
     /// The network namespace of the other end: a name, a path, or the number of a process
     #[arg(long, value_name = "NAME|PATH|PID", requires = "peer")]
-    namespace: Option<String>,
+    namespace: Option<OsString>,
     /// Set the bit rates of CAN hardware to those of the skin, for which it is taken down for a moment
     #[arg(long, conflicts_with = "peer")]
     set_bit_rates: bool,
@@ -58,7 +59,7 @@ pub(crate) struct Up {
 pub(crate) struct Down {
     /// Names of interfaces, or skins: what ends in .toml or holds a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
-    what: Vec<String>,
+    what: Vec<OsString>,
     /// Print what would be done, and do nothing
     #[arg(long)]
     dry_run: bool,
@@ -84,7 +85,8 @@ impl Up {
         };
         let Word::Name(name) = word(given)? else {
             return Err(Failure::usage(format!(
-                "--peer goes with the NAME of an interface, and {given} is a skin"
+                "--peer goes with the NAME of an interface, and {} is a skin",
+                quoted_os(given)
             )));
         };
         plain(&name)?;
@@ -126,7 +128,7 @@ fn plain(name: &str) -> Result<(), Failure> {
 }
 
 /// Opens a namespace; `None` when it is the one where we are.
-fn enter(word: &str) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
+fn enter(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     let namespace = Namespace::named(word);
     let not_allowed = || not_allowed(&format!("look into the network namespace {namespace}"));
     let denied = |error: &NamespaceError| matches!(error, NamespaceError::Io { source, .. } if source.kind() == io::ErrorKind::PermissionDenied);
@@ -162,7 +164,7 @@ fn not_allowed(what: &str) -> Failure {
         ));
     }
     let again: Vec<_> = std::iter::once(look::program())
-        .chain(std::env::args().skip(1).map(|word| quoted(&word).into_owned()))
+        .chain(std::env::args_os().skip(1).map(|word| quoted_os(&word)))
         .collect();
     let again = again.join(" ");
     Failure::run(format!("not allowed to {what}, which needs root: `sudo {again}`"))

@@ -1,6 +1,7 @@
 //! What the judgement rests on.
 
 use std::collections::BTreeSet;
+use std::ffi::OsStr;
 use std::path::PathBuf;
 
 use protocol::bus::Choice;
@@ -74,7 +75,7 @@ pub struct Bus {
 impl Bus {
     /// The buses of a skin.
     #[must_use]
-    pub fn of_skin(file: &str, skin: &Skin) -> Vec<Self> {
+    pub fn of_skin(file: &OsStr, skin: &Skin) -> Vec<Self> {
         let of = |(index, target): (usize, Target)| Self {
             cells: Some(skin.cells_of(index).map(|cell| cell.node).collect()),
             sums: skin.buses.get(index).is_some_and(|bus| bus.reply != Reply::Torque),

@@ -161,7 +161,7 @@ fn put(line: &[u8]) {
 
 #[cfg(not(target_os = "none"))]
 fn task() -> Option<u8> {
-    std::env::args().nth(1)?.bytes().next()
+    std::env::args_os().nth(1)?.as_encoded_bytes().first().copied()
 }
 
 /// Here that is not known.
