@@ -14,29 +14,37 @@ use super::Session;
 use super::accounts::Accounts;
 use crate::bus::{Seen, Stop};
 
-/// What is known of one life of the cell.
+/// State of the test about one life of the cell.
 #[derive(Debug, Default)]
 pub(super) struct Life {
-    /// When its first heartbeat with CLAIMING came, after a restart.
+    /// Time of its first heartbeat with CLAIMING, after a restart.
     pub(super) claimed: Option<Micros>,
     /// Segments that wait for the others, by kind, and the last one that came.
     pub(super) segments: [(Segment, Option<Seen>); 8],
-    /// What was counted of the bus.
+    /// Kinds of which a packet came as a whole; the test may have begun in the middle of the first one.
+    pub(super) joined: [bool; 8],
+    /// Accounts of the bus.
     pub(super) accounts: Accounts,
     /// *sent* of the last heartbeat, and packets since.
     pub(super) sent: Option<(u16, u16)>,
-    /// The last heartbeat had CLAIMING.
+    /// Flag of the last heartbeat: CLAIMING.
     pub(super) claiming: bool,
     /// The last torque was saturated.
     pub(super) saturated: bool,
-    /// When a heartbeat came that nothing asked for.
+    /// Time of the last heartbeat that nothing asked for.
     pub(super) regular: Option<Micros>,
 }
 
 impl Life {
     /// Returns the life that begins with a heartbeat of that time. The test's own packets continue: they were on the bus.
     fn after(former: Self, claimed: Micros) -> Self {
-        Self { claimed: Some(claimed), accounts: former.accounts.restarted(), ..Self::default() }
+        let accounts = former.accounts.restarted();
+        Self { claimed: Some(claimed), joined: [true; 8], accounts, ..Self::default() }
+    }
+
+    /// Notes that packets of a kind are received from their beginnings on; returns whether that was so before.
+    pub(super) fn joins(&mut self, place: usize) -> bool {
+        self.joined.get_mut(place).is_none_or(|joined| core::mem::replace(joined, true))
     }
 
     /// Returns whether a segment waits for others.

@@ -57,6 +57,9 @@ impl Session<'_> {
             if segments.is_waiting() && now.since(last.at) > PATIENT {
                 *segments = Segment::NONE;
                 let frame = last.frame;
+                if !self.life.joins(place) {
+                    continue;
+                }
                 self.check("SEND-1", false, || {
                     format!("{frame} is no packet: no other segment within {} ms", PATIENT.0 / 1_000)
                 });
@@ -84,7 +87,12 @@ impl Session<'_> {
                 // Those that come late are counted, and belong together all the same.
                 match segments.push(Micros(0), id, Lengths::of(id), frame.data()) {
                     Ok(Reassembly::Waiting) => return,
-                    Ok(Reassembly::Complete(packet)) => Ok(packet),
+                    Ok(Reassembly::Complete(packet)) => {
+                        self.life.joins(id.kind as usize);
+                        Ok(packet)
+                    }
+                    // The segment before it is the end of a packet that began before the test.
+                    Ok(Reassembly::Incomplete) if !self.life.joins(id.kind as usize) => return,
                     Ok(Reassembly::Incomplete) => Err(PacketError::Incomplete),
                     Ok(Reassembly::Ambiguous) => Err(PacketError::Ambiguous),
                     Err(error) => Err(error),
