@@ -10,6 +10,7 @@ use cell_node::io::{Cells, FlashFile, Line, LinkIds, Sockets, Stopped};
 use clap::Parser;
 use protocol::bus::Choice;
 use protocol::id::CellId;
+use protocol::last_words::{CellRange, LastWords};
 use protocol::skin::{Reply, Skin, Wires};
 use rustix::process::{Pid, Signal, getppid, set_parent_process_death_signal};
 
@@ -63,6 +64,23 @@ fn range(text: &str) -> Result<(u8, u8), String> {
         .ok_or_else(|| "two node ids of 1 to 254, the smaller one first, such as 1-64".to_owned())
 }
 
+impl Arguments {
+    /// The first and the last node id.
+    fn nodes(&self) -> Option<(u8, u8)> {
+        self.node.map(|node| (node, node)).or(self.nodes)
+    }
+
+    /// Writes why this process ends; as last words that the program that started it can read, if one did.
+    fn say_why(&self, why: impl core::fmt::Display) {
+        match self.nodes().filter(|_| self.with_parent.is_some()) {
+            Some((first, last)) => {
+                say(LastWords { cells: CellRange(first, last), bus: self.bus.clone(), why: why.to_string() });
+            }
+            None => say(why),
+        }
+    }
+}
+
 /// One line in one piece, for hundreds of cells may share this standard error.
 fn say(text: impl core::fmt::Display) {
     protocol::usage::say(&format!("cell-node: {text}"));
@@ -84,13 +102,14 @@ fn main() -> ExitCode {
         Ok((mut cells, sockets, line)) => {
             let Err(stopped) = cells.run(sockets, &line);
             // The program that started hundreds of cells reports once that their bus is gone.
-            if arguments.with_parent.is_none() || !matches!(stopped, Stopped::Bus(_)) {
-                say(stopped);
+            let is_gone = matches!(&stopped, Stopped::Bus(error) if error.is_closed());
+            if arguments.with_parent.is_none() || !is_gone {
+                arguments.say_why(stopped);
             }
             ExitCode::from(1)
         }
         Err(error) => {
-            say(format_args!("{error:#}"));
+            arguments.say_why(format_args!("{error:#}"));
             ExitCode::from(2)
         }
     }
@@ -116,8 +135,7 @@ fn prepare(arguments: &Arguments) -> Result<(Cells, Sockets, Line)> {
         Reply::Torque => None,
         Reply::Sum { .. } => Some(skin.wires(bus_index)),
     };
-    let one = arguments.node.map(|node| (node, node));
-    let (first, last) = one.or(arguments.nodes).context("--node or --nodes is needed")?;
+    let (first, last) = arguments.nodes().context("--node or --nodes is needed")?;
     let mut cells = Cells::new(bus.format);
     for number in first..=last {
         start(&mut cells, arguments, &skin, bus_index, wires.as_ref(), CellId::new(number.into())?)?;

@@ -12,6 +12,8 @@ pub mod fixed;
 pub mod id;
 #[cfg(feature = "host")]
 pub mod input;
+#[cfg(feature = "host")]
+pub mod last_words;
 pub mod message;
 pub mod packet;
 pub mod parameters;

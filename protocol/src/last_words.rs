@@ -1,0 +1,105 @@
+//! The reason for which a process of cells ends: a line on its standard error that people read, and the program that has
+//! started it.
+
+use std::fmt::{self, Display, Formatter};
+
+/// The first and the last cell of one process as text: `cell 3`, `cells 1 to 4`.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct CellRange(pub u8, pub u8);
+
+impl Display for CellRange {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        match self {
+            Self(first, last) if first == last => write!(f, "cell {first}"),
+            Self(first, last) => write!(f, "cells {first} to {last}"),
+        }
+    }
+}
+
+/// The reason for which a process of cells ends.
+///
+/// ```
+/// use protocol::last_words::{CellRange, LastWords};
+///
+/// let words = LastWords { cells: CellRange(1, 4), bus: "vcan0".to_owned(), why: "cannot send".to_owned() };
+/// let line = words.to_string();
+/// assert_eq!(line, "cells 1 to 4 on vcan0 end: cannot send");
+/// assert_eq!(LastWords::parse(&line), Some(words));
+/// ```
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct LastWords {
+    /// Its cells.
+    pub cells: CellRange,
+    /// Their bus.
+    pub bus: String,
+    /// The reason, one line.
+    pub why: String,
+}
+
+impl Display for LastWords {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let Self { cells: cells @ CellRange(first, last), bus, why } = self;
+        write!(f, "{cells} on {bus} {}: {why}", if first == last { "ends" } else { "end" })
+    }
+}
+
+impl LastWords {
+    /// Reads the line back; `None` if it is another one.
+    #[must_use]
+    pub fn parse(line: &str) -> Option<Self> {
+        let (head, why) = line.split_once(": ")?;
+        // No name of a bus has a space.
+        let (cells, bus) = match head.split(' ').collect::<Vec<_>>().as_slice() {
+            ["cell", one, "on", bus, "ends"] => {
+                let one = one.parse().ok()?;
+                (CellRange(one, one), *bus)
+            }
+            ["cells", first, "to", last, "on", bus, "end"] => {
+                (CellRange(first.parse().ok()?, last.parse().ok()?), *bus)
+            }
+            _ => return None,
+        };
+        let words = Self { cells, bus: bus.to_owned(), why: why.to_owned() };
+        // Only what this program would have written.
+        (words.to_string() == line).then_some(words)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn what_was_written_is_read_back(
+            first in 0..=255_u8, last in 0..=255_u8, bus in "[^ /:]{1,15}", why in "\\PC{0,80}",
+        ) {
+            let words = LastWords { cells: CellRange(first, last), bus, why };
+            prop_assert_eq!(LastWords::parse(&words.to_string()), Some(words));
+        }
+
+        #[test]
+        fn no_line_panics_and_what_is_read_is_what_stands_there(line in "(cells? )?\\PC{0,60}") {
+            if let Some(words) = LastWords::parse(&line) {
+                prop_assert_eq!(words.to_string(), line);
+            }
+        }
+    }
+
+    #[test]
+    fn other_lines_are_no_last_words() {
+        for line in [
+            "",
+            "cell 3 on vcan0 is there: no",
+            "cell 3 on vcan0 ends",
+            "cell 256 on vcan0 ends: no",
+            "cells 1 on vcan0 end: no",
+            "cells 3 to 3 on vcan0 end: no",
+            "cell 03 on vcan0 ends: no",
+            "flash of cell 3 (a b) is not used: its CRC is wrong",
+        ] {
+            assert_eq!(LastWords::parse(line), None, "{line}");
+        }
+    }
+}
