@@ -13,6 +13,8 @@ use protocol::skin::{ControllerKind, MAX_ROBOT_JOINTS, Skin};
 use protocol::time::Micros;
 use thiserror::Error;
 
+use crate::external::Absence;
+
 /// A controller's input in a tick. Joints that the robot does not have are zero.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Input {
@@ -74,6 +76,13 @@ pub trait Controller: Send {
     /// Its counters with their names: for the end of a run, not for the tick.
     fn counts(&self) -> Vec<(String, u64)> {
         Vec::new()
+    }
+
+    /// Why it counts as absent at the end of a run, if it does; `silent` are the bad cycles in a row before that, where
+    /// they are as many as halt a robot. For the end, not for the tick. A controller in this program is never absent.
+    fn absence(&self, silent: Option<u32>) -> Option<Absence> {
+        let _ = silent;
+        None
     }
 }
 

@@ -25,6 +25,7 @@ use protocol::skin::{ControllerKind, LostBus, MAX_ROBOT_JOINTS, Safety, Skin};
 use protocol::time::Micros;
 
 use crate::controller::{BadCycle, Controller, Input, Step};
+use crate::external::Absence;
 use crate::robot::{Moved, Robot};
 use carried::{Carried, Heard, bit};
 use chain::Chain;
@@ -197,6 +198,17 @@ impl Cycle {
     #[must_use]
     pub fn counts(&self) -> Vec<(String, u64)> {
         self.controller.counts()
+    }
+
+    /// Why the controller counts as absent, if it does: the robot stands without being halted, because the controller may
+    /// take its time to begin, or there never was an answer.
+    #[must_use]
+    pub fn absence(&self) -> Option<Absence> {
+        if self.bad_in_a_row == 0 || self.halted.is_some() {
+            return None;
+        }
+        let stands = self.bad_in_a_row >= self.safety.bad_cycles;
+        self.controller.absence(stands.then_some(self.bad_in_a_row))
     }
 
     /// Broadcasts so far.

@@ -227,3 +227,53 @@ fn a_halted_robot_stands_whatever_is_commanded() {
     }
     assert_eq!(cycle.positions().map(f64::to_bits), moved.map(f64::to_bits));
 }
+
+/// Another program that answers from one tick to another.
+struct Present(std::ops::Range<u64>);
+
+impl Controller for Present {
+    fn step(&mut self, input: &Input) -> Step {
+        let answers = self.0.contains(&input.tick);
+        if answers { Step::Move([0.0; MAX_ROBOT_JOINTS]) } else { Step::Bad(BadCycle::NoPeer) }
+    }
+
+    fn absence(&self, silent: Option<u32>) -> Option<Absence> {
+        let (socket, answers) = (std::path::PathBuf::new(), self.0.end - self.0.start);
+        silent.map(|ticks| Absence::Gone { socket, answers, ticks })
+    }
+}
+
+/// A loop of so many ticks with a controller that may take a second to begin; why it is absent at the end.
+fn absence_after(ticks: u64, present: std::ops::Range<u64>) -> (Option<Absence>, Option<Halt>) {
+    let (mut cycle, bus) = cycle(Box::new(Present(present)));
+    cycle.starts = Some(Micros(1_000_000));
+    let mut halted = None;
+    for number in 0..ticks {
+        halted = cycle.tick(tick(number), 0, [works(&bus)]).record.halted;
+    }
+    (cycle.absence(), halted)
+}
+
+#[test]
+fn a_run_that_ends_before_its_missing_controller_halts_it_is_without_one() {
+    let limit = u64::from(testing::skin().safety.bad_cycles);
+    assert!(absence_after(400, 0..0).0.is_some());
+    // It has begun to answer, and is gone before it counts as there.
+    assert!(absence_after(400, 100..100 + limit - 1).0.is_some());
+    // It came late.
+    assert_eq!(absence_after(400, 350..400).0, None);
+    // It is gone for a moment, as it may be at any time.
+    assert_eq!(absence_after(400, 0..401 - limit).0, None);
+    // The halt says more.
+    let (absence, halted) = absence_after(400, 100..200);
+    assert_eq!((absence, halted), (None, Some(Halt::BadCycles(BadCycle::NoPeer))));
+    let (absence, halted) = absence_after(600, 0..0);
+    assert_eq!((absence, halted.is_some()), (None, true));
+}
+
+#[test]
+fn a_controller_of_this_program_is_never_absent() {
+    let (mut cycle, bus) = cycle(Box::new(Dead));
+    cycle.tick(tick(0), 0, [works(&bus)]);
+    assert_eq!(cycle.absence(), None);
+}

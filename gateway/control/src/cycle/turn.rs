@@ -12,6 +12,7 @@ use protocol::parameters::MAX_JOINTS;
 
 use crate::cycle::carried::Heard;
 use crate::cycle::{Cycle, Record, Reference, Tick};
+use crate::external::Absence;
 use model::scenario::{Mode, Scenario};
 use model::table::Snapshot;
 
@@ -135,6 +136,12 @@ impl Turn {
     #[must_use]
     pub fn counts(&self) -> Vec<(String, u64)> {
         self.cycle.counts()
+    }
+
+    /// Why the controller counts as absent, if it does.
+    #[must_use]
+    pub fn absence(&self) -> Option<Absence> {
+        self.cycle.absence()
     }
 
     /// One tick. `now` is a monotonic clock in ns, `due` when the tick should have begun by it; `send`

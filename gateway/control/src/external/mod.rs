@@ -10,10 +10,12 @@
 //! datagram can stop a tick: others are counted, by reason. The bytes are in
 //! `docs/reference/external-controller.md`.
 
+mod absence;
 mod datagram;
 mod exchange;
 mod socket;
 
+pub use absence::{Absence, Others};
 pub use datagram::{Answer, Command, Nonsense, State};
 pub use socket::{External, SocketError};
 

@@ -12,6 +12,7 @@ use rustix::io::Errno;
 use rustix::net::SocketAddrUnix;
 use thiserror::Error;
 
+use super::absence::Absence;
 use super::datagram::{MAX_ANSWER_BYTES, State};
 use super::exchange::{Exchange, Sender, Sent};
 use crate::controller::{Controller, Input, Pace, Step};
@@ -133,6 +134,10 @@ impl Controller for External {
 
     fn counts(&self) -> Vec<(String, u64)> {
         self.exchange.counts.each().collect()
+    }
+
+    fn absence(&self, silent: Option<u32>) -> Option<Absence> {
+        Absence::of(self.path.clone(), &self.exchange.counts, silent)
     }
 }
 

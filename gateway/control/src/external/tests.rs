@@ -324,3 +324,59 @@ proptest! {
         prop_assert_eq!(Heard::decode(&answer.encode(6), 6), Ok(Heard::Answer(answer)));
     }
 }
+
+/// Checks why a gateway counts its controller as absent, with so many bad cycles at the end; the text names the socket.
+fn absent(gateway: &External, path: &Path, silent: Option<u32>, words: &str) {
+    let absence = gateway.absence(silent).unwrap_or_else(|| panic!("not absent: {words}")).to_string();
+    assert!(absence.contains(words) && absence.contains(&path.display().to_string()), "{absence}");
+    assert!(!absence.contains('\n'), "{absence:?}");
+}
+
+#[test]
+fn a_controller_that_never_says_hello_is_absent_whatever_else_comes() {
+    let (folder, path, mut gateway) = gateway();
+    gateway.step(&input(0));
+    absent(&gateway, &path, None, "no external controller said hello on ");
+    let program = program(&folder, "program");
+    let of_another_version = [&HELLO[..4], &[2, 0, 3, 0]].concat();
+    program.send(&of_another_version).unwrap();
+    program.send(&velocity(0, 0.5)).unwrap();
+    gateway.step(&input(1));
+    absent(&gateway, &path, None, " (2 datagrams came that are no hello of this version): start it");
+    UnixDatagram::unbound().unwrap().send_to(HELLO, &path).unwrap();
+    gateway.step(&input(2));
+    absent(&gateway, &path, Some(25), ", 1 came from a socket without an address");
+}
+
+#[test]
+fn a_controller_that_says_hello_and_never_answers_in_time_is_absent() {
+    let (folder, path, mut gateway) = gateway();
+    let program = program(&folder, "program");
+    program.send(HELLO).unwrap();
+    gateway.step(&input(0));
+    gateway.step(&input(1));
+    // Always a tick behind.
+    program.send(&velocity(0, 0.5)).unwrap();
+    program.send(b"SKBC").unwrap();
+    gateway.step(&input(2));
+    let counts = "(2 without an answer, 1 answered late, 1 datagrams of nonsense)";
+    absent(&gateway, &path, None, counts);
+    absent(&gateway, &path, Some(25), counts);
+}
+
+#[test]
+fn a_controller_that_answered_is_absent_only_if_it_is_silent_at_the_end() {
+    let (folder, path, mut gateway) = gateway();
+    let one = program(&folder, "program");
+    one.send(HELLO).unwrap();
+    gateway.step(&input(0));
+    one.send(&velocity(0, 0.5)).unwrap();
+    gateway.step(&input(1));
+    assert_eq!(gateway.absence(None), None);
+    absent(&gateway, &path, Some(40), " answered 1 ticks and none of the last 40");
+    // A second one takes over; the first one's answers count all the same.
+    let other = program(&folder, "other");
+    other.send(HELLO).unwrap();
+    gateway.step(&input(2));
+    assert_eq!(gateway.absence(None), None);
+}
