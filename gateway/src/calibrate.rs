@@ -202,17 +202,15 @@ impl Calibrate {
         }
         let folder = tempfile::tempdir().map_err(Failure::run)?;
         let path = self.record.clone().unwrap_or_else(|| folder.path().join("calibration.mcap"));
-        let options = self.options(skin, text, settings, motion, path.clone())?;
-        if !self.quiet {
-            let seconds = options.scenario.duration.0 / 1_000_000;
-            note(format_args!(
-                "the robot moves for {seconds} s about its start, each joint by {} at most",
-                self.within
-            ));
-        }
+        let mut options = self.options(skin, text, settings, motion, path.clone())?;
+        let seconds = options.scenario.duration.0 / 1_000_000;
+        let within = self.within;
+        options
+            .announced
+            .push(format!("the robot moves for {seconds} s about its start, each joint by {within} at most"));
         let summary =
             run::run(&options, None).map_err(|error| Failure::with_code(error.exit_code(), error))?;
-        let mut complaints = summary.complaints();
+        let mut complaints = summary.complaints(self.quiet);
         if summary.outcome != Outcome::Done {
             let last = complaints.pop().unwrap_or_else(|| "the run did not come to its end".to_owned());
             return Err(Failure::run(last));
@@ -273,6 +271,7 @@ impl Calibrate {
             record: record::Options { candump: None, mcap: Some(mcap), force: self.force.force },
             quiet: self.quiet,
             planned: Some(motion),
+            announced: Vec::new(),
         })
     }
 }

@@ -55,16 +55,6 @@ fn joined(between: &str, items: impl IntoIterator<Item: Display>) -> String {
     items.into_iter().map(|item| item.to_string()).collect::<Vec<_>>().join(between)
 }
 
-/// Node ids in order; of three and more in a row the first and the last, as in `1-250`.
-pub(crate) fn ranges(nodes: &[u8]) -> Vec<String> {
-    let in_a_row = nodes.chunk_by(|one, next| one.checked_add(1) == Some(*next));
-    let text = |row: &[u8]| match row {
-        [first, _, .., last] => vec![format!("{first}-{last}")],
-        few => few.iter().map(u8::to_string).collect(),
-    };
-    in_a_row.flat_map(text).collect()
-}
-
 /// A few names, or the first of many.
 pub(crate) fn some(names: &[String]) -> String {
     let few = names.get(..NAMES).filter(|_| names.len() > NAMES);
@@ -234,12 +224,6 @@ fn folded(name: &str, width: Option<usize>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn node_ids_in_a_row_are_folded() {
-        assert_eq!(ranges(&[1, 2, 4, 5, 6, 253, 254, 255]), ["1", "2", "4-6", "253-255"]);
-        assert_eq!(ranges(&[]), [""; 0]);
-    }
 
     #[test]
     fn a_long_name_is_folded_between_words_and_keeps_its_indent() {

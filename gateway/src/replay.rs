@@ -16,7 +16,7 @@ use protocol::id::Node;
 use protocol::usage::{Failure, print};
 
 use super::arguments::{BusKinds, Programs, Word, nanos, one_of};
-use super::output::{self, Force, apart};
+use super::output::{self, Force, apart, note};
 use super::print::{Rows, json, list, or, quantiles};
 use super::view::Page;
 
@@ -166,14 +166,19 @@ impl Replay {
         let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
         let page = |listen| Page::of_replay(&self.files, self.skin.as_deref(), &options.kinds, listen);
         // Its pipes stay open until the end.
-        let _page = self.shown.view.map(page).transpose()?;
+        let mut page = self.shown.view.map(page).transpose()?;
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
+        if let Some(status) = page.as_mut().and_then(|(page, _lines)| page.ended()) {
+            note(format_args!(
+                "--view: the process that served the page ended before the replay did ({status})"
+            ));
+        }
         let json = json(&summary)?;
         let write = |(whole, file)| output::finish("--summary", whole, file, &json);
         let written = file.map_or(Ok(()), write);
         print(&if self.shown.json { json } else { table(&summary) }).and(written)?;
-        summary.verdict().map_or(Ok(()), |why| Err(Failure::run(why)))
+        summary.verdict(self.shown.quiet).map_or(Ok(()), |why| Err(Failure::run(why)))
     }
 
     fn options(&self) -> Result<Options, Failure> {

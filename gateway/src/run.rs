@@ -12,7 +12,7 @@ use bench::record::{self, Candump};
 use bench::remote::Lines;
 use bench::run::launch::in_memory;
 use bench::run::{self, Options};
-use bench::summary::{Outcome, Summary};
+use bench::summary::Summary;
 use clap::Args;
 use model::scenario::{IDLE, Scenario};
 use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds};
@@ -153,7 +153,8 @@ pub(crate) struct Demo {
 /// loop for the scenario's duration, and prints a table of what happened. Ctrl-C ends it early, with the
 /// table. Embedded buses lie in SKINBUS_DIR, if that is set: give a bench beside another one a directory of its
 /// own. Exit code 0: it came to its end; 1: it did not, a bus was lost at its end, or its recording is incomplete; 2:
-/// wrong use or configuration; 3: the robot was halted at its end.
+/// wrong use or configuration; 3: the robot was halted at its end; 4: there was no external controller; 5: a process of
+/// cells ended by an error of its own.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
@@ -203,12 +204,10 @@ impl Demo {
         let own = given.is_none() && kind == BusKind::Embedded;
         let buses = own.then(|| buses::directory("demo")).transpose()?;
         options.directory = buses.as_ref().map(|buses| buses.path().to_owned()).or(given);
-        if !options.quiet {
-            let place = options.directory.as_ref();
-            let place = place.map(|path| format!("SKINBUS_DIR={} ", quoted_os(path.as_os_str())));
-            let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
-            note(format_args!("its frames in words: {place}gateway dump vcan0 --bus-kind {kind}"));
-        }
+        let place = options.directory.as_ref();
+        let place = place.map(|path| format!("SKINBUS_DIR={} ", quoted_os(path.as_os_str())));
+        let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
+        options.announced.push(format!("its frames in words: {place}gateway dump vcan0 --bus-kind {kind}"));
         let Common { recording, summary, view, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
@@ -305,6 +304,7 @@ impl Common {
             record: record::Options::default(),
             quiet: self.quiet,
             planned: None,
+            announced: Vec::new(),
         }
     }
 }
@@ -338,13 +338,12 @@ fn bench(
     if let Some(panic) = panicked {
         panic::resume_unwind(panic);
     }
-    if ended.control.ticks > 0 {
-        print(&show::rows(&ended).text())?;
-    }
+    let printed = if ended.control.ticks > 0 { print(&show::rows(&ended).text()) } else { Ok(()) };
     // The last line is the failure's own; each of them is one line.
-    let mut lines = ended.complaints();
-    let code = if ended.outcome == Outcome::Halted && unwritten.is_none() { 3 } else { 1 };
-    lines.extend(unwritten.map(|failure| failure.to_string()));
+    let mut lines = ended.complaints(options.quiet);
+    let lost: Vec<_> = unwritten.into_iter().chain(printed.err()).collect();
+    let code = if lost.is_empty() { ended.outcome.exit_code() } else { 1 };
+    lines.extend(lost.iter().map(ToString::to_string));
     let Some(last) = lines.pop() else { return Ok(()) };
     for line in lines {
         note(format_args!("gateway: {line}"));

@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
 use std::io;
-use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
 use std::os::fd::AsFd;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, ExitStatus, Stdio};
 
 use bench::remote::Lines;
 use bench::run;
@@ -271,12 +272,19 @@ impl Page {
             command.arg("--bus-kind").arg(OsString::from(format!("{}={kind}", bus.name)));
         }
         if let Some(listen) = listen {
+            // Its own refusal would come when the run has begun.
+            TcpListener::bind(listen).map_err(|error| {
+                Failure::usage(format!(
+                    "--view={listen}: {error}; name another port, or --view alone for a free one"
+                ))
+            })?;
             command.arg("--listen").arg(listen.to_string());
         }
         if let Some(directory) = directory {
             command.env("SKINBUS_DIR", directory);
         }
-        // Its signals are its own: the run ends it.
+        // Its signals are its own: the run ends it, also on Ctrl-C.
+        command.process_group(0);
         let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
         let mut page = child.map(Self).map_err(|error| failed(&error))?;
         let (Some(commands), Some(state)) = (page.0.stdout.take(), page.0.stdin.take()) else {
@@ -284,6 +292,11 @@ impl Page {
         };
         let lines = Lines::new(commands, state).map_err(|error| failed(&error))?;
         Ok((page, lines))
+    }
+
+    /// How its process has ended, if it has.
+    pub(crate) fn ended(&mut self) -> Option<ExitStatus> {
+        self.0.try_wait().ok().flatten()
     }
 }
 

@@ -4,8 +4,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use bench::summary::{
-    BusSummary, CellSummary, Halted, HostSummary, Loop, NetworkSummary, Outcome, Processor, Recording,
-    RepliesSummary, Summary, SumsSummary, TickBefore, Written,
+    BusSummary, CellError, CellSummary, ErrorCells, Halted, HostSummary, Loop, Memory, NetworkSummary,
+    Outcome, Processor, Recording, RepliesSummary, Summary, SumsSummary, TickBefore, Written,
 };
 use model::quantiles::{Quantiles, histogram};
 use model::table::{Accuracy, Event, Status, Table};
@@ -67,6 +67,11 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
             command_rad_s: vec![0.0; 6],
             halted: true,
         }],
+        no_controller: Some("no external controller said hello".to_owned()),
+        cell_errors: vec![CellError {
+            reason: "cannot send to vcan0".to_owned(),
+            cells: vec![ErrorCells { bus: "vcan0".to_owned(), nodes: vec![1] }],
+        }],
         first_broadcast_s: 1.0,
         control: Loop {
             ticks: 500,
@@ -89,9 +94,11 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
         backlog_dropped: Some(0),
         buses: vec![bus],
         processor: Processor::default(),
-        cell_private_kib: Some(768),
-        gateway_private_kib: Some(9_000),
-        buses_private_kib: Some(500),
+        memory: Memory {
+            cell_private_kib: Some(768),
+            gateway_private_kib: Some(9_000),
+            buses_private_kib: Some(500),
+        },
         recording: Some(Recording {
             files: vec![Written {
                 path: "run.log".to_owned(),
@@ -206,6 +213,23 @@ fn the_names_in_maps_are_documented() {
     for name in names {
         assert!(SUMMARY_MD.contains(&format!("`{name}`")), "{name}");
     }
+}
+
+#[test]
+fn every_outcome_is_documented_with_its_exit_code() {
+    let rows: BTreeMap<_, _> = SUMMARY_MD
+        .lines()
+        .filter_map(|line| {
+            let mut columns = line.strip_prefix("| ")?.split(" | ");
+            let (code, name) = (columns.next()?.parse::<u8>().ok()?, columns.next()?);
+            Some((name.strip_prefix('`')?.strip_suffix('`')?.to_owned(), code))
+        })
+        .collect();
+    let outcomes = Outcome::ALL.map(|outcome| {
+        let name = serde_json::to_value(outcome).unwrap().as_str().unwrap().to_owned();
+        (name, outcome.exit_code())
+    });
+    assert_eq!(rows, BTreeMap::from(outcomes));
 }
 
 /// A bus whose two cells are pressed: one answers in time, the other one's replies are lost, refused, late

@@ -137,3 +137,64 @@ fn a_controllers_nonsense_is_counted_and_ignored() {
     assert_eq!(positions.len(), 1);
     assert!(log.messages.iter().any(|(message, _)| *message == Message::Halt), "the cells are halted");
 }
+
+/// Runs a bench whose controller may take longer to begin than the run lasts; `control` is what there is of one.
+fn ends_without_controller(control: impl FnOnce(&Place), why: &str) {
+    let place = place(25);
+    place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 600.0"));
+    let bench = place.bench(60.0, "--quiet");
+    let gateway = place.path("controller.sock");
+    until("the gateway's socket", || gateway.exists().then_some(()));
+    control(&place);
+    // The loop runs, and so many ticks are over.
+    place.test_client().waits_for_joints(30);
+    bench.signal(Signal::TERM);
+    let ended = bench.end();
+    place.is_left_clean();
+    assert_eq!(ended.code(), Some(4), "{ended:#?}");
+    let line = ended.stderr.trim_end();
+    assert!(line.starts_with("gateway: ") && !line.contains('\n'), "one line, though quiet: {ended:#?}");
+    assert!(line.contains(why) && line.contains("controller.sock"), "{line}");
+    let summary = place.summary();
+    summary.adds_up();
+    assert_eq!(summary.0["outcome"], "no_controller", "{:#}", summary.0);
+    assert_eq!(summary.0["no_controller"], line.trim_start_matches("gateway: "));
+    assert_eq!(summary.0["halts"], serde_json::json!([]), "it had time to begin");
+    assert!(ended.stdout.lines().nth(1).unwrap().contains("no controller"), "{}", ended.stdout);
+}
+
+#[test]
+fn a_run_to_which_no_controller_comes_has_an_outcome_of_its_own() {
+    let place = place(25);
+    place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 600.0"));
+    let ended = place.bench(0.5, "--quiet").end();
+    assert_eq!((ended.code(), ended.stderr.lines().count()), (Some(4), 1), "{ended:#?}");
+    assert!(ended.stderr.contains("no external controller said hello on "), "{ended:#?}");
+    let summary = place.summary();
+    let bad = summary.count("/loop/bad_cycles", NOBODY);
+    assert_eq!((&summary.0["outcome"], bad), (&"no_controller".into(), summary.number("/loop/ticks")));
+    ends_without_controller(|_| {}, "no external controller said hello on ");
+}
+
+#[test]
+fn a_program_that_says_hello_in_another_version_is_no_controller() {
+    let control = |place: &Place| {
+        let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
+        let hello = [b"SKBC".as_slice(), &[2, 0, 3, 0]].concat();
+        own.send_to(&hello, place.path("controller.sock")).unwrap();
+    };
+    ends_without_controller(control, "(1 datagrams came that are no hello of this version)");
+}
+
+#[test]
+fn a_controller_that_says_hello_and_does_not_answer_is_none() {
+    let mut peer = None;
+    let control = |place: &Place| {
+        let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
+        own.send_to(&[b"SKBC".as_slice(), &[1, 0, 3, 0]].concat(), place.path("controller.sock")).unwrap();
+        // It stays there, and reads nothing.
+        peer = Some(own);
+    };
+    ends_without_controller(control, " said hello and answered no tick in time (");
+    drop(peer);
+}

@@ -4,8 +4,12 @@
 
 mod process;
 
+use std::os::unix::fs::PermissionsExt;
+
+use model::generate::Format as Wire;
 use process::log::Log;
-use process::{Ended, PRESSED, Place, Summary, is_stopped, skin, tells, until};
+use process::test_client::TestClient;
+use process::{Ended, PRESSED, Place, Running, Summary, is_stopped, skin, tells, until};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Message, NetworkPage, State};
@@ -130,6 +134,69 @@ fn several_cells_in_a_killed_process_are_all_named() {
     bench.signal(Signal::TERM);
     bench.end().well();
     assert_eq!(place.summary().adds_up().silent(), [1, 2, 3, 4]);
+}
+
+/// Ends the cells of vcan1 by an error of their own: they lose their bus, and its folder is one in which they may not
+/// look for it again. Afterwards it is served again.
+fn errors_on_vcan1(place: &Place, bench: &Running, server: Running, processes: usize) -> Running {
+    let mode = |mode| std::fs::set_permissions(place.buses(), std::fs::Permissions::from_mode(mode)).unwrap();
+    let serve = || {
+        let server = place.start("vcan-setup", "serve vcan1");
+        server.prints("serving vcan1 at ");
+        server
+    };
+    let all = bench.cells().len();
+    mode(0o755);
+    server.signal(Signal::KILL);
+    server.end();
+    until("the ends of its cells", || (bench.cells().len() == all - processes).then_some(()));
+    mode(0o700);
+    let server = serve();
+    TestClient::on(place, "vcan1", Format::Fd).waits_for_joints(10);
+    server
+}
+
+#[test]
+fn cells_that_end_by_an_error_of_their_own_are_the_runs_outcome_and_their_reason_is_given_once() {
+    for (per_process, quiet) in [(1, true), (4, false)] {
+        let place = Place::new();
+        place.write("skin.toml", &process::skin_of(8, 2, Wire::Fd));
+        place.scenario(PRESSED);
+        let first = place.start("vcan-setup", "serve vcan1");
+        first.prints("serving vcan1 at ");
+        let more = if quiet { "--quiet" } else { "" };
+        let bench = place.bench(60.0, &format!("{more} --cells-per-process {per_process}"));
+        TestClient::on(&place, "vcan1", Format::Fd).waits_for_joints(10);
+        let server = errors_on_vcan1(&place, &bench, first, 4 / per_process);
+        bench.signal(Signal::TERM);
+        let ended = bench.end();
+        server.signal(Signal::TERM);
+        server.end().well();
+        place.is_left_clean();
+        assert_eq!(ended.code(), Some(5), "{ended:#?}");
+        let summary = place.summary();
+        summary.adds_up();
+        assert_eq!(summary.0["outcome"], "cell_error", "{:#}", summary.0);
+        let [error] = summary.0["cell_errors"].as_array().unwrap().as_slice() else {
+            panic!("{:#}", summary.0)
+        };
+        assert_eq!(error["cells"], serde_json::json!([{ "bus": "vcan1", "nodes": [1, 2, 3, 4] }]));
+        let why = error["reason"].as_str().unwrap();
+        // The gateway itself may not look there either.
+        let given = ended.stderr.lines().filter(|line| !line.starts_with("vcan1 cannot be opened again yet"));
+        assert_eq!(given.filter(|line| line.contains(why)).count(), 1, "{ended:#?}");
+        let last = ended.stderr.lines().last().unwrap();
+        if quiet {
+            assert_eq!(ended.stderr.lines().count(), 1, "{ended:#?}");
+            let line = format!("gateway: 4 cells ended by errors of their own: 1-4 on vcan1 ({why})");
+            assert_eq!(last, line);
+        } else {
+            assert_eq!(last, "gateway: 4 cells ended by errors of their own, given above: 1-4 on vcan1");
+            let note = format!("the process of cells 1 to 4 on vcan1 ended (exit status: 1: {why})\n");
+            assert!(ended.stderr.contains(&note), "{ended:#?}");
+        }
+        assert!(ended.stdout.contains("ended by errors of their own"), "{}", ended.stdout);
+    }
 }
 
 #[test]

@@ -6,7 +6,7 @@ mod process;
 
 use std::fs;
 use std::io::Read;
-use std::os::unix::fs::symlink;
+use std::os::unix::fs::{PermissionsExt, symlink};
 use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
@@ -371,6 +371,17 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
     killed.end();
     until("its buses' end", || place.files().iter().all(|name| name.ends_with(".log")).then_some(()));
     assert!(!times(&place.path("skinbus-demo-3.log")).is_empty());
+}
+
+#[test]
+fn a_demonstration_that_is_refused_announces_nothing() {
+    let place = Place::new();
+    fs::create_dir(place.buses()).unwrap();
+    fs::set_permissions(place.buses(), fs::Permissions::from_mode(0o755)).unwrap();
+    let refused = place.start("gateway", "demo --duration 1").end();
+    let said = refused.refusal(2);
+    assert!(said.contains("buses") && said.contains("0755"), "{said}");
+    assert_eq!(place.files(), ["buses"]);
 }
 
 #[test]

@@ -155,6 +155,61 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
 }
 
 #[test]
+fn a_bus_that_a_page_takes_down_and_up_at_once_is_no_loss_of_the_run() {
+    let place = Place::new();
+    place.write("skin.toml", &(skin(4) + "\n[safety]\nbad_cycles = 10000\n"));
+    let (run, address) = watched_skin(&place, "");
+    let mut page = Page::new(&address);
+    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    // In one go, before the run has noticed that the bus was away: once, and again while it comes up.
+    for times in [1, 1, 2, 3] {
+        let seen = run.stderr().matches("vcan0 works again").count();
+        for down in [true, false].repeat(times) {
+            page.command(&format!(r#""on":"bus","down":{down},"bus":0"#));
+        }
+        (0..times).for_each(|_| assert!(page.answer("bus vcan0 down") && page.answer("bus vcan0 up")));
+        until("the bus", || (run.stderr().matches("vcan0 works again").count() > seen).then_some(()));
+        page.hears("the bus up", |said| said["bench"]["buses"][0]["down"] == false);
+    }
+    page.sees("all cells again", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    assert_eq!(end(&place, run), Some(0));
+}
+
+#[test]
+fn a_cell_that_a_page_restarts_while_its_node_id_is_taken_ends_by_an_error_of_its_own() {
+    let place = Place::new();
+    let (run, address) = watched(&place, 4, "");
+    let mut page = Page::new(&address);
+    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    page.act("kill", 3);
+    page.sees("that it is silent", |it| it.cells[2].0 == 4);
+    place.write("other.toml", &place.read("skin.toml").replace("serial = 100003\n", "serial = 777\n"));
+    let other = place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 3 --skin other.toml");
+    page.sees("another cell 3", |it| it.cells[2].0 == 1);
+    page.act("restart", 3);
+    let why = "cell 3 is on vcan0 already, with serial number ";
+    run.hears(&format!("the process of cell 3 on vcan0 ended (exit status: 1: {why}"));
+    drop(other);
+    assert_eq!(end(&place, run), Some(5));
+    let errors = &place.summary().0["cell_errors"];
+    assert!(errors[0]["reason"].as_str().unwrap().starts_with(why), "{errors:#}");
+    assert_eq!(errors[0]["cells"], json!([{ "bus": "vcan0", "nodes": [3] }]));
+}
+
+#[test]
+fn a_page_at_an_address_that_is_taken_is_refused_before_the_run() {
+    let place = Place::new();
+    place.skin(4);
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap();
+    let words = format!("run skin.toml --bus-kind embedded --duration 1 --candump run.log --view={address}");
+    let refused = place.start("gateway", &words).end();
+    let said = refused.refusal(2);
+    assert!(said.starts_with(&format!("gateway: --view={address}: Address already in use")), "{said}");
+    assert_eq!(place.files(), ["skin.toml"], "nothing was done");
+}
+
+#[test]
 fn a_link_that_a_page_takes_down_leaves_a_cell_unreachable() {
     let place = Place::new();
     process::sums::grid(&place, Format::Fd);
@@ -202,6 +257,7 @@ fn a_server_that_hangs_or_ends_does_not_hold_the_run_up() {
     page.command(r#""on":"bus","down":true,"bus":0"#);
     assert!(page.answer("bus vcan0 down"));
     signal(server, Signal::KILL);
+    run.hears("--view: the process that served the page has ended; the run goes on without a page\n");
     run.hears("the process that served vcan0 ended (exit status: 0); it is served again");
     run.hears("vcan0 works again");
     goes_on(&run);

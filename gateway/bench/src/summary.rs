@@ -10,7 +10,7 @@ use protocol::time::Micros;
 use serde::Serialize;
 
 pub use self::cells::{CellSummary, RepliesSummary};
-pub use self::outcome::{Halted, Outcome, TickBefore};
+pub use self::outcome::{CellError, ErrorCells, Halted, Outcome, TickBefore, cells_in_error, ranges};
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Contributions, Event, Status, SumCounts, Table};
 pub use trace::recording::account::{Recording, Written};
@@ -41,6 +41,10 @@ pub struct Summary {
     pub further_halts: u64,
     /// The ticks up to the last halt, oldest first.
     pub before_halt: Vec<TickBefore>,
+    /// Why the external controller counts as absent, if it does; none of a halted robot.
+    pub no_controller: Option<String>,
+    /// Errors by which processes of cells ended.
+    pub cell_errors: Vec<CellError>,
     /// From the start of the program to the first broadcast, in s.
     pub first_broadcast_s: f64,
     /// The control loop.
@@ -55,12 +59,9 @@ pub struct Summary {
     pub buses: Vec<BusSummary>,
     /// Processor time while the loop ran, in cores.
     pub processor: Processor,
-    /// Private memory of the largest cell process in KiB, if cells were started.
-    pub cell_private_kib: Option<u64>,
-    /// Private memory of this program in KiB, at the end of the loop.
-    pub gateway_private_kib: Option<u64>,
-    /// Private memory of all processes that were started to serve buses, in KiB; none without any.
-    pub buses_private_kib: Option<u64>,
+    /// Private memory.
+    #[serde(flatten)]
+    pub memory: Memory,
     /// What was recorded, and what was lost.
     pub recording: Option<Recording>,
 }
@@ -92,15 +93,18 @@ impl Summary {
         self.outcome = match &self.failure {
             Some(_) => Outcome::Failed,
             None if self.halted.is_some() => Outcome::Halted,
+            None if self.no_controller.is_some() => Outcome::NoController,
+            None if !self.cell_errors.is_empty() => Outcome::CellError,
             None if self.interrupted => Outcome::Interrupted,
             None => Outcome::Done,
         };
         self
     }
 
-    /// The messages about its end, a line each and the reason of its exit code last; none when all is well.
+    /// The messages about its end, a line each and the reason of its exit code last; none when all is well. Reasons of
+    /// cells' errors are not repeated unless the run was `quiet`.
     #[must_use]
-    pub fn complaints(&self) -> Vec<String> {
+    pub fn complaints(&self, quiet: bool) -> Vec<String> {
         // The error of a failed run names the lost bus.
         let came_to_its_end = self.failure.is_none() || self.failure == self.lost_frames();
         let lost = self.lost_buses().filter(|_| came_to_its_end);
@@ -111,7 +115,11 @@ impl Summary {
                  the ticks before it"
             )
         });
-        [lost, halted, self.failure.clone()].into_iter().flatten().collect()
+        let absent = self.no_controller.clone();
+        [lost, cells_in_error(&self.cell_errors, quiet), absent, halted, self.failure.clone()]
+            .into_iter()
+            .flatten()
+            .collect()
     }
 
     fn lost_buses(&self) -> Option<String> {
@@ -172,6 +180,17 @@ pub struct Processor {
     pub cells: f64,
     /// Embedded buses.
     pub buses: f64,
+}
+
+/// Private memory, in KiB.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Memory {
+    /// Of the largest cell process, if cells were started.
+    pub cell_private_kib: Option<u64>,
+    /// Of this program, at the end of the loop.
+    pub gateway_private_kib: Option<u64>,
+    /// Of all processes that were started to serve buses; none without any.
+    pub buses_private_kib: Option<u64>,
 }
 
 /// Packets from the cells: sent = delivered + rejected + unheard + lost, and lost = dropped + backlog + outage + hosts

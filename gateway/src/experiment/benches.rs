@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use bench::summary::Outcome;
 use paper::arm::{self, Reply};
 use paper::moving::Run;
 use paper::scale::Bench;
@@ -72,8 +73,9 @@ impl Benches {
         Ok(Run { rows, summary, joints })
     }
 
-    /// Runs `gateway run` on a bench of so many cells, each bus' cells in one process, and reads its summary; one that
-    /// failed or was halted has a summary too.
+    /// Runs `gateway run` on a bench of so many cells, each bus' cells in one process, and reads its summary. One that
+    /// failed or was halted, as the machine cannot do it, has a summary too; one whose cells ended by an error of their own
+    /// measures nothing.
     pub(super) fn scaled(&self, bench: &Bench) -> Result<Value, Failure> {
         let what = format!("the bench of {} cells ({})", bench.cells, bench.name());
         let buses = buses::directory("experiment")?;
@@ -87,7 +89,9 @@ impl Benches {
         let texts = [bench.skin(), bench.scenario()];
         let texts = texts.each_ref().map(String::as_str);
         let ended = self.perform(&what, &files, texts, CellId::MAX.get(), buses.path())?;
-        if files.summary.exists() {
+        let is_invalid = |outcome: Outcome| ended.status.code() == Some(outcome.exit_code().into());
+        let is_invalid = [Outcome::CellError, Outcome::NoController].into_iter().any(is_invalid);
+        if files.summary.exists() && !is_invalid {
             read_summary(&what, &files.summary)
         } else {
             Err(failed(&what, &last_words(&ended)))

@@ -4,10 +4,10 @@ use std::cmp::Reverse;
 use std::fmt::Display;
 
 use analysis::paper;
-use bench::summary::{BusSummary, CellSummary, Halted, Outcome, Processor, Summary};
+use bench::summary::{BusSummary, CellSummary, Halted, Outcome, Processor, Summary, ranges};
 use model::table::Errors;
 
-use crate::print::{Rows, count, list, or, quantiles, ranges, words};
+use crate::print::{Rows, count, list, or, quantiles, words};
 
 /// Halts that are listed one by one.
 const HALTS: usize = 10;
@@ -26,6 +26,10 @@ pub(super) fn rows(summary: &Summary) -> Rows {
     };
     let mut rows = Rows::new(&summary.skin, cells, ended);
     halts(&mut rows, summary);
+    for error in &summary.cell_errors {
+        rows.section("ended by errors of their own", count(error.count(), "cell"), &error.reason);
+        rows.row("cells", error.names(), "");
+    }
     accuracy(&mut rows, summary);
     control(&mut rows, summary);
     for bus in &summary.buses {
@@ -249,11 +253,11 @@ fn costs(rows: &mut Rows, summary: &Summary) {
     rows.section("cost", "", "");
     let parts = format!("gateway {gateway:.3}, cells {cells:.3}, buses {buses:.3}");
     rows.row("processor, cores", format!("{:.3}", gateway + cells + buses), parts);
-    if let Some(kib) = summary.cell_private_kib {
+    if let Some(kib) = summary.memory.cell_private_kib {
         rows.row("private memory of a cell process", format!("{kib} KiB"), "the largest");
     }
-    if let Some(kib) = summary.gateway_private_kib {
-        let buses = summary.buses_private_kib.map(|kib| format!("its servers of buses {kib} KiB"));
+    if let Some(kib) = summary.memory.gateway_private_kib {
+        let buses = summary.memory.buses_private_kib.map(|kib| format!("its servers of buses {kib} KiB"));
         rows.row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
     }
     rows.row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");

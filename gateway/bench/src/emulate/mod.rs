@@ -169,8 +169,8 @@ impl<'a> Emulator<'a> {
             let factory = factory(bench.skin, cell);
             fs::write(&place.program, self.firmware.of(&factory)).map_err(EmulateError::Files)?;
             let log = File::create(&place.log).map_err(EmulateError::Files)?;
-            processes.emulate(cell, self.command(&place, log), &place.log)?;
             let name = bench.skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str());
+            processes.emulate(cell, name, self.command(&place, log), &place.log)?;
             planned.add(name, bench.kinds.of(name), place.socket, filters(cell, &factory));
         }
         let _lines = planned.join(bench.directory)?;
@@ -225,8 +225,7 @@ impl<'a> Emulator<'a> {
             return Err(EmulateError::Interrupted);
         }
         if let Some(ended) = ended {
-            let bus = skin.buses.get(ended.bus).map_or("", |bus| bus.name.as_str());
-            return Err(EmulateError::Ended { cells: format!("{ended} on {bus}"), how: ended.how() });
+            return Err(EmulateError::Ended { cells: ended.to_string(), how: ended.how() });
         }
         for done in &done {
             if let Some(failure) = &done.failure {

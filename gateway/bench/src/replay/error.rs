@@ -7,7 +7,7 @@ use protocol::bus::KindsError;
 use thiserror::Error;
 
 use super::checks::Mismatch;
-use crate::run::RunError;
+use crate::run::{RunError, why};
 use model::decode::BUSES;
 use trace::capture::CaptureError;
 
@@ -98,12 +98,14 @@ pub enum ReplayError {
         cells: String,
     },
     /// A process of cells ended too early.
-    #[error("the process of {cells} ended while starting ({status}); see its message above")]
+    #[error("the process of {cells} ended while starting ({status}){}", why(.said.as_deref()))]
     Ended {
         /// Its cells.
         cells: String,
         /// How.
         status: ExitStatus,
+        /// Why, if it said so.
+        said: Option<String>,
     },
     /// Another gateway is on a bus.
     #[error("another gateway is on {0}: stop it, or send the capture to another bus with --map")]

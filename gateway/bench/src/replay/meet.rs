@@ -105,8 +105,9 @@ impl Session {
             if session.is_interrupted() {
                 return Err(RunError::Interrupted.into());
             }
-            if let Some(ended) = session.buses.processes.ended().first() {
-                return Err(ReplayError::Ended { cells: ended.to_string(), status: ended.status });
+            if let Some(ended) = session.buses.processes.ended().into_iter().next() {
+                let cells = ended.to_string();
+                return Err(ReplayError::Ended { cells, status: ended.status, said: ended.said });
             }
             if let Some(bus_link) = comparator.other_gateway() {
                 return Err(ReplayError::OtherGateway(

@@ -49,6 +49,7 @@ use self::session::Session;
 use self::shared_state::SharedState;
 use self::start::Routes;
 use self::survey::{Part, Survey};
+use crate::run::EndedProcesses;
 use crate::run::progress::Progress;
 use crate::run::realtime::idle_lateness;
 use crate::setup::names;
@@ -147,7 +148,8 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
         warn_of_doubles(&checks, &heard, &progress);
     }
     let shared_state = Arc::new(SharedState::new(checks));
-    Session { shared_state, buses, signalled, progress, measuring: Vec::new() }
+    let (measuring, ended) = (Vec::new(), EndedProcesses::default());
+    Session { shared_state, buses, signalled, progress, measuring, ended }
         .run(idle.as_ref(), skin_override.as_ref())
 }
 

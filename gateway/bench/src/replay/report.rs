@@ -9,6 +9,7 @@ use serde::Serialize;
 use super::comparator::{Lacking, Tally};
 use super::difference::Difference;
 use super::player::BusLinkTally;
+use crate::summary::{CellError, cells_in_error};
 use model::quantiles::Quantiles;
 
 /// A whole replay.
@@ -46,6 +47,8 @@ pub struct Summary {
     pub lockstep: Option<Lockstep>,
     /// With a comparison, its result.
     pub expect: Option<Expect>,
+    /// Errors by which processes of cells ended.
+    pub cell_errors: Vec<CellError>,
     /// Why it did not come to its end, if it did not.
     pub failure: Option<String>,
 }
@@ -123,13 +126,13 @@ fn nonzero<const N: usize>(counts: [(&'static str, u64); N]) -> Vec<(&'static st
 }
 
 impl Summary {
-    /// Why it is no success, in one line; none when it is.
+    /// Why it is no success, in one line; none when it is. Reasons of cells' errors are not repeated unless it was `quiet`.
     #[must_use]
-    pub fn verdict(&self) -> Option<String> {
+    pub fn verdict(&self, quiet: bool) -> Option<String> {
         if let Some(failure) = &self.failure {
             return Some(failure.clone());
         }
-        let mut wrong = Vec::new();
+        let mut wrong: Vec<_> = cells_in_error(&self.cell_errors, quiet).into_iter().collect();
         if let Some(expect) = self.expect.as_ref().filter(|expect| !expect.tally.is_good()) {
             let Tally { different, missing, extra, not_requested, .. } = expect.tally;
             let counts = nonzero([

@@ -21,9 +21,9 @@ use super::shared_state::SharedState;
 use super::source::{self, AHEAD};
 use super::start::{Buses, SkinOverride};
 use super::survey::Bus;
-use crate::run::RunError;
 use crate::run::progress::Progress;
 use crate::run::realtime::{self, Granted};
+use crate::run::{EndedProcesses, RunError};
 use crate::setup::spawn;
 use model::quantiles::Quantiles;
 
@@ -38,6 +38,8 @@ pub(super) struct Session {
     pub(super) progress: Progress,
     /// Cells that were put into test mode, by bus.
     pub(super) measuring: Vec<Vec<CellId>>,
+    /// Processes of cells that have ended.
+    pub(super) ended: EndedProcesses,
 }
 
 impl Session {
@@ -127,11 +129,20 @@ impl Session {
         for line in said.try_iter() {
             self.progress.note(&line);
         }
+        self.look_at_processes(true);
         let plan_summary = plan_summary.unwrap_or_else(|error| {
             played.failure.get_or_insert(ReplayError::Read(error));
             PlanSummary::default()
         });
         Ok(self.summary(played, plan_summary, live, duration_s, granted, idle))
+    }
+
+    /// Notes the processes of cells that have ended; all that are not noted yet when it is the `last` time.
+    fn look_at_processes(&mut self, last: bool) {
+        let ended = self.buses.processes.ended();
+        for note in self.ended.take(ended, last) {
+            self.progress.note(&note);
+        }
     }
 
     /// Shows how it goes, until it is over; whether there is another gateway.
@@ -145,9 +156,7 @@ impl Session {
             for line in said.try_iter() {
                 self.progress.note(&line);
             }
-            for ended in self.buses.processes.ended() {
-                self.progress.note(&format!("the process of {ended} ended ({})", ended.status));
-            }
+            self.look_at_processes(false);
             if self.shared_state.checks.options.hears() && other_gateway.is_none() {
                 let bus_link = self.shared_state.comparator().other_gateway();
                 other_gateway = bus_link.map(|bus_link| {
@@ -212,6 +221,7 @@ impl Session {
             memory_locked: granted.locked,
             lockstep: options.lockstep.then_some(lockstep),
             expect: options.expect.map(|tolerance| self.expectation(tolerance)),
+            cell_errors: self.ended.errors(),
             failure: played.failure.map(|failure| failure.to_string()),
         }
     }

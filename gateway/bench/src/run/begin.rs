@@ -14,7 +14,7 @@ use protocol::usage::say;
 
 use super::RunError;
 use super::bench::{Bench, LOOK};
-use super::launch::{Ended, LISTEN, Plan, STARTING, program};
+use super::launch::{LISTEN, Plan, STARTING, program};
 use super::receiver::BusEvent;
 use crate::setup::{Timeout, names};
 use crate::view::View;
@@ -69,6 +69,17 @@ impl Bench<'_> {
             self.organise()
         } else {
             Ok(())
+        }
+    }
+
+    /// Shows what is so from now on.
+    pub(super) fn announce(&self) {
+        if self.options.quiet {
+            return;
+        }
+        self.options.announced.iter().for_each(|line| say(line));
+        if let Some(log) = &self.log {
+            say(&format!("frames are recorded in {}", log.display()));
         }
     }
 
@@ -183,9 +194,11 @@ impl Bench<'_> {
                 BusEvent::Notice(_) | BusEvent::Up => {}
             }
         }
-        match self.processes.ended().first() {
+        match self.processes.ended().into_iter().next() {
             None => Ok(()),
-            Some(ended) => Err(RunError::Ended { cells: self.cells_of(ended), how: ended.how() }),
+            Some(ended) => {
+                Err(RunError::Ended { cells: ended.to_string(), status: ended.status, said: ended.said })
+            }
         }
     }
 
@@ -193,11 +206,6 @@ impl Bench<'_> {
     pub(super) fn other_gateway(&self, bus: usize) -> RunError {
         let link = self.bus_links.get(bus).map(|bus_link| &bus_link.link);
         RunError::OtherGateway(link.map(|link| (link.name.clone(), link.kind)))
-    }
-
-    /// The cells of a process that has ended, as text.
-    pub(super) fn cells_of(&self, ended: &Ended) -> String {
-        format!("{ended} on {}", self.name(ended.bus))
     }
 
     /// Sends a command on every bus.

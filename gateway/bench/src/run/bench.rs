@@ -1,6 +1,7 @@
 //! A bench: its buses, its cells' processes, and what all of its threads share.
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver as Inlet, Sender};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -16,7 +17,8 @@ use protocol::packet::Epoch;
 use protocol::time::Micros;
 
 use super::Options;
-use super::commanded::Remote;
+use super::commanded::{Remote, SwitchedBuses};
+use super::ended::EndedProcesses;
 use super::hosts::Hosts;
 use super::launch::Processes;
 use super::link::{Link, Slot, may_return};
@@ -94,6 +96,12 @@ pub(super) struct Bench<'a> {
     pub(super) recorded: Option<rtrb::Producer<Timed>>,
     /// Who commands it, if anybody does.
     pub(super) remote: Option<Remote>,
+    /// Buses that a command has taken down, and not yet brought back.
+    pub(super) commanded: SwitchedBuses,
+    /// Processes of cells that have ended.
+    pub(super) ended: EndedProcesses,
+    /// Where frames are recorded, if only this program knows.
+    pub(super) log: Option<PathBuf>,
     // In this order they end: the cells before their buses.
     pub(super) processes: Processes,
     /// Held for its lines and files.

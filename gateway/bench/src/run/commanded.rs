@@ -1,7 +1,8 @@
 //! Commands to a run from another process: checked, carried out, noted, and answered with the state of the bench.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::io;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use protocol::bus::BusKind;
@@ -11,7 +12,7 @@ use vcan_setup::link::Kind;
 use vcan_setup::netlink::Netlink;
 
 use super::Options;
-use super::bench::Bench;
+use super::bench::{Bench, BusLink};
 use super::launch::{LaunchError, program};
 use super::measured::Measured;
 use super::progress::Progress;
@@ -30,12 +31,70 @@ const ANSWERS: usize = 8;
 #[derive(Debug)]
 pub(super) struct Remote {
     lines: Lines,
-    /// Buses that it has taken down.
-    down: BTreeSet<usize>,
     answers: Vec<Answer>,
     /// How many answers there were.
     count: u64,
     due: Instant,
+}
+
+/// Buses that commands have taken down. They outlive the remote, since only a bus itself shows that it works again.
+#[derive(Debug, Default)]
+pub(super) struct SwitchedBuses(BTreeMap<usize, Switched>);
+
+/// A bus that a command has taken down.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Switched {
+    /// It stays down.
+    Down,
+    /// It was taken up, or is left to come back, when it had taken so many of this run's commands.
+    Up { commands: u64 },
+}
+
+impl SwitchedBuses {
+    /// Whether a bus is to stay down.
+    pub(super) fn is_down(&self, bus: usize) -> bool {
+        self.0.get(&bus) == Some(&Switched::Down)
+    }
+
+    /// Whether the loss of a bus is due to a command, and no reason to end: it is down, or has not worked since it was
+    /// taken up.
+    pub(super) fn is_expected(&self, bus: usize) -> bool {
+        self.0.contains_key(&bus)
+    }
+
+    /// Checks that a command may take a bus down, or up.
+    ///
+    /// # Errors
+    /// When it is so already, or about to be.
+    fn check(&self, down: bool, bus: usize) -> Result<(), Refused> {
+        match (down, self.0.get(&bus)) {
+            (true, Some(Switched::Down)) => Err(Refused::Already("up")),
+            (false, Some(Switched::Up { .. })) => Err(Refused::ComesUp),
+            (false, None) => Err(Refused::Already("down")),
+            (true, Some(Switched::Up { .. }) | None) | (false, Some(Switched::Down)) => Ok(()),
+        }
+    }
+
+    /// Takes in that a bus was switched, when it had taken so many commands.
+    fn switched(&mut self, down: bool, bus: usize, commands: u64) {
+        self.0.insert(bus, if down { Switched::Down } else { Switched::Up { commands } });
+    }
+
+    /// Leaves the buses that are down to come back, since nobody will take them up; `commands` is how many each has taken.
+    fn release(&mut self, commands: impl Fn(usize) -> u64) {
+        for (bus, switched) in self.0.iter_mut().filter(|(_, switched)| **switched == Switched::Down) {
+            *switched = Switched::Up { commands: commands(*bus) };
+        }
+    }
+
+    /// Forgets the buses that have come up: which are there, and have taken a command since. Until its receiver has noticed
+    /// that a bus was away, and has opened it again, it takes none.
+    fn settle(&mut self, taken: impl Fn(usize) -> Option<u64>) {
+        self.0.retain(|bus, switched| match switched {
+            Switched::Down => true,
+            Switched::Up { commands } => taken(*bus).is_none_or(|taken| taken <= *commands),
+        });
+    }
 }
 
 /// Why a command is not carried out.
@@ -55,6 +114,8 @@ enum Refused {
     NoLinks,
     #[error("it is not {0} by a command")]
     Already(&'static str),
+    #[error("it was taken up, and does not work yet")]
+    ComesUp,
     #[error("another program serves it: end that one")]
     NotServed,
     #[error("it is no virtual interface: only vcan, vxcan and embedded buses are taken down here")]
@@ -71,7 +132,7 @@ enum Refused {
 
 impl Remote {
     pub(super) fn new(lines: Lines) -> Self {
-        Self { lines, down: BTreeSet::new(), answers: Vec::new(), count: 0, due: Instant::now() }
+        Self { lines, answers: Vec::new(), count: 0, due: Instant::now() }
     }
 
     fn answer(&mut self, done: bool, text: String) {
@@ -85,24 +146,29 @@ impl Remote {
 }
 
 impl Bench<'_> {
-    /// Whether a command has taken a bus down.
-    pub(super) fn is_taken_down(&self, bus: usize) -> bool {
-        self.remote.as_ref().is_some_and(|remote| remote.down.contains(&bus))
-    }
-
-    /// A bus works: nobody has it down.
-    pub(super) fn is_up_again(&mut self, bus: usize) {
-        self.remote.iter_mut().for_each(|remote| _ = remote.down.remove(&bus));
-    }
-
     /// Carries out the commands that have come, and sends the state when it is time. With its other side a remote ends, and
-    /// buses that it has taken down are as any that were lost.
+    /// buses that it has taken down come back.
     pub(super) fn obey(&mut self, measured: &Measured, progress: &Progress) {
-        let Some(mut remote) = self.remote.take().filter(|remote| !remote.lines.has_ended()) else { return };
+        let links = &self.bus_links;
+        self.commanded.settle(|bus| {
+            let link = &links.get(bus)?.link;
+            (!link.is_gone()).then(|| link.state.commands.load(Ordering::Relaxed))
+        });
+        let Some(mut remote) = self.remote.take() else { return };
+        if remote.lines.has_ended() {
+            self.commanded.release(|bus| commands(links, bus));
+            // At the end of the run it may end first.
+            if !self.signalled.load(Ordering::Relaxed) {
+                progress.error(
+                    "--view: the process that served the page has ended; the run goes on without a page",
+                );
+            }
+            return;
+        }
         for _ in 0..AT_ONCE {
             let Some(command) = remote.lines.receive() else { break };
             let what = self.words(command);
-            match self.carry_out(command, &mut remote.down) {
+            match self.carry_out(command) {
                 Ok(()) => {
                     let note = format!("view: {what}");
                     progress.note(&note);
@@ -141,14 +207,16 @@ impl Bench<'_> {
         }
     }
 
-    fn carry_out(&mut self, command: Command, down: &mut BTreeSet<usize>) -> Result<(), Refused> {
+    fn carry_out(&mut self, command: Command) -> Result<(), Refused> {
         match command {
             Command::Process { action, bus, node } => self.act(action, bus, node),
             Command::Link { down, bus, nodes } => self.command_link(down, bus, nodes),
-            Command::Bus { down: true, bus } if down.contains(&bus) => Err(Refused::Already("up")),
-            Command::Bus { down: false, bus } if !down.contains(&bus) => Err(Refused::Already("down")),
-            Command::Bus { down: true, bus } => self.switch_bus(true, bus).map(|()| _ = down.insert(bus)),
-            Command::Bus { down: false, bus } => self.switch_bus(false, bus).map(|()| _ = down.remove(&bus)),
+            Command::Bus { down, bus } => {
+                self.commanded.check(down, bus)?;
+                self.switch_bus(down, bus)?;
+                self.commanded.switched(down, bus, commands(&self.bus_links, bus));
+                Ok(())
+            }
         }
     }
 
@@ -209,7 +277,7 @@ impl Bench<'_> {
             pairs.map(move |[one, other]| LinkDown { bus, nodes: [one.get(), other.get()] })
         });
         let buses = self.bus_links.iter().enumerate().map(|(bus, bus_link)| BusState {
-            down: remote.down.contains(&bus),
+            down: self.commanded.is_expected(bus),
             links: bus_link.network.is_some(),
         });
         State {
@@ -220,6 +288,11 @@ impl Bench<'_> {
             answers: remote.answers.clone(),
         }
     }
+}
+
+/// How many commands a bus has taken.
+fn commands(links: &[BusLink], bus: usize) -> u64 {
+    links.get(bus).map_or(0, |bus_link| bus_link.link.state.commands.load(Ordering::Relaxed))
 }
 
 /// Serves an embedded bus.
@@ -267,6 +340,46 @@ mod tests {
         let why = "Operation not permitted (os error 1); a run that may not do it needs CAP_NET_ADMIN, or `sudo ip \
                    link set vcan0 down` does it";
         assert_eq!(refused.to_string(), why);
+    }
+
+    #[test]
+    fn a_bus_that_was_taken_up_is_expected_until_it_has_worked() {
+        let mut buses = SwitchedBuses::default();
+        assert!(matches!(buses.check(false, 0), Err(Refused::Already("down"))));
+        buses.check(true, 0).unwrap();
+        buses.switched(true, 0, 100);
+        assert!(matches!(buses.check(true, 0), Err(Refused::Already("up"))));
+        buses.settle(|_| Some(105));
+        assert!(buses.is_down(0) && buses.is_expected(0), "what works there is of before");
+        // Down and up at once: the receiver has not noticed anything yet.
+        buses.check(false, 0).unwrap();
+        buses.switched(false, 0, 105);
+        buses.settle(|_| Some(105));
+        assert!(!buses.is_down(0) && buses.is_expected(0));
+        assert!(matches!(buses.check(false, 0), Err(Refused::ComesUp)));
+        buses.settle(|_| None);
+        assert!(buses.is_expected(0), "the receiver has noticed it");
+        // Again, before it has worked.
+        buses.check(true, 0).unwrap();
+        buses.switched(true, 0, 105);
+        buses.switched(false, 0, 105);
+        buses.settle(|_| Some(105));
+        assert!(buses.is_expected(0) && !buses.is_expected(1));
+        buses.settle(|_| Some(106));
+        assert!(!buses.is_expected(0), "it works: its next loss is one");
+    }
+
+    #[test]
+    fn buses_that_a_remote_had_down_come_back_without_it() {
+        let mut buses = SwitchedBuses::default();
+        buses.switched(true, 0, 7);
+        buses.switched(false, 1, 7);
+        buses.release(|_| 9);
+        assert!(!buses.is_down(0) && buses.is_expected(0) && buses.is_expected(1));
+        buses.settle(|_| Some(9));
+        assert!(buses.is_expected(0) && !buses.is_expected(1));
+        buses.settle(|_| Some(10));
+        assert!(!buses.is_expected(0));
     }
 
     #[test]

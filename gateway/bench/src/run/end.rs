@@ -132,6 +132,7 @@ impl Bench<'_> {
         let all = received.iter().flatten().map(|received| received.table.accuracy());
         Summary {
             cells: self.cell_summaries(received),
+            cell_errors: self.ended.errors(),
             halted: measured.halts.why().map(str::to_owned),
             halts: measured.halts.all(),
             further_halts: measured.halts.further,

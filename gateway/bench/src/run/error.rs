@@ -2,6 +2,7 @@
 
 use std::error::Error;
 use std::path::PathBuf;
+use std::process::ExitStatus;
 
 use model::scenario::{FaultKind, Scenario};
 use protocol::bus::{BusError, BusKind};
@@ -128,12 +129,14 @@ pub enum RunError {
         cells: String,
     },
     /// A cell's process ended too early.
-    #[error("{cells} ended while starting ({how}); see the message above")]
+    #[error("{cells} ended while starting ({status}){}", why(.said.as_deref()))]
     Ended {
         /// Its cells.
         cells: String,
         /// How.
-        how: String,
+        status: ExitStatus,
+        /// Why, if it said so.
+        said: Option<String>,
     },
     /// Cells are not emulated.
     #[error(transparent)]
@@ -197,6 +200,11 @@ impl RunError {
             | Self::ReceiverEnded => 1,
         }
     }
+}
+
+/// The reason that a process gave, or where else there may be one.
+pub(crate) fn why(said: Option<&str>) -> String {
+    said.map_or_else(|| "; see the message above".to_owned(), |said| format!(": {said}"))
 }
 
 fn other_gateway(link: Option<&(String, BusKind)>) -> String {

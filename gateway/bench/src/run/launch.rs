@@ -5,7 +5,7 @@ use std::fmt::{self, Display, Formatter};
 use std::fs::File;
 use std::io::Write;
 use std::os::fd::AsRawFd;
-use std::os::unix::process::CommandExt;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::Arc;
@@ -13,6 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use protocol::bus::Kinds;
+use protocol::last_words::CellRange;
 use protocol::skin::{Cell, Skin};
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, setrlimit};
@@ -20,6 +21,7 @@ use thiserror::Error;
 
 use super::RunError;
 use super::io::end_with_parent;
+use super::words::StandardError;
 use crate::remote::{Phase, ProcessState};
 use model::scenario::ProcessAction;
 
@@ -28,7 +30,7 @@ pub const LISTEN: Duration = Duration::from_millis(500);
 /// Timeout of started cells without progress.
 pub const STARTING: Duration = Duration::from_secs(15);
 /// Files that a gateway or a server of a bus has open beside buses and clients.
-const OTHER_FILES: usize = 24;
+const OTHER_FILES: usize = 26;
 /// Files of a gateway for one bus.
 const FILES_OF_A_BUS: usize = 4;
 /// How long processes may take to end after SIGTERM.
@@ -57,6 +59,9 @@ pub enum LaunchError {
     /// The ends of processes cannot be noticed.
     #[error("cannot catch SIGCHLD: {0}")]
     Signal(std::io::Error),
+    /// What processes write cannot be read.
+    #[error("a pipe for the messages of cells: {0}")]
+    Pipe(std::io::Error),
     /// Fewer files may be open than buses and cells need.
     #[error(
         "{limit} files may be open at once, and this bench needs {needed}: say `ulimit -n {needed}` before it"
@@ -122,6 +127,7 @@ struct Process {
     /// What started it, and does so again.
     command: Command,
     bus: usize,
+    bus_name: String,
     nodes: (u8, u8),
     child: Child,
     phase: Phase,
@@ -129,34 +135,44 @@ struct Process {
     log: Option<PathBuf>,
 }
 
-/// A process that ended by itself or was killed; displayed as its cells.
+/// A process that ended by itself or was killed; displayed as its cells and their bus.
 #[derive(Clone, Debug)]
 pub struct Ended {
     /// Its bus.
-    pub bus: usize,
+    pub bus: String,
     /// The first and last of its cells.
     pub nodes: (u8, u8),
     /// How it ended.
     pub status: ExitStatus,
-    /// The last that an emulator said before that.
+    /// The last that it said before that.
     pub said: Option<String>,
 }
 
 impl Ended {
+    /// Its cells.
+    #[must_use]
+    pub const fn cells(&self) -> CellRange {
+        CellRange(self.nodes.0, self.nodes.1)
+    }
+
     /// How it ended, with what it said, if anything.
     #[must_use]
     pub fn how(&self) -> String {
         let status = self.status;
         self.said.as_ref().map_or_else(|| status.to_string(), |said| format!("{status}: {said}"))
     }
+
+    /// The reason, if it ended by an error of its own: not by a signal, and not with exit code 0.
+    #[must_use]
+    pub fn error(&self) -> Option<String> {
+        let code = self.status.code().filter(|&code| code != 0)?;
+        Some(self.said.clone().unwrap_or_else(|| format!("exit code {code}, and no reason was given")))
+    }
 }
 
 impl Display for Ended {
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        match self.nodes {
-            (first, last) if first == last => write!(f, "cell {first}"),
-            (first, last) => write!(f, "cells {first} to {last}"),
-        }
+        write!(f, "{} on {}", self.cells(), self.bus)
     }
 }
 
@@ -166,6 +182,10 @@ pub struct Processes {
     all: Vec<Process>,
     /// Set by SIGCHLD, so that hundreds of processes are polled only when one has changed.
     changed: Arc<AtomicBool>,
+    /// What they write; none before one is started.
+    error: Option<StandardError>,
+    /// Ended by themselves, and found so when they were to be started again.
+    found: Vec<Ended>,
 }
 
 /// How to start cells.
@@ -193,7 +213,8 @@ impl Processes {
     /// # Errors
     /// When the ends of processes cannot be noticed.
     pub fn new() -> Result<Self, LaunchError> {
-        let processes = Self::default();
+        let mut processes = Self::default();
+        processes.error = Some(StandardError::new().map_err(LaunchError::Pipe)?);
         let changed = Arc::clone(&processes.changed);
         signal_hook::flag::register(signal_hook::consts::SIGCHLD, changed).map_err(LaunchError::Signal)?;
         Ok(processes)
@@ -210,25 +231,31 @@ impl Processes {
             nodes.sort_unstable();
             for nodes in groups(&nodes, plan.per_process) {
                 let mut command = plan.of(&described.name, nodes);
-                let child = spawn(&mut command)?;
-                let phase = Phase::Running;
-                self.all.push(Process { command, bus, nodes, child, phase, log: None });
+                let child = start(&mut command, self.error.as_ref())?;
+                let (phase, bus_name) = (Phase::Running, described.name.clone());
+                self.all.push(Process { command, bus, bus_name, nodes, child, phase, log: None });
             }
         }
         Ok(())
     }
 
-    /// Starts the emulator of a cell, from the same kind of thread; `log` is the file of its messages.
+    /// Starts the emulator of a cell on a bus of this name, from the same kind of thread; `log` is the file of its messages.
     ///
     /// # Errors
     /// When it does not start.
-    pub fn emulate(&mut self, cell: &Cell, mut command: Command, log: &Path) -> Result<(), LaunchError> {
+    pub fn emulate(
+        &mut self,
+        cell: &Cell,
+        bus_name: &str,
+        mut command: Command,
+        log: &Path,
+    ) -> Result<(), LaunchError> {
         command.process_group(0);
         end_with_parent(&mut command);
         let child = spawn(&mut command)?;
         let nodes = (cell.node.get(), cell.node.get());
-        let (phase, log) = (Phase::Running, Some(log.to_owned()));
-        self.all.push(Process { command, bus: cell.bus, nodes, child, phase, log });
+        let (phase, bus_name, log) = (Phase::Running, bus_name.to_owned(), Some(log.to_owned()));
+        self.all.push(Process { command, bus: cell.bus, bus_name, nodes, child, phase, log });
         Ok(())
     }
 
@@ -248,17 +275,17 @@ impl Processes {
         self.all.iter().map(Process::state)
     }
 
-    /// Processes that have ended since the last call.
+    /// Processes that have ended since the last call; passes on what others have written to standard error.
     pub fn ended(&mut self) -> Vec<Ended> {
-        let mut ended = Vec::new();
+        self.error.iter_mut().for_each(StandardError::read);
+        let mut ended = std::mem::take(&mut self.found);
         if !self.changed.swap(false, Ordering::Relaxed) {
             return ended;
         }
         for process in self.all.iter_mut().filter(|process| process.lives()) {
             if let Ok(Some(status)) = process.child.try_wait() {
                 process.phase = Phase::Ended;
-                let said = process.log.as_deref().and_then(last_line);
-                ended.push(Ended { bus: process.bus, nodes: process.nodes, status, said });
+                ended.push(process.ended(status, self.error.as_mut()));
             }
         }
         ended
@@ -276,9 +303,15 @@ impl Processes {
             ProcessAction::Stop => process.signal(Signal::STOP, Phase::Stopped),
             ProcessAction::Continue => process.signal(Signal::CONT, Phase::Running),
             ProcessAction::Restart => {
+                let lived = process.lives();
                 process.signal(Signal::KILL, Phase::Ended);
-                let _ = process.child.wait();
-                process.child = spawn(&mut process.command)?;
+                // One that had ended by itself before is not killed.
+                let status = process.child.wait().ok().filter(|status| lived && status.signal().is_none());
+                self.found.extend(status.map(|status| process.ended(status, self.error.as_mut())));
+                process.child = match &process.log {
+                    Some(_) => spawn(&mut process.command)?,
+                    None => start(&mut process.command, self.error.as_ref())?,
+                };
                 process.phase = Phase::Running;
             }
         }
@@ -293,6 +326,20 @@ impl Process {
 
     fn lives(&self) -> bool {
         self.phase != Phase::Ended
+    }
+
+    /// What it has left, when it has ended.
+    fn ended(&self, status: ExitStatus, error: Option<&mut StandardError>) -> Ended {
+        let said = match (&self.log, error) {
+            (Some(log), _) => last_line(log),
+            (None, Some(error)) => {
+                // It has written everything by now.
+                error.read();
+                error.of(&self.bus_name, self.nodes)
+            }
+            (None, None) => None,
+        };
+        Ended { bus: self.bus_name.clone(), nodes: self.nodes, status, said }
     }
 
     /// Sends it a signal, after which it is in a phase; one that has ended stays so.
@@ -341,6 +388,17 @@ impl Plan<'_> {
 
 pub(super) fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
     command.spawn().map_err(|source| LaunchError::Start { path: command.get_program().into(), source })
+}
+
+/// Starts a process of cells, whose standard error is read here.
+fn start(command: &mut Command, error: Option<&StandardError>) -> Result<Child, LaunchError> {
+    if let Some(error) = error {
+        error.give(command).map_err(LaunchError::Pipe)?;
+    }
+    let child = spawn(command);
+    // Or each would keep a file open here.
+    command.stderr(Stdio::inherit());
+    child
 }
 
 /// The last of an emulator's messages that is no mere information.

@@ -16,6 +16,7 @@ mod begin;
 mod bench;
 mod commanded;
 mod end;
+mod ended;
 mod error;
 mod halts;
 mod hosts;
@@ -34,6 +35,7 @@ pub mod served;
 mod start;
 mod usage;
 mod watch;
+mod words;
 
 use std::path::PathBuf;
 
@@ -42,7 +44,9 @@ use protocol::bus::Kinds;
 use protocol::skin::Skin;
 
 use self::commanded::Remote;
+pub(crate) use self::ended::EndedProcesses;
 pub use self::error::RunError;
+pub(crate) use self::error::why;
 pub use self::network::TooDeep;
 use crate::emulate::Emulated;
 use crate::remote::Lines;
@@ -82,6 +86,8 @@ pub struct Options {
     pub quiet: bool,
     /// What moves the robot in place of the scenario.
     pub planned: Option<Motion>,
+    /// Lines that are true once the loop begins, and are shown then.
+    pub announced: Vec<String>,
 }
 
 /// Runs a bench to its end, or until SIGINT or SIGTERM. A run that fails has a summary too, with the reason. While the
@@ -99,7 +105,10 @@ pub fn run(options: &Options, remote: Option<Lines>) -> Result<Summary, RunError
     };
     bench.remote = remote.map(Remote::new);
     match bench.begin() {
-        Ok(()) => Ok(bench.watch()),
+        Ok(()) => {
+            bench.announce();
+            Ok(bench.watch())
+        }
         Err(error) => bench.give_up(error),
     }
 }

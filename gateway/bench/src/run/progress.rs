@@ -67,6 +67,11 @@ impl Progress {
         }
     }
 
+    /// Writes an error above the line, also if it is quiet.
+    pub fn error(&self, text: &str) {
+        self.bar.suspend(|| say(text));
+    }
+
     /// Removes the line.
     pub fn clear(&self) {
         self.bar.finish_and_clear();

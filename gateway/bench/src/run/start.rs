@@ -1,5 +1,6 @@
 //! From a description to buses that are open and received on.
 
+use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc;
 use std::sync::{Arc, Mutex};
@@ -15,6 +16,8 @@ use protocol::usage::say;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGXFSZ};
 
 use super::bench::{Bench, BusLink};
+use super::commanded::SwitchedBuses;
+use super::ended::EndedProcesses;
 use super::hosts::Hosts;
 use super::launch::{Processes, allow_files, program};
 use super::link::{Link, ReceiveEnd, Slot};
@@ -59,9 +62,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         if signalled.load(Ordering::Relaxed) { RunError::Interrupted } else { refused.into() }
     })?;
     let numbered = options.record.candump.as_ref().is_some_and(|candump| candump.numbered);
-    if let Some(log) = outputs.log().filter(|_| numbered && !options.quiet) {
-        say(&format!("frames are recorded in {}", log.display()));
-    }
+    let log = outputs.log().filter(|_| numbered).map(Path::to_owned);
     // From now on an external controller can connect, so that it is ready when the loop begins.
     let controller: Box<dyn Controller> = match &options.planned {
         Some(motion) => {
@@ -121,6 +122,9 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         recorder,
         recorded,
         remote: None,
+        commanded: SwitchedBuses::default(),
+        ended: EndedProcesses::default(),
+        log,
         processes,
         _emulation: emulation,
         served,

@@ -27,8 +27,9 @@ use super::receiver::BusEvent;
 use super::usage::{Spent, private_kib};
 use crate::record::Recorder;
 use crate::setup::spawn;
-use crate::summary::Summary;
+use crate::summary::{Memory, Summary};
 use control::cycle::turn::{Timed, Turn};
+use control::external::Absence;
 use model::scenario::{FaultKind, Stimulus, Touches};
 use model::table::Notice;
 
@@ -39,8 +40,15 @@ pub(super) const LOOK: Duration = Duration::from_millis(10);
 /// Records that wait for the main thread: more than a second of ticks.
 const RECORDS: usize = 1_024;
 
-/// What a controller counted, by name.
-type Counts = BTreeMap<String, u64>;
+/// What the loop's thread leaves.
+struct LoopEnd {
+    /// What the machine granted it.
+    granted: Granted,
+    /// What the controller counted, by name.
+    counts: BTreeMap<String, u64>,
+    /// Why the controller counts as absent, if it does.
+    absence: Option<Absence>,
+}
 
 /// Faults and touches that are still to come.
 struct Script {
@@ -93,30 +101,32 @@ impl Bench<'_> {
         progress.clear();
         measured.take(&mut inlet, self.began);
         summary.processor = Spent::by(&self.processes, &self.served).since(&before, summary.duration_s);
-        summary.cell_private_kib = self.processes.pids().filter_map(private_kib).max();
-        summary.gateway_private_kib = private_kib(std::process::id());
         let of_buses = self.served.iter().filter_map(|bus| private_kib(bus.pid()));
-        summary.buses_private_kib = of_buses.reduce(|all, one| all + one);
+        summary.memory = Memory {
+            cell_private_kib: self.processes.pids().filter_map(private_kib).max(),
+            gateway_private_kib: private_kib(std::process::id()),
+            buses_private_kib: of_buses.reduce(|all, one| all + one),
+        };
         if failure.is_some() || ended.is_err() {
             // The cells get no more commands.
             let _ = self.say(&Message::Halt);
         }
-        let (granted, controller) = ended.map_err(|_| RunError::Panicked("control loop"))?;
+        let LoopEnd { granted, counts, absence } = ended.map_err(|_| RunError::Panicked("control loop"))?;
         let control = &mut summary.control;
-        (control.fifo, control.memory_locked, control.controller) =
-            (granted.fifo, granted.locked, controller);
-        match failure {
+        (control.fifo, control.memory_locked, control.controller) = (granted.fifo, granted.locked, counts);
+        let ended = match failure {
             Some(failure) => Err(failure),
-            None => self.last_words(summary.interrupted),
-        }
+            None => {
+                summary.no_controller = absence.map(|absence| absence.to_string());
+                self.last_words(summary.interrupted)
+            }
+        };
+        self.look_at_processes(&progress, true);
+        ended
     }
 
-    /// The loop's thread, which leaves what the machine granted and what the controller counted.
-    fn start_loop(
-        &self,
-        mut turn: Turn,
-        mut slots: Vec<Slot>,
-    ) -> Result<JoinHandle<(Granted, Counts)>, RunError> {
+    /// The loop's thread.
+    fn start_loop(&self, mut turn: Turn, mut slots: Vec<Slot>) -> Result<JoinHandle<LoopEnd>, RunError> {
         let period_ns = self.options.skin.timing.tick_nanos();
         let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
         let shared = Arc::clone(&self.shared);
@@ -126,7 +136,8 @@ impl Bench<'_> {
                 slots.get_mut(bus).is_some_and(|slot| slot.read().offer(frames))
             };
             realtime::run(&mut turn, &shared, period_ns, ticks, send);
-            (granted, turn.counts().into_iter().filter(|(_, count)| *count > 0).collect())
+            let counts = turn.counts().into_iter().filter(|(_, count)| *count > 0).collect();
+            LoopEnd { granted, counts, absence: turn.absence() }
         })
     }
 
@@ -150,6 +161,7 @@ impl Bench<'_> {
         self.inject_faults(script, progress)?;
         self.obey(measured, progress);
         self.hear(script, progress)?;
+        self.look_at_processes(progress, false);
         self.serve_again(progress);
         self.look_at_hosts(script, progress)?;
         for note in self.watch_networks()? {
@@ -282,14 +294,14 @@ impl Bench<'_> {
         progress.note(&format!("scenario: {what} {begin} cell {from} {end} cell {to} on {bus}"));
     }
 
-    /// Whether all buses are gone, and none is to come back by a command.
+    /// Whether all buses are gone, and none is down, or comes up again, by a command.
     fn has_no_bus(&self) -> bool {
         let mut buses = self.bus_links.iter().enumerate();
-        buses.all(|(bus, bus_link)| bus_link.link.is_gone() && !self.is_taken_down(bus))
+        buses.all(|(bus, bus_link)| bus_link.link.is_gone() && !self.commanded.is_expected(bus))
     }
 
-    /// Handles the events of receivers and processes.
-    fn hear(&mut self, script: &Script, progress: &Progress) -> Result<(), RunError> {
+    /// Handles the events of receivers.
+    fn hear(&self, script: &Script, progress: &Progress) -> Result<(), RunError> {
         let bus_event: Vec<_> = self.bus_event.try_iter().collect();
         let mut returned = BTreeSet::new();
         let mut changed = BTreeMap::<(usize, &str), Vec<CellId>>::new();
@@ -322,10 +334,7 @@ impl Bench<'_> {
                     ));
                 }
                 BusEvent::Down(why) => progress.note(&why.to_string()),
-                BusEvent::Up => {
-                    self.is_up_again(bus);
-                    progress.note(&format!("{} works again", self.name(bus)));
-                }
+                BusEvent::Up => progress.note(&format!("{} works again", self.name(bus))),
                 // Without any bus there is no torque, unless one is to come back.
                 BusEvent::Lost(why) if self.has_no_bus() => return Err(RunError::Lost(why)),
                 BusEvent::Lost(why) => {
@@ -349,10 +358,15 @@ impl Bench<'_> {
                 count => format!("{count} cells on {bus} have {how} ({first} ...)"),
             });
         }
-        for ended in self.processes.ended() {
-            progress.note(&format!("the process of {} ended ({})", self.cells_of(&ended), ended.how()));
-        }
         Ok(())
+    }
+
+    /// Notes the processes of cells that have ended; all that are not noted yet when it is the `last` time.
+    fn look_at_processes(&mut self, progress: &Progress, last: bool) {
+        let ended = self.processes.ended();
+        for note in self.ended.take(ended, last) {
+            progress.note(&note);
+        }
     }
 
     /// Takes what links to other hosts report.
@@ -385,7 +399,7 @@ impl Bench<'_> {
     /// Serves embedded buses again that were ours and whose processes have ended, unless a command has taken them down.
     fn serve_again(&mut self, progress: &Progress) {
         let gone = self.bus_links.iter().enumerate();
-        let gone = gone.filter(|&(bus, bus_link)| bus_link.link.is_gone() && !self.is_taken_down(bus));
+        let gone = gone.filter(|&(bus, bus_link)| bus_link.link.is_gone() && !self.commanded.is_down(bus));
         let gone: Vec<_> = gone.map(|(_, bus_link)| bus_link.link.name.clone()).collect();
         for served in self.served.iter_mut().filter(|served| gone.iter().any(|name| name == served.bus())) {
             let Some(status) = served.ended() else { continue };

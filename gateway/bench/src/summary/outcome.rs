@@ -2,19 +2,44 @@
 
 use serde::Serialize;
 
-/// How a run ended.
+/// Errors of cells that are given one by one.
+const REASONS: usize = 4;
+
+/// How a run ended. Of several that apply it is the one that is named last here; but a halt counts more than a lost bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "snake_case")]
 pub enum Outcome {
     /// It ran for its whole duration.
     #[default]
     Done,
     /// A signal ended it early.
     Interrupted,
-    /// The robot was halted when it ended, also if a signal ended it.
+    /// Processes of cells ended by an error of their own.
+    CellError,
+    /// The external controller that the skin requires never answered, or was not there at the end.
+    NoController,
+    /// The robot was halted when it ended.
     Halted,
     /// It did not come to its end, a bus was lost at its end, or its recording is incomplete.
     Failed,
+}
+
+impl Outcome {
+    /// All outcomes.
+    pub const ALL: [Self; 6] =
+        [Self::Done, Self::Interrupted, Self::CellError, Self::NoController, Self::Halted, Self::Failed];
+
+    /// The exit code of a run that ended so; 2 is wrong use.
+    #[must_use]
+    pub const fn exit_code(self) -> u8 {
+        match self {
+            Self::Done | Self::Interrupted => 0,
+            Self::Failed => 1,
+            Self::Halted => 3,
+            Self::NoController => 4,
+            Self::CellError => 5,
+        }
+    }
 }
 
 impl core::fmt::Display for Outcome {
@@ -22,10 +47,79 @@ impl core::fmt::Display for Outcome {
         f.write_str(match self {
             Self::Done => "done",
             Self::Interrupted => "interrupted",
+            Self::CellError => "cell error",
+            Self::NoController => "no controller",
             Self::Halted => "halted",
             Self::Failed => "failed",
         })
     }
+}
+
+/// An error by which processes of cells ended.
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
+pub struct CellError {
+    /// The reason that they gave.
+    pub reason: String,
+    /// Their cells, by bus.
+    pub cells: Vec<ErrorCells>,
+}
+
+/// Cells of one bus that ended by an error.
+#[derive(Clone, Debug, Eq, PartialEq, Serialize)]
+pub struct ErrorCells {
+    /// The bus.
+    pub bus: String,
+    /// Their node ids, in order.
+    pub nodes: Vec<u8>,
+}
+
+impl CellError {
+    /// How many cells it ended.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        self.cells.iter().map(|cells| cells.nodes.len()).sum()
+    }
+
+    /// The cells as text: `1-6, 9 on vcan0; 1 on vcan1`.
+    #[must_use]
+    pub fn names(&self) -> String {
+        let of_bus =
+            |ErrorCells { bus, nodes }: &ErrorCells| format!("{} on {bus}", ranges(nodes).join(", "));
+        self.cells.iter().map(of_bus).collect::<Vec<_>>().join("; ")
+    }
+}
+
+/// The cells that ended by errors of their own, in one line; with the first few reasons, if these were not given before.
+/// `None` without any.
+#[must_use]
+pub fn cells_in_error(errors: &[CellError], with_reasons: bool) -> Option<String> {
+    let each = errors.iter().take(REASONS).map(|error| match with_reasons {
+        true => format!("{} ({})", error.names(), error.reason),
+        false => error.names(),
+    });
+    let each = each.collect::<Vec<_>>().join("; ");
+    let above = if with_reasons { "" } else { ", given above" };
+    let more = match errors.len().saturating_sub(REASONS) {
+        0 => String::new(),
+        more => format!("; and {more} more reasons, which --summary FILE keeps"),
+    };
+    let all = match errors.iter().map(CellError::count).sum() {
+        0_usize => return None,
+        1 => format!("1 cell ended by an error of its own{above}"),
+        count => format!("{count} cells ended by errors of their own{above}"),
+    };
+    Some(format!("{all}: {each}{more}"))
+}
+
+/// Node ids in order as text, three and more in a row as one: `1-3`, `5`.
+#[must_use]
+pub fn ranges(nodes: &[u8]) -> Vec<String> {
+    let in_a_row = nodes.chunk_by(|one, next| one.checked_add(1) == Some(*next));
+    let text = |row: &[u8]| match row {
+        [first, _, .., last] => vec![format!("{first}-{last}")],
+        few => few.iter().map(u8::to_string).collect(),
+    };
+    in_a_row.flat_map(text).collect()
 }
 
 /// One time that the robot was halted.
@@ -82,4 +176,91 @@ pub struct TickBefore {
     pub command_rad_s: Vec<f64>,
     /// Whether the robot was halted.
     pub halted: bool,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::summary::Summary;
+
+    fn error(reason: &str, nodes: &[u8]) -> CellError {
+        let cells = vec![ErrorCells { bus: "vcan0".to_owned(), nodes: nodes.to_vec() }];
+        CellError { reason: reason.to_owned(), cells }
+    }
+
+    /// A summary of which everything applies that the flags say: absence, errors of cells, a halt, an interruption.
+    fn summary([absent, errors, halted, interrupted]: [bool; 4]) -> Summary {
+        let halt = Halted { at_s: 1.0, tick: 500, epoch: 62, reason: "no answer".to_owned(), until_s: None };
+        Summary {
+            no_controller: absent.then(|| "no hello".to_owned()),
+            cell_errors: if errors { vec![error("no memory", &[1, 2, 3])] } else { Vec::new() },
+            halted: halted.then(|| "no answer".to_owned()),
+            halts: if halted { vec![halt] } else { Vec::new() },
+            interrupted,
+            ..Summary::default()
+        }
+    }
+
+    #[test]
+    fn new_outcomes_take_the_place_of_success_only_and_the_last_line_is_the_outcomes() {
+        for bits in 0..16_u8 {
+            let flags = [8, 4, 2, 1].map(|bit| bits & bit != 0);
+            let [absent, errors, halted, _] = flags;
+            let failed = summary(flags).rated(Some("a bus is lost".to_owned()));
+            assert_eq!((failed.outcome, failed.outcome.exit_code()), (Outcome::Failed, 1));
+            assert_eq!(failed.complaints(true).last().unwrap(), "a bus is lost");
+            let rated = summary(flags).rated(None);
+            let lines = rated.complaints(true);
+            let last = lines.last().map_or("", String::as_str);
+            let (code, words) = match rated.outcome {
+                Outcome::Halted => (3, "the robot was halted at 1.000 s"),
+                Outcome::NoController => (4, "no hello"),
+                Outcome::CellError => (5, "3 cells ended by errors of their own: 1-3 on vcan0 (no memory)"),
+                Outcome::Done | Outcome::Interrupted => (0, ""),
+                Outcome::Failed => panic!("{flags:?}"),
+            };
+            assert!(last.starts_with(words) && last.is_empty() == words.is_empty(), "{flags:?}: {lines:?}");
+            assert_eq!(rated.outcome.exit_code(), code);
+            assert_eq!(code == 3, halted, "{flags:?}");
+            assert_eq!(code == 0, !absent && !errors && !halted, "{flags:?}");
+            assert_eq!(lines.len(), [absent, errors, halted].into_iter().filter(|it| *it).count());
+        }
+    }
+
+    #[test]
+    fn every_outcome_is_rated_above_those_before_it() {
+        let codes = Outcome::ALL.map(Outcome::exit_code);
+        assert_eq!(codes, [0, 0, 5, 4, 3, 1], "2 is wrong use");
+        let names = Outcome::ALL.map(|outcome| serde_json::to_string(&outcome).unwrap());
+        let spoken = Outcome::ALL.map(|outcome| format!("{:?}", outcome.to_string().replace(' ', "_")));
+        assert_eq!(names, spoken);
+    }
+
+    #[test]
+    fn errors_of_cells_are_one_line_however_many_there_are() {
+        assert_eq!(cells_in_error(&[], true), None);
+        let one = [error("a", &[7])];
+        assert_eq!(
+            cells_in_error(&one, true).unwrap(),
+            "1 cell ended by an error of its own: 7 on vcan0 (a)"
+        );
+        assert_eq!(
+            cells_in_error(&one, false).unwrap(),
+            "1 cell ended by an error of its own, given above: 7 on vcan0"
+        );
+        let many: Vec<_> = (1..=252).map(|node| error(&format!("reason {node}"), &[node])).collect();
+        let line = cells_in_error(&many, true).unwrap();
+        assert!(
+            line.starts_with("252 cells ended by errors of their own: 1 on vcan0 (reason 1); "),
+            "{line}"
+        );
+        assert!(line.ends_with("; and 248 more reasons, which --summary FILE keeps"), "{line}");
+        assert!(line.len() < 300, "{line}");
+    }
+
+    #[test]
+    fn node_ids_in_a_row_are_folded() {
+        assert_eq!(ranges(&[1, 2, 4, 5, 6, 253, 254, 255]), ["1", "2", "4-6", "253-255"]);
+        assert_eq!(ranges(&[]), [""; 0]);
+    }
 }

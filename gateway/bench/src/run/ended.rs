@@ -1,0 +1,131 @@
+//! Processes of cells that have ended while a run or a replay lasted: noted in groups, and the reasons of those that ended
+//! by an error of their own kept for the summary.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::{Duration, Instant};
+
+use super::launch::Ended;
+use crate::summary::{CellError, ErrorCells};
+
+/// Processes that end within this time are noted together.
+const TOGETHER: Duration = Duration::from_millis(50);
+/// Processes that are named in one note.
+const NAMED: usize = 6;
+
+/// What is known of processes that have ended.
+#[derive(Debug, Default)]
+pub(crate) struct EndedProcesses {
+    /// Not noted yet.
+    new: Vec<Ended>,
+    /// When the last of them was found.
+    found: Option<Instant>,
+    /// The cells of those that ended by an error of their own, by its reason and by bus.
+    errors: BTreeMap<String, BTreeMap<String, BTreeSet<u8>>>,
+}
+
+impl EndedProcesses {
+    /// Takes processes that have ended, and returns the notes that are due; all of them when it is the `last` time.
+    pub(crate) fn take(&mut self, ended: Vec<Ended>, last: bool) -> Vec<String> {
+        if !ended.is_empty() {
+            self.found = Some(Instant::now());
+            self.new.extend(ended);
+        }
+        if self.new.is_empty() || (!last && self.found.is_some_and(|found| found.elapsed() < TOGETHER)) {
+            return Vec::new();
+        }
+        let mut groups = BTreeMap::<(String, String), Vec<Ended>>::new();
+        for ended in self.new.drain(..) {
+            groups.entry((ended.bus.clone(), ended.how())).or_default().push(ended);
+        }
+        groups.into_iter().map(|((bus, how), group)| self.note((&bus, &how), &group)).collect()
+    }
+
+    /// The note of processes of one bus that have ended in the same way. A reason is given once.
+    fn note(&mut self, (bus, how): (&str, &str), group: &[Ended]) -> String {
+        let error = group.first().and_then(|ended| Some((ended.status, ended.error()?)));
+        let how = error.map_or_else(
+            || how.to_owned(),
+            |(status, why)| {
+                let known = self.errors.contains_key(&why);
+                let cells = self.errors.entry(why).or_default().entry(bus.to_owned()).or_default();
+                cells.extend(group.iter().flat_map(|ended| ended.nodes.0..=ended.nodes.1));
+                if known { format!("{status}: for a reason given above") } else { how.to_owned() }
+            },
+        );
+        match group {
+            [one] => format!("the process of {one} ended ({how})"),
+            many => {
+                let named: Vec<_> = many.iter().take(NAMED).map(|ended| ended.cells().to_string()).collect();
+                let more = if many.len() > NAMED { ", ..." } else { "" };
+                let named = named.join(", ");
+                format!("{} processes of cells on {bus} ended ({how}): {named}{more}", many.len())
+            }
+        }
+    }
+
+    /// The errors by which processes ended, each once.
+    pub(crate) fn errors(&self) -> Vec<CellError> {
+        let cells = |(bus, nodes): (&String, &BTreeSet<u8>)| ErrorCells {
+            bus: bus.clone(),
+            nodes: nodes.iter().copied().collect(),
+        };
+        let errors = self.errors.iter();
+        errors
+            .map(|(why, buses)| CellError { reason: why.clone(), cells: buses.iter().map(cells).collect() })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::process::ExitStatusExt;
+    use std::process::ExitStatus;
+
+    fn ended(nodes: (u8, u8), raw_status: i32, said: Option<&str>) -> Ended {
+        let said = said.map(str::to_owned);
+        Ended { bus: "vcan0".to_owned(), nodes, status: ExitStatus::from_raw(raw_status), said }
+    }
+
+    #[test]
+    fn many_that_end_for_one_reason_are_one_note_and_one_error() {
+        let nodes: Vec<u8> = (1..=252).collect();
+        let mut processes = EndedProcesses::default();
+        let all = || nodes.iter().map(|&node| ended((node, node), 1 << 8, Some("cannot send"))).collect();
+        let [note] = processes.take(all(), true).try_into().unwrap();
+        assert_eq!(note.matches("cannot send").count(), 1, "{note}");
+        let [again] = processes.take(all(), true).try_into().unwrap();
+        assert!(!again.contains("cannot send"), "{again}");
+        let [error] = processes.errors().try_into().unwrap();
+        assert_eq!((error.reason.as_str(), &error.cells[0].nodes), ("cannot send", &nodes));
+    }
+
+    #[test]
+    fn signals_are_no_errors_and_a_process_without_a_reason_has_its_exit_code() {
+        let mut processes = EndedProcesses::default();
+        let notes = processes.take(vec![ended((1, 1), 9, None), ended((2, 2), 0, None)], true);
+        assert_eq!(notes.len(), 2);
+        assert!(
+            notes.contains(&"the process of cell 1 on vcan0 ended (signal: 9 (SIGKILL))".to_owned()),
+            "{notes:?}"
+        );
+        assert!(processes.errors().is_empty());
+        let [note] = processes.take(vec![ended((1, 1), 101 << 8, None)], true).try_into().unwrap();
+        assert_eq!(note, "the process of cell 1 on vcan0 ended (exit status: 101)");
+        let [error] = processes.errors().try_into().unwrap();
+        assert_eq!(error.reason, "exit code 101, and no reason was given");
+    }
+
+    #[test]
+    fn those_that_end_together_wait_for_each_other() {
+        let mut processes = EndedProcesses::default();
+        assert!(processes.take(vec![ended((1, 1), 9, None)], false).is_empty());
+        assert!(processes.take(vec![ended((2, 2), 9, None)], false).is_empty());
+        let [note] = processes.take(Vec::new(), true).try_into().unwrap();
+        assert!(
+            note.starts_with("2 processes of cells on vcan0 ended (signal: 9 (SIGKILL)): cell 1, cell 2"),
+            "{note}"
+        );
+        assert!(processes.take(Vec::new(), true).is_empty());
+    }
+}

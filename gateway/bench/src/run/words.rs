@@ -1,0 +1,113 @@
+//! The standard error of the processes of cells: one pipe for all of them, read where their ends are noticed.
+//!
+//! A process writes before it ends, so its last words are there when its end is.
+
+use std::io::{self, ErrorKind, PipeReader, PipeWriter, Read, pipe};
+use std::process::Command;
+
+use protocol::last_words::{CellRange, LastWords};
+use protocol::usage::say;
+use rustix::io::ioctl_fionbio;
+
+/// What stands before each line of a cell's process.
+const PROGRAM: &str = "cell-node: ";
+
+/// Bytes of a line that are waited for its end.
+const LONGEST: usize = 1 << 16;
+
+/// The standard error of the processes of cells.
+#[derive(Debug)]
+pub(super) struct StandardError {
+    read: PipeReader,
+    write: PipeWriter,
+    /// The begin of a line whose end has not come.
+    unread: Vec<u8>,
+    /// Those that nobody has taken.
+    words: Vec<LastWords>,
+}
+
+impl StandardError {
+    /// Makes the pipe.
+    ///
+    /// # Errors
+    /// When the system gives none.
+    pub(super) fn new() -> io::Result<Self> {
+        let (read, write) = pipe()?;
+        ioctl_fionbio(&read, true)?;
+        Ok(Self { read, write, unread: Vec::new(), words: Vec::new() })
+    }
+
+    /// Makes it the standard error of a program that is started next.
+    ///
+    /// # Errors
+    /// When too many files are open.
+    pub(super) fn give(&self, command: &mut Command) -> io::Result<()> {
+        command.stderr(self.write.try_clone()?);
+        Ok(())
+    }
+
+    /// Reads what has come: last words are kept, other lines are passed on to the standard error of this program.
+    pub(super) fn read(&mut self) {
+        let mut piece = [0; 4_096];
+        loop {
+            match self.read.read(&mut piece) {
+                Ok(count @ 1..) => self.unread.extend(piece.iter().take(count)),
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                // Nothing is there.
+                Ok(0) | Err(_) => break,
+            }
+        }
+        while let Some(end) = self.unread.iter().position(|&byte| byte == b'\n') {
+            let line: Vec<_> = self.unread.drain(..=end).collect();
+            self.take(&String::from_utf8_lossy(line.strip_suffix(b"\n").unwrap_or(&line)));
+        }
+        if self.unread.len() > LONGEST {
+            say(&String::from_utf8_lossy(&core::mem::take(&mut self.unread)));
+        }
+    }
+
+    fn take(&mut self, line: &str) {
+        match line.strip_prefix(PROGRAM).and_then(LastWords::parse) {
+            Some(words) => self.words.push(words),
+            None => say(line),
+        }
+    }
+
+    /// Takes the reason that a process of cells gave.
+    pub(super) fn of(&mut self, bus: &str, (first, last): (u8, u8)) -> Option<String> {
+        let cells = CellRange(first, last);
+        let at = self.words.iter().position(|words| words.cells == cells && words.bus == bus)?;
+        Some(self.words.remove(at).why)
+    }
+}
+
+impl Drop for StandardError {
+    fn drop(&mut self) {
+        self.read();
+        if !self.unread.is_empty() {
+            say(&String::from_utf8_lossy(&self.unread));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Write;
+
+    #[test]
+    fn last_words_are_kept_by_process_and_come_in_any_pieces() {
+        let mut error = StandardError::new().unwrap();
+        error.write.write_all(b"cell-node: cell 3 on vcan0 ends: no ").unwrap();
+        error.read();
+        assert_eq!(error.of("vcan0", (3, 3)), None);
+        error.write.write_all(b"memory\ncell-node: cells 1 to 4 on vcan1 end: other\n").unwrap();
+        error.write.write_all(b"cell-node: cell 3 on vcan0 ends: again\n").unwrap();
+        error.read();
+        assert_eq!(error.of("vcan1", (3, 3)), None);
+        let two = [error.of("vcan0", (3, 3)), error.of("vcan0", (3, 3))];
+        assert_eq!(two, [Some("no memory".to_owned()), Some("again".to_owned())]);
+        assert_eq!(error.of("vcan1", (1, 4)), Some("other".to_owned()));
+        assert!(error.words.is_empty() && error.unread.is_empty());
+    }
+}
