@@ -1,12 +1,14 @@
 //! Triangle meshes: STL, COLLADA (DAE) and OBJ files, and primitives.
 
 mod collada;
+mod obj;
+mod polygon;
 mod primitive;
 mod simplify;
+mod stl;
 #[cfg(test)]
 mod tests;
 
-use std::borrow::Cow;
 use std::ffi::OsStr;
 use std::fs;
 use std::io;
@@ -70,6 +72,14 @@ pub enum MeshError {
         /// The file.
         file: String,
         /// What the parser says, in one line.
+        reason: String,
+    },
+    /// A part of the file is missing.
+    #[error("mesh {file}: {reason}: it is cut off or damaged; copy or download it again")]
+    Damaged {
+        /// The file.
+        file: String,
+        /// What does not fit, in one line.
         reason: String,
     },
     /// The file has no triangle.
@@ -166,12 +176,8 @@ impl Mesh {
     pub fn parse(name: &str, bytes: &[u8], up: UpAxis) -> Result<Self, MeshError> {
         let extension = Path::new(name).extension().and_then(OsStr::to_str).unwrap_or_default();
         let triangles = match extension.to_ascii_lowercase().as_str() {
-            "stl" => loaded(mesh_loader::stl::from_slice(&without_title(bytes)), name)?,
-            "obj" => {
-                // Only for materials, which are not needed.
-                let other = |_: &Path| Err::<Vec<u8>, _>(io::Error::from(io::ErrorKind::NotFound));
-                loaded(mesh_loader::obj::from_slice(bytes, None, other), name)?
-            }
+            "stl" => stl::triangles(name, bytes)?,
+            "obj" => obj::triangles(name, bytes)?,
             "dae" => collada::triangles(name, bytes, up)?,
             _ => return Err(MeshError::Extension { file: name.to_owned(), extension: extension.to_owned() }),
         };
@@ -185,24 +191,6 @@ impl Mesh {
     }
 }
 
-/// A binary STL file without the text that it begins with, if that says `solid` as if the file were ASCII. It is binary
-/// when it is exactly as long as its count of triangles says.
-fn without_title(bytes: &[u8]) -> Cow<'_, [u8]> {
-    const TITLE: usize = 80;
-    const TRIANGLE: usize = 50;
-    let text = bytes.iter().position(|byte| !byte.is_ascii_whitespace());
-    let solid = text.and_then(|text| bytes.get(text..)).is_some_and(|text| text.starts_with(b"solid"));
-    let count = bytes.get(TITLE..).and_then(<[u8]>::first_chunk).map(|count| u32::from_le_bytes(*count));
-    let length =
-        count.and_then(|count| usize::try_from(count).ok()?.checked_mul(TRIANGLE)?.checked_add(TITLE + 4));
-    if !solid || length != Some(bytes.len()) {
-        return Cow::Borrowed(bytes);
-    }
-    let mut untitled = bytes.to_vec();
-    untitled.iter_mut().take(TITLE).for_each(|byte| *byte = 0);
-    Cow::Owned(untitled)
-}
-
 fn too_many(file: &str, count: usize) -> MeshError {
     MeshError::TooLarge {
         file: file.to_owned(),
@@ -212,29 +200,12 @@ fn too_many(file: &str, count: usize) -> MeshError {
     }
 }
 
-fn syntax(file: &str, reason: &str) -> MeshError {
-    MeshError::Syntax { file: file.to_owned(), reason: reason.lines().collect::<Vec<_>>().join(" ") }
+fn damaged(file: &str, reason: &str) -> MeshError {
+    MeshError::Damaged { file: file.to_owned(), reason: reason.to_owned() }
 }
 
-/// The triangles of a parsed file; those that name a vertex which is not there are an error.
-fn loaded(scene: io::Result<mesh_loader::Scene>, name: &str) -> Result<Vec<Triangle>, MeshError> {
-    let scene = scene.map_err(|error| syntax(name, &error.to_string()))?;
-    let count = scene.meshes.iter().map(|mesh| mesh.faces.len()).sum();
-    if count > MAX_TRIANGLES {
-        return Err(too_many(name, count));
-    }
-    let mut triangles = Vec::with_capacity(count);
-    for mesh in &scene.meshes {
-        let corner = |index: u32| {
-            let vertex = usize::try_from(index).ok().and_then(|index| mesh.vertices.get(index));
-            let [x, y, z] = *vertex.ok_or_else(|| syntax(name, &format!("vertex {index} is not there")))?;
-            Ok(Point3::new(f64::from(x), f64::from(y), f64::from(z)))
-        };
-        for &[a, b, c] in &mesh.faces {
-            triangles.push([corner(a)?, corner(b)?, corner(c)?]);
-        }
-    }
-    Ok(triangles)
+fn syntax(file: &str, reason: &str) -> MeshError {
+    MeshError::Syntax { file: file.to_owned(), reason: reason.lines().collect::<Vec<_>>().join(" ") }
 }
 
 /// A linear map and a shift, of corners.

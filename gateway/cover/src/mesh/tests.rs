@@ -218,7 +218,7 @@ fn what_is_no_mesh_is_refused_in_one_line() {
     assert!(parse("a.dae", &dae("<unit meter=\"0\"/>", PLAIN)).contains("its unit is \"0\" m"));
     assert!(parse("a.dae", &dae("<up_axis>UP</up_axis>", PLAIN)).contains("its up_axis is \"UP\""));
     assert!(parse("a.dae", &dae("", PLAIN).replace("#shape", "#none")).contains("geometry \"#none\""));
-    assert!(parse("a.dae", &dae("", PLAIN).replace("1 2 3</p>", "1 2 9</p>")).contains("vertex Some(9)"));
+    assert!(parse("a.dae", &dae("", PLAIN).replace("1 2 3</p>", "1 2 9</p>")).contains("vertex 9 of"));
     assert!(
         parse("a.dae", &dae("", PLAIN).replace("0 0 3</float", "0 0 x</float")).contains("\"x\" in element")
     );
@@ -227,6 +227,27 @@ fn what_is_no_mesh_is_refused_in_one_line() {
     let many = vec![[Point3::origin(); 3]; MAX_TRIANGLES + 1];
     let many = message(Mesh::new("many", many));
     assert_eq!(many, "mesh many: 1000001 triangles, at most 1000000; decimate the mesh");
+}
+
+#[test]
+fn a_face_of_an_obj_has_its_own_area() {
+    let area = |mesh: &Mesh| mesh.triangles().iter().map(crate::surface::area).sum::<f64>();
+    let text = "# notch\nv 0 0 0\nv 0.3 0 0 1 0.5 0.5\nv 0.3 0.25 0\nv 0.3 0.1 0 2\nv 0 0.25 0\n";
+    for face in
+        ["f 1 2 3 4 5", "f 5/1 1/2/3 2//1 \\\n 3 4 # all", "f -5 -4 -3 -2 -1", "p 1\nf 1 2\nf 2 3 4 5 1"]
+    {
+        let mesh = Mesh::parse("a.obj", format!("{text}{face}\n").as_bytes(), UpAxis::Ignore).unwrap();
+        assert_eq!(mesh.triangles().len(), 3, "{face}");
+        assert!((area(&mesh) - 0.045).abs() < 1e-8, "{face}: {}", area(&mesh));
+    }
+    let refused =
+        |line: &str| message(Mesh::parse("a.obj", format!("{text}{line}\n").as_bytes(), UpAxis::Ignore));
+    assert!(refused("f 1 2 6").contains("line 7: vertex 6 is not there; 5 come before the face"));
+    assert!(refused("f 0 1 2").contains("vertex 0 is not there"));
+    assert!(refused("f 1 2 x").contains("\"x\" is not a corner of a face"));
+    assert!(refused("v 1 2").contains("a vertex has 2 numbers, not 3"));
+    assert!(refused("v 1 2 three").contains("\"three\" is not a number"));
+    assert!(refused("f 1 3 2 5").contains("a polygon with 4 corners crosses itself"));
 }
 
 #[test]

@@ -1,0 +1,234 @@
+//! A geometry's `mesh`: its vertices, and the triangles of its primitives.
+
+use nalgebra::Point3;
+use roxmltree::Node;
+
+use super::{Named as _, Names, child, children, floats, numbers};
+use crate::mesh::polygon::{Filled, fan};
+use crate::mesh::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
+
+/// The most indices of one corner.
+const MAX_OFFSET: usize = 64;
+
+/// A `mesh` element.
+#[derive(Debug)]
+pub(super) struct Mesh<'a, 'i, 'n> {
+    /// The file's name, for errors.
+    name: &'a str,
+    mesh: Node<'a, 'i>,
+    /// Those of the mesh's own elements.
+    own: Names<'a, 'i>,
+    /// Those of the whole file.
+    all: &'n Names<'a, 'i>,
+}
+
+/// The corners of a primitive, by their indices.
+struct Corners {
+    kind: &'static str,
+    /// Where in each group of indices that of the vertex is.
+    offset: usize,
+    /// Indices for each corner.
+    stride: usize,
+    points: Vec<Point3<f64>>,
+}
+
+impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
+    pub(super) fn new(name: &'a str, mesh: Node<'a, 'i>, all: &'n Names<'a, 'i>) -> Self {
+        Self { name, mesh, own: Names::of(name, mesh.descendants()), all }
+    }
+
+    fn error(&self, reason: &str) -> MeshError {
+        syntax(self.name, reason)
+    }
+
+    /// The triangles, as the file has them.
+    pub(super) fn triangles(&self) -> Result<Vec<Triangle>, MeshError> {
+        let mut filled = Filled::default();
+        for element in self.mesh.children().filter(Node::is_element) {
+            let kinds = ["triangles", "polylist", "polygons", "tristrips", "trifans"];
+            let Some(kind) = kinds.into_iter().find(|kind| element.has_tag_name_of(kind)) else { continue };
+            let corners = self.corners(element, kind)?;
+            match kind {
+                "triangles" => self.plain(element, &corners, &mut filled)?,
+                "polylist" => self.polylist(element, &corners, &mut filled)?,
+                "polygons" => self.polygons(element, &corners, &mut filled)?,
+                _ => {
+                    for indices in children(element, "p") {
+                        let points = self.points(indices, &corners)?;
+                        if kind == "tristrips" {
+                            strip(&points, &mut filled.triangles);
+                        } else {
+                            fan(&points, &mut filled.triangles);
+                        }
+                    }
+                }
+            }
+            if filled.triangles.len() > MAX_TRIANGLES {
+                return Err(too_many(self.name, filled.triangles.len()));
+            }
+        }
+        filled.finish().map_err(|why| self.error(&why))
+    }
+
+    /// Triangles with three corners each.
+    fn plain(
+        &self,
+        element: Node<'a, 'i>,
+        corners: &Corners,
+        Filled { triangles, .. }: &mut Filled,
+    ) -> Result<(), MeshError> {
+        let before = triangles.len();
+        for indices in children(element, "p") {
+            let points = self.points(indices, corners)?;
+            let (all, rest) = points.as_chunks();
+            if !rest.is_empty() {
+                return Err(self.error(&format!("triangles have {} corners, no multiple of 3", points.len())));
+            }
+            triangles.extend_from_slice(all);
+        }
+        self.counted(element, "triangles", triangles.len() - before)
+    }
+
+    /// Polygons whose corners are all in one list.
+    fn polylist(
+        &self,
+        element: Node<'a, 'i>,
+        corners: &Corners,
+        filled: &mut Filled,
+    ) -> Result<(), MeshError> {
+        let sizes = child(element, "vcount").map(|node| numbers(self.name, node, str::parse::<usize>));
+        let sizes = sizes.transpose()?.unwrap_or_default();
+        let points = child(element, "p").map(|node| self.points(node, corners)).transpose()?;
+        let points = points.unwrap_or_default();
+        let announced = sizes.iter().fold(0_usize, |sum, size| sum.saturating_add(*size));
+        if announced != points.len() {
+            let got = points.len();
+            return Err(self.error(&format!("a polylist has {got} corners, but its vcount {announced}")));
+        }
+        self.counted(element, "polygons", sizes.len())?;
+        let mut rest = points.as_slice();
+        for size in sizes {
+            let Some((outline, after)) = rest.split_at_checked(size) else { break };
+            filled.add(outline, &[]);
+            rest = after;
+        }
+        Ok(())
+    }
+
+    /// Polygons with a list of corners each, some with holes.
+    fn polygons(
+        &self,
+        element: Node<'a, 'i>,
+        corners: &Corners,
+        filled: &mut Filled,
+    ) -> Result<(), MeshError> {
+        let mut count = 0;
+        for polygon in element.children().filter(Node::is_element) {
+            let (outline, holes) = match polygon.tag_name().name() {
+                "p" => (Some(polygon), Vec::new()),
+                "ph" => {
+                    let holes = children(polygon, "h").map(|hole| self.points(hole, corners));
+                    (child(polygon, "p"), holes.collect::<Result<_, _>>()?)
+                }
+                _ => continue,
+            };
+            let outline = outline.ok_or_else(|| self.error("a polygon with holes has no outline"))?;
+            filled.add(&self.points(outline, corners)?, &holes);
+            count += 1;
+        }
+        self.counted(element, "polygons", count)
+    }
+
+    /// Checks the element's count of its primitives, if it has one.
+    fn counted(&self, element: Node<'_, '_>, what: &str, got: usize) -> Result<(), MeshError> {
+        match element.attribute("count").map(|count| count.trim().parse::<usize>()) {
+            Some(Ok(count)) if count != got => {
+                Err(self.error(&format!("{got} {what} are there, but {count} are announced")))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The points of a list of indices.
+    fn points(&self, indices: Node<'_, '_>, corners: &Corners) -> Result<Vec<Point3<f64>>, MeshError> {
+        let Corners { kind, offset, stride, points } = corners;
+        let indices = numbers(self.name, indices, str::parse::<usize>)?;
+        let groups = indices.chunks_exact(*stride);
+        if !groups.remainder().is_empty() {
+            let got = indices.len();
+            return Err(self
+                .error(&format!("{got} indices of {kind} are no multiple of {stride}, those of a corner")));
+        }
+        let point = |group: &[usize]| {
+            let index = group.get(*offset).copied().unwrap_or(usize::MAX);
+            points.get(index).copied().ok_or_else(|| {
+                self.error(&format!(
+                    "vertex {index} of {kind} is not there; the geometry has {}",
+                    points.len()
+                ))
+            })
+        };
+        groups.map(point).collect()
+    }
+
+    /// An element of this kind that a reference of this mesh names: of its own; else the only one of the file.
+    fn referred(&self, kind: &'static str, input: Node<'_, '_>) -> Result<Node<'a, 'i>, MeshError> {
+        let source = input.attribute("source").unwrap_or_default();
+        let own = self.own.find(kind, source)?;
+        let found = own.map_or_else(|| self.all.find(kind, source), |own| Ok(Some(own)))?;
+        found.ok_or_else(|| self.error(&format!("{kind} {source:?} is not there")))
+    }
+
+    /// How a primitive's indices name points.
+    fn corners(&self, element: Node<'a, 'i>, kind: &'static str) -> Result<Corners, MeshError> {
+        let mut stride = 0;
+        let mut vertex = None;
+        for input in children(element, "input") {
+            let offset = input.attribute("offset").map_or(Some(0), |offset| offset.trim().parse().ok());
+            let offset = offset.filter(|offset| *offset < MAX_OFFSET);
+            let offset = offset.ok_or_else(|| self.error("an input has a wrong offset"))?;
+            stride = stride.max(offset + 1);
+            if input.attribute("semantic") == Some("VERTEX") {
+                vertex = Some((offset, self.referred("vertices", input)?));
+            }
+        }
+        let (offset, vertices) = vertex.ok_or_else(|| self.error("a geometry has no vertices"))?;
+        let position = |input: &Node<'_, '_>| input.attribute("semantic") == Some("POSITION");
+        let position = children(vertices, "input").find(position);
+        let position = position.ok_or_else(|| self.error("vertices have no position"))?;
+        let points = self.positions(self.referred("source", position)?)?;
+        Ok(Corners { kind, offset, stride, points })
+    }
+
+    /// The points of a source.
+    fn positions(&self, source: Node<'a, 'i>) -> Result<Vec<Point3<f64>>, MeshError> {
+        let accessor = child(source, "technique_common").and_then(|common| child(common, "accessor"));
+        let number = |name: &str| accessor?.attribute(name)?.trim().parse::<usize>().ok();
+        let within = Names::of(self.name, source.descendants());
+        let named = accessor.filter(|accessor| accessor.has_attribute("source")).map(|accessor| {
+            let reference = accessor.attribute("source").unwrap_or_default();
+            let near = within.find("float_array", reference)?;
+            near.map_or_else(|| self.referred("float_array", accessor), Ok)
+        });
+        let array = named.or_else(|| child(source, "float_array").map(Ok));
+        let array = array.ok_or_else(|| self.error("a source has no numbers"))??;
+        let values = floats(self.name, array)?;
+        self.counted(array, "numbers of a source", values.len())?;
+        let values = values.get(number("offset").unwrap_or(0)..).unwrap_or_default();
+        let stride = number("stride").unwrap_or(3);
+        if stride < 3 {
+            return Err(self.error(&format!("a source of positions has {stride} numbers each, not 3")));
+        }
+        let groups = values.chunks(stride);
+        let points = groups.filter_map(|group| group.first_chunk().map(|&[x, y, z]| Point3::new(x, y, z)));
+        Ok(points.collect())
+    }
+}
+
+/// The triangles of a strip, of which every other one is wound the other way.
+fn strip(corners: &[Point3<f64>], triangles: &mut Vec<Triangle>) {
+    triangles.extend(corners.windows(3).enumerate().filter_map(|(at, corners)| {
+        let &[a, b, c] = corners else { return None };
+        Some(if at % 2 == 0 { [a, b, c] } else { [b, a, c] })
+    }));
+}

@@ -1,0 +1,276 @@
+//! COLLADA files: unit, axis, the scene's nodes with their transforms, and what geometry they place.
+//!
+//! Triangles, polygons with and without holes, strips and fans are read; lines, materials and animations are
+//! ignored. A reference names one element of one kind: identifiers that several elements of that kind share are
+//! refused where they are referred to. A geometry's sources and vertices are its own: many exporters give those of
+//! all geometries the same identifiers.
+
+mod geometry;
+#[cfg(test)]
+mod tests;
+
+use std::borrow::Cow;
+use std::collections::HashMap;
+
+use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
+use roxmltree::{Document, Node};
+
+use super::{Affine, MAX_TRIANGLES, MeshError, Triangle, UpAxis, syntax, too_many};
+use geometry::Mesh;
+
+/// How deep nodes may be nested. A circle of `instance_node` ends here.
+const MAX_DEPTH: usize = 64;
+
+/// How many nodes may be visited, so that nodes which are placed again and again come to an end.
+const MAX_NODES: usize = 100_000;
+
+/// The triangles of a file's scene, in m.
+pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Triangle>, MeshError> {
+    let text = text(bytes).map_err(|error| syntax(name, &error))?;
+    let document = Document::parse(text.trim_start_matches('\u{feff}').trim_start())
+        .map_err(|error| syntax(name, &error.to_string()))?;
+    let root = document.root_element();
+    if root.tag_name().name() != "COLLADA" {
+        return Err(syntax(name, &format!("its first element is {}, not COLLADA", root.tag_name().name())));
+    }
+    let names = Names::of(name, root.descendants());
+    let mut reader = Reader { name, names, geometry: HashMap::new(), visited: 0, triangles: Vec::new() };
+    let outer = outer(name, root, up)?;
+    let scene = child(root, "scene").and_then(|scene| child(scene, "instance_visual_scene"));
+    let scene = scene.map(|instance| reader.referred(instance, "visual_scene")).transpose()?;
+    let scene = scene.or_else(|| child(child(root, "library_visual_scenes")?, "visual_scene"));
+    match scene {
+        Some(scene) => {
+            for node in children(scene, "node") {
+                reader.node(node, &outer, 0)?;
+            }
+        }
+        None => {
+            // A file of geometry alone.
+            for geometry in root.descendants().filter(|node| node.has_tag_name_of("geometry")) {
+                reader.place(geometry, &outer)?;
+            }
+        }
+    }
+    Ok(reader.triangles)
+}
+
+/// The file's text: in UTF-8, in UTF-16 with a byte order mark, or in Latin-1 that is declared.
+fn text(bytes: &[u8]) -> Result<Cow<'_, str>, String> {
+    let wide = |read: fn([u8; 2]) -> u16| {
+        let words: Vec<_> = bytes.as_chunks().0.iter().map(|word| read(*word)).collect();
+        String::from_utf16(&words).map(Cow::Owned).map_err(|error| error.to_string())
+    };
+    match (bytes, core::str::from_utf8(bytes)) {
+        ([0xff, 0xfe, ..], _) => wide(u16::from_le_bytes),
+        ([0xfe, 0xff, ..], _) => wide(u16::from_be_bytes),
+        (_, Ok(text)) => Ok(Cow::Borrowed(text)),
+        (_, Err(error)) => {
+            let declaration = bytes.split(|byte| *byte == b'>').next().unwrap_or_default();
+            let declaration = String::from_utf8_lossy(declaration).to_ascii_lowercase();
+            if ["iso-8859-1", "latin1", "latin-1"].iter().any(|name| declaration.contains(name)) {
+                return Ok(bytes.iter().map(|byte| char::from(*byte)).collect());
+            }
+            Err(format!("it is not UTF-8, as XML without another encoding is: {error}"))
+        }
+    }
+}
+
+/// Names without their namespace, which some files have and some have not.
+trait Named {
+    fn has_tag_name_of(&self, name: &str) -> bool;
+}
+
+impl Named for Node<'_, '_> {
+    fn has_tag_name_of(&self, name: &str) -> bool {
+        self.is_element() && self.tag_name().name() == name
+    }
+}
+
+fn children<'a, 'i>(node: Node<'a, 'i>, name: &'static str) -> impl Iterator<Item = Node<'a, 'i>> {
+    node.children().filter(move |child| child.has_tag_name_of(name))
+}
+
+fn child<'a, 'i>(node: Node<'a, 'i>, name: &'static str) -> Option<Node<'a, 'i>> {
+    children(node, name).next()
+}
+
+/// The file's unit and axis.
+fn outer(name: &str, root: Node<'_, '_>, up: UpAxis) -> Result<Affine, MeshError> {
+    let asset = child(root, "asset");
+    let meter = asset.and_then(|asset| child(asset, "unit")?.attribute("meter"));
+    let scale = match meter {
+        None => 1.0,
+        Some(meter) => {
+            let parsed = meter.trim().parse::<f64>().ok().filter(|value| value.is_finite() && *value > 0.0);
+            parsed.ok_or_else(|| syntax(name, &format!("its unit is {meter:?} m, which is not above 0")))?
+        }
+    };
+    let axis = asset.and_then(|asset| child(asset, "up_axis")?.text()).map_or("Y_UP", str::trim);
+    let turn = match (up, axis) {
+        (UpAxis::Ignore, _) | (UpAxis::Follow, "Z_UP") => Matrix3::identity(),
+        // x stays; y to z.
+        (UpAxis::Follow, "Y_UP") => Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0),
+        // x to z, y to -x, z to -y: X_UP has y to the left, and z towards the viewer.
+        (UpAxis::Follow, "X_UP") => Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0),
+        (UpAxis::Follow, _) => {
+            return Err(syntax(name, &format!("its up_axis is {axis:?}, none of X_UP, Y_UP and Z_UP")));
+        }
+    };
+    Ok(Affine { linear: turn * scale, shift: Vector3::zeros() })
+}
+
+/// Elements by kind and id.
+#[derive(Debug)]
+struct Names<'a, 'i> {
+    /// The file's name, for errors.
+    file: &'a str,
+    elements: HashMap<(&'a str, &'a str), Vec<Node<'a, 'i>>>,
+}
+
+impl<'a, 'i> Names<'a, 'i> {
+    fn of(file: &'a str, nodes: impl Iterator<Item = Node<'a, 'i>>) -> Self {
+        let mut elements = HashMap::<_, Vec<_>>::new();
+        for node in nodes {
+            if let Some(id) = node.attribute("id") {
+                elements.entry((node.tag_name().name(), id)).or_default().push(node);
+            }
+        }
+        Self { file, elements }
+    }
+
+    /// The element of this kind that `reference` names; none if there is none.
+    fn find(&self, kind: &str, reference: &str) -> Result<Option<Node<'a, 'i>>, MeshError> {
+        let wrong = |reason: String| Err(syntax(self.file, &reason));
+        let Some(id) = reference.strip_prefix('#') else {
+            return wrong(format!("its {kind} {reference:?} is not in this file; write all into one file"));
+        };
+        match self.elements.get(&(kind, id)).map_or(&[][..], Vec::as_slice) {
+            [] => Ok(None),
+            [one] => Ok(Some(*one)),
+            several => wrong(format!("the id {id:?} belongs to {} {kind} elements", several.len())),
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Reader<'a, 'i> {
+    /// The file's name, for errors.
+    name: &'a str,
+    names: Names<'a, 'i>,
+    /// What was read of a geometry.
+    geometry: HashMap<roxmltree::NodeId, Vec<Triangle>>,
+    /// Nodes visited.
+    visited: usize,
+    triangles: Vec<Triangle>,
+}
+
+impl<'a, 'i> Reader<'a, 'i> {
+    fn error(&self, reason: &str) -> MeshError {
+        syntax(self.name, reason)
+    }
+
+    /// The element of this kind that an element's `url` names, in this file.
+    fn referred(&self, node: Node<'_, '_>, kind: &str) -> Result<Node<'a, 'i>, MeshError> {
+        let url = node.attribute("url").unwrap_or_default();
+        let missing = || self.error(&format!("{kind} {url:?} is not there"));
+        self.names.find(kind, url)?.ok_or_else(missing)
+    }
+
+    fn node(&mut self, node: Node<'a, 'i>, outer: &Affine, depth: usize) -> Result<(), MeshError> {
+        self.visited += 1;
+        if depth > MAX_DEPTH || self.visited > MAX_NODES {
+            return Err(self.error(&format!(
+                "its nodes are nested more than {MAX_DEPTH} deep, or more than {MAX_NODES}"
+            )));
+        }
+        let mut here = *outer;
+        for element in node.children().filter(Node::is_element) {
+            if let Some(step) = self.transform(element)? {
+                here = here.after(&step);
+            }
+        }
+        for element in node.children().filter(Node::is_element) {
+            match element.tag_name().name() {
+                "node" => self.node(element, &here, depth + 1)?,
+                "instance_node" => {
+                    let target = self.referred(element, "node")?;
+                    self.node(target, &here, depth + 1)?;
+                }
+                "instance_geometry" => {
+                    let geometry = self.referred(element, "geometry")?;
+                    self.place(geometry, &here)?;
+                }
+                // Where its vertices are is up to joints.
+                "instance_controller" => {
+                    let url = element.attribute("url").unwrap_or_default();
+                    return Err(self.error(&format!("controller {url:?} deforms a mesh; apply it first")));
+                }
+                _ => (),
+            }
+        }
+        Ok(())
+    }
+
+    /// A node's element as a transform, if it is one.
+    fn transform(&self, element: Node<'_, '_>) -> Result<Option<Affine>, MeshError> {
+        let kind = element.tag_name().name();
+        if !matches!(kind, "matrix" | "translate" | "rotate" | "scale") {
+            return Ok(None);
+        }
+        let numbers = floats(self.name, element)?;
+        let identity = Affine::identity();
+        Ok(Some(match (kind, numbers.as_slice()) {
+            ("matrix", &[a, b, c, x, d, e, f, y, g, h, i, z, _, _, _, _]) => {
+                Affine { linear: Matrix3::new(a, b, c, d, e, f, g, h, i), shift: Vector3::new(x, y, z) }
+            }
+            ("translate", &[x, y, z]) => Affine { shift: Vector3::new(x, y, z), ..identity },
+            ("scale", &[x, y, z]) => {
+                Affine { linear: Matrix3::from_diagonal(&Vector3::new(x, y, z)), ..identity }
+            }
+            ("rotate", &[x, y, z, degrees]) => {
+                let axis = Unit::try_new(Vector3::new(x, y, z), 0.0);
+                let turn = axis.map(|axis| Rotation3::from_axis_angle(&axis, degrees.to_radians()));
+                turn.map_or(identity, |turn| Affine { linear: turn.into_inner(), ..identity })
+            }
+            _ => return Err(self.error(&format!("a {kind} has {} numbers", numbers.len()))),
+        }))
+    }
+
+    fn place(&mut self, geometry: Node<'a, 'i>, here: &Affine) -> Result<(), MeshError> {
+        if !self.geometry.contains_key(&geometry.id()) {
+            let read = match child(geometry, "mesh") {
+                Some(mesh) => Mesh::new(self.name, mesh, &self.names).triangles()?,
+                None => Vec::new(),
+            };
+            self.geometry.insert(geometry.id(), read);
+        }
+        let triangles = self.geometry.get(&geometry.id()).map_or(&[][..], Vec::as_slice);
+        let count = self.triangles.len() + triangles.len();
+        if count > MAX_TRIANGLES {
+            return Err(too_many(self.name, count));
+        }
+        self.triangles.extend(triangles.iter().map(|triangle| here.map(triangle)));
+        Ok(())
+    }
+}
+
+/// The numbers of an element's text.
+fn floats(file: &str, element: Node<'_, '_>) -> Result<Vec<f64>, MeshError> {
+    numbers(file, element, str::parse::<f64>)
+}
+
+fn numbers<T, E>(
+    file: &str,
+    element: Node<'_, '_>,
+    parse: impl Fn(&str) -> Result<T, E>,
+) -> Result<Vec<T>, MeshError> {
+    let words = element.text().unwrap_or_default().split_ascii_whitespace();
+    let number = |word| {
+        parse(word).map_err(|_| {
+            let kind = element.tag_name().name();
+            syntax(file, &format!("{word:?} in element {kind} is not a number"))
+        })
+    };
+    words.map(number).collect()
+}

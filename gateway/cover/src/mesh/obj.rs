@@ -1,0 +1,73 @@
+//! Wavefront OBJ files: vertices and faces. Normals, textures, materials, groups and lines are ignored.
+
+use nalgebra::Point3;
+
+use super::polygon::Filled;
+use super::{MAX_TRIANGLES, MeshError, Triangle, syntax, too_many};
+
+/// The triangles of a file.
+pub(super) fn triangles(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
+    let mut vertices: Vec<Point3<f64>> = Vec::new();
+    let mut filled = Filled::default();
+    // Names may be in any encoding; numbers are ASCII.
+    let text = String::from_utf8_lossy(bytes);
+    for (line, words) in lines(&text) {
+        let wrong = |why: String| syntax(name, &format!("line {line}: {why}"));
+        let mut words = words.iter().flat_map(|part| part.split_ascii_whitespace());
+        match words.next() {
+            Some("v") => vertices.push(vertex(words).map_err(wrong)?),
+            Some("f") => {
+                let corners: Vec<_> =
+                    words.map(|word| corner(word, &vertices)).collect::<Result<_, _>>().map_err(wrong)?;
+                filled.add(&corners, &[]);
+                if filled.triangles.len() > MAX_TRIANGLES {
+                    return Err(too_many(name, filled.triangles.len()));
+                }
+            }
+            _ => (),
+        }
+    }
+    filled.finish().map_err(|why| syntax(name, &why))
+}
+
+/// Lines without their comments, each with its number from 1; one that ends with `\` goes on in the next.
+fn lines(text: &str) -> impl Iterator<Item = (usize, Vec<&str>)> {
+    let text = text.trim_start_matches('\u{feff}');
+    let mut lines = text.lines().enumerate();
+    core::iter::from_fn(move || {
+        let (index, mut line) = lines.next()?;
+        let mut parts = Vec::new();
+        loop {
+            let (code, comment) = line.split_once('#').map_or((line, false), |(code, _)| (code, true));
+            let goes_on = (!comment).then(|| code.trim_end().strip_suffix('\\')).flatten();
+            parts.push(goes_on.unwrap_or(code));
+            match goes_on.and_then(|_| lines.next()) {
+                Some((_, next)) => line = next,
+                None => return Some((index + 1, parts)),
+            }
+        }
+    })
+}
+
+/// A vertex: x, y, z, then maybe a weight, or a colour.
+fn vertex<'a>(words: impl Iterator<Item = &'a str>) -> Result<Point3<f64>, String> {
+    let number = |word: &str| word.parse::<f32>().map_err(|_| format!("{word:?} is not a number"));
+    let number = |word| number(word).map(f64::from);
+    let numbers = words.map(number).collect::<Result<Vec<_>, _>>()?;
+    match *numbers.as_slice() {
+        [x, y, z, weight] if weight != 0.0 => Ok(Point3::new(x / weight, y / weight, z / weight)),
+        [_, _, _, _] => Err("the weight of a vertex is 0".to_owned()),
+        [x, y, z, ..] => Ok(Point3::new(x, y, z)),
+        _ => Err(format!("a vertex has {} numbers, not 3", numbers.len())),
+    }
+}
+
+/// The vertex of a face's corner, `5`, `5/1`, `5//1` or `5/1/1`; negative numbers count from the last one.
+fn corner(word: &str, vertices: &[Point3<f64>]) -> Result<Point3<f64>, String> {
+    let number = word.split('/').next().unwrap_or_default();
+    let index = number.parse::<i64>().map_err(|_| format!("{word:?} is not a corner of a face"))?;
+    let count = i64::try_from(vertices.len()).unwrap_or(i64::MAX);
+    let index = if index < 0 { index.checked_add(count) } else { index.checked_sub(1) };
+    let vertex = index.and_then(|index| vertices.get(usize::try_from(index).ok()?));
+    vertex.copied().ok_or_else(|| format!("vertex {number} is not there; {count} come before the face"))
+}
