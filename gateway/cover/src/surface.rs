@@ -29,6 +29,13 @@ const ESCAPING: f64 = 0.3;
 /// Which share of the rays from inside another link may leave it through gaps of its mesh.
 const LEAKING: f64 = 0.1;
 
+/// Which share of the rays from a side has to leave the robot at the minimum, whatever link is in the way: less comes
+/// in through the gap between two links only, where nothing can touch a cell.
+const REACHED: f64 = 0.05;
+
+/// Rays for that share; if half of the first [`FEW`] leave, no others are cast.
+const REACHING: u32 = 128;
+
 /// How far above the surface rays start, in pitches.
 const ABOVE: f64 = 1e-3;
 
@@ -143,21 +150,48 @@ impl<'a> Surface<'a> {
         // A sheet has two outer sides: the one that faces more of the world, and of two equal ones the front.
         let back = if front < 0.95 { self.escaping(point, &-face) } else { 0.0 };
         let (side, share) = if back > front { (-face, back) } else { (*face, front) };
-        (share >= ESCAPING && !self.inside_another(&(point + side * (ABOVE * self.pitch)))).then_some(side)
+        let is_outer = share >= ESCAPING
+            && !self.inside_another(&(point + side * (ABOVE * self.pitch)))
+            && self.is_reached(point, &side);
+        is_outer.then_some(side)
     }
 
     /// The share of rays from just above a point that escapes, weighted by how directly they leave.
     fn escaping(&self, point: &Point3<f64>, side: &Vector3<f64>) -> f64 {
+        let rays = self.rays(point, side);
+        share(|ray| self.escapes(&rays(*ray), HIDING * self.pitch))
+    }
+
+    /// Checks that something can touch a point from a side: enough rays leave the robot.
+    fn is_reached(&self, point: &Point3<f64>, side: &Vector3<f64>) -> bool {
+        let rays = self.rays(point, side);
+        let leaves = |ray: &u32| self.escapes(&rays(*ray), f64::INFINITY);
+        let few = count((0..FEW).filter(leaves));
+        if 2 * few >= FEW {
+            return true;
+        }
+        let mut needed = (REACHED * f64::from(REACHING)).ceil() - f64::from(few);
+        let left = (FEW..REACHING).filter(leaves).find(|_| {
+            needed -= 1.0;
+            needed <= 0.0
+        });
+        needed <= 0.0 || left.is_some()
+    }
+
+    /// Rays by number, from just above a point to a side, the denser the more directly they leave.
+    fn rays(&self, point: &Point3<f64>, side: &Vector3<f64>) -> impl Fn(u32) -> Ray {
         let origin = point + side * (ABOVE * self.pitch);
-        let (s, t) = tangents(side);
-        let escapes = |ray: &u32| {
-            let (u, v) = scattered(*ray);
+        let ((s, t), side) = (tangents(side), *side);
+        move |ray| {
+            let (u, v) = scattered(ray);
             let (radius, (sin, cos)) = (u.sqrt(), (TAU * v).sin_cos());
-            let direction = s * (radius * cos) + t * (radius * sin) + side * (1.0 - u).sqrt();
-            let ray = Ray::new(origin, direction);
-            !self.own.blocks(&ray, f64::INFINITY) && !self.others.blocks(&ray, HIDING * self.pitch)
-        };
-        share(escapes)
+            Ray::new(origin, s * (radius * cos) + t * (radius * sin) + side * (1.0 - u).sqrt())
+        }
+    }
+
+    /// Checks that a ray meets nothing of its own link, and no other link before it is `until` long.
+    fn escapes(&self, ray: &Ray, until: f64) -> bool {
+        !self.own.blocks(ray, f64::INFINITY) && !self.others.blocks(ray, until)
     }
 
     fn inside_another(&self, point: &Point3<f64>) -> bool {
@@ -240,12 +274,16 @@ impl<'a> Surface<'a> {
 
 /// The share of rays that pass, from few of them when those agree.
 fn share(escapes: impl Fn(&u32) -> bool) -> f64 {
-    let count = |rays: core::ops::Range<u32>| rays.filter(&escapes).fold(0_u32, |count, _| count + 1);
-    let few = count(0..FEW);
+    let few = count((0..FEW).filter(&escapes));
     if few == 0 || few == FEW {
         return f64::from(few) / f64::from(FEW);
     }
-    f64::from(few + count(FEW..RAYS)) / f64::from(RAYS)
+    f64::from(few + count((FEW..RAYS).filter(&escapes))) / f64::from(RAYS)
+}
+
+/// Counts rays.
+fn count(rays: impl Iterator<Item = u32>) -> u32 {
+    rays.fold(0, |count, _| count + 1)
 }
 
 /// Points of the unit square that are spread evenly however many are taken (a sequence of Roberts).

@@ -210,6 +210,78 @@ fn other_links_hide_and_keep_cells_away() {
     assert!(skin.cells.iter().all(|cell| cell.link == 1));
 }
 
+/// The 642 corners of an icosahedron whose edges were halved three times.
+fn directions() -> Vec<Vector3<f64>> {
+    let long = (1.0 + 5.0_f64.sqrt()) / 2.0;
+    let turned = |x: f64, y: f64| [[0.0, x, y], [x, y, 0.0], [y, 0.0, x]];
+    let corners = [(1.0, long), (1.0, -long), (-1.0, long), (-1.0, -long)];
+    let mut all: Vec<_> = corners.into_iter().flat_map(|(x, y)| turned(x, y)).map(Vector3::from).collect();
+    all.iter_mut().for_each(|corner| *corner = corner.normalize());
+    let mut edge = 1.2;
+    for _ in 0..3 {
+        let pairs = all.iter().enumerate().flat_map(|(at, a)| all[..at].iter().map(move |b| (a, b)));
+        let middles = pairs.filter(|(a, b)| (*a - *b).norm() < edge).map(|(a, b)| (a + b).normalize());
+        let middles: Vec<_> = middles.collect();
+        all.extend(middles);
+        edge /= 1.8;
+    }
+    assert_eq!(all.len(), 642);
+    all
+}
+
+/// How many cells of the first link nothing can touch: no direction leads from them past all links.
+fn enclosed(links: &[Link], skin: &Skin) -> usize {
+    let directions = directions();
+    let parts = links.iter().flat_map(|link| link.parts.iter().map(|part| part.triangles(&link.pose)));
+    let tree = tree::Tree::new(parts.flatten().collect());
+    let blocked = |cell: &&Cell| {
+        let (position, normal) = vectors(cell);
+        let from = links[0].pose * Point3::from(position + normal * 1e-4);
+        directions.iter().all(|direction| tree.blocks(&tree::Ray::new(from, *direction), f64::INFINITY))
+    };
+    skin.cells.iter().filter(|cell| cell.link == 0).filter(blocked).count()
+}
+
+#[test]
+fn no_cell_is_where_links_together_enclose_it() {
+    let at = |z: f64| Isometry3::translation(0.0, 0.0, z);
+    let plate = single(Mesh::cuboid([0.4, 0.4, 0.02]).unwrap());
+    // A tube without a bottom, 2 mm above the plate; no ray from the plate alone, or from the tube alone, is blocked by much.
+    let closed = Mesh::cylinder(0.1, 0.2).unwrap();
+    let tube = |wall: f64, lift: f64| {
+        let is_open = |triangle: &&Triangle| triangle.iter().any(|corner| corner.z > -0.1 + 1e-9);
+        let open: Vec<_> = closed.triangles().iter().filter(is_open).copied().collect();
+        let inner = Part {
+            scale: [1.0 - wall, 1.0 - wall, 1.0 - wall / 2.0],
+            ..Part::new(Mesh::new("tube", open.clone()).unwrap())
+        };
+        let outer = Part::new(Mesh::new("tube", open).unwrap());
+        let parts = if wall > 0.0 { vec![outer, inner] } else { vec![outer] };
+        Link { pose: at(0.11 + lift), ..link("tube", parts) }
+    };
+    for (wall, lift) in [(0.0, 0.002), (0.05, 0.002), (0.0, 0.0005), (0.0, -0.001)] {
+        let tube = tube(wall, lift);
+        let below = |cell: &&Cell| cell.normal[2] > 0.9 && vectors(cell).0.xy().norm() < 0.095;
+        let links = [plate.clone(), tube];
+        let skin = cover(&links[..1], &links[1..], &options()).unwrap();
+        sound(&skin, &options());
+        assert_eq!(skin.cells.iter().filter(below).count(), 0, "{wall} {lift}");
+        assert_eq!(enclosed(&links, &skin), 0);
+        let outside = skin.cells.iter().filter(|cell| cell.normal[2] > 0.9).count();
+        assert!(outside > 60, "{outside}");
+        // As the second of two covered links too, and inside the tube as little as on the plate.
+        let links = [links[1].clone(), links[0].clone()];
+        let skin = cover(&links, &[], &options()).unwrap();
+        assert_eq!(enclosed(&links, &skin), 0);
+        assert!(skin.cells.iter().filter(|cell| cell.link == 1).filter(below).count() == 0);
+    }
+    // High above the plate it hides nothing.
+    let links = [plate, tube(0.0, 0.3)];
+    let skin = cover(&links[..1], &links[1..], &options()).unwrap();
+    let alone = cover(&links[..1], &[], &options()).unwrap();
+    assert_eq!(skin.cells.len(), alone.cells.len());
+}
+
 #[test]
 fn keep_out_boxes_hold_no_cell() {
     let keep_out = KeepOut { link: 0, min: [-1.0, -1.0, 0.05], max: [1.0, 1.0, 1.0] };
