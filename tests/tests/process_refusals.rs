@@ -51,7 +51,7 @@ fn an_invalid_skin_is_refused_with_line_key_value_and_what_is_allowed() {
         (
             "position = [",
             "position = [2.0, 0.0, 0.0]#[",
-            "cell[0].position = [2, 0, 0]: node 1 can come 2.000 m from a joint, 0.001 m more than the \
+            "cell[0].position = [2, 0, 0]: node 1 can come 2.000 m from a frame of its rows, 0.001 m more than the \
              1.999 m that Q1.14 holds",
         ),
         (

@@ -136,8 +136,8 @@ pub enum ImportError {
     },
     /// A cell that is too far away.
     #[error(
-        "{}position px,py,pz = {x},{y},{z} of link {link:?} can come {reach:.3} m from a joint; less than {REACH} m is \
-         possible: correct it, or choose a root nearer to the link",
+        "{}position px,py,pz = {x},{y},{z} of link {link:?} can come {reach:.3} m from a frame of the rows below \
+         it, if all joints turn freely; less than {REACH} m is possible: correct it, or choose a root nearer to the link",
         at(*line)
     )]
     Reach {

@@ -226,7 +226,7 @@ pub enum Problem {
     },
     /// The chain is longer than a cell can compute.
     #[error(
-        "link {link:?} can come {reach:.3} m from the axes below it; less than {REACH} m is possible: choose a tip or a root nearer to the other"
+        "link {link:?} can come {reach:.3} m from a frame of the rows below it, if all joints turn freely; less than {REACH} m is possible: choose a tip or a root nearer to the other"
     )]
     Reach {
         /// The link.

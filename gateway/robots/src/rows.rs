@@ -2,6 +2,7 @@
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
+use crate::chain::MAX_LENGTH_M;
 use nalgebra::{Isometry3, Matrix4, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use protocol::parameters::RowKind;
 use protocol::skin::{Base, ChainRow, DenavitHartenberg, JointKind};
@@ -13,11 +14,21 @@ const ANGLE_TOLERANCE: f64 = 1e-11;
 /// Lengths below are zero, in m.
 const LENGTH_TOLERANCE_M: f64 = 1e-12;
 
+/// Origins that are nearer to each other are one, and a way that is shorter by less is as long, in m.
+const SAME_PLACE_M: f64 = 1e-9;
+
 /// Below this sine of the angle between two axes their common normal has lost digits.
 const WELL_KNOWN_SINE: f64 = 1e-3;
 
-/// Lengths of a row, and of the way along the next axis to its common normal, above which a fixed row is inserted, in m.
+/// How far frame 0 may be from the first joint's origin, and the last frame from its own, along their axes, in m.
 const LONG_M: f64 = 1.0;
+
+/// The length in m that a fixed row has to save: each adds a rounding to what a cell computes. The second is for chains that are too
+/// long with the first.
+pub(crate) const ROW_COSTS_M: [f64; 2] = [0.2, 0.0];
+
+/// The cost in m of a length that no row can have.
+const IMPOSSIBLE_M: f64 = 1e3;
 
 /// One row of the table in standard Denavit-Hartenberg form, `Rz(theta) Tz(d) Tx(a) Rx(alpha)`. It leads from frame l - 1, whose z
 /// axis is that of the row's joint, to frame l.
@@ -64,9 +75,10 @@ impl Row {
         ChainRow { kind, table: DenavitHartenberg { a, alpha, d, theta_offset }, limits }
     }
 
-    /// The greater of |a| and |d| in m.
+    /// The way along it in m, if a row can be as long.
     fn length(&self) -> f64 {
-        self.a.abs().max(self.d.abs())
+        let length = |value: f64| if value.abs() < MAX_LENGTH_M { value.abs() } else { IMPOSSIBLE_M };
+        length(self.a) + length(self.d)
     }
 
     /// With what is nearly zero or nearly a quarter turn made so.
@@ -110,26 +122,79 @@ pub(crate) struct Axis {
     pub(crate) kind: JointKind,
 }
 
-/// Frame 0 and rows of a chain: one row for each axis, and fixed rows where they are needed. The last row's origin is where the last
-/// axis is nearest to `tip`.
-pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>) -> (Isometry3<f64>, Vec<Row>) {
+/// Rows from frame 0 to an axis.
+#[derive(Clone, Debug)]
+struct Way {
+    rows: Vec<Row>,
+    /// Where they lead, in the root's coordinates.
+    frame: Isometry3<f64>,
+    /// Their length, and what their fixed rows cost, in m.
+    cost: f64,
+}
+
+impl Way {
+    /// With these rows at its end.
+    fn and(&self, rows: &[Row], row_cost: f64) -> Self {
+        let frame = rows.iter().fold(self.frame, |frame, row| frame * row.transform(0.0));
+        let cost = |row: &Row| row.length() + if row.kind == RowKind::Fixed { row_cost } else { 0.0 };
+        let cost = self.cost + rows.iter().map(cost).sum::<f64>();
+        Self { rows: [self.rows.as_slice(), rows].concat(), frame, cost }
+    }
+}
+
+impl Axis {
+    /// Its point that is nearest to another axis; none where that is not well known.
+    fn foot(&self, other: &Self) -> Option<Point3<f64>> {
+        let across = self.direction.cross(&other.direction);
+        let between = other.point - self.point;
+        let along = between.cross(&other.direction).dot(&across) / across.norm_squared();
+        (across.norm() >= WELL_KNOWN_SINE).then(|| self.point + self.direction * along)
+    }
+}
+
+/// Frame 0 and rows of a chain: one row for each axis, and fixed rows where they are needed. Of all ways that lead from frame to frame
+/// along common normals, or by way of joints, it is the shortest, so that rows do not fold back. The last row's origin is where the
+/// last axis is nearest to `tip`. `row_cost` is the length in m that a fixed row has to save.
+pub(crate) fn chain(axes: &[Axis], tip: &Point3<f64>, row_cost: f64) -> (Isometry3<f64>, Vec<Row>) {
     let Some(first) = axes.first() else { return (Isometry3::identity(), Vec::new()) };
     let base = base(first);
-    let (mut frame, mut rows) = (base, Vec::new());
+    let mut ways = vec![Way { rows: Vec::new(), frame: base, cost: 0.0 }];
     for (index, axis) in axes.iter().enumerate() {
         let kind = axis.kind.row();
-        if let Some(next) = axes.get(index + 1) {
-            let point = frame.inverse_transform_point(&next.point).coords;
-            let direction = frame.inverse_transform_vector(&next.direction);
-            let between = between(kind, &point, &direction);
-            frame = between.iter().fold(frame, |frame, row| frame * row.transform(0.0));
-            rows.extend(between);
-        } else {
-            let d = frame.inverse_transform_point(tip).z.clamp(-LONG_M, LONG_M);
-            rows.push(Row { kind, a: 0.0, alpha: 0.0, d, theta_offset: 0.0 }.tidy());
+        let next = axes.get(index + 1);
+        let mut longer: Vec<Way> = Vec::new();
+        for way in &ways {
+            let local = |point: &Point3<f64>| way.frame.inverse_transform_point(point).coords;
+            let Some(next) = next else {
+                let d = local(tip).z.clamp(-LONG_M, LONG_M);
+                longer.push(
+                    way.and(&[Row { kind, a: 0.0, alpha: 0.0, d, theta_offset: 0.0 }.tidy()], row_cost),
+                );
+                continue;
+            };
+            let direction = way.frame.inverse_transform_vector(&next.direction);
+            let mut places = vec![local(&next.point)];
+            places.extend(axes.get(index + 2).and_then(|beyond| next.foot(beyond)).map(|foot| local(&foot)));
+            for rows in between(kind, &places, &direction) {
+                let way = way.and(&rows, row_cost);
+                // Ways to one frame differ in nothing that comes.
+                let same = |other: &&mut Way| {
+                    let apart = other.frame.translation.vector - way.frame.translation.vector;
+                    apart.norm() < SAME_PLACE_M
+                };
+                match longer.iter_mut().find(same) {
+                    Some(other) if way.cost < other.cost - SAME_PLACE_M => *other = way,
+                    Some(_) => {}
+                    None => longer.push(way),
+                }
+            }
         }
+        ways = longer;
     }
-    (base, rows)
+    // Of equal ones the first: the one that leads by way of common normals, and joints.
+    let shortest =
+        ways.into_iter().reduce(|best, way| if way.cost < best.cost - SAME_PLACE_M { way } else { best });
+    (base, shortest.map(|way| way.rows).unwrap_or_default())
 }
 
 /// Frame 0: z is the first axis, x is as near to the root's as that allows, and the origin is where the axis is nearest to the root's
@@ -148,32 +213,18 @@ fn base(first: &Axis) -> Isometry3<f64> {
     Isometry3::from_parts(origin.into(), UnitQuaternion::from_rotation_matrix(&turn))
 }
 
-/// The rows from a frame whose z axis moves to one whose z axis is the line through `point` along `direction`.
-fn between(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> Vec<Row> {
+/// The rows that may lead from a frame whose z axis moves to one whose z axis is the line through the `places` along `direction`.
+fn between(kind: RowKind, places: &[Vector3<f64>], direction: &Vector3<f64>) -> Vec<Vec<Row>> {
+    let Some(point) = places.first() else { return Vec::new() };
+    // Where the axis is nearest to the frame's origin.
+    let nearest = point - direction * direction.dot(point);
+    let places = places.iter().copied().chain([nearest]);
     let sine = direction.x.hypot(direction.y);
     if sine < ANGLE_TOLERANCE {
-        return vec![parallel(kind, point, direction)];
+        return places.map(|place| vec![parallel(kind, &place, direction)]).collect();
     }
-    let mut candidates = Vec::new();
-    if sine >= WELL_KNOWN_SINE {
-        let (row, along) = common_normal(kind, point, direction);
-        candidates.push((row.length().max(along.abs()), vec![row]));
-    }
-    // The next joint's origin, or where its axis is nearest.
-    for at in [*point, point - direction * direction.dot(point)] {
-        let rows = helper(kind, &at, direction);
-        candidates.push((rows.iter().map(Row::length).fold(0.0, f64::max), rows.to_vec()));
-    }
-    let short = candidates.iter().position(|(length, _)| *length <= LONG_M);
-    let shortest =
-        || (0..candidates.len()).min_by(|&i, &j| measure(&candidates, i).total_cmp(&measure(&candidates, j)));
-    let chosen = short.or_else(shortest).unwrap_or_default();
-    candidates.into_iter().nth(chosen).map(|(_, rows)| rows).unwrap_or_default()
-}
-
-/// How long a candidate is.
-fn measure(candidates: &[(f64, Vec<Row>)], at: usize) -> f64 {
-    candidates.get(at).map_or(f64::INFINITY, |(length, _)| *length)
+    let normal = (sine >= WELL_KNOWN_SINE).then(|| vec![common_normal(kind, point, direction)]);
+    normal.into_iter().chain(places.map(|place| helper(kind, &place, direction).to_vec())).collect()
 }
 
 /// To an axis that is parallel to z, or opposite: d is free, and leads to the next joint's origin.
@@ -181,19 +232,18 @@ fn parallel(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> Ro
     let meets = point.xy().norm() < LENGTH_TOLERANCE_M;
     let theta_offset = if meets { 0.0 } else { upright(point.y.atan2(point.x)) };
     let alpha = if direction.z > 0.0 { 0.0 } else { PI };
-    let d = point.z.clamp(-LONG_M, LONG_M);
-    Row { kind, a: along_x(point, theta_offset), alpha, d, theta_offset }.tidy()
+    Row { kind, a: along_x(point, theta_offset), alpha, d: point.z, theta_offset }.tidy()
 }
 
-/// Along the common normal; also how far its foot on the next axis is from `point`.
-fn common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> (Row, f64) {
+/// Along the common normal.
+fn common_normal(kind: RowKind, point: &Vector3<f64>, direction: &Vector3<f64>) -> Row {
     let along = -point.xy().dot(&direction.xy()) / direction.xy().norm_squared();
     let theta_offset = upright(direction.x.atan2(-direction.y));
     // Of the direction, what is at a right angle to the new x.
     let (sine, cosine) = theta_offset.sin_cos();
     let alpha = (sine * direction.x - cosine * direction.y).atan2(direction.z);
     let d = point.z + along * direction.z;
-    (Row { kind, a: along_x(point, theta_offset), alpha, d, theta_offset }.tidy(), along)
+    Row { kind, a: along_x(point, theta_offset), alpha, d, theta_offset }.tidy()
 }
 
 /// How far a point is along the x axis that was turned by this angle about z. Not the length of the common normal: the angle may have been
@@ -207,10 +257,10 @@ fn along_x(point: &Vector3<f64>, theta: f64) -> f64 {
 /// lost however small the angle between them is.
 fn helper(kind: RowKind, at: &Vector3<f64>, direction: &Vector3<f64>) -> [Row; 2] {
     let normal = Vector3::new(-direction.y, direction.x, 0.0).normalize();
-    let (row, _) = common_normal(kind, at, &normal);
+    let row = common_normal(kind, at, &normal);
     let frame = row.transform(0.0);
     let at = frame.inverse_transform_point(&Point3::from(*at)).coords;
-    let (back, _) = common_normal(RowKind::Fixed, &at, &frame.inverse_transform_vector(direction));
+    let back = common_normal(RowKind::Fixed, &at, &frame.inverse_transform_vector(direction));
     [row, back]
 }
 

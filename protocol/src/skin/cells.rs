@@ -93,7 +93,7 @@ fn cell(at: &Place, raw: &raw::Cell, robot: &Robot, buses: &[Bus], base: Base) -
     if reach >= REACH {
         let [x, y, z] = raw.position;
         let why = format!(
-            "node {node} can come {reach:.3} m from a joint, {:.3} m more than the {REACH} m that Q1.14 holds",
+            "node {node} can come {reach:.3} m from a frame of its rows, {:.3} m more than the {REACH} m that Q1.14 holds",
             reach - REACH
         );
         return Err(at.key("position").fault(format_args!("[{x}, {y}, {z}]"), why));

@@ -119,7 +119,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     assert_eq!(
         says("[0.1, 0.0, 0.06]", "[1.6, 0.0, 0.0]"),
         "skin.toml:34: cell[0].position = [1.6, 0, 0]: \
-         node 1 can come 2.100 m from a joint, 0.101 m more than the 1.999 m that Q1.14 holds"
+         node 1 can come 2.100 m from a frame of its rows, 0.101 m more than the 1.999 m that Q1.14 holds"
     );
     assert_eq!(
         says("[controller]", "[[bus]]\nname = \"vcan0\"\nreply = \"torque\"\nformat = \"fd\"\n[controller]"),

@@ -27,13 +27,30 @@ pub(crate) struct Hanging {
 pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain, RobotError> {
     let root = urdf.index(root.unwrap_or_else(|| urdf.root()))?;
     let path = path(urdf, root, urdf.index(tip)?)?;
-    let root_name = urdf.link_name(root).to_owned();
-    let joints = joints(urdf, &root_name, tip, &path)?;
-    let (base, rows) = table(urdf, &path, &joints, tip)?;
+    let joints = joints(urdf, urdf.link_name(root), tip, &path)?;
+    let build = |row_cost| with_rows(urdf, root, tip, &path, &joints, row_cost);
+    let [usual, least] = rows::ROW_COSTS_M;
+    build(usual).or_else(|error| {
+        let is_long = matches!(*error.problem, Problem::Reach { .. } | Problem::Length { .. });
+        if is_long { build(least) } else { Err(error) }
+    })
+}
 
-    let (hanging, apart) = hanging(urdf, root, &path);
+/// Builds a chain whose fixed rows save this length, in m.
+fn with_rows(
+    urdf: &Urdf,
+    root: usize,
+    tip: &str,
+    path: &[&UrdfJoint],
+    joints: &[Joint],
+    row_cost: f64,
+) -> Result<Chain, RobotError> {
+    let root_name = urdf.link_name(root).to_owned();
+    let (base, rows) = table(urdf, path, joints, tip, row_cost)?;
+
+    let (hanging, apart) = hanging(urdf, root, path);
     let at_zero = frames(&base, &rows, &[]);
-    let behind = behind(&path, &[]);
+    let behind = behind(path, &[]);
     let carried = hanging.iter().map(|it| (it.link.clone(), carrier(&rows, &at_zero, &behind, it)));
     let carried: Vec<_> = carried.collect();
     let below = urdf.pose(&root_name, &|joint| urdf.rest(joint))?;
@@ -41,7 +58,7 @@ pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain,
         below,
         root: root_name,
         tip: tip.to_owned(),
-        joints,
+        joints: joints.to_vec(),
         rows,
         base,
         residual: 0.0,
@@ -57,7 +74,7 @@ pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain,
             return Err(urdf.error(Problem::Reach { link: link.clone(), reach }));
         }
     }
-    let Residual { residual, link } = residual::residual(&chain, &path, &hanging);
+    let Residual { residual, link } = residual::residual(&chain, path, &hanging);
     if residual.is_nan() || residual > MAX_RESIDUAL {
         return Err(urdf.error(Problem::Residual { link, residual }));
     }
@@ -144,6 +161,7 @@ fn table(
     path: &[&UrdfJoint],
     joints: &[Joint],
     tip: &str,
+    row_cost: f64,
 ) -> Result<(Isometry3<f64>, Vec<Row>), RobotError> {
     let moving = path.iter().filter_map(|joint| Some((joint, moves(joint)?)));
     let axes: Vec<_> = moving
@@ -155,7 +173,7 @@ fn table(
         .collect();
     let end = path.iter().fold(Isometry3::identity(), |pose, joint| pose * joint.origin);
     let end = Point3::from(end.translation.vector);
-    let (base, rows) = rows::chain(&axes, &end);
+    let (base, rows) = rows::chain(&axes, &end, row_cost);
     if rows.len() > MAX_ROWS {
         return Err(urdf.error(Problem::TooManyRows { count: rows.len(), tip: tip.to_owned() }));
     }

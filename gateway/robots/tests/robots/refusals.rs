@@ -209,7 +209,7 @@ fn chains_that_are_too_long() {
     };
     assert_eq!(
         chain(&reaching(0.8), "l4"),
-        "t.urdf: link \"l4\" can come 2.100 m from the axes below it; less than 1.999 m is possible: choose a tip or a root nearer to the other"
+        "t.urdf: link \"l4\" can come 2.100 m from a frame of the rows below it, if all joints turn freely; less than 1.999 m is possible: choose a tip or a root nearer to the other"
     );
     assert_eq!(good(&reaching(0.8), "l3").rows.len(), 3);
     assert_eq!(good(&reaching(0.74), "l4").rows.len(), 3);

@@ -3,6 +3,7 @@
 use core::f64::consts::{FRAC_PI_2, PI};
 
 use nalgebra::{Isometry3, Point3};
+use protocol::skin::reach;
 use robots::{Chain, JointKind, Row, RowKind, Urdf};
 
 use crate::common::{difference, named};
@@ -117,6 +118,91 @@ fn a_far_foot_is_avoided() {
     assert!(chain.rows.iter().all(|row| row.a.abs() <= 0.5 && row.d.abs() <= 0.5), "{:?}", chain.rows);
 }
 
+/// The waist and the left arm of a humanoid whose shoulder axis is tilted against the waist's by 16 degrees: their common normal is
+/// 0.9 m beside the robot. The tip is this far from the elbow.
+fn tilted_shoulder(forearm: f64) -> Vec<Written> {
+    let [x, y, z] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+    vec![
+        Written::hinge([0.0; 3], [0.0; 3]).axis(z),
+        Written::hinge([-0.004, 0.0, 0.044], [0.0; 3]).axis(x),
+        Written::hinge([0.0; 3], [0.0; 3]).axis(y),
+        Written::hinge([0.004, 0.1002, 0.2478], [0.2793, 5.5e-5, -1.9e-4]).axis(y),
+        Written::hinge([0.0, 0.038, -0.0138], [-0.2793, 0.0, 0.0]).axis(x),
+        Written::hinge([0.0, 0.0062, -0.1032], [0.0; 3]).axis(z),
+        Written::hinge([0.0158, 0.0, -0.0805], [0.0; 3]).axis(y),
+        Written::fixed([forearm, 0.0, -0.01], [0.0; 3]),
+    ]
+}
+
+/// The farthest that the tip comes from any joint before it, of many positions, in m.
+fn farthest(urdf: &Urdf, chain: &Chain) -> f64 {
+    let (mut most, mut state) = (0.0_f64, 1_u32);
+    for _ in 0..1000 {
+        let positions: Vec<_> = chain
+            .joints
+            .iter()
+            .map(|_| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (f64::from(state >> 8) / f64::from(1 << 24) - 0.5) * 2.0 * PI
+            })
+            .collect();
+        let position = named(chain, &positions);
+        let at = |link: &str| urdf.pose(link, &position).unwrap().translation.vector;
+        let tip = at(&chain.tip);
+        let joints = (1..=chain.joints.len()).map(|joint| at(&format!("l{joint}")));
+        most = joints.map(|joint| (tip - joint).norm()).fold(most, f64::max);
+    }
+    most
+}
+
+#[test]
+fn rows_do_not_fold_back_beside_the_robot() {
+    for forearm in [0.3, 1.0, 1.3] {
+        let urdf = Urdf::parse("t.urdf", &robot(&tilted_shoulder(forearm))).unwrap();
+        let chain = urdf.chain(None, "l8").unwrap();
+        let place = chain.link("l8").unwrap();
+        let bound = reach(&chain.chain_rows()[..place.row], place.frame.translation.vector.into());
+        let seen = farthest(&urdf, &chain);
+        assert!((0.9..1.15).contains(&(bound / seen)), "{bound} m for {seen} m");
+        assert!(chain.rows[..7].iter().all(|row| row.a.abs().max(row.d.abs()) < 0.26), "{:?}", chain.rows);
+        assert!(chain.residual < 1e-14, "{}", chain.residual);
+    }
+    let long = Urdf::parse("t.urdf", &robot(&tilted_shoulder(1.7))).unwrap().chain(None, "l8").unwrap_err();
+    assert!(long.to_string().contains("can come 2."), "{long}");
+}
+
+/// No way is longer than the one from joint to joint, with a fixed row for each.
+#[test]
+fn rows_are_no_longer_than_the_way_from_joint_to_joint() {
+    let mut state = 7_u32;
+    let mut random = || {
+        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+        f64::from(state >> 8) / f64::from(1 << 24) - 0.5
+    };
+    for tilt in [1e-9, 1e-3, 0.03, 0.3, 3.0] {
+        for _ in 0..40 {
+            let joints: Vec<_> = (0..6)
+                .map(|_| Written::hinge([(); 3].map(|()| 0.4 * random()), [(); 3].map(|()| tilt * random())))
+                .collect();
+            let way: f64 = joints
+                .iter()
+                .skip(1)
+                .map(|joint| joint.xyz.iter().map(|it| it * it).sum::<f64>().sqrt())
+                .sum();
+            let chain = chain(&joints);
+            let rows: f64 = chain.rows.iter().map(|row| row.a.abs() + row.d.abs()).sum();
+            let first = Point3::from(joints[0].xyz);
+            let base = (first - Point3::from(chain.base.translation.vector)).norm();
+            let fixed = 0.2 * f64::from(u32::try_from(joints.len()).unwrap());
+            assert!(
+                rows < 3.0_f64.sqrt() * way + base + fixed,
+                "{tilt}: {rows} {way} {base}: {:?}",
+                chain.rows
+            );
+        }
+    }
+}
+
 #[test]
 fn slides_are_rows_of_their_own() {
     let chain = chain(&[
@@ -128,7 +214,8 @@ fn slides_are_rows_of_their_own() {
         Written::slide([0.1, 0.1, 0.1], [0.0, 0.4, 0.0]).axis([0.0, -3.0, 4.0]),
     ]);
     use RowKind::{Prismatic, Revolute};
-    assert_eq!(kinds(&chain), [Prismatic, Revolute, Prismatic, Prismatic, Revolute, Prismatic]);
+    let moving: Vec<_> = kinds(&chain).into_iter().filter(|kind| *kind != RowKind::Fixed).collect();
+    assert_eq!(moving, [Prismatic, Revolute, Prismatic, Prismatic, Revolute, Prismatic]);
     let kinds: Vec<_> = chain.joints.iter().map(|joint| joint.kind == JointKind::Prismatic).collect();
     assert_eq!(kinds, [true, false, true, true, false, true]);
     assert!(chain.residual < 1e-14, "{}", chain.residual);
