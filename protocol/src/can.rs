@@ -67,6 +67,32 @@ pub const fn dlc_len(dlc: u8) -> usize {
     }
 }
 
+/// A number that does not fit its identifier.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+#[error("{got:X} does not fit an identifier of {bits} bits: at most {max:X}")]
+pub struct IdentifierError {
+    /// The number.
+    pub got: u32,
+    /// Bits of the identifier: 11 or 29.
+    pub bits: u8,
+    /// The greatest identifier of that many bits.
+    pub max: u32,
+}
+
+/// Checks an identifier that comes from elsewhere, and returns it as [`Frame`] keeps it. `flags` are those of [`EXTENDED`],
+/// [`REMOTE`] and [`ERROR`] that it has; an extended identifier and an error's kind have 29 bits, any other one 11.
+///
+/// # Errors
+/// When the number has more bits than that.
+pub const fn identifier(number: u32, flags: u32) -> Result<u32, IdentifierError> {
+    let (bits, max) =
+        if flags & (EXTENDED | ERROR) == 0 { (11, STANDARD_MASK) } else { (29, EXTENDED_MASK) };
+    if number > max {
+        return Err(IdentifierError { got: number, bits, max });
+    }
+    Ok(number | flags & !EXTENDED_MASK)
+}
+
 /// Classic CAN or CAN FD.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Format {
@@ -371,6 +397,24 @@ mod tests {
         for len in 0..=64 {
             assert_eq!(Some(fd_len(len)), lens.into_iter().find(|&it| it >= len), "{len}");
         }
+    }
+
+    #[test]
+    fn an_identifier_has_the_bits_that_its_flags_say() {
+        for (number, flags, bits, max) in [
+            (0x7FF, 0, 11, STANDARD_MASK),
+            (0x7FF, REMOTE, 11, STANDARD_MASK),
+            (0x1FFF_FFFF, EXTENDED, 29, EXTENDED_MASK),
+            (0x1FFF_FFFF, ERROR, 29, EXTENDED_MASK),
+            (0x1FFF_FFFF, EXTENDED | REMOTE, 29, EXTENDED_MASK),
+        ] {
+            assert_eq!(identifier(number, flags), Ok(number | flags));
+            for got in [number + 1, number + 1 | EXTENDED, u32::MAX] {
+                assert_eq!(identifier(got, flags), Err(IdentifierError { got, bits, max }));
+            }
+        }
+        let wrong = identifier(0x18F0_10FE, 0).unwrap_err().to_string();
+        assert_eq!(wrong, "18F010FE does not fit an identifier of 11 bits: at most 7FF");
     }
 
     #[test]

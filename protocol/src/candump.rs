@@ -7,9 +7,11 @@
 //!   (1700000000.123456) vcan0 20000004#0001...   error frame: 8 digits with 0x20000000 set
 //! ```
 //!
-//! Also read: lines that are indented or quoted by `>` or `|`, several spaces, 9 digits of a second (`-N`), a direction `T` or `R` at the end (`-x`),
-//! dots between bytes, a raw DLC (`_9` to `_F`). Lines that do not begin with a parenthesis are other
-//! text, as can-utils has it; CAN XL frames (`00242#81:00:12345678#...`) are named but not read.
+//! Also read: lines that are indented or quoted by `>` or `|`, or stand behind a prefix as journald's, several spaces or
+//! tabs, any number of digits of a second (9: `-N`), a direction `T` or `R` behind the frame (`-x`), other words there, dots
+//! between bytes, a raw DLC (`_9` to `_F`), the kernel's flags in an identifier of 8 digits (80000000 extended, 40000000
+//! remote, 20000000 error). Lines without a parenthesis are other text, as can-utils has it; CAN XL frames
+//! (`00242#81:00:12345678#...`) are named but not read.
 
 mod portable;
 mod read;
@@ -20,7 +22,8 @@ use core::fmt;
 use thiserror::Error;
 
 use crate::can::Frame;
-use read::Cursor;
+use read::{Cursor, is_blank};
+pub use read::{fraction, eight_digit_identifier};
 pub use write::{write_frame, write_record};
 
 /// When a line's frame was on the bus.
@@ -118,25 +121,34 @@ fn parse_widely(line: &[u8]) -> Result<Line<'_>, LineError> {
     let text = trim_end(line);
     // In mails and issues.
     let indent = text.iter().take_while(|byte| matches!(byte, b' ' | b'\t' | b'>' | b'|')).count();
-    let is_frame = match text.get(indent..).unwrap_or_default() {
-        [b'(', next, ..] if indent > 0 => next.is_ascii_digit(),
-        [b'(', ..] => true,
-        _ => false,
-    };
-    if !is_frame {
-        return Ok(other(text));
+    match text.get(indent..).unwrap_or_default() {
+        [b'(', next, ..] if indent > 0 && next.is_ascii_digit() => parse_at(text, indent),
+        [b'(', ..] if indent == 0 => parse_at(text, 0),
+        [b'#' | b';' | b'/', ..] => Ok(other(text)),
+        _ => Ok(behind_prefix(text).unwrap_or_else(|| other(text))),
     }
-    let mut cursor = Cursor::new(text, indent + 1);
+}
+
+/// Reads a line whose parenthesis is at this place.
+fn parse_at(text: &[u8], at: usize) -> Result<Line<'_>, LineError> {
+    let mut cursor = Cursor::new(text, at + 1);
     let time = cursor.time()?;
     cursor.expect(b')', "`)` after the time")?;
-    cursor.spaces()?;
+    cursor.blanks()?;
     let interface = cursor.word()?;
-    cursor.spaces()?;
+    cursor.blanks()?;
     let Some(frame) = cursor.frame()? else {
         return Ok(Line::CanXl);
     };
     let direction = cursor.direction()?;
     Ok(Line::Frame(Record { time, interface, frame, direction }))
+}
+
+/// A frame behind words, as journald writes them before each line; what is like one there may be anything.
+fn behind_prefix(text: &[u8]) -> Option<Line<'_>> {
+    let begins = |pair: &[u8]| matches!(pair, [before, b'('] if is_blank(*before));
+    let places = text.windows(2).enumerate().filter(|(_, pair)| begins(pair));
+    places.map(|(at, _)| parse_at(text, at + 1)).find_map(Result::ok)
 }
 
 /// Reads a frame alone, as cansend takes it: `123#DEADBEEF`. Never panics.
@@ -240,10 +252,78 @@ mod tests {
         assert!(matches!(parse_bytes("(1.000000) kän 123# \u{A0}".as_bytes()), Ok(Line::Frame(_))));
     }
 
+    /// What another program reads of lines that are written in all manners; see `vectors/candump.tsv`.
+    #[test]
+    fn lines_have_the_values_that_can_utils_and_python_can_read() {
+        let vectors = include_str!("../tests/vectors/candump.tsv");
+        let mut count = 0;
+        for row in vectors.lines().filter(|row| !row.starts_with('#')) {
+            let (line, expected) = row.rsplit_once("\t=> ").unwrap();
+            let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}: {:?}", parse(line)) };
+            let (seconds, nanos) = (record.time.nanos / 1_000_000_000, record.time.nanos % 1_000_000_000);
+            let read = format!("{seconds}.{nanos:09} {} {}", record.interface, record.frame);
+            assert_eq!(read, expected, "{line}");
+            count += 1;
+        }
+        assert!(count >= 300, "{count}");
+    }
+
+    #[test]
+    fn the_kernels_flags_in_an_identifier_are_flags() {
+        for (line, expected) in [
+            ("98f010fe#35", "18F010FE#35"),
+            ("18f010fe#35", "18F010FE#35"),
+            ("92345678##1AA", "12345678##1AA"),
+            ("D2345678##1AA", "12345678##1AA"),
+            ("C0000123#R4", "00000123#R4"),
+            ("C0000123#0000", "00000123#R2"),
+            ("C0000123#", "00000123#R"),
+            ("A0000004#0001", "20000004#0001"),
+            ("E0000004#0001", "20000004#0001"),
+            ("FFFFFFFF#", "3FFFFFFF#"),
+        ] {
+            assert_eq!(frame_of(&format!("(1.000000) can0 {line}")).to_string(), expected, "{line}");
+        }
+    }
+
+    #[test]
+    fn a_fraction_has_any_number_of_digits() {
+        let time = |text: &str| match parse(&format!("({text}) can0 123#")) {
+            Ok(Line::Frame(record)) => (record.time.nanos, record.time.nine_digits),
+            other => panic!("{text}: {other:?}"),
+        };
+        assert_eq!(time("7"), (7_000_000_000, false));
+        for digits in 1..=12 {
+            let text = format!("1.{}", &"123456789876"[..digits]);
+            let nanos = format!("1{:0<9}", &"123456789"[..digits.min(9)]).parse().unwrap();
+            assert_eq!(time(&text), (nanos, digits > 6), "{text}");
+        }
+    }
+
+    #[test]
+    fn words_may_stand_before_and_behind_a_frame() {
+        for line in [
+            "Nov 26 18:00:00 rpi candump[512]: (1700000000.123456) can0 123#1122",
+            "\t(1700000000.123456)\tcan0\t123#1122\t",
+            "(1700000000.123456) can0 123#1122 :: EEC1(EngSpeed: 499.375 rpm)",
+            "(1700000000.123456) can0 123#1122   ERRORFRAME",
+            "words (2) and (1700000000.123456) can0 123#1122",
+        ] {
+            let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}: {:?}", parse(line)) };
+            assert_eq!(record.to_string(), "(1700000000.123456) can0 123#1122", "{line}");
+            assert_eq!(record.direction, None);
+        }
+        let Ok(Line::Frame(sent)) = parse("(1.000000) can0 123# T :: words") else { panic!() };
+        assert_eq!(sent.direction, Some(Direction::Sent));
+        for line in ["# (1.000000) can0 123#", "// (1.000000) can0 123#", "rpi: (1.000000) can0 123#1"] {
+            assert_eq!(parse(line), Ok(Line::Other), "{line}");
+        }
+    }
+
     #[test]
     fn what_is_wrong_is_said_with_its_column() {
         let says = |line| parse(line).unwrap_err().to_string();
-        assert_eq!(says("(1.5) can0 123#"), "column 5: 6 or 9 digits of a second");
+        assert_eq!(says("(1.) can0 123#"), "column 4: digits of a second");
         assert_eq!(says("(1.000000) can0 12#11"), "column 17: an identifier of 3 or 8 hexadecimal digits");
         assert_eq!(says("(1.000000) can0 800#11"), "column 17: an 11-bit identifier, at most 7FF");
         assert_eq!(says("(1.000000) can0 123#1"), "column 22: the second digit of a byte");
@@ -251,7 +331,10 @@ mod tests {
             says("(1.000000) can0 123#112233445566778899"),
             "column 39: at most 8 bytes in a classic frame"
         );
-        assert_eq!(says("(1.000000) can0 123#11 X"), "column 24: `T`, `R` or the end of the line");
+        let further = "the end of the data: a byte stands behind a space";
+        assert_eq!(says("(1.000000) can0 123#11 22"), format!("column 24: {further}"));
+        let remote = "no data in a remote frame, whose flag the identifier has";
+        assert_eq!(says("(1.000000) can0 C0000123#11"), format!("column 26: {remote}"));
         assert_eq!(says("(1.000000) can0 123##"), "column 22: one digit of FD flags");
         assert_eq!(says("(1.000000) "), "column 11: a space");
     }

@@ -7,7 +7,7 @@
 //!   0          11     18 20   3 or 8 digits, # or ## and flags, whole bytes, the end of the line
 //! ```
 
-use super::read::{eight_digits, four_bytes, value};
+use super::read::{eight_digits, four_bytes, is_blank, value};
 use super::{Record, Timestamp};
 use crate::can::{EXTENDED, EXTENDED_MASK, Format, Frame, STANDARD_MASK};
 
@@ -19,8 +19,8 @@ const TIME: usize = 20;
 pub(super) fn record(line: &[u8]) -> Option<Record<'_>> {
     let (time, rest) = line.split_first_chunk::<TIME>()?;
     let nanos = nanos(time)?;
-    let space = rest.iter().position(|&byte| byte == b' ')?;
-    let (name, frame) = rest.split_at_checked(space)?;
+    let blank = rest.iter().position(|&byte| is_blank(byte))?;
+    let (name, frame) = rest.split_at_checked(blank)?;
     let interface = core::str::from_utf8(name).ok().filter(|name| !name.is_empty())?;
     let frame = match frame {
         [_, a, b, c, b'#', rest @ ..] => {

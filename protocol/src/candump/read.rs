@@ -2,7 +2,7 @@
 
 use super::write::MAX_PAD;
 use super::{Direction, LineError, Timestamp};
-use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, STANDARD_MASK};
+use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, identifier};
 
 /// What a byte is as a hexadecimal digit; [`NONE`] when it is none.
 #[expect(clippy::indexing_slicing, reason = "when this is compiled")]
@@ -120,17 +120,17 @@ impl<'a> Cursor<'a> {
         if self.take(byte) { Ok(()) } else { Err(self.error(expected)) }
     }
 
-    /// At least one space.
-    pub(super) fn spaces(&mut self) -> Result<(), LineError> {
-        self.expect(b' ', "a space")?;
-        while self.take(b' ') {}
-        Ok(())
+    /// At least one space or tab.
+    pub(super) fn blanks(&mut self) -> Result<(), LineError> {
+        let blanks = self.rest().iter().take_while(|byte| is_blank(**byte)).count();
+        self.at += blanks;
+        if blanks == 0 { Err(self.error("a space")) } else { Ok(()) }
     }
 
-    /// Up to the next space.
+    /// Up to the next space or tab.
     pub(super) fn word(&mut self) -> Result<&'a str, LineError> {
         let rest = self.rest();
-        let len = rest.iter().position(|&byte| byte == b' ').unwrap_or(rest.len());
+        let len = rest.iter().position(|&byte| is_blank(byte)).unwrap_or(rest.len());
         let word = rest.get(..len).and_then(|word| core::str::from_utf8(word).ok());
         let word = word.filter(|word| !word.is_empty());
         let word = word.ok_or_else(|| self.error("the name of an interface"))?;
@@ -153,17 +153,20 @@ impl<'a> Cursor<'a> {
     pub(super) fn time(&mut self) -> Result<Timestamp, LineError> {
         let padded = self.peek() == Some(b'0');
         let (seconds, whole_digits) = self.digits("seconds since 1970")?;
-        self.expect(b'.', "`.` and the fraction of a second")?;
-        let (fraction, digits) = self.digits("6 or 9 digits of a second")?;
-        let nanos = match digits {
-            6 => fraction * 1_000,
-            9 => fraction,
-            _ => return Err(self.error("6 or 9 digits of a second")),
-        };
+        let (nanos, digits) = if self.take(b'.') { self.fraction()? } else { (0, 0) };
         let whole = seconds.checked_mul(1_000_000_000).and_then(|whole| whole.checked_add(nanos));
         let nanos = whole.ok_or_else(|| self.error("a time before the year 2554"))?;
         let min_digits = if padded { u8::try_from(whole_digits).unwrap_or(MAX_PAD).min(MAX_PAD) } else { 1 };
-        Ok(Timestamp { nanos, nine_digits: digits == 9, min_digits })
+        Ok(Timestamp { nanos, nine_digits: digits > 6, min_digits })
+    }
+
+    /// The fraction of a second in ns, and how many digits it has.
+    fn fraction(&mut self) -> Result<(u64, usize), LineError> {
+        let count = self.rest().iter().take_while(|byte| byte.is_ascii_digit()).count();
+        let digits = self.rest().get(..count).unwrap_or_default();
+        let (nanos, digits) = fraction(digits).ok_or_else(|| self.error("digits of a second"))?;
+        self.at += count;
+        Ok((nanos, digits))
     }
 
     /// A frame, or `None` for CAN XL, whose text is skipped.
@@ -183,23 +186,31 @@ impl<'a> Cursor<'a> {
         self.expect(b'#', expected)?;
         let wrong = |expected| LineError { column: start + 1, expected };
         let id = match digits {
-            3 if id <= STANDARD_MASK => id,
-            3 => return Err(wrong("an 11-bit identifier, at most 7FF")),
-            8 if id & ERROR != 0 && id & (EXTENDED | REMOTE) == 0 => id,
-            8 if id <= EXTENDED_MASK => id | EXTENDED,
-            8 => return Err(wrong("a 29-bit identifier, at most 1FFFFFFF")),
+            3 => identifier(id, 0).map_err(|_| wrong("an 11-bit identifier, at most 7FF"))?,
+            8 => eight_digit_identifier(id),
             _ => return Err(wrong(expected)),
         };
         if self.take(b'#') {
             let flags = self.peek().and_then(nibble).ok_or_else(|| self.error("one digit of FD flags"))?;
             self.at += 1;
-            return self.data(id, Format::Fd, flags).map(Some);
+            // In CAN FD no frame is remote.
+            return self.data(id & !REMOTE, Format::Fd, flags).map(Some);
         }
         if matches!(self.peek(), Some(b'R' | b'r')) {
             self.at += 1;
             return self.remote(id).map(Some);
         }
-        self.data(id, Format::Classic, 0).map(Some)
+        let column = self.at + 1;
+        let frame = self.data(id & !REMOTE, Format::Classic, 0)?;
+        if id & REMOTE == 0 {
+            return Ok(Some(frame));
+        }
+        // The flag is the kernel's: its struct has a length and bytes without a meaning.
+        if frame.data().iter().any(|byte| *byte != 0) {
+            return Err(LineError { column, expected: "no data in a remote frame, whose flag the identifier has" });
+        }
+        let remote = Frame::remote(id, frame.len()).map_err(|_| self.error("a length of 0 to 8"))?;
+        Ok(Some(remote.with_raw_dlc(frame.raw_dlc())))
     }
 
     fn remote(&mut self, id: u32) -> Result<Frame, LineError> {
@@ -241,17 +252,47 @@ impl<'a> Cursor<'a> {
         }
     }
 
+    /// The direction behind a frame; other words there are left out, and a further byte is an error.
     pub(super) fn direction(&mut self) -> Result<Option<Direction>, LineError> {
         if self.is_at_end() {
             return Ok(None);
         }
-        self.spaces()?;
-        match self.rest() {
-            b"T" => Ok(Some(Direction::Sent)),
-            b"R" => Ok(Some(Direction::Received)),
-            _ => Err(self.error("`T`, `R` or the end of the line")),
+        self.blanks()?;
+        let rest = self.rest();
+        let len = rest.iter().position(|&byte| is_blank(byte)).unwrap_or(rest.len());
+        match rest.get(..len) {
+            Some(b"T") => Ok(Some(Direction::Sent)),
+            Some(b"R") => Ok(Some(Direction::Received)),
+            Some([high, low]) if value(*high) < 16 && value(*low) < 16 => {
+                Err(self.error("the end of the data: a byte stands behind a space"))
+            }
+            Some(_) | None => Ok(None),
         }
     }
+}
+
+/// Whether a byte separates words.
+pub(super) const fn is_blank(byte: u8) -> bool {
+    matches!(byte, b' ' | b'\t')
+}
+
+/// Returns the fraction of a second that digits are, in ns, and their count; `None` without a digit. What is below a
+/// nanosecond is left out.
+#[must_use]
+pub fn fraction(digits: &[u8]) -> Option<(u64, usize)> {
+    if digits.is_empty() || !digits.iter().all(u8::is_ascii_digit) {
+        return None;
+    }
+    let nine = digits.iter().chain(&[b'0'; 9]).take(9);
+    Some((nine.fold(0, |nanos, digit| nanos * 10 + u64::from(digit - b'0')), digits.len()))
+}
+
+/// Returns the identifier that 8 digits are, with its flags. One with the kernel's flags has them in its upper three
+/// bits; one without any is extended, as can-utils and python-can take it, and an error's kind is not.
+#[must_use]
+pub const fn eight_digit_identifier(word: u32) -> u32 {
+    let number = word & EXTENDED_MASK;
+    if word & ERROR != 0 { number | ERROR } else { number | EXTENDED | word & REMOTE }
 }
 
 #[cfg(test)]
