@@ -85,8 +85,7 @@ pub struct IdentifierError {
 /// # Errors
 /// When the number has more bits than that.
 pub const fn identifier(number: u32, flags: u32) -> Result<u32, IdentifierError> {
-    let (bits, max) =
-        if flags & (EXTENDED | ERROR) == 0 { (11, STANDARD_MASK) } else { (29, EXTENDED_MASK) };
+    let (bits, max) = if flags & (EXTENDED | ERROR) == 0 { (11, STANDARD_MASK) } else { (29, EXTENDED_MASK) };
     if number > max {
         return Err(IdentifierError { got: number, bits, max });
     }

@@ -23,7 +23,7 @@ use thiserror::Error;
 
 use crate::can::Frame;
 use read::{Cursor, is_blank};
-pub use read::{fraction, eight_digit_identifier};
+pub use read::{eight_digit_identifier, fraction};
 pub use write::{write_frame, write_record};
 
 /// When a line's frame was on the bus.

@@ -207,7 +207,10 @@ impl<'a> Cursor<'a> {
         }
         // The flag is the kernel's: its struct has a length and bytes without a meaning.
         if frame.data().iter().any(|byte| *byte != 0) {
-            return Err(LineError { column, expected: "no data in a remote frame, whose flag the identifier has" });
+            return Err(LineError {
+                column,
+                expected: "no data in a remote frame, whose flag the identifier has",
+            });
         }
         let remote = Frame::remote(id, frame.len()).map_err(|_| self.error("a length of 0 to 8"))?;
         Ok(Some(remote.with_raw_dlc(frame.raw_dlc())))

@@ -2,15 +2,11 @@
 
 use std::io::{self, Write};
 
-use super::last_times::LastTimes;
-use super::log::{LogWriter, Style, Wrote};
+use super::log::{Less, LogWriter, Style, Wrote};
 use super::mcap::McapWriter;
+pub use super::mcap::Origin;
 use super::{CaptureError, Entry, Format, Note, NoteKind, Reader};
-use protocol::candump::Record;
 use thiserror::Error;
-
-/// Buses whose times are compared.
-const BUSES: usize = 64;
 
 /// Where entries go.
 #[derive(Debug)]
@@ -23,15 +19,23 @@ enum Form<W: Write> {
 }
 
 impl<W: Write> Output<W> {
-    /// A capture of a format; `style` is for a log.
+    /// A capture of a format, made of a log; `style` is for a log.
     ///
     /// # Errors
     /// When its beginning cannot be written.
     pub fn new(out: W, format: Format, style: Style) -> io::Result<Self> {
-        Ok(Self(match format {
-            Format::Candump => Form::Log(LogWriter::new(out, style)),
-            Format::Mcap => Form::Mcap(Box::new(McapWriter::new(out)?)),
-        }))
+        Ok(match format {
+            Format::Candump => Self(Form::Log(LogWriter::new(out, style))),
+            Format::Mcap => Self::recording(out, Origin { of_log: true, file: None })?,
+        })
+    }
+
+    /// A recording.
+    ///
+    /// # Errors
+    /// When its beginning cannot be written.
+    pub fn recording(out: W, origin: Origin<'_>) -> io::Result<Self> {
+        Ok(Self(Form::Mcap(Box::new(McapWriter::new(out, origin)?))))
     }
 
     /// Writes an entry.
@@ -51,8 +55,19 @@ impl<W: Write> Output<W> {
     /// When they cannot be written.
     pub fn pass_on(&mut self) -> io::Result<()> {
         match &mut self.0 {
-            Form::Log(log) => log.flush(),
+            Form::Log(log) => log.pass_on(),
             Form::Mcap(_) => Ok(()),
+        }
+    }
+
+    /// Hands everything on: what was written can be read from the output, whatever happens afterwards.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn keep(&mut self) -> io::Result<()> {
+        match &mut self.0 {
+            Form::Log(log) => log.pass_on(),
+            Form::Mcap(mcap) => mcap.flush(),
         }
     }
 
@@ -68,6 +83,44 @@ impl<W: Write> Output<W> {
     }
 }
 
+/// Where [`convert`] writes.
+pub trait Target {
+    /// Writes an entry.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote>;
+
+    /// Hands lines on that wait for more.
+    ///
+    /// # Errors
+    /// When they cannot be written.
+    fn pass_on(&mut self) -> io::Result<()>;
+}
+
+impl<W: Write> Target for Output<W> {
+    fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
+        Self::write(self, entry)
+    }
+
+    fn pass_on(&mut self) -> io::Result<()> {
+        Self::pass_on(self)
+    }
+}
+
+/// Frames whose line says less than the capture, by what it does not say.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Shortened {
+    /// Digits of their times.
+    pub digits: u64,
+    /// Their direction.
+    pub direction: u64,
+    /// Their raw DLC.
+    pub raw_dlc: u64,
+    /// The name of their bus.
+    pub name: u64,
+}
+
 /// What a conversion came to.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Converted {
@@ -75,18 +128,18 @@ pub struct Converted {
     pub frames: u64,
     /// Other lines and words that were written.
     pub notes: u64,
-    /// Lines or messages that begin like a frame and are none.
+    /// Lines that begin like a frame and are none.
     pub unreadable: u64,
+    /// Messages that are none of their type.
+    pub unreadable_messages: u64,
     /// CAN XL frames, kept as text.
     pub can_xl: u64,
     /// Frames that whoever took the capture lost.
     pub dropped: u64,
     /// Frames whose line says less than the capture.
-    pub shortened: u64,
+    pub shortened: Shortened,
     /// Notes that are not in the output.
     pub omitted: u64,
-    /// How often a frame is older than the one before it on its bus, and the first of them, counted from 1.
-    pub backwards: Option<(u64, u64)>,
 }
 
 /// Why a conversion ended before its time.
@@ -109,13 +162,12 @@ pub enum ConvertError {
 ///
 /// # Errors
 /// When one side fails, or `unreadable` says so.
-pub fn convert<W: Write>(
+pub fn convert(
     from: &mut Reader,
-    to: &mut Output<W>,
+    to: &mut impl Target,
     mut unreadable: impl FnMut(&Note<'_>, &str) -> Result<(), String>,
 ) -> Result<Converted, ConvertError> {
     let mut done = Converted::default();
-    let mut last_times = LastTimes::default();
     loop {
         let entry = match from.next() {
             Ok(Some(entry)) => entry,
@@ -127,9 +179,9 @@ pub fn convert<W: Write>(
             }
         };
         match &entry {
-            Entry::Frame(record) => done.frame(record, &mut last_times),
+            Entry::Frame(_) => done.frames += 1,
             Entry::Note(note) => {
-                done.note(&note.kind);
+                done.note(note);
                 if let NoteKind::Unreadable(why) = &note.kind {
                     unreadable(note, why).map_err(ConvertError::Strict)?;
                 }
@@ -137,7 +189,7 @@ pub fn convert<W: Write>(
         }
         match to.write(&entry).map_err(ConvertError::Write)? {
             Wrote::All => {}
-            Wrote::Less => done.shortened += 1,
+            Wrote::Less(less) => done.shortened.count(less),
             Wrote::Nothing => {
                 done.notes -= 1;
                 done.omitted += 1;
@@ -150,21 +202,24 @@ pub fn convert<W: Write>(
     }
 }
 
-impl Converted {
-    fn frame(&mut self, record: &Record<'_>, last_times: &mut LastTimes<BUSES>) {
-        self.frames += 1;
-        let nanos = record.time.nanos;
-        if last_times.replace(record.interface, nanos).is_some_and(|last| nanos < last) {
-            self.backwards.get_or_insert((0, self.frames)).0 += 1;
-        }
+impl Shortened {
+    fn count(&mut self, less: Less) {
+        let Less { digits, direction, raw_dlc, name } = less;
+        self.digits += u64::from(digits);
+        self.direction += u64::from(direction);
+        self.raw_dlc += u64::from(raw_dlc);
+        self.name += u64::from(name);
     }
+}
 
-    fn note(&mut self, kind: &NoteKind) {
+impl Converted {
+    fn note(&mut self, note: &Note<'_>) {
         self.notes += 1;
-        match kind {
+        match &note.kind {
             NoteKind::Text => {}
             NoteKind::Dropped(frames) => self.dropped = self.dropped.saturating_add(*frames),
             NoteKind::CanXl => self.can_xl += 1,
+            NoteKind::Unreadable(_) if note.line == 0 => self.unreadable_messages += 1,
             NoteKind::Unreadable(_) => self.unreadable += 1,
         }
     }

@@ -33,10 +33,20 @@ const MAGIC: &[(&[u8], Kind)] = &[
     (b"Time Stamp", CSV),
     (b"\xEF\xBB\xBFTime", CSV),
     (b"version https://git-lfs", Kind::Other("a Git LFS pointer to a file", "fetch it with `git lfs pull`")),
-    (b"#ROSBAG V", Kind::Other("a ROS 1 bag", "make an MCAP of it")),
+    (
+        b"#ROSBAG V",
+        Kind::Other(
+            "a ROS 1 bag",
+            "make an MCAP of it with `rosbags-convert --src FILE --dst NEW --dst-storage mcap` (pip install rosbags)",
+        ),
+    ),
     (
         b"SQLite format 3",
-        Kind::Other("an SQLite database", "if it is a ROS 2 bag, make an MCAP of it with `ros2 bag convert`"),
+        Kind::Other(
+            "an SQLite database",
+            "of a ROS 2 bag make an MCAP with `rosbags-convert --src FOLDER --dst NEW --dst-storage mcap` (pip install \
+             rosbags), of python-can's a candump log with can_logconvert",
+        ),
     ),
     (b"\xFF\xFE", UTF_16),
     (b"\xFE\xFF", UTF_16),

@@ -10,6 +10,7 @@
 //! one as it was. Entries stand in the order of the file, which is not always that of their times.
 
 pub mod convert;
+mod error;
 mod extras;
 mod last_times;
 pub mod log;
@@ -18,12 +19,15 @@ mod mcap;
 mod parts;
 mod places;
 mod reader;
+mod text_kinds;
+mod times;
 
+pub use error::CaptureError;
 pub use extras::{Extras, Latched, SKIN, Topic};
 pub use mcap::ORIGIN;
 pub use parts::{Part, PartsError};
 pub use places::{Place, Places};
-pub use reader::{CaptureError, Format, Reader};
+pub use reader::{Format, Reader};
 
 pub use crate::note::{BusNote, Note, NoteKind};
 

@@ -5,13 +5,15 @@
 //! ```
 //!
 //! Each part says which one it is and of which recording. What a shell makes of `run*.mcap` is put in order by that,
-//! whatever the files are called.
+//! whatever the files are called. Logs, and recordings that other programs split, are put in order by their first frames.
 
+use std::collections::HashSet;
+use std::fs;
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use super::Extras;
+use super::{Extras, Format};
 
 /// Why several files are not the parts of one recording.
 #[derive(Debug, Error)]
@@ -20,13 +22,25 @@ pub enum PartsError {
     /// Not even one.
     #[error("no file is named: name a capture")]
     None,
-    /// One is no part of anything.
-    #[error(
-        "{} is no part of a recording: several files are read as one only if they are parts of one, as `gateway run \
-         --record` splits it; name this one alone",
-        .0.display()
-    )]
-    NoPart(PathBuf),
+    /// One is a part of a recording, and another is not.
+    #[error("{} is a part of a recording, and {} is none: name the parts alone", .part.display(), .other.display())]
+    Mixed {
+        /// The part.
+        part: PathBuf,
+        /// The other one.
+        other: PathBuf,
+    },
+    /// Logs and recordings are not one capture.
+    #[error("{} is a candump log, and {} an MCAP recording: make a log of it first with `gateway convert`", .log.display(), .mcap.display())]
+    Formats {
+        /// The log.
+        log: PathBuf,
+        /// The recording.
+        mcap: PathBuf,
+    },
+    /// One is named twice.
+    #[error("{} is named twice: name it once", .0.display())]
+    Same(PathBuf),
     /// One has no name.
     #[error("- is standard input, which cannot be one of several files: name files alone")]
     StandardInput,
@@ -75,21 +89,62 @@ pub struct Part {
 }
 
 impl Part {
-    /// By what the file has beside its frames.
-    pub(super) fn of(path: &Path, extras: &Extras) -> Result<Self, PartsError> {
-        let facts = extras.fact("program", "began_ns").zip(extras.fact("part", "number"));
-        let part = facts.and_then(|(began, number)| {
-            Some(Self { path: path.to_owned(), began: began.to_owned(), number: number.parse().ok()? })
-        });
-        part.ok_or_else(|| PartsError::NoPart(path.to_owned()))
+    /// By what the file has beside its frames; `None` when it is no part of anything.
+    fn of(path: &Path, extras: &Extras) -> Option<Self> {
+        let (began, number) = extras.fact("program", "began_ns").zip(extras.fact("part", "number"))?;
+        Some(Self { path: path.to_owned(), began: began.to_owned(), number: number.parse().ok()? })
     }
+}
+
+/// One of several files.
+#[derive(Debug)]
+pub(super) struct Named {
+    pub(super) path: PathBuf,
+    pub(super) format: Format,
+    part: Option<Part>,
+    /// The time of its first frame, in ns since 1970.
+    first: Option<u64>,
+}
+
+impl Named {
+    pub(super) fn new(path: &Path, format: Format, extras: &Extras, first: Option<u64>) -> Self {
+        Self { path: path.to_owned(), format, part: Part::of(path, extras), first }
+    }
+}
+
+/// The files in the order in which they are read: parts of one recording by their numbers, and others by the times of
+/// their first frames.
+///
+/// # Errors
+/// When they are not one capture.
+pub(super) fn together(mut files: Vec<Named>) -> Result<Vec<PathBuf>, PartsError> {
+    let mut places = HashSet::new();
+    let mut is_again =
+        |file: &&Named| !places.insert(fs::canonicalize(&file.path).unwrap_or_else(|_| file.path.clone()));
+    if let Some(again) = files.iter().find(|file| is_again(file)) {
+        return Err(PartsError::Same(again.path.clone()));
+    }
+    let (parts, others): (Vec<_>, Vec<_>) = files.iter().partition(|file| file.part.is_some());
+    match (parts.first(), others.first()) {
+        (Some(part), Some(other)) => {
+            return Err(PartsError::Mixed { part: part.path.clone(), other: other.path.clone() });
+        }
+        (Some(_), None) => return ordered(files.into_iter().filter_map(|file| file.part).collect()),
+        (None, _) => {}
+    }
+    let of = |format| files.iter().find(|file| file.format == format).map(|file| file.path.clone());
+    if let (Some(log), Some(mcap)) = (of(Format::Candump), of(Format::Mcap)) {
+        return Err(PartsError::Formats { log, mcap });
+    }
+    files.sort_by_key(|file| file.first);
+    Ok(files.into_iter().map(|file| file.path).collect())
 }
 
 /// The files of parts, in their order.
 ///
 /// # Errors
 /// When they are not all parts of one recording, one is missing between two others, or is there twice.
-pub(super) fn ordered(mut parts: Vec<Part>) -> Result<Vec<PathBuf>, PartsError> {
+fn ordered(mut parts: Vec<Part>) -> Result<Vec<PathBuf>, PartsError> {
     parts.sort_by_key(|part| part.number);
     for pair in parts.windows(2) {
         let [one, next] = pair else { continue };

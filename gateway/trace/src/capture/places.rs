@@ -187,7 +187,7 @@ impl Places {
         let mut end = Vec::new();
         file.seek(SeekFrom::Start(length.saturating_sub(END)))?;
         (&mut file).take(END).read_to_end(&mut end)?;
-        let latest = end.split(|&byte| byte == b'\n').filter_map(|line| known_time(line)?).max();
+        let latest = end.split(|&byte| is_line_end(byte)).filter_map(|line| known_time(line)?).max();
         self.mark(last, latest.unwrap_or(0));
         Ok(())
     }
@@ -212,6 +212,10 @@ impl Places {
     }
 }
 
+const fn is_line_end(byte: u8) -> bool {
+    matches!(byte, b'\n' | b'\r')
+}
+
 /// The first frame of a log at this place or behind it: where its line begins, and its time if it says that itself.
 fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, Option<u64>)>> {
     file.seek(SeekFrom::Start(at))?;
@@ -219,7 +223,7 @@ fn line_at(file: &mut File, at: u64) -> io::Result<Option<(u64, Option<u64>)>> {
     file.take(2 * LONGEST_LINE as u64).read_to_end(&mut piece)?;
     let mut from = at;
     // Within a line, unless it is the first one.
-    for (number, line) in piece.split_inclusive(|&byte| byte == b'\n').enumerate() {
+    for (number, line) in piece.split_inclusive(|&byte| is_line_end(byte)).enumerate() {
         let text = line.trim_ascii_end();
         if let Some(nanos) = known_time(text).filter(|_| number > 0 || at == 0) {
             return Ok(Some((from, nanos)));

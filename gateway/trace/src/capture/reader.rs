@@ -7,15 +7,15 @@ use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 use protocol::input;
-use thiserror::Error;
 
 use super::log::{Clock, LogReader, Remark};
 use super::magic::{self, Kind};
-use super::mcap::{Fault, McapReader, ORIGIN, SOURCE, State};
-use super::parts::{self, Part, PartsError};
+use super::mcap::{Buses, Fault, McapReader, ORIGIN, SOURCE, State, Survey};
+use super::parts::{self, Named, PartsError};
 use super::places::{Place, Places};
-use super::{Entry, Extras, Item, Through};
-use crate::container::Damage;
+use super::text_kinds::kind_of;
+use super::times::Times;
+use super::{CaptureError, Entry, Extras, Item, Through};
 
 /// What a capture is written in.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -24,43 +24,6 @@ pub enum Format {
     Candump,
     /// An MCAP recording.
     Mcap,
-}
-
-/// Why a capture cannot be read, or not further.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum CaptureError {
-    /// It cannot be opened or read.
-    #[error("{name}: {source}")]
-    Io {
-        /// Its name.
-        name: String,
-        /// Why.
-        source: io::Error,
-    },
-    /// Several files are not the parts of one recording.
-    #[error(transparent)]
-    Parts(#[from] PartsError),
-    /// Its first bytes say that it is something else.
-    #[error("{name} is {what}, and no candump log or MCAP recording: {hint}")]
-    Other {
-        /// Its name.
-        name: String,
-        /// What it is.
-        what: &'static str,
-        /// What to do.
-        hint: &'static str,
-    },
-    /// From here on it is not what it was.
-    #[error("{name} is damaged: {what}; {entries} frames and notes before that were read")]
-    Damaged {
-        /// Its name.
-        name: String,
-        /// What is wrong.
-        what: Damage,
-        /// How many entries came before.
-        entries: u64,
-    },
 }
 
 /// Reads a capture from its beginning to its end, in bounded memory. The parts of a split recording are one capture.
@@ -80,6 +43,13 @@ pub struct Reader {
     through: Through,
     /// Whether a part before this one has no end.
     is_unfinished: bool,
+    /// The buses of other people's frames, as far as they are known before they are read.
+    buses: Buses,
+    times: Times,
+    /// The file before this one, until the first frame of this one is read.
+    before: Option<String>,
+    /// What was remarked of the logs before this one.
+    remarks: Vec<Remark>,
 }
 
 enum Source {
@@ -111,10 +81,13 @@ impl Source {
         }
     }
 
-    /// Whether nothing more comes of it, when it is a recording.
+    /// Whether nothing more comes of it.
     fn is_at_its_end(&mut self, name: &str, entries: u64) -> Result<bool, CaptureError> {
-        let Self::Mcap(mcap) = self else { return Ok(false) };
-        mcap.is_at_its_end().map_err(|fault| fault.of(name, entries))
+        let at_its_end = match self {
+            Self::Log(log) => log.is_at_its_end().map_err(Fault::from),
+            Self::Mcap(mcap) => mcap.is_at_its_end(),
+        };
+        at_its_end.map_err(|fault| fault.of(name, entries))
     }
 }
 
@@ -150,10 +123,11 @@ impl Reader {
         Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), plain(), false))
     }
 
-    /// Opens one file, or the parts of one recording in any order.
+    /// Opens one file, or several as one capture: the parts of one recording in any order, or other files, which are read
+    /// in the order of their first frames.
     ///
     /// # Errors
-    /// As [`Reader::open`]; when several files are not parts of one recording that follow each other.
+    /// As [`Reader::open`]; when several files are not one capture.
     pub fn open_all(paths: &[PathBuf]) -> Result<Self, CaptureError> {
         Self::open_parts(paths, plain(), false)
     }
@@ -186,8 +160,27 @@ impl Reader {
         let name = parts::title(&ordered);
         let mut rest = VecDeque::from(ordered);
         let first = rest.pop_front().ok_or(PartsError::None)?;
-        let opened = Source::open(&first, &through, State::new(others, None))?;
-        Ok(Self::begin(name, opened, rest, through, others))
+        let buses = Self::survey([&first].into_iter().chain(&rest));
+        let opened = Source::open(&first, &through, State::new(others, None).with_buses(buses.clone()))?;
+        Ok(Self { buses, ..Self::begin(name, opened, rest, through, others) })
+    }
+
+    /// The buses of other people's frames in all of the files; none where they need not be known before. Files that
+    /// cannot be read report that when they are.
+    fn survey<'a>(paths: impl Iterator<Item = &'a PathBuf> + Clone) -> Buses {
+        let recording = |path: &&PathBuf| {
+            let mut file = File::open(path).ok().filter(|_| path.is_file())?;
+            is_mcap(&mut file).is_ok_and(|is| is).then_some(file)
+        };
+        let mut survey = Survey::default();
+        for mut file in paths.clone().filter_map(|path| recording(&path)) {
+            let _ = survey.look(&mut file);
+        }
+        if !survey.is_needed() {
+            return Buses::default();
+        }
+        let files = paths.filter_map(|path| recording(&path));
+        files.fold(Buses::default(), |known, file| survey.buses_of(Box::new(file), known)).settled()
     }
 
     /// The parts of a recording in their order.
@@ -195,11 +188,41 @@ impl Reader {
         if let [] | [_] = paths {
             return Ok(paths.to_vec());
         }
-        let part = |path: &PathBuf| match is_input(path) {
-            true => Err(PartsError::StandardInput.into()),
-            false => Ok(Part::of(path, Self::open(path)?.extras())?),
+        let named = |path: &PathBuf| match is_input(path) {
+            true => Err(CaptureError::from(PartsError::StandardInput)),
+            false => {
+                let mut reader = Self::open(path)?;
+                // What is a part says so before its frames.
+                let first = reader.first_time();
+                Ok(Named::new(path, reader.format(), reader.extras(), first))
+            }
         };
-        Ok(parts::ordered(paths.iter().map(part).collect::<Result<_, CaptureError>>()?)?)
+        Ok(parts::together(paths.iter().map(named).collect::<Result<_, CaptureError>>()?)?)
+    }
+
+    /// The time of the first frame; none where it cannot be read up to there.
+    fn first_time(&mut self) -> Option<u64> {
+        loop {
+            match self.next() {
+                Ok(Some(Entry::Frame(record))) => return Some(record.time.nanos),
+                Ok(Some(Entry::Note(_))) => {}
+                Ok(None) | Err(_) => return None,
+            }
+        }
+    }
+
+    /// Reads on up to the first frame; whether there is one.
+    ///
+    /// # Errors
+    /// As of [`Reader::next`].
+    pub fn has_frame(&mut self) -> Result<bool, CaptureError> {
+        loop {
+            match self.next()? {
+                Some(Entry::Frame(_)) => return Ok(true),
+                Some(Entry::Note(_)) => {}
+                None => return Ok(false),
+            }
+        }
     }
 
     fn begin(
@@ -209,7 +232,21 @@ impl Reader {
         through: Through,
         others: bool,
     ) -> Self {
-        Self { name, file, source, others, entries: 0, part: 0, rest, through, is_unfinished: false }
+        Self {
+            name,
+            file,
+            source,
+            others,
+            entries: 0,
+            part: 0,
+            rest,
+            through,
+            is_unfinished: false,
+            buses: Buses::default(),
+            times: Times::default(),
+            before: None,
+            remarks: Vec::new(),
+        }
     }
 
     /// What it is called: its name, or those of its first and last part.
@@ -222,13 +259,21 @@ impl Reader {
     fn go_on(&mut self) -> Result<bool, CaptureError> {
         let Some(path) = self.rest.pop_front() else { return Ok(false) };
         self.part += 1;
+        self.before = Some(self.file.clone());
+        self.remarks = self.log_remarks();
+        let lines = self.lines();
         let mut before = self.extras().clone();
         if let Some(what) = before.unfinished.as_mut().filter(|_| !self.is_unfinished) {
             *what = format!("{}: {what}", self.file);
             self.is_unfinished = true;
         }
-        let state = State::new(self.others, Some(before));
-        (self.file, self.source) = Source::open(&path, &self.through, state)?;
+        let state = State::new(self.others, Some(before)).with_buses(self.buses.clone());
+        let source;
+        (self.file, source) = Source::open(&path, &self.through, state)?;
+        self.source = match source {
+            Source::Log(log) => Source::Log(log.behind(lines)),
+            mcap @ Source::Mcap(_) => mcap,
+        };
         Ok(true)
     }
 
@@ -253,10 +298,12 @@ impl Reader {
         let Some(path) = places.path(place.part) else { return Ok(()) };
         if self.part != place.part || place.offset == 0 {
             let before = (place.part > 0).then(|| self.extras().clone());
-            (self.file, self.source) = Source::open(path, &self.through, State::new(self.others, before))?;
+            let state = State::new(self.others, before).with_buses(self.buses.clone());
+            (self.file, self.source) = Source::open(path, &self.through, state)?;
             self.part = place.part;
             self.rest = places.behind(place.part).cloned().collect();
         }
+        self.times = Times::default();
         let name = self.file.clone();
         let failed = |source| CaptureError::Io { name: name.clone(), source };
         if place.offset > 0 {
@@ -313,13 +360,19 @@ impl Reader {
         while !self.rest.is_empty() && self.source.is_at_its_end(&self.file, self.entries)? {
             self.go_on()?;
         }
-        let Self { file: name, source, entries, .. } = self;
+        let Self { file: name, source, entries, times, before, .. } = self;
         let next = match source {
             Source::Log(log) => log.next().map(|next| next.map(Item::Entry)).map_err(Fault::from),
             Source::Mcap(mcap) => mcap.next(),
         };
         let next = next.map_err(|fault| fault.of(name, *entries))?;
         *entries += u64::from(matches!(next, Some(Item::Entry(_))));
+        if let Some(Item::Entry(Entry::Frame(record))) = &next {
+            if let Some(before) = before.take().filter(|_| record.time.nanos < times.latest()) {
+                times.overlaps(name, &before);
+            }
+            times.take(record.interface, record.time.nanos);
+        }
         Ok(next)
     }
 
@@ -340,19 +393,56 @@ impl Reader {
         }
     }
 
-    /// What is to be known of the times and flags of the frames so far.
+    /// What is to be known of the times, flags and buses of the frames so far, a line each.
     #[must_use]
-    pub fn remarks(&self) -> &[Remark] {
+    pub fn remarks(&self) -> Vec<String> {
+        let shared = match &self.source {
+            Source::Mcap(mcap) => mcap.buses().is_shared(),
+            Source::Log(_) => false,
+        };
+        let shared = shared.then(|| {
+            "topics have frames of one frame_id: each topic is a bus of its own, and is called by its topic".to_owned()
+        });
+        let of_log = self.log_remarks().into_iter().map(|remark| remark.to_string());
+        of_log.chain(self.times.remarks()).chain(shared).collect()
+    }
+
+    fn log_remarks(&self) -> Vec<Remark> {
+        let mut remarks = self.remarks.clone();
+        if let Source::Log(log) = &self.source {
+            remarks.extend(log.remarks().iter().filter(|remark| !self.remarks.contains(remark)));
+        }
+        remarks
+    }
+
+    /// Whether the frames so far say when they were.
+    #[must_use]
+    pub fn has_times(&self) -> bool {
+        !self.log_remarks().contains(&Remark::NoTimes)
+    }
+
+    /// What a text without frames is, and what to do with it, by its first lines; `None` where they do not say that.
+    #[must_use]
+    pub fn text_kind(&self) -> Option<(&'static str, &'static str)> {
         match &self.source {
-            Source::Log(log) => log.remarks(),
-            Source::Mcap(_) => &[],
+            Source::Log(log) => kind_of(log.sample()),
+            Source::Mcap(_) => None,
+        }
+    }
+
+    /// Whether another program wrote frames in it, in a type of its own.
+    #[must_use]
+    pub fn has_foreign_frames(&self) -> bool {
+        match &self.source {
+            Source::Mcap(mcap) => mcap.has_foreign(),
+            Source::Log(_) => false,
         }
     }
 
     /// Whether all that has been taken from the input is used up, so that the next entry may take a while: the
     /// time to flush what is shown of a live pipe.
     #[must_use]
-    pub const fn is_drained(&self) -> bool {
+    pub fn is_drained(&self) -> bool {
         match &self.source {
             Source::Log(log) => log.is_drained(),
             Source::Mcap(_) => false,
@@ -366,17 +456,6 @@ impl Reader {
         match &self.source {
             Source::Log(_) => Extras::NONE,
             Source::Mcap(mcap) => mcap.extras(),
-        }
-    }
-}
-
-impl Fault {
-    /// As an error of a file of which so many entries have been read.
-    pub(super) fn of(self, name: &str, entries: u64) -> CaptureError {
-        let name = name.to_owned();
-        match self {
-            Self::Io(source) => CaptureError::Io { name, source },
-            Self::Damaged(what) => CaptureError::Damaged { name, what, entries },
         }
     }
 }

@@ -6,6 +6,7 @@
 //!         text: u32 length with the NUL, bytes, NUL        sequence: u32 count, elements
 //! ```
 
+use protocol::can::IdentifierError;
 use thiserror::Error;
 
 /// "Plain CDR, little endian", and two bytes of options.
@@ -78,6 +79,7 @@ impl<'a> Decode<'a> for &'a str {
         let bytes = from.bytes()?;
         let wrong = CdrError::Text { at: from.at - bytes.len() };
         let text = match bytes {
+            _ if from.form == Form::Ros1 => bytes,
             // Some writers leave the NUL of an empty text away.
             [] => bytes,
             [text @ .., 0] => text,
@@ -205,6 +207,28 @@ pub enum CdrError {
         /// What would be right.
         allowed: &'static str,
     },
+    /// An identifier that has more bits than its frame's kind.
+    #[error("id of a message: {0}")]
+    Identifier(#[from] IdentifierError),
+    /// A time that no recording has.
+    #[error(
+        "the time of a message is {sec} s and {nanosec} ns: allowed are 0 s or more, and less than 1000000000 ns"
+    )]
+    Time {
+        /// Seconds since 1970.
+        sec: i64,
+        /// Nanoseconds.
+        nanosec: u32,
+    },
+}
+
+/// The encoding of a message.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Form {
+    /// That of ROS 2.
+    Cdr,
+    /// That of ROS 1: without a head, without padding, texts without a NUL.
+    Ros1,
 }
 
 /// Reads a message; texts and bytes are borrowed from it. Never panics.
@@ -212,6 +236,7 @@ pub enum CdrError {
 pub struct Reader<'a> {
     bytes: &'a [u8],
     at: usize,
+    form: Form,
 }
 
 impl<'a> Reader<'a> {
@@ -221,10 +246,16 @@ impl<'a> Reader<'a> {
     /// When it is no little-endian CDR.
     pub fn new(bytes: &'a [u8]) -> Result<Self, CdrError> {
         match bytes {
-            [0, 1, _, _, ..] => Ok(Self { bytes, at: HEAD.len() }),
+            [0, 1, _, _, ..] => Ok(Self { bytes, at: HEAD.len(), form: Form::Cdr }),
             [first, second, ..] => Err(CdrError::Encoding { got: [*first, *second] }),
             _ => Err(CdrError::Encoding { got: [0; 2] }),
         }
+    }
+
+    /// Begins at the first field of a message of ROS 1.
+    #[must_use]
+    pub const fn ros1(bytes: &'a [u8]) -> Self {
+        Self { bytes, at: 0, form: Form::Ros1 }
     }
 
     /// A number, a text, or what else a message is made of.
@@ -245,7 +276,10 @@ impl<'a> Reader<'a> {
     }
 
     fn number<const N: usize>(&mut self, what: &'static str) -> Result<[u8; N], CdrError> {
-        let over = (self.at - HEAD.len()) % N;
+        let over = match self.form {
+            Form::Cdr => (self.at - HEAD.len()) % N,
+            Form::Ros1 => 0,
+        };
         if over != 0 {
             self.at += N - over;
         }

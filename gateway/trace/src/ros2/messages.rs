@@ -3,7 +3,7 @@
 //! There is no convention for CAN in recordings that would bring a candump line back as it was: `can_msgs/Frame`
 //! holds 8 bytes, `ros2_socketcan_msgs/FdFrame` has no flags. These do, and any viewer reads them.
 
-use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE};
+use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, identifier};
 use protocol::candump::{Direction, Record, Timestamp};
 
 use super::cdr::{CdrError, Encode, Reader, Writer};
@@ -52,35 +52,49 @@ pub fn stamp(message: &[u8]) -> Result<u64, CdrError> {
 /// When it is no such message.
 pub fn frame(message: &[u8], time: Timestamp) -> Result<Record<'_>, CdrError> {
     let mut from = Reader::new(message)?;
-    let (Header { frame_id: interface, .. }, mut id) = (from.get()?, from.get::<u32>()?);
-    if id > EXTENDED_MASK {
-        return Err(CdrError::Value { what: "id", got: id.into(), allowed: "29 bits" });
-    }
+    let (Header { frame_id: interface, .. }, number) = (from.get()?, from.get::<u32>()?);
+    let mut kind = 0;
     for flag in [EXTENDED, REMOTE, ERROR] {
-        id |= if from.get()? { flag } else { 0 };
+        kind |= if from.get()? { flag } else { 0 };
     }
+    let id = identifier(number, kind)?;
     let format = if from.get()? { Format::Fd } else { Format::Classic };
     let [flags, length, raw_dlc, direction]: [u8; 4] = from.get()?;
     let direction = match direction {
         0 => None,
         1 => Some(Direction::Received),
         2 => Some(Direction::Sent),
-        got => return Err(CdrError::Value { what: "direction", got: got.into(), allowed: "0, 1 or 2" }),
+        got => return Err(value("direction", got, "0, 1 or 2")),
     };
+    let is_remote = id & REMOTE != 0;
+    if is_remote && format == Format::Fd {
+        return Err(value("is_rtr", 1, "0 in an FD frame"));
+    }
+    let most_flags = if format == Format::Fd { 15 } else { 0 };
+    if flags > most_flags {
+        return Err(value("flags", flags, "0 to 15 in an FD frame, 0 in a classic one"));
+    }
+    let is_raw = format == Format::Classic && length == 8;
+    if !(raw_dlc == 0 || is_raw && matches!(raw_dlc, 9..=15)) {
+        return Err(value("raw_dlc", raw_dlc, "0; 9 to 15 in a classic frame of 8 bytes"));
+    }
     let data = from.bytes()?;
-    let wrong = CdrError::Value {
-        what: "length",
-        got: length.into(),
-        allowed: "that of the data; 8 in a classic frame, 64 in an FD one",
+    let wrong = value(
+        "length",
+        length,
+        "that of the data, which a remote frame does not have; 8 in a classic frame, 64 in an FD one",
+    );
+    let frame = match is_remote {
+        false if data.len() == usize::from(length) => Frame::with_data(id, format, flags, data),
+        true if data.is_empty() => Frame::remote(id, length),
+        true | false => return Err(wrong),
     };
-    let requested = [0; 64];
-    let data = match id & REMOTE {
-        0 if data.len() == usize::from(length) => data,
-        0 => return Err(wrong),
-        _ => requested.get(..usize::from(length)).ok_or(wrong)?,
-    };
-    let frame = Frame::with_data(id, format, flags, data).map_err(|_| wrong)?.with_raw_dlc(raw_dlc);
+    let frame = frame.map_err(|_| wrong)?.with_raw_dlc(raw_dlc);
     Ok(Record { time, interface, frame, direction })
+}
+
+fn value(what: &'static str, got: u8, allowed: &'static str) -> CdrError {
+    CdrError::Value { what, got: got.into(), allowed }
 }
 
 /// Something between frames: a comment, frames that were lost, a line that is no frame.
@@ -178,9 +192,22 @@ mod tests {
             frame(&bytes, time).map(|_| ()).unwrap_err().to_string()
         };
         // The empty name takes 5 bytes, and 3 fill.
-        assert!(with(23, 0xFF).starts_with("id of a message is 4278190080: allowed is 29 bits"));
+        let id = "id of a message: FF000000 does not fit an identifier of 11 bits: at most 7FF";
+        assert_eq!(with(23, 0xFF), id);
+        assert!(with(21, 8).ends_with("800 does not fit an identifier of 11 bits: at most 7FF"));
+        assert!(with(28, 1).starts_with("flags of a message is 1: allowed is 0 to 15 in an FD frame"));
+        assert!(with(30, 14).starts_with("raw_dlc of a message is 14: allowed is 0; 9 to 15"));
+        let time =
+            "the time of a message is -1 s and 0 ns: allowed are 0 s or more, and less than 1000000000 ns";
+        assert_eq!(back_from_1969(&buffer), time);
         assert!(with(29, 1).starts_with("length of a message is 1: allowed is that of the data"));
         assert!(with(31, 3).starts_with("direction of a message is 3: allowed is 0, 1 or 2"));
+    }
+
+    fn back_from_1969(message: &[u8]) -> String {
+        let mut bytes = message.to_vec();
+        bytes[4..8].copy_from_slice(&(-1_i32).to_le_bytes());
+        frame(&bytes, Timestamp::nine_digits(0)).map(|_| ()).unwrap_err().to_string()
     }
 
     fn note(kind: NoteKind, text: &[u8]) -> Note<'_> {

@@ -81,7 +81,16 @@ impl Encode for Header<'_> {
 impl<'a> Decode<'a> for Header<'a> {
     fn decode(from: &mut Reader<'a>) -> Result<Self, CdrError> {
         let (sec, nanosec) = (from.get::<i32>()?, from.get::<u32>()?);
-        let nanos = u64::try_from(sec).unwrap_or(0) * NANOS + u64::from(nanosec);
-        Ok(Self { nanos, frame_id: from.get()? })
+        Ok(Self { nanos: nanos(sec.into(), nanosec)?, frame_id: from.get()? })
     }
+}
+
+/// Returns a message's time in ns since 1970.
+///
+/// # Errors
+/// When it is before 1970, or has more nanoseconds than a second.
+pub fn nanos(sec: i64, nanosec: u32) -> Result<u64, CdrError> {
+    let whole = u64::try_from(sec).ok().filter(|_| u64::from(nanosec) < NANOS);
+    let nanos = whole.and_then(|sec| sec.checked_mul(NANOS)?.checked_add(nanosec.into()));
+    nanos.ok_or(CdrError::Time { sec, nanosec })
 }

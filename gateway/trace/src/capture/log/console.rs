@@ -10,12 +10,13 @@
 //!    can0  5A1   [4]  remote request
 //!    can0  20000004   [8]  00 08 00 00 00 00 00 00   ERRORFRAME
 //!    can0  123 [0003] (00|81:03:DEADBEEF) 11 22 33                CAN XL
+//!    (2023-11-14 22:13:20.123456) can0 123#1122                   a log with dates
 //! ```
 //!
 //! Colours (`-c`) may stand between words, anything before it, as a prompt, and anything behind the data but a further byte.
 
-use protocol::can::{BIT_RATE_SWITCH, ERROR, ERROR_STATE, EXTENDED, EXTENDED_MASK, Frame, STANDARD_MASK};
-use protocol::candump::{Direction, LineError, Timestamp};
+use protocol::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame, REMOTE, identifier};
+use protocol::candump::{self, Direction, LineError, Timestamp, eight_digit_identifier};
 
 /// A line that is a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -84,12 +85,12 @@ enum Length {
     CanXl,
 }
 
-fn identifier(digits: &[u8]) -> Option<u32> {
+fn identifier_of(digits: &[u8]) -> Option<u32> {
     let id = u32::from_str_radix(core::str::from_utf8(digits).ok()?, 16).ok()?;
     match digits.len() {
-        3 => Some(id).filter(|&id| id <= STANDARD_MASK),
-        _ if id & !EXTENDED_MASK == ERROR => Some(id),
-        _ => Some(id | EXTENDED).filter(|_| id <= EXTENDED_MASK),
+        3 => identifier(id, 0).ok(),
+        // Whether it is remote stands behind it.
+        _ => Some(eight_digit_identifier(id) & !REMOTE),
     }
 }
 
@@ -110,6 +111,14 @@ impl<'a> Cursor<'a> {
         self.blanks();
         let id_at = self.at;
         let id = self.word();
+        if let (Stamp::Local(_), None) = (stamp, marks) {
+            // A log whose times are dates.
+            let frame = id.contains(&b'#').then(|| core::str::from_utf8(id).ok()).flatten();
+            if let Some(frame) = frame.and_then(|text| candump::parse_frame(text).ok()) {
+                let seen = Seen { stamp, interface, frame, direction: self.direction(), has_flags: true };
+                return Some(Ok(Console::Frame(seen)));
+            }
+        }
         if !matches!(id.len(), 3 | 8) || !id.iter().all(u8::is_ascii_hexdigit) || !self.blanks() {
             return None;
         }
@@ -119,10 +128,33 @@ impl<'a> Cursor<'a> {
         }
         let (direction, flags) = marks.map_or((None, None), |(direction, flags)| (Some(direction), flags));
         let has_flags = flags.is_some() || !matches!(length, Length::Fd(_));
-        let expected = "an identifier, at most 7FF in 3 digits or 3FFFFFFF in 8";
-        let frame = identifier(id).ok_or(LineError { column: id_at + 1, expected });
+        let expected = "an identifier, at most 7FF in 3 digits";
+        let frame = identifier_of(id).ok_or(LineError { column: id_at + 1, expected });
         let frame = frame.and_then(|id| self.frame(id, length, flags.unwrap_or(0)));
+        if self.is_of_isotpsniffer(frame.is_ok()) {
+            return None;
+        }
         Some(frame.map(|frame| Console::Frame(Seen { stamp, interface, frame, direction, has_flags })))
+    }
+
+    /// A direction behind a frame of a log.
+    fn direction(&mut self) -> Option<Direction> {
+        self.blanks();
+        match self.word() {
+            b"T" => Some(Direction::Sent),
+            b"R" => Some(Direction::Received),
+            _ => None,
+        }
+    }
+
+    /// Whether a dash and a quoted text are behind the data, as isotpsniffer prints messages that are put together of
+    /// frames.
+    fn is_of_isotpsniffer(&self, has_frame: bool) -> bool {
+        if has_frame {
+            self.rest().starts_with(b"- '")
+        } else {
+            memchr::memmem::find(self.text, b"  - '").is_some()
+        }
     }
 
     fn rest(&self) -> &'a [u8] {
@@ -184,14 +216,10 @@ impl<'a> Cursor<'a> {
         let (number, digits) = self.number()?;
         let is_date = self.take(b'-');
         let seconds = if is_date { self.date(number)? } else { number };
-        let (fraction, fraction_digits) = self.take(b'.').then(|| self.number())??;
-        let nanos = match fraction_digits {
-            6 => fraction * 1_000,
-            9 => fraction,
-            _ => return None,
-        };
-        let nanos = seconds.checked_mul(1_000_000_000)?.checked_add(nanos)?;
-        let time = Timestamp { nine_digits: fraction_digits == 9, ..Timestamp::six_digits(nanos) };
+        let fraction = self.take(b'.').then(|| self.run(|byte| byte.is_ascii_digit()))?;
+        let (fraction, fraction_digits) = candump::fraction(fraction)?;
+        let nanos = seconds.checked_mul(1_000_000_000)?.checked_add(fraction)?;
+        let time = Timestamp { nine_digits: fraction_digits > 6, ..Timestamp::six_digits(nanos) };
         self.take(b')').then_some(())?;
         Some(match digits {
             _ if is_date => Stamp::Local(time),
@@ -303,7 +331,7 @@ impl<'a> Cursor<'a> {
             expected: "the end: there are more data bytes than the length says",
         };
         let is_near = self.at <= from + 1;
-        if is_near && byte(self.word()).is_some() { Err(further) } else { Ok(data) }
+        if is_near && byte(Self { ..*self }.word()).is_some() { Err(further) } else { Ok(data) }
     }
 }
 

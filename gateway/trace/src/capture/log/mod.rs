@@ -12,4 +12,4 @@ pub(super) use read::{LogReader, known_time};
 #[cfg(test)]
 mod tests;
 
-pub use write::{Digits, LogWriter, Style, Wrote};
+pub use write::{Digits, Less, LogWriter, Style, Wrote};

@@ -14,6 +14,8 @@ use crate::container::read_some;
 pub const LONGEST: usize = 8_192;
 /// Bytes that are read at once; several of the longest lines.
 const CHUNK: usize = 1 << 18;
+/// Bytes of the lines before the first frame that are kept to tell what they are.
+const SAMPLE: usize = 4_096;
 /// What some editors write before the first line.
 const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
@@ -31,6 +33,9 @@ pub(crate) struct LogReader {
     clock: Clock,
     /// Each once.
     remarks: Vec<Remark>,
+    /// The beginning of the lines before the first frame; nothing more once there is one.
+    sample: Vec<u8>,
+    any_frame: bool,
 }
 
 impl LogReader {
@@ -42,8 +47,14 @@ impl LogReader {
         for (to, from) in buffer.iter_mut().zip(head) {
             *to = *from;
         }
-        let (clock, remarks) = (Clock::default(), Vec::new());
-        Self { input, buffer, rest: 0..head.len(), at_end: false, taken, lines: 0, clock, remarks }
+        let (clock, remarks, sample) = (Clock::default(), Vec::new(), Vec::new());
+        let (rest, any_frame) = (0..head.len(), false);
+        Self { input, buffer, rest, at_end: false, taken, lines: 0, clock, remarks, sample, any_frame }
+    }
+
+    /// The same of a log that goes on behind so many lines of others.
+    pub(crate) fn behind(self, lines: u64) -> Self {
+        Self { lines, ..self }
     }
 
     /// Goes on behind so many bytes and lines, which have been passed over.
@@ -69,8 +80,22 @@ impl LogReader {
         &self.remarks
     }
 
-    pub(crate) const fn is_drained(&self) -> bool {
-        self.rest.start >= self.rest.end
+    /// The beginning of the lines before the first frame.
+    pub(crate) fn sample(&self) -> &[u8] {
+        &self.sample
+    }
+
+    /// Whether no whole line is left of what has been taken from the input.
+    pub(crate) fn is_drained(&self) -> bool {
+        self.buffer.get(self.rest.clone()).is_none_or(|rest| line_end(rest).is_none())
+    }
+
+    /// Whether no line is left. Reads more if it has to.
+    pub(crate) fn is_at_its_end(&mut self) -> io::Result<bool> {
+        while self.rest.is_empty() && !self.at_end {
+            self.fill()?;
+        }
+        Ok(self.rest.is_empty())
     }
 
     /// The next entry: one for each line. Never panics.
@@ -89,6 +114,7 @@ impl LogReader {
         }
         if let Ok(Line::Frame(record)) = candump::parse_bytes(text) {
             self.clock.at(record.time.nanos);
+            self.any_frame = true;
             return Ok(Some(Entry::Frame(record)));
         }
         let mut note = note(text, long, self.clock.last(), self.lines);
@@ -103,9 +129,14 @@ impl LogReader {
                         self.remarks.push(remark);
                     }
                 }
+                self.any_frame = true;
                 return Ok(Some(Entry::Frame(Record { time, interface, frame, direction })));
             }
             Some(Err(error)) => note.kind = NoteKind::Unreadable(error.to_string()),
+        }
+        if !self.any_frame && self.sample.len() < SAMPLE {
+            self.sample.extend_from_slice(text.get(..SAMPLE).unwrap_or(text));
+            self.sample.push(b'\n');
         }
         Ok(Some(Entry::Note(note)))
     }
@@ -117,7 +148,7 @@ impl LogReader {
         let mut seen = 0;
         while !evidence.is_enough() {
             let fresh = self.buffer.get(self.rest.start + seen..self.rest.end).unwrap_or_default();
-            let end = memchr::memchr(b'\n', fresh);
+            let end = line_end(fresh);
             let line = fresh.get(..end.unwrap_or(fresh.len())).unwrap_or_default();
             if end.is_some() || self.at_end {
                 if let Some((interface, nanos)) = relative(line) {
@@ -136,18 +167,28 @@ impl LogReader {
         Ok(())
     }
 
-    /// Where the next line stands in the buffer, without its end, and whether it was longer than is read.
+    /// Where the next line stands in the buffer, without its end, and whether it was longer than is read. A line ends with
+    /// a line feed, a carriage return, or both.
     #[inline]
     fn next_line(&mut self) -> io::Result<Option<(Range<usize>, bool)>> {
         let Range { start, end } = self.rest;
         let fresh = self.buffer.get(start..end).unwrap_or_default();
-        match memchr::memchr(b'\n', fresh) {
-            Some(at) if at < LONGEST => {
-                self.rest.start = start + at + 1;
-                Ok(Some((start..self.before_return(start..start + at), false)))
-            }
+        match line_end(fresh) {
+            Some(at) if at < LONGEST => match fresh.get(at..) {
+                Some([b'\r']) => self.line_beyond(),
+                Some([b'\r', b'\n', ..]) => Ok(Some((self.end_line(start + at, 2), false))),
+                _ => Ok(Some((self.end_line(start + at, 1), false))),
+            },
             _ => self.line_beyond(),
         }
+    }
+
+    /// Uses up the next line with its end, and returns where it stands.
+    #[inline]
+    const fn end_line(&mut self, end: usize, length: usize) -> Range<usize> {
+        let start = self.rest.start;
+        self.rest.start = end + length;
+        start..end
     }
 
     /// The same for a line that is not whole in the buffer, or too long.
@@ -157,29 +198,30 @@ impl LogReader {
             let Range { start, end } = self.rest;
             let fresh = self.buffer.get(start + seen..end).unwrap_or_default();
             // A line end beyond the limit is as good as none.
-            let fresh = fresh.get(..LONGEST - seen).unwrap_or(fresh);
-            if let Some(at) = memchr::memchr(b'\n', fresh) {
-                let newline = start + seen + at;
-                self.rest.start = newline + 1;
-                return Ok(Some((start..self.before_return(start..newline), false)));
+            let within = fresh.get(..LONGEST - seen).unwrap_or(fresh);
+            match line_end(within).map(|at| (at, fresh.get(at..).unwrap_or_default())) {
+                // Its line feed may come yet.
+                Some((at, [b'\r'])) if !self.at_end => {
+                    seen += at;
+                    self.fill()?;
+                    continue;
+                }
+                Some((at, rest)) => {
+                    let length = if rest.starts_with(b"\r\n") { 2 } else { 1 };
+                    return Ok(Some((self.end_line(start + seen + at, length), false)));
+                }
+                None => {}
             }
-            seen += fresh.len();
+            seen += within.len();
             if seen == LONGEST {
                 let line = self.skip_line(start..start + seen)?;
                 return Ok(Some((line, true)));
             }
             if self.at_end || self.fill()? == 0 {
                 let Range { start, end } = self.rest;
-                self.rest.start = end;
-                return Ok((start < end).then(|| (start..self.before_return(start..end), false)));
+                return Ok((start < end).then(|| (self.end_line(end, 0), false)));
             }
         }
-    }
-
-    /// The line's end without the carriage return of other systems.
-    fn before_return(&self, line: Range<usize>) -> usize {
-        let returned = self.buffer.get(line.clone()).is_some_and(|line| line.ends_with(b"\r"));
-        line.end - usize::from(returned)
     }
 
     /// Goes to the end of a line, of which `line` is kept. Where that is in the buffer afterwards.
@@ -188,7 +230,7 @@ impl LogReader {
         let kept = line.len();
         let mut rest = line.end..self.rest.end;
         loop {
-            if let Some(at) = self.buffer.get(rest.clone()).and_then(|rest| memchr::memchr(b'\n', rest)) {
+            if let Some(at) = self.buffer.get(rest.clone()).and_then(line_end) {
                 self.rest = rest.start + at + 1..rest.end;
                 return Ok(0..kept);
             }
@@ -217,6 +259,12 @@ impl LogReader {
         self.at_end = got == 0;
         Ok(got)
     }
+}
+
+/// Where a line ends.
+#[inline]
+fn line_end(text: &[u8]) -> Option<usize> {
+    memchr::memchr2(b'\n', b'\r', text)
 }
 
 /// The bus and the time of a frame whose time is relative.
@@ -308,6 +356,8 @@ mod tests {
         for piece in [1, 2, 5, 1000] {
             let found = all(b"one\n\r\n(1.000000) can0 123#\n\xFF\nfive", piece);
             assert_eq!(found, [text(1, b"one"), text(2, b""), text(4, b"\xFF"), text(5, b"five")]);
+            let found = all(b"one\r(1.000000) can0 123#\r\rfour\r\nfive\r", piece);
+            assert_eq!(found, [text(1, b"one"), text(3, b""), text(4, b"four"), text(5, b"five")]);
             assert_eq!(all(b"", piece), []);
             assert_eq!(all(b"\n", piece), [text(1, b"")]);
         }

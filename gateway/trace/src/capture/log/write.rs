@@ -1,14 +1,18 @@
 //! Captures as candump text: written.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
+use std::fmt;
 use std::io::{self, Write};
 
 use protocol::candump::{Direction, Record, Timestamp, write_record};
+use protocol::usage::is_unprintable;
 
 use crate::capture::{Entry, Note, NoteKind};
 
 /// Bytes that are written together.
 const PIECE: usize = 1 << 16;
+/// Bytes of lines before the first frame that wait for it: what has no frame is no log.
+const WAITING: usize = 1 << 20;
 
 /// How many digits of a second are written.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -38,10 +42,23 @@ pub struct Style {
 pub enum Wrote {
     /// All of it is in the log.
     All,
-    /// Its line is shorter than what is known: digits, direction or raw DLC are left out, as was asked for.
-    Less,
+    /// Its line says less than what is known.
+    Less(Less),
     /// It is not in the log: a note that was not asked for, or that a log has no place for.
     Nothing,
+}
+
+/// What the line of a frame does not say.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Less {
+    /// Digits of its time.
+    pub digits: bool,
+    /// Its direction.
+    pub direction: bool,
+    /// Its raw DLC.
+    pub raw_dlc: bool,
+    /// The name of its bus, which has another one in the log.
+    pub name: bool,
 }
 
 /// Writes entries as lines.
@@ -50,15 +67,75 @@ pub struct LogWriter<W> {
     out: W,
     style: Style,
     /// Lines that wait to be written.
-    lines: String,
+    lines: Lines,
+    any_frame: bool,
     /// Frames that were lost so far, by bus.
     lost: HashMap<String, u64>,
+    names: Names,
+}
+
+/// Text that is written to as a string, and holds any bytes.
+#[derive(Debug, Default)]
+struct Lines(Vec<u8>);
+
+impl fmt::Write for Lines {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        self.0.extend_from_slice(text.as_bytes());
+        Ok(())
+    }
+}
+
+/// The names of buses in a log.
+#[derive(Debug, Default)]
+struct Names {
+    /// The bus of the last frame, and its name in the log if that is another one.
+    last: (String, Option<String>),
+    /// Names in the log, by those of the buses.
+    written: HashMap<String, String>,
+    taken: HashSet<String>,
+}
+
+impl Names {
+    /// Names that are told apart.
+    const MOST: usize = 4_096;
+
+    /// Makes `bus` the last one, and returns its name in the log if that is another one.
+    #[inline]
+    fn of(&mut self, bus: &str) -> Option<&str> {
+        if self.last.0 != bus || self.taken.is_empty() {
+            let written = self.assign(bus);
+            self.last = (bus.to_owned(), Some(written).filter(|name| name != bus));
+        }
+        self.last.1.as_deref()
+    }
+
+    /// A name that a line can have, and that no other bus has there: blanks, and what a terminal obeys, are replaced.
+    fn assign(&mut self, bus: &str) -> String {
+        if let Some(name) = self.written.get(bus) {
+            return name.clone();
+        }
+        let is_odd = |letter: char| letter.is_whitespace() || is_unprintable(letter);
+        let plain = if bus.is_empty() || bus.contains(is_odd) {
+            format!("_{}", bus.replace(is_odd, "_"))
+        } else {
+            bus.to_owned()
+        };
+        let further = (2..).map(|number| format!("{plain}_{number}"));
+        let mut candidates = [plain.clone()].into_iter().chain(further);
+        let name = candidates.find(|name| !self.taken.contains(name)).unwrap_or_default();
+        if self.taken.len() < Self::MOST {
+            self.taken.insert(name.clone());
+            self.written.insert(bus.to_owned(), name.clone());
+        }
+        name
+    }
 }
 
 impl<W: Write> LogWriter<W> {
     /// Writes to `out`, many lines at once.
     pub fn new(out: W, style: Style) -> Self {
-        Self { out, style, lines: String::with_capacity(2 * PIECE), lost: HashMap::new() }
+        let lines = Lines(Vec::with_capacity(2 * PIECE));
+        Self { out, style, lines, any_frame: false, lost: HashMap::new(), names: Names::default() }
     }
 
     /// Writes an entry.
@@ -81,7 +158,7 @@ impl<W: Write> LogWriter<W> {
             Digits::Six => false,
             Digits::Nine => true,
         };
-        let mut less = !nine_digits && nanos % 1_000 != 0;
+        let mut less = Less { digits: !nine_digits && nanos % 1_000 != 0, ..Less::default() };
         let mut written = Record { time: Timestamp { nine_digits, ..time }, interface, frame, direction };
         let mut way = match direction {
             None => "",
@@ -89,50 +166,48 @@ impl<W: Write> LogWriter<W> {
             Some(Direction::Received) => " R",
         };
         if !self.style.directions {
-            less |= !way.is_empty();
+            less.direction = !way.is_empty();
             way = "";
         }
         if self.style.plain {
-            less |= frame.raw_dlc() != 0;
+            less.raw_dlc = frame.raw_dlc() != 0;
             written.frame = frame.with_raw_dlc(0);
         }
-        let name;
-        if interface.is_empty() || interface.contains(|byte: char| byte.is_whitespace()) {
-            // No line can have it; what another recording calls a bus may be anything.
-            name = format!("_{interface}").replace(char::is_whitespace, "_");
-            written.interface = &name;
-            less = true;
+        if let Some(name) = self.names.of(interface) {
+            written.interface = name;
+            less.name = true;
         }
-        // A string takes everything.
+        self.any_frame = true;
+        // They take everything.
         let _ = write_record(&mut self.lines, &written);
-        self.lines.push_str(way);
+        self.lines.0.extend_from_slice(way.as_bytes());
         self.end_line()?;
-        Ok(if less { Wrote::Less } else { Wrote::All })
+        Ok(if less == Less::default() { Wrote::All } else { Wrote::Less(less) })
     }
 
     /// A line of a log as it was; what a recording says itself in candump's words, or as a comment.
     fn note(&mut self, note: &Note<'_>) -> io::Result<Wrote> {
-        let text = String::from_utf8_lossy(note.text);
+        let lines = &mut self.lines.0;
         match note.kind {
+            // A line feed in it would begin a line that no log had.
             _ if note.line > 0 => {
-                if let Ok(text) = str::from_utf8(note.text) {
-                    self.lines.push_str(text);
-                } else {
-                    self.put()?;
-                    self.out.write_all(note.text)?;
-                }
+                let ends = |byte: &u8| if matches!(byte, b'\n' | b'\r') { b' ' } else { *byte };
+                lines.extend(note.text.iter().map(ends));
             }
             NoteKind::Dropped(frames) => {
                 let total = self.lost.entry(note.interface.to_owned()).or_default();
                 *total = total.saturating_add(frames);
-                let (bus, s) = (note.interface, if frames == 1 { "" } else { "s" });
-                self.lines += &format!(
+                let (bus, s) = (self.names.of(note.interface), if frames == 1 { "" } else { "s" });
+                let bus = bus.filter(|_| !note.interface.is_empty()).unwrap_or(note.interface);
+                let text = format!(
                     "DROPCOUNT: dropped {frames} CAN frame{s} on '{bus}' socket (total drops {total})"
                 );
+                lines.extend_from_slice(text.as_bytes());
             }
             NoteKind::Text => {
-                self.lines.push_str("# ");
-                self.lines.push_str(&text.replace(['\n', '\r'], " "));
+                let text = String::from_utf8_lossy(note.text).replace(is_unprintable, " ");
+                lines.extend_from_slice(b"# ");
+                lines.extend_from_slice(text.as_bytes());
             }
             NoteKind::CanXl | NoteKind::Unreadable(_) => return Ok(Wrote::Nothing),
         }
@@ -141,14 +216,23 @@ impl<W: Write> LogWriter<W> {
     }
 
     fn end_line(&mut self) -> io::Result<()> {
-        self.lines.push('\n');
-        if self.lines.len() < PIECE { Ok(()) } else { self.put() }
+        self.lines.0.push(b'\n');
+        let most = if self.any_frame { PIECE } else { WAITING };
+        if self.lines.0.len() < most { Ok(()) } else { self.put() }
     }
 
     fn put(&mut self) -> io::Result<()> {
-        self.out.write_all(self.lines.as_bytes())?;
-        self.lines.clear();
+        self.out.write_all(&self.lines.0)?;
+        self.lines.0.clear();
         Ok(())
+    }
+
+    /// Hands on what waits, unless there was no frame yet.
+    ///
+    /// # Errors
+    /// When `out` fails.
+    pub fn pass_on(&mut self) -> io::Result<()> {
+        if self.any_frame { self.flush() } else { Ok(()) }
     }
 
     /// Hands on what waits.
@@ -189,11 +273,16 @@ mod tests {
         let style = |digits, plain| Style { digits, plain, directions: !plain };
         let as_is = |line: &str| (format!("{line}\n"), vec![Wrote::All]);
         assert_eq!(written(style(Digits::Own, false), &[frame(line)]), as_is(line));
-        let bare = (line.replace(" T", "\n"), vec![Wrote::Less]);
+        let less = Less::default();
+        let bare = (line.replace(" T", "\n"), vec![Wrote::Less(Less { direction: true, ..less })]);
         assert_eq!(written(Style::default(), &[frame(line)]), bare);
-        let six = ("(1.000000) can0 123#1122334455667788_A T\n".to_owned(), vec![Wrote::Less]);
+        let six = (
+            "(1.000000) can0 123#1122334455667788_A T\n".to_owned(),
+            vec![Wrote::Less(Less { digits: true, ..less })],
+        );
         assert_eq!(written(style(Digits::Six, false), &[frame(line)]), six);
-        let plain = ("(1.000000007) can0 123#1122334455667788\n".to_owned(), vec![Wrote::Less]);
+        let less = Less { direction: true, raw_dlc: true, ..less };
+        let plain = ("(1.000000007) can0 123#1122334455667788\n".to_owned(), vec![Wrote::Less(less)]);
         assert_eq!(written(style(Digits::Own, true), &[frame(line)]), plain);
         let short = frame("(1.000001) can0 123#");
         assert_eq!(written(style(Digits::Nine, true), &[short]), as_is("(1.000001000) can0 123#"));
@@ -223,24 +312,63 @@ mod tests {
         let entries = [
             note(NoteKind::Dropped(3), 0, b"3 frames did not fit a queue"),
             note(NoteKind::Dropped(1), 0, b""),
-            note(NoteKind::Text, 0, b"two\nlines"),
+            note(NoteKind::Text, 0, b"two\n\x1blines"),
             note(NoteKind::Unreadable("a message is too short".to_owned()), 0, b"\0"),
         ];
         let (text, wrote) = written(Style::default(), &entries);
         let expected = "DROPCOUNT: dropped 3 CAN frames on 'vcan0' socket (total drops 3)\n\
                         DROPCOUNT: dropped 1 CAN frame on 'vcan0' socket (total drops 4)\n\
-                        # two lines\n";
+                        # two  lines\n";
         assert_eq!(text, expected);
         assert_eq!(wrote, [Wrote::All, Wrote::All, Wrote::All, Wrote::Nothing]);
     }
 
     #[test]
-    fn a_bus_whose_name_no_line_can_have_gets_another() {
+    fn a_bus_whose_name_no_line_can_have_gets_another_that_is_its_own() {
         let Entry::Frame(record) = frame("(1.000000) can0 123#") else { panic!() };
-        for (name, expected) in [("", "_"), ("my bus", "_my_bus")] {
-            let (text, wrote) =
-                written(Style::default(), &[Entry::Frame(Record { interface: name, ..record })]);
-            assert_eq!((text, wrote), (format!("(1.000000) {expected} 123#\n"), vec![Wrote::Less]));
-        }
+        let names = [
+            "",
+            "my bus",
+            "my\tbus",
+            "_my_bus",
+            "\u{1b}[31mred",
+            "c\r@n",
+            "a\0b",
+            "a\u{202e}b",
+            "can0",
+            "my bus",
+        ];
+        let expected = [
+            "_",
+            "_my_bus",
+            "_my_bus_2",
+            "_my_bus_3",
+            "__[31mred",
+            "_c_@n",
+            "_a_b",
+            "_a_b_2",
+            "can0",
+            "_my_bus",
+        ];
+        let entries = names.map(|interface| Entry::Frame(Record { interface, ..record }));
+        let (text, wrote) = written(Style::default(), &entries);
+        let lines = expected.map(|name| format!("(1.000000) {name} 123#"));
+        assert_eq!(text.lines().collect::<Vec<_>>(), lines);
+        let other = Wrote::Less(Less { name: true, ..Less::default() });
+        let is_other =
+            names.iter().zip(expected).map(|(bus, name)| if *bus == name { Wrote::All } else { other });
+        assert_eq!(wrote, is_other.collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn nothing_is_written_before_the_first_frame() {
+        let mut bytes = Vec::new();
+        let mut log = LogWriter::new(&mut bytes, Style::default());
+        log.write(&note(NoteKind::Text, 1, b"words")).unwrap();
+        log.pass_on().unwrap();
+        assert!(log.out.is_empty());
+        log.write(&frame("(1.000000) can0 123#")).unwrap();
+        log.pass_on().unwrap();
+        assert_eq!(log.out, b"words\n(1.000000) can0 123#\n");
     }
 }

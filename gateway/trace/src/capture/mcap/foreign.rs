@@ -1,51 +1,63 @@
 //! Frames as other people's recordings have them, of bridges between CAN and ROS.
 //!
 //! ```text
-//!   can_msgs/msg/Frame                         ros2_socketcan_msgs/msg/FdFrame
-//!   std_msgs/Header header                     std_msgs/Header header
-//!   uint32 id                                  uint32 id
-//!   bool is_rtr, is_extended, is_error         bool is_extended, is_error
-//!   uint8 dlc                                  uint8 len
-//!   uint8[8] data                              uint8[<=64] data
+//!   can_msgs/msg/Frame, can_msgs/Frame of ROS 1    ros2_socketcan_msgs/msg/FdFrame
+//!   std_msgs/Header header                         std_msgs/Header header
+//!   uint32 id                                      uint32 id
+//!   bool is_rtr, is_extended, is_error             bool is_extended, is_error
+//!   uint8 dlc                                      uint8 len
+//!   uint8[8] data                                  uint8[<=64] data
 //! ```
 
-use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, FD_FORMAT, Format, Frame};
+use protocol::can::{ERROR, EXTENDED, FD_FORMAT, Format, Frame, REMOTE, identifier};
 use protocol::candump::{Record, Timestamp};
 
-use crate::ros2::Header;
 use crate::ros2::cdr::{CdrError, Reader};
+use crate::ros2::{Header, nanos};
 
 /// A type of frames that is not ours.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Foreign {
     Classic,
+    /// The same as ROS 1 writes it.
+    Ros1,
     Fd,
 }
 
 impl Foreign {
-    /// By the type's name; `None` when it is another type.
-    pub(super) fn of(schema: &str) -> Option<Self> {
-        match schema {
-            "can_msgs/msg/Frame" => Some(Self::Classic),
-            "ros2_socketcan_msgs/msg/FdFrame" => Some(Self::Fd),
+    /// By the encoding of messages and the type's name; `None` when it is another type.
+    pub(super) fn of(encoding: &str, schema: &str) -> Option<Self> {
+        match (encoding, schema) {
+            ("cdr", "can_msgs/msg/Frame") => Some(Self::Classic),
+            ("ros1", "can_msgs/Frame") => Some(Self::Ros1),
+            ("cdr", "ros2_socketcan_msgs/msg/FdFrame") => Some(Self::Fd),
             _ => None,
         }
     }
 
+    /// The header of a message, and the reader behind it.
+    fn header(self, message: &[u8]) -> Result<(Header<'_>, Reader<'_>), CdrError> {
+        let mut from;
+        let header = match self {
+            Self::Classic | Self::Fd => {
+                from = Reader::new(message)?;
+                from.get()?
+            }
+            Self::Ros1 => {
+                from = Reader::ros1(message);
+                let [_sequence, sec, nanosec]: [u32; 3] = from.get()?;
+                Header { nanos: nanos(sec.into(), nanosec)?, frame_id: from.get()? }
+            }
+        };
+        Ok((header, from))
+    }
+
     /// Reads a message. Its time is that of its header, or of the recording when that has none; its bus the
-    /// header's name, or `topic` when that has none. FD flags are not in it: the frame has FDF alone.
-    pub(super) fn decode<'a>(
-        self,
-        message: &'a [u8],
-        log_time: u64,
-        topic: &'a str,
-    ) -> Result<Record<'a>, CdrError> {
-        let mut from = Reader::new(message)?;
-        let (Header { nanos: stamp, frame_id: name }, id) = (from.get()?, from.get::<u32>()?);
-        if id > EXTENDED_MASK {
-            return Err(CdrError::Value { what: "id", got: id.into(), allowed: "29 bits" });
-        }
-        let remote = self == Self::Classic && from.get()?;
+    /// header's name. FD flags are not in it: the frame has FDF alone.
+    pub(super) fn decode(self, message: &[u8], log_time: u64) -> Result<Record<'_>, CdrError> {
+        let (Header { nanos: stamp, frame_id: interface }, mut from) = self.header(message)?;
+        let number = from.get::<u32>()?;
+        let remote = if self != Self::Fd && from.get()? { REMOTE } else { 0 };
         let extended = if from.get()? { EXTENDED } else { 0 };
         let error = if from.get()? { ERROR } else { 0 };
         let length: u8 = from.get()?;
@@ -54,12 +66,12 @@ impl Foreign {
             got: length.into(),
             allowed: "8 in a classic frame, 64 in an FD one, and not more than there is data",
         };
-        let id = id | extended | error;
+        let id = identifier(number, remote | extended | error)?;
         let frame = match self {
-            Self::Classic => {
+            Self::Classic | Self::Ros1 => {
                 let bytes: [u8; 8] = from.get()?;
                 let data = bytes.get(..usize::from(length)).ok_or(wrong)?;
-                if remote { Frame::remote(id, length) } else { Frame::classic(id, data) }
+                if remote != 0 { Frame::remote(id, length) } else { Frame::classic(id, data) }
             }
             Self::Fd => {
                 let data = from.bytes()?.get(..usize::from(length)).ok_or(wrong)?;
@@ -67,7 +79,6 @@ impl Foreign {
             }
         };
         let time = Timestamp::nine_digits(if stamp == 0 { log_time } else { stamp });
-        let interface = if name.is_empty() { topic } else { name };
         Ok(Record { time, interface, frame: frame.map_err(|_| wrong)?, direction: None })
     }
 }
@@ -90,15 +101,15 @@ mod tests {
         for byte in [0_u8, 1, 0, 2, 0xAA, 0xBB, 0, 0, 0, 0, 0, 0] {
             out.put(byte);
         }
-        let record = Foreign::of("can_msgs/msg/Frame").unwrap().decode(&bytes, 9, "/from_can_bus").unwrap();
+        let record = Foreign::of("cdr", "can_msgs/msg/Frame").unwrap().decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
         // Remote instead, and then too long.
         let at = bytes.len() - 12;
         bytes[at] = 1;
-        let record = Foreign::Classic.decode(&bytes, 9, "").unwrap();
+        let record = Foreign::Classic.decode(&bytes, 9).unwrap();
         assert_eq!(record.to_string(), "(17.000000005) can 1F334455#R2");
         bytes[at + 3] = 9;
-        assert!(Foreign::Classic.decode(&bytes, 9, "").unwrap_err().to_string().starts_with("length"));
+        assert!(Foreign::Classic.decode(&bytes, 9).unwrap_err().to_string().starts_with("length"));
     }
 
     #[test]
@@ -110,9 +121,44 @@ mod tests {
             out.put(byte);
         }
         out.bytes(&[1, 2, 3]);
-        let foreign = Foreign::of("ros2_socketcan_msgs/msg/FdFrame").unwrap();
-        let record = foreign.decode(&bytes, 9, "/from_can_bus_fd").unwrap();
-        assert_eq!(record.to_string(), "(0.000000009) /from_can_bus_fd 22C##4010203");
-        assert_eq!(Foreign::of("std_msgs/msg/String"), None);
+        let foreign = Foreign::of("cdr", "ros2_socketcan_msgs/msg/FdFrame").unwrap();
+        let record = foreign.decode(&bytes, 9).unwrap();
+        assert_eq!(record.to_string(), "(0.000000009)  22C##4010203");
+        assert_eq!(Foreign::of("cdr", "std_msgs/msg/String"), None);
+        assert_eq!(Foreign::of("ros1", "can_msgs/msg/Frame"), None);
+    }
+
+    #[test]
+    fn a_frame_of_ros_1_is_read() {
+        let mut bytes = vec![9, 0, 0, 0, 17, 0, 0, 0, 5, 0, 0, 0, 3, 0, 0, 0];
+        bytes.extend(b"can\x55\x44\x33\x1F\0\x01\0\x02\xAA\xBB\0\0\0\0\0\0");
+        let foreign = Foreign::of("ros1", "can_msgs/Frame").unwrap();
+        let record = foreign.decode(&bytes, 9).unwrap();
+        assert_eq!(record.to_string(), "(17.000000005) can 1F334455#AABB");
+        assert!(foreign.decode(&bytes[..bytes.len() - 1], 9).is_err());
+    }
+
+    #[test]
+    fn an_identifier_that_does_not_fit_is_an_error_and_is_not_masked() {
+        for (id, extended, fits) in [
+            (0x7FF, 0_u8, true),
+            (0x800, 0, false),
+            (0x18F0_10FE, 0, false),
+            (0x1FFF_FFFF, 1, true),
+            (0x2000_0000, 1, false),
+        ] {
+            let mut bytes = Vec::new();
+            let mut out = Writer::new(&mut bytes);
+            head(&mut out, 1, "can", id);
+            [0, extended, 0, 1, 0xAA, 0, 0, 0, 0, 0, 0, 0].into_iter().for_each(|byte: u8| out.put(byte));
+            let read = Foreign::Classic.decode(&bytes, 9).map(|record| record.frame.id());
+            assert_eq!(read.ok(), fits.then_some(id), "{id:X}");
+            let mut out = Writer::new(&mut bytes);
+            head(&mut out, 1, "can", id);
+            [extended, 0, 1].into_iter().for_each(|byte| out.put(byte));
+            out.bytes(&[0xAA]);
+            let read = Foreign::Fd.decode(&bytes, 9).map(|record| record.frame.id());
+            assert_eq!(read.ok(), fits.then_some(id), "{id:X}");
+        }
     }
 }

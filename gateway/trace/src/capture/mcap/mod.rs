@@ -1,14 +1,18 @@
 //! Captures as MCAP recordings: the channels of frames and notes are read and written, other topics are counted.
 
+mod buses;
 mod foreign;
 mod read;
 mod state;
+mod survey;
 mod write;
 
+pub(super) use buses::Buses;
 pub(super) use read::McapReader;
 pub(super) use state::State;
-pub use write::ORIGIN;
+pub(super) use survey::Survey;
 pub(super) use write::{McapWriter, SOURCE};
+pub use write::{ORIGIN, Origin};
 
 use std::io;
 

@@ -5,6 +5,7 @@ use std::io::{BufReader, Chain, Cursor, Read};
 use ::mcap::records::op;
 
 use super::Fault;
+use super::buses::Buses;
 use super::state::{KEPT, State, Target};
 use crate::capture::{Extras, Item};
 use crate::container::{Chunk, Damage, Framed, LONGEST, MAGIC, Record, Source, parse};
@@ -65,6 +66,15 @@ impl McapReader {
 
     pub(crate) const fn extras(&self) -> &Extras {
         self.state.extras()
+    }
+
+    pub(crate) const fn buses(&self) -> &Buses {
+        self.state.buses()
+    }
+
+    /// Whether a channel so far has frames that another program wrote.
+    pub(crate) fn has_foreign(&self) -> bool {
+        self.state.has_foreign()
     }
 
     /// Whether nothing more comes. Reads on up to the next message, which [`McapReader::next`] then gives out.

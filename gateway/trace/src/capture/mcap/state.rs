@@ -8,6 +8,7 @@ use ::mcap::records::op;
 use protocol::candump::{Direction, Record, Timestamp};
 
 use super::Fault;
+use super::buses::{Buses, beginning};
 use super::foreign::Foreign;
 use super::write::{SECONDS_DIGITS, TIME_DIGITS};
 use crate::capture::log::LONGEST as LONGEST_LINE;
@@ -25,8 +26,6 @@ const ENTRY: usize = Names::ENTRY;
 const LONGEST_FRAME: usize = 4 << 10;
 /// The longest message that is a note: a line and its place.
 const LONGEST_NOTE: usize = LONGEST_LINE + (1 << 10);
-/// Letters of a topic's name that stand for a bus without a name.
-const LONGEST_BUS: usize = 255;
 
 /// What is known of a recording.
 pub(crate) struct State {
@@ -41,6 +40,8 @@ pub(crate) struct State {
     /// Whether attachments and metadata are known already.
     knows_files: bool,
     any_frame: bool,
+    /// The buses of other people's frames.
+    buses: Buses,
     /// Whether messages that are only counted are requested too.
     others: bool,
     /// Whether no other part of the recording came before.
@@ -98,9 +99,28 @@ impl State {
             kept: 0,
             knows_files: !is_first,
             any_frame: false,
+            buses: Buses::default(),
             others,
             is_first,
         }
+    }
+
+    /// The same with the buses that are known already.
+    pub(crate) fn with_buses(self, buses: Buses) -> Self {
+        Self { buses, ..self }
+    }
+
+    pub(super) const fn buses(&self) -> &Buses {
+        &self.buses
+    }
+
+    pub(super) fn into_buses(self) -> Buses {
+        self.buses
+    }
+
+    /// Whether a channel so far has frames that another program wrote.
+    pub(super) fn has_foreign(&self) -> bool {
+        self.channels.values().any(|channel| matches!(channel.what, What::Foreign(_)))
     }
 
     pub(super) const fn extras(&self) -> &Extras {
@@ -239,7 +259,9 @@ impl State {
         let schema = self.schemas.get(&schema).cloned().unwrap_or_default();
         // Each of them may be kept twice.
         self.names.add(2 * (topic.len() + schema.len()))?;
-        let what = if encoding != "cdr" {
+        let what = if let Some(foreign) = Foreign::of(encoding, &schema) {
+            Some(What::Foreign(foreign))
+        } else if encoding != "cdr" {
             None
         } else if schema == Record::TYPE && topic.starts_with(TOPIC_OF_STATE) {
             Some(What::Latched)
@@ -248,7 +270,7 @@ impl State {
         } else if schema == Note::TYPE {
             Some(What::Notes)
         } else {
-            Foreign::of(&schema).map(What::Foreign)
+            None
         };
         let what = what.unwrap_or_else(|| {
             let topics = &mut self.extras.topics;
@@ -282,9 +304,11 @@ impl State {
                 decode(message, LONGEST_FRAME, |message| messages::frame(message, time)).map(Entry::Frame)
             }
             What::Foreign(foreign) => {
-                let bus = beginning(topic);
-                decode(message, LONGEST_FRAME, |message| foreign.decode(message, log_time, bus))
-                    .map(Entry::Frame)
+                let record = decode(message, LONGEST_FRAME, |message| foreign.decode(message, log_time));
+                let buses = &mut self.buses;
+                record.map(|record| {
+                    Entry::Frame(Record { interface: buses.name(topic, record.interface), ..record })
+                })
             }
             What::Notes => {
                 let note = decode(message, LONGEST_NOTE, |message| messages::note(message, published));
@@ -324,12 +348,6 @@ fn latched(message: &[u8]) -> Result<Record<'_>, MessageError> {
     decode(message, LONGEST_FRAME, |message| {
         messages::frame(message, Timestamp::nine_digits(messages::stamp(message)?))
     })
-}
-
-/// The beginning of a topic's name, which may be as long as anything.
-fn beginning(topic: &str) -> &str {
-    let ends = (0..=LONGEST_BUS.min(topic.len())).rev();
-    ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()
 }
 
 /// A message that does not have the type of its channel.

@@ -1,5 +1,6 @@
 //! The entries of a capture as an MCAP recording.
 
+use std::fs::Metadata;
 use std::io::{self, Write};
 
 use protocol::candump::{Record, Timestamp};
@@ -16,6 +17,8 @@ const FURTHER: &str = "/further";
 pub const ORIGIN: &str = "capture";
 /// Its content.
 pub(crate) const SOURCE: (&str, &str) = ("from", "candump log");
+/// The same of one that was made of a recording.
+const OTHER_SOURCE: (&str, &str) = ("from", "MCAP recording");
 /// The metadata of a channel: digits of a second, 6 or 9.
 pub(super) const TIME_DIGITS: &str = "time_digits";
 /// The same: digits that seconds are padded to; missing where they are not.
@@ -54,11 +57,23 @@ struct Waiting {
     text: Vec<u8>,
 }
 
+/// What a recording is made of, and where.
+#[derive(Clone, Copy, Debug)]
+pub struct Origin<'a> {
+    /// Whether it is made of a log, and not of a recording.
+    pub of_log: bool,
+    /// The file that it is written to while it grows, whose mark it gets.
+    pub file: Option<&'a Metadata>,
+}
+
 impl<W: Write> McapWriter<W> {
     /// Begins a recording.
-    pub(crate) fn new(out: W) -> io::Result<Self> {
-        let mut file = FileWriter::new(out)?;
-        let (key, value) = SOURCE;
+    pub(crate) fn new(out: W, origin: Origin<'_>) -> io::Result<Self> {
+        let mut file = match origin.file {
+            Some(about) => FileWriter::in_file(out, about)?,
+            None => FileWriter::new(out)?,
+        };
+        let (key, value) = if origin.of_log { SOURCE } else { OTHER_SOURCE };
         file.metadata(ORIGIN, &[(key.to_owned(), value.to_owned())].into())?;
         Ok(Self { file, channels: Vec::new(), last: 0, notes: None, waiting: Some(Vec::new()), bytes: 0 })
     }
@@ -132,6 +147,11 @@ impl<W: Write> McapWriter<W> {
             self.channels.len() - 1
         };
         Ok(self.last)
+    }
+
+    /// Ends the chunk, and hands everything on but notes that wait for the first frame.
+    pub(crate) fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
     }
 
     /// Writes the end.

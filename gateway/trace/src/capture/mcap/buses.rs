@@ -1,0 +1,125 @@
+//! The buses of other people's frames: topic and `frame_id` together say which bus a frame was on.
+//!
+//! ```text
+//!   /can0/from_can_bus  can ──┬─ one frame_id ──> /can0/from_can_bus
+//!   /can1/from_can_bus  can ──┘                   /can1/from_can_bus
+//!   /left               can7 ───────────────────> can7
+//! ```
+//!
+//! Nodes write one `frame_id` whatever their interface is. Of a file all pairs are known from the beginning; of a pipe
+//! the first topic with a `frame_id` keeps it as its bus' name, and later ones get their own.
+
+use std::collections::{HashMap, HashSet};
+
+/// Pairs that are kept; frames of further ones have the bus that they name.
+const PAIRS: usize = 4_096;
+/// Letters of a topic's name that stand for a bus.
+const LONGEST: usize = 255;
+
+/// The names of buses.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Buses {
+    /// By topic and `frame_id`.
+    names: HashMap<String, HashMap<String, String>>,
+    /// The topics with each `frame_id`.
+    topics: HashMap<String, HashSet<String>>,
+    /// Pairs of topic and `frame_id`, in the order in which they came.
+    pairs: Vec<(String, String)>,
+    taken: HashSet<String>,
+    is_shared: bool,
+}
+
+impl Buses {
+    /// Returns the bus of a message.
+    pub(super) fn name<'a>(&'a mut self, topic: &str, frame_id: &'a str) -> &'a str {
+        let is_known = self.names.get(topic).is_some_and(|names| names.contains_key(frame_id));
+        if !is_known && self.pairs.len() < PAIRS {
+            self.topics.entry(frame_id.to_owned()).or_default().insert(topic.to_owned());
+            self.pairs.push((topic.to_owned(), frame_id.to_owned()));
+            self.assign(topic, frame_id);
+        }
+        self.names.get(topic).and_then(|names| names.get(frame_id)).map_or(frame_id, String::as_str)
+    }
+
+    /// Returns the names as they are when all pairs are known.
+    pub(crate) fn settled(self) -> Self {
+        let mut all = Self { topics: self.topics, ..Self::default() };
+        for (topic, frame_id) in &self.pairs {
+            all.assign(topic, frame_id);
+        }
+        Self { pairs: self.pairs, ..all }
+    }
+
+    /// Whether a `frame_id` is that of several topics.
+    pub(crate) const fn is_shared(&self) -> bool {
+        self.is_shared
+    }
+
+    /// Gives a pair a name that no other one has.
+    fn assign(&mut self, topic: &str, frame_id: &str) {
+        let is_shared = self.topics.get(frame_id).is_some_and(|topics| topics.len() > 1);
+        let own = Some(frame_id).filter(|name| !name.is_empty() && !is_shared).map(str::to_owned);
+        self.is_shared |= is_shared && !frame_id.is_empty();
+        let short = beginning(topic);
+        let further = (1..).map(|number| match number {
+            1 => format!("{short}/{frame_id}"),
+            _ => format!("{short}/{frame_id}-{number}"),
+        });
+        let mut candidates = own.into_iter().chain([short.to_owned()]).chain(further);
+        let Some(name) = candidates.find(|name| !self.taken.contains(name)) else { return };
+        self.taken.insert(name.clone());
+        self.names.entry(topic.to_owned()).or_default().insert(frame_id.to_owned(), name);
+    }
+}
+
+/// The beginning of a topic's name, which may be as long as anything.
+pub(super) fn beginning(topic: &str) -> &str {
+    let ends = (0..=LONGEST.min(topic.len())).rev();
+    ends.filter_map(|end| topic.get(..end)).next().unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn named(buses: &mut Buses, pairs: &[(&str, &str)]) -> Vec<String> {
+        pairs.iter().map(|(topic, frame_id)| buses.name(topic, frame_id).to_owned()).collect()
+    }
+
+    #[test]
+    fn a_frame_id_of_one_topic_is_the_bus() {
+        let mut buses = Buses::default();
+        let pairs = [("/a", "can0"), ("/a", "can1"), ("/b", "can7"), ("/c", ""), ("/a", "can0")];
+        assert_eq!(named(&mut buses, &pairs), ["can0", "can1", "can7", "/c", "can0"]);
+        assert!(!buses.is_shared());
+    }
+
+    #[test]
+    fn topics_with_one_frame_id_are_buses_of_their_own() {
+        let pairs = [("/can0/in", "can"), ("/can1/in", "can"), ("/can1/in", "other")];
+        let mut buses = Buses::default();
+        assert_eq!(named(&mut buses, &pairs), ["can", "/can1/in", "other"], "of a pipe");
+        let mut buses = buses.settled();
+        assert_eq!(named(&mut buses, &pairs), ["/can0/in", "/can1/in", "other"], "of a file");
+        assert!(buses.is_shared());
+    }
+
+    proptest! {
+        #[test]
+        fn two_buses_never_become_one(
+            pairs in proptest::collection::vec(("/[ab]{1,2}(/x)?", "(/?[ab]{1,2}|can|/a/x|)"), 1..40), settled: bool
+        ) {
+            let pairs: Vec<_> = pairs.iter().map(|(topic, name)| (topic.as_str(), name.as_str())).collect();
+            let mut buses = Buses::default();
+            let mut names = named(&mut buses, &pairs);
+            if settled {
+                buses = buses.settled();
+                names = named(&mut buses, &pairs);
+            }
+            let different: HashSet<_> = pairs.iter().collect();
+            prop_assert_eq!(names.iter().collect::<HashSet<_>>().len(), different.len());
+            prop_assert_eq!(named(&mut buses, &pairs), names, "and they stay");
+        }
+    }
+}

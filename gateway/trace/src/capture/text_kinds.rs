@@ -1,0 +1,173 @@
+//! What a text is in which there is no frame, by its first lines.
+
+const EXPORT: &str =
+    "no converter of it is known here: export it as a candump log from the program that wrote it";
+const ASC: (&str, &str) =
+    ("a Vector ASC log", "write a candump log with can-utils' `asc2log -I FILE -O NEW.log`");
+
+/// Says what a text is, and what to do with it; `None` where no line says that.
+pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
+    let text = String::from_utf8_lossy(text);
+    let lines: Vec<_> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
+    let any = |is: &dyn Fn(&str) -> bool| lines.iter().any(|line| is(line));
+    let all = |is: &dyn Fn(&str) -> bool| !lines.is_empty() && lines.iter().all(|line| is(line));
+    let words = |line: &str| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
+    let begins_with = |begin: &'static str| any(&|line| line.starts_with(begin));
+    let kinds: [(bool, (&'static str, &'static str)); 15] = [
+        (begins_with("***BUSMASTER"), ("a BUSMASTER log", EXPORT)),
+        (
+            any(&|line| line == "BS_:" || line == "NS_ :" || line == "NS_:" || line.starts_with("BO_ "))
+                || begins_with("VERSION \""),
+            ("a DBC file", "it describes signals and holds no frames: name a capture"),
+        ),
+        (any(&|line| line.starts_with("base hex") || line.starts_with("base dec")), ASC),
+        (any(&|line| line.starts_with("Begin Triggerblock") || line == "// version 7.0.0"), ASC),
+        (
+            any(&|line| is_trc(&words(line))),
+            ("a PEAK trace", "write a candump log with python-can's can_logconvert"),
+        ),
+        (
+            any(&|line| words(line).get(..3).is_some_and(|head| head == ["Time", "ID", "DLC"])),
+            ("a CANHacker trace", EXPORT),
+        ),
+        (begins_with("# Logger type:"), ("a CSS Electronics CLX000 log", EXPORT)),
+        (any(&|line| line.starts_with("< frame ")), ("what socketcand sends", EXPORT)),
+        (
+            any(&|line| line.starts_with("Timestamp:") && line.contains(" DL:")),
+            ("what python-can prints", "it is no log: let python-can write one with `can_logger -f NEW.log`"),
+        ),
+        (any(&|line| is_kvaser(line)), ("a Kvaser log", EXPORT)),
+        (any(&|line| is_crtd(&words(line))), ("a CRTD log", EXPORT)),
+        (any(&is_canboat), ("a canboat log of NMEA 2000 messages", EXPORT)),
+        (
+            any(&|line| line.contains("]  ") && line.contains("  - '")),
+            (
+                "what isotpsniffer prints",
+                "messages put together of frames are no frames: take the capture with `candump -l`",
+            ),
+        ),
+        (
+            all(&|line| is_frame_of_cansend(line)),
+            (
+                "a list of frames for cansend",
+                "there are no times in it: write lines like `(1700000000.123456) can0 123#00`",
+            ),
+        ),
+        (
+            is_table(&lines),
+            (
+                "a table in CSV",
+                "python-can's can_logconvert makes a candump log of its own tables; of others write lines like \
+                 `(1700000000.123456) can0 123#00`",
+            ),
+        ),
+    ];
+    kinds.into_iter().find(|(is, _)| *is).map(|(_, kind)| kind)
+}
+
+fn is_hex(word: &str) -> bool {
+    !word.is_empty() && word.bytes().all(|byte| byte.is_ascii_hexdigit())
+}
+
+/// `1)  1841  0001  8  00 ...`, with or without `Rx` before the identifier.
+fn is_trc(words: &[String]) -> bool {
+    let number = words.first().and_then(|word| word.strip_suffix(')'));
+    let is_number = number.is_some_and(|word| word.parse::<u64>().is_ok());
+    is_number && words.get(1).is_some_and(|word| word.parse::<f64>().is_ok()) && words.len() > 3
+}
+
+/// `Chn Identifier Flg DLC ...` or `... logging started`.
+fn is_kvaser(line: &str) -> bool {
+    line.starts_with("Chn Identifier") || line.contains("Kvaser")
+}
+
+/// `1320745424.002 1R11 402 FA 01`, and headers with `CXX`.
+fn is_crtd(words: &[String]) -> bool {
+    let [time, kind, ..] = words else { return false };
+    let kind = kind.trim_start_matches(|digit: char| digit.is_ascii_digit());
+    let is_of_crtd = matches!(kind, "R11" | "R29" | "T11" | "T29" | "CXX" | "CEV");
+    is_of_crtd && time.parse::<f64>().is_ok()
+}
+
+/// `2016-02-28T19:57:02.364Z,6,129285,204,255,8,...`.
+fn is_canboat(line: &str) -> bool {
+    let fields: Vec<_> = line.split(',').collect();
+    let [time, rest @ ..] = fields.as_slice() else { return false };
+    let (numbers, data) = rest.split_at(rest.len().min(5));
+    let is_time = time.len() > 18 && matches!(time.as_bytes().get(10), Some(b'T' | b'-' | b' '));
+    is_time
+        && numbers.len() == 5
+        && numbers.iter().all(|it| it.parse::<u32>().is_ok())
+        && data.iter().all(|it| is_hex(it))
+}
+
+/// `123#00`, `can0 123#00` or `cansend can0 123#00`.
+fn is_frame_of_cansend(line: &str) -> bool {
+    let words: Vec<_> = line.split_whitespace().collect();
+    if line.starts_with('#') {
+        return true;
+    }
+    let frame = match words.as_slice() {
+        [frame] | [_, frame] | ["cansend", _, frame] => frame,
+        _ => return false,
+    };
+    protocol::candump::parse_frame(frame).is_ok()
+}
+
+/// Lines with as many separators each, three at least.
+fn is_table(lines: &[&str]) -> bool {
+    // The last one may be cut off.
+    let lines = lines.get(..lines.len().saturating_sub(1)).filter(|lines| !lines.is_empty()).unwrap_or(lines);
+    [',', ';', '\t'].iter().any(|separator| {
+        let mut counts = lines.iter().map(|line| line.matches(*separator).count());
+        let first = counts.next().unwrap_or(0);
+        first >= 3 && counts.all(|count| count == first)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_of_other_programs_are_told() {
+        for (text, expected) in [
+            ("VERSION \"1.0\"\n\nNS_:\n\nBS_:\n", "a DBC file"),
+            ("BO_ 100 MSG: 8 ECU\n SG_ s : 0|8@1+ (1,0) [0|255] \"\" X\n", "a DBC file"),
+            (
+                "// version 7.1.0\ndate Mon\nbase hex  timestamps absolute\n 0.001 2 701 Rx d 1 05\n",
+                "a Vector ASC log",
+            ),
+            ("base hex timestamps absolute\n", "a Vector ASC log"),
+            ("***BUSMASTER Ver 2.6.2***\n***PROTOCOL CAN***\n", "a BUSMASTER log"),
+            (
+                "Time   ID     DLC Data                    Comment\r\n00,000 00D00422 8 00 \r\n",
+                "a CANHacker trace",
+            ),
+            (";  Start time: 10.05.2016\n     1)      1841  0001  8  00 00 00\n", "a PEAK trace"),
+            ("1) 2.5 Rx 0300 7 00 00\n", "a PEAK trace"),
+            ("# Logger type: 29\n# HW rev: 00.01\nTimestamp ID Data\n", "a CSS Electronics CLX000 log"),
+            ("< hi >\n< frame 0B0B00C9 1701324984.734672 0000 >\n", "what socketcand sends"),
+            (
+                "Timestamp: 0.0    ID: 123    S Rx                DL:  4    11 22 33 44\n",
+                "what python-can prints",
+            ),
+            ("Chn Identifier Flg   DLC  D0...1...2\n", "a Kvaser log"),
+            ("1320745424.002 1R11 402 FA 01 C3\n", "a CRTD log"),
+            ("2016-02-28T19:57:02.364Z,6,129285,204,255,2,a3,99\n", "a canboat log of NMEA 2000 messages"),
+            (" vcan0  714  [3]  11 22 33  - '.\"3'\n", "what isotpsniffer prints"),
+            ("309#40\n025#00\n", "a list of frames for cansend"),
+            ("#!/bin/sh\ncansend vcan0 1D0#0A\ncansend vcan0 1D0#\n", "a list of frames for cansend"),
+            ("time;id;data;dlc\n1;2;3;4\n5;6;7;8\n", "a table in CSV"),
+        ] {
+            assert_eq!(kind_of(text.as_bytes()).map(|(what, _)| what), Some(expected), "{text}");
+        }
+    }
+
+    #[test]
+    fn words_are_no_kind() {
+        for text in ["", "hello\nthis is noise\n", "a, b, c\nd\n", "\u{1b}[31m\0\n"] {
+            assert_eq!(kind_of(text.as_bytes()), None, "{text}");
+        }
+    }
+}

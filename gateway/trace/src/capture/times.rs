@@ -1,0 +1,130 @@
+//! What the times of frames say of themselves: whether they run backwards, and whether they are times at all.
+
+use std::fmt;
+
+/// Buses whose times are compared.
+const BUSES: usize = 64;
+/// Frames of one time that are no accident.
+const ENOUGH: u64 = 3;
+
+/// Looks at the times of frames, each bus by itself: only frames of one bus have an order.
+#[derive(Debug, Default)]
+pub(super) struct Times {
+    buses: Vec<Bus>,
+    /// The bus of the last frame.
+    current: usize,
+    frames: u64,
+    latest: u64,
+    /// How often a frame is older than the one before it on its bus, and the first of them, counted from 1.
+    backwards: Option<(u64, u64)>,
+    /// Names of a file that begins before the end of the one before it, and of that one.
+    overlap: Option<(String, String)>,
+}
+
+#[derive(Debug)]
+struct Bus {
+    name: String,
+    first: u64,
+    last: u64,
+    frames: u64,
+    /// Whether it has frames of several times.
+    has_several: bool,
+}
+
+impl Times {
+    /// A frame of a bus has this time.
+    #[inline]
+    pub(super) fn take(&mut self, bus: &str, nanos: u64) {
+        self.frames += 1;
+        self.latest = self.latest.max(nanos);
+        if self.buses.get(self.current).is_none_or(|current| current.name != bus) {
+            let Some(place) = self.place(bus, nanos) else { return };
+            self.current = place;
+        }
+        let Some(bus) = self.buses.get_mut(self.current) else { return };
+        bus.frames += 1;
+        if nanos < bus.last {
+            self.backwards.get_or_insert((0, self.frames)).0 += 1;
+        }
+        bus.has_several |= nanos != bus.first;
+        bus.last = nanos;
+    }
+
+    fn place(&mut self, bus: &str, nanos: u64) -> Option<usize> {
+        let known = self.buses.iter().position(|it| it.name == bus);
+        known.or_else(|| {
+            let new = Bus { name: bus.to_owned(), first: nanos, last: nanos, frames: 0, has_several: false };
+            (self.buses.len() < BUSES).then(|| {
+                self.buses.push(new);
+                self.buses.len() - 1
+            })
+        })
+    }
+
+    /// The latest time so far, in ns since 1970.
+    pub(super) const fn latest(&self) -> u64 {
+        self.latest
+    }
+
+    /// A file begins before the end of the one before it.
+    pub(super) fn overlaps(&mut self, file: &str, before: &str) {
+        self.overlap.get_or_insert_with(|| (file.to_owned(), before.to_owned()));
+    }
+
+    /// What is to be known of them, a line each.
+    pub(super) fn remarks(&self) -> impl Iterator<Item = String> {
+        let backwards = self.backwards.map(|(times, first)| {
+            format!("times run backwards {times} times, first at frame {first}; the order is kept")
+        });
+        let overlap = self.overlap.as_ref().map(|(file, before)| {
+            format!(
+                "{file} begins before {before} ends: they are read one after the other, and not in the order of their times"
+            )
+        });
+        let constant = self.buses.iter().filter(|bus| !bus.has_several && bus.frames >= ENOUGH);
+        let constant = constant.map(|Bus { name, first, frames, .. }| {
+            format!(
+                "all {frames} frames of {name} have the time {}: rates, gaps and loads mean nothing",
+                Seconds(*first)
+            )
+        });
+        overlap.into_iter().chain(backwards).chain(constant)
+    }
+}
+
+/// A time in s, as a log has it.
+struct Seconds(u64);
+
+impl fmt::Display for Seconds {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}.{:09}", self.0 / 1_000_000_000, self.0 % 1_000_000_000)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn remarks(frames: &[(&str, u64)]) -> Vec<String> {
+        let mut times = Times::default();
+        frames.iter().for_each(|(bus, nanos)| times.take(bus, *nanos));
+        times.remarks().collect()
+    }
+
+    #[test]
+    fn one_time_for_all_frames_of_a_bus_is_remarked() {
+        let nothing: [String; 0] = [];
+        assert_eq!(remarks(&[("a", 5), ("a", 5)]), nothing, "two frames may have come at once");
+        assert_eq!(remarks(&[("a", 5), ("a", 5), ("a", 6)]), nothing);
+        assert_eq!(
+            remarks(&[("a", 0), ("b", 1), ("a", 0), ("b", 2), ("a", 0)]),
+            ["all 3 frames of a have the time 0.000000000: rates, gaps and loads mean nothing"]
+        );
+    }
+
+    #[test]
+    fn times_that_run_backwards_are_counted_by_bus() {
+        let backwards = ["times run backwards 1 times, first at frame 3; the order is kept"];
+        assert_eq!(remarks(&[("a", 5), ("b", 1), ("a", 4), ("b", 2)]), backwards);
+    }
+}
