@@ -1,5 +1,6 @@
 //! `gateway convert`.
 
+mod live;
 mod torques;
 
 use std::ffi::OsStr;
@@ -14,11 +15,12 @@ use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;
-use trace::capture::convert::{ConvertError, Converted, Output, convert};
-use trace::capture::log::{Digits, Style};
-use trace::capture::{Format, Reader};
+use trace::capture::convert::{ConvertError, Converted, Origin, Output, Shortened, Target, convert};
+use trace::capture::log::{Digits, Style, Wrote};
+use trace::capture::{Entry, Format, Reader};
 use trace::files::WholeFile;
 
+use self::live::Live;
 use super::arguments::{Word, one_of};
 use super::input::{captures, no_frame, others, place, skin_for};
 use super::output::{Force, apart, note, refused};
@@ -34,7 +36,8 @@ const PIECE: usize = 1 << 18;
 /// or .txt a candump log, - a log on standard output, .csv the torques of each epoch, as `gateway explain` computes
 /// them. Frames come back bit for bit: times, names of buses, directions, FD flags, raw
 /// DLCs, error and remote frames; comments, drop lines and lines that cannot be read keep their places. What OUT has no
-/// place for is reported. OUT appears when it is complete. Exit code 0: done, 1: it cannot be done, 2: wrong use.
+/// place for is reported. OUT appears when it is complete; of a pipe it grows, as a log under its name and as a recording
+/// under OUT.part, and has what came a tenth of a second after it came. Exit code 0: done, 1: it cannot be done, 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway convert run.mcap run.log
@@ -44,7 +47,8 @@ const PIECE: usize = 1 << 18;
   gateway convert run.log torques.csv --skin skin.toml
   candump -L can0 | gateway convert - can0.mcap")]
 pub(crate) struct Convert {
-    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input
+    /// A candump log or an MCAP recording, or several as one: all parts of a split one in any order, or others, which are read
+    /// in the order of their first frames; - for standard input
     #[arg(value_name = "IN", required = true)]
     from: Vec<PathBuf>,
     /// The new capture, or a CSV file; - for candump text on standard output
@@ -95,21 +99,39 @@ impl Convert {
         if !is_standard(&self.to) {
             apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
             self.force.check("", &self.to)?;
+            if !text && size(&self.from).is_none() {
+                live::check(&self.to).map_err(|error| refused("", &self.to, &error))?;
+            }
+        }
+        if is_standard(&self.to) {
+            self.check_frames()?;
         }
         let (mut reader, bar, live) = self.open()?;
         let stopped = stop::flag();
         let name = reader.name().to_owned();
-        if !text && reader.format() == Format::Mcap {
+        let of_log = reader.format() == Format::Candump;
+        if !text && !of_log && !reader.has_foreign_frames() {
             return Err(Failure::usage(format!("{name} is an MCAP recording already: copy it")));
         }
         let digits = self.digits.unwrap_or(if self.plain { Digits::Six } else { Digits::Own });
         let directions = !self.plain && (self.direction || reader.is_of_a_log());
         let style = Style { digits, plain: self.plain, directions };
-        let failed = |error: io::Error| Failure::run(format!("{to}: {error}"));
-        let (whole, out) = self.create(stopped)?;
-        let mut output = Output::new(out, format, style).map_err(failed)?;
+        let mut sink = if live && self.is_new() {
+            let refused = |error: io::Error| refused("", &self.to, &error);
+            Sink::Live(
+                Live::create(&self.to, self.force.force, (format, style, of_log), stopped)
+                    .map_err(refused)?,
+            )
+        } else {
+            let (whole, out) = self.create(stopped)?;
+            let output = match format {
+                Format::Candump => Output::new(out, format, style),
+                Format::Mcap => Output::recording(out, Origin { of_log, file: None }),
+            };
+            Sink::Whole(whole, output.map_err(|error| Failure::run(format!("{to}: {error}")))?)
+        };
         let mut named = 0;
-        let done = convert(&mut reader, &mut output, |line, why| {
+        let done = convert(&mut reader, &mut sink, |line, why| {
             named += 1;
             let place = place(&name, line.line);
             if self.strict {
@@ -126,11 +148,12 @@ impl Convert {
         bar.finish_and_clear();
         let done = match done {
             Ok(done) => done,
-            Err(ConvertError::Write(error)) => return written(&self.to, error),
-            Err(error) => return Err(Failure::run(error)),
+            Err(ConvertError::Write(error)) => return self.not_written(&sink, error),
+            Err(error @ ConvertError::Strict(_)) => return Err(sink.discard(Failure::run(error))),
+            Err(error) => return Err(sink.close(Failure::run(error))),
         };
         if done.frames == 0 {
-            return Err(no_frame(&reader));
+            return Err(sink.discard(no_frame(&reader)));
         }
         if stopped.load(Ordering::Relaxed) && !live {
             let frames = done.frames;
@@ -139,21 +162,39 @@ impl Convert {
         if let Some(why) = &reader.extras().unfinished {
             let said = format!("{name}: {why}");
             if self.strict {
-                return Err(Failure::run(said));
+                return Err(sink.discard(Failure::run(said)));
             }
             note(said);
         }
-        if let Err(error) = output.finish() {
-            return written(&self.to, error);
-        }
-        if let Some(whole) = whole {
-            whole.finish().map_err(failed)?;
-        }
-        for line in remarks(&reader, &done, &style) {
+        sink.finish().or_else(|(left, error)| written(&self.to, &left, error))?;
+        for line in remarks(&reader, &done, &style, text) {
             note(format_args!("{name}: {line}"));
         }
         note(format_args!("{name} -> {to}: {} frames, {} notes", done.frames, done.notes));
         Ok(())
+    }
+
+    /// Sees that files that are read have a frame, before their other lines are written to standard output.
+    fn check_frames(&self) -> Result<(), Failure> {
+        if !self.from.iter().all(|file| file.is_file()) {
+            return Ok(());
+        }
+        let mut reader = captures(&self.from, |file| Box::new(file))?;
+        match reader.has_frame() {
+            Ok(false) if !stop::flag().load(Ordering::Relaxed) => Err(no_frame(&reader)),
+            // What is wrong is reported when it is read again.
+            Ok(_) | Err(_) => Ok(()),
+        }
+    }
+
+    /// Whether OUT is a file that is begun, and nothing that is written to as it is.
+    fn is_new(&self) -> bool {
+        !is_standard(&self.to) && fs::metadata(&self.to).map_or(true, |there| there.is_file())
+    }
+
+    fn not_written(&self, sink: &Sink, error: io::Error) -> Result<(), Failure> {
+        let left = sink.left();
+        written(&self.to, &left, error)
     }
 
     /// The torque of every epoch, in a CSV file.
@@ -250,12 +291,75 @@ fn size(from: &[PathBuf]) -> Option<u64> {
     from.iter().map(of).sum()
 }
 
-/// An error of the output; a closed pipe is none: its reader may have ended, as `head` does.
-fn written(to: &Path, error: io::Error) -> Result<(), Failure> {
+/// An error of the output, and what is left of that; a closed pipe is none: its reader may have ended, as `head` does.
+fn written(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
     if is_standard(to) {
         return protocol::usage::written(Err(error));
     }
-    Err(Failure::run(format!("{}: {error}; nothing is left of it", to.display())))
+    Err(Failure::run(format!("{}: {error}; {left}", to.display())))
+}
+
+/// Where entries go: a file that appears when it is whole, or one that grows.
+enum Sink {
+    Whole(Option<WholeFile>, Output<BufWriter<Stoppable<File>>>),
+    Live(Live),
+}
+
+impl Sink {
+    /// What is left when it ends by an error.
+    fn left(&self) -> String {
+        match self {
+            Self::Whole(..) => "nothing is left of it".to_owned(),
+            Self::Live(live) => live.left(),
+        }
+    }
+
+    /// Ends it without its end; what was written stays.
+    fn close(self, why: Failure) -> Failure {
+        match self {
+            Self::Whole(..) => why,
+            Self::Live(live) => {
+                let left = live.left();
+                why.and(left)
+            }
+        }
+    }
+
+    /// Leaves nothing of it.
+    fn discard(self, why: Failure) -> Failure {
+        if let Self::Live(live) = self {
+            live.discard();
+        }
+        why
+    }
+
+    /// Writes the end; an error says what is left.
+    fn finish(self) -> Result<(), (String, io::Error)> {
+        let left = self.left();
+        let finished = match self {
+            Self::Whole(whole, mut output) => {
+                output.finish().and_then(|()| whole.map_or(Ok(()), WholeFile::finish))
+            }
+            Self::Live(live) => live.finish(),
+        };
+        finished.map_err(|error| (left, error))
+    }
+}
+
+impl Target for Sink {
+    fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
+        match self {
+            Self::Whole(_, output) => output.write(entry),
+            Self::Live(live) => live.write(entry),
+        }
+    }
+
+    fn pass_on(&mut self) -> io::Result<()> {
+        match self {
+            Self::Whole(_, output) => output.pass_on(),
+            Self::Live(live) => live.pass_on(),
+        }
+    }
 }
 
 /// Progress by bytes of the input, on a terminal.
@@ -267,21 +371,23 @@ fn bar(size: Option<u64>) -> ProgressBar {
 }
 
 /// Notes on a conversion, a line each.
-fn remarks(reader: &Reader, done: &Converted, style: &Style) -> Vec<String> {
-    let mut lines: Vec<_> = reader.remarks().iter().map(ToString::to_string).collect();
-    if let Some((times, first)) = done.backwards {
-        lines.push(format!("times run backwards {times} times, first at frame {first}; the order is kept"));
-    }
-    let shortened = if style.plain || style.digits != Digits::Own || style.directions {
-        "frames are written without something that a log cannot have or was not to have"
+fn remarks(reader: &Reader, done: &Converted, style: &Style, text: bool) -> Vec<String> {
+    let mut lines = reader.remarks();
+    let direction = if style.plain {
+        "frames are written without their direction"
     } else {
         "frames are written without their direction, which not every tool reads; --direction writes it"
     };
+    let Shortened { digits, direction: directions, raw_dlc, name } = done.shortened;
     for (count, what) in [
         (done.unreadable, "begin like a frame and are none: not read"),
+        (done.unreadable_messages, "messages are none of their type: not read"),
         (done.can_xl, "are CAN XL frames: not read"),
         (done.dropped, "frames are missing: the recorder lost them"),
-        (done.shortened, shortened),
+        (digits, "frames are written without the digits of their times below 1 us"),
+        (directions, direction),
+        (raw_dlc, "frames are written without their raw DLC"),
+        (name, "frames have a bus that is written under another name: blanks and controls are _ in a log"),
         (done.omitted, "notes are left out"),
     ] {
         if count > 0 {
@@ -290,7 +396,8 @@ fn remarks(reader: &Reader, done: &Converted, style: &Style) -> Vec<String> {
     }
     match others(reader) {
         others if others.is_empty() => {}
-        others => lines.push(format!("a log has no place for {others}")),
+        others if text => lines.push(format!("a log has no place for {others}")),
+        others => lines.push(format!("frames alone are written, without {others}")),
     }
     lines
 }

@@ -124,8 +124,7 @@ impl Dump {
         let pick = Pick { kinds: self.kind.clone(), nodes: self.node.clone(), from: self.from, to: self.to };
         let max = self.max.unwrap_or(u64::MAX);
         let to_out = BufWriter::new(Stoppable::new(&out));
-        let show = Show::new(to_out, self.format, pick, self.contact, how, max);
-        let mut show = show.on_terminal(out.is_terminal());
+        let mut show = Show::new(to_out, self.format, pick, self.contact, how, max);
         if let Some(path) = &self.skin {
             let skin = Skin::read(path).map_err(Failure::usage)?;
             remark_another(&self.sources, path, &skin);
@@ -238,6 +237,9 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> R
         }
     };
     written(done)?;
+    if !reader.has_times() {
+        show.without_times();
+    }
     // They have been named, each where it is.
     missing.frames = 0;
     missing.tell(reader, "not shown");

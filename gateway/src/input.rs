@@ -17,7 +17,7 @@ use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use trace::capture::{Format, Note, NoteKind, ORIGIN, Reader};
+use trace::capture::{CaptureError, Format, Note, NoteKind, ORIGIN, Reader};
 
 use super::output;
 use super::print::{count, some};
@@ -106,9 +106,30 @@ pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
     // What is no capture either says so as a skin.
     let is_recording = file.is_file() && Reader::open(file).is_ok_and(|it| it.format() == Format::Mcap);
     if !is_recording {
-        return Skin::read(file).map_err(Failure::usage);
+        return read_skin(file);
     }
     attached(&[file.to_owned()], "name the skin's own file")
+}
+
+/// Reads a skin's own file. The error for another text says what that is as a capture.
+pub(crate) fn read_skin(file: &Path) -> Result<Skin, Failure> {
+    Skin::read(file).map_err(|error| as_capture(file).unwrap_or_else(|| Failure::usage(error)))
+}
+
+/// Why a file that is no skin is no skin: what it is, where its name is not that of a description.
+fn as_capture(file: &Path) -> Option<Failure> {
+    if file.extension().is_some_and(|end| end == "toml") || !file.is_file() {
+        return None;
+    }
+    let mut reader = match Reader::open(file) {
+        Err(error @ CaptureError::Other { .. }) => return Some(Failure::usage(error)),
+        opened => opened.ok()?,
+    };
+    let name = file.display();
+    Some(match reader.has_frame().ok()? {
+        true => Failure::usage(format!("{name} is a capture ({}), and a skin is needed", format(&reader))),
+        false => no_frame(&reader),
+    })
 }
 
 /// The skin that a recording has with it.
@@ -164,6 +185,9 @@ pub(crate) fn place(name: &str, line: u64) -> String {
 /// The error for a capture without frames.
 pub(crate) fn no_frame(reader: &Reader) -> Failure {
     let name = reader.name();
+    if let Some((what, hint)) = reader.text_kind() {
+        return Failure::usage(format!("{name} is {what}, and no candump log or MCAP recording: {hint}"));
+    }
     let what = match (reader.format(), reader.lines()) {
         (Format::Candump, 0) => "it is empty: there is no frame in it".to_owned(),
         (Format::Candump, lines) => format!(
@@ -195,6 +219,8 @@ pub(crate) fn others(reader: &Reader) -> String {
 pub(crate) struct Missing {
     /// Lines that cannot be read.
     pub(crate) lines: u64,
+    /// Messages that cannot be read.
+    messages: u64,
     /// Frames that the recorder lost.
     pub(crate) frames: u64,
     /// CAN XL frames.
@@ -208,8 +234,14 @@ impl Missing {
             NoteKind::Text => {}
             NoteKind::CanXl => self.can_xl += 1,
             NoteKind::Dropped(frames) => self.frames = self.frames.saturating_add(frames),
+            NoteKind::Unreadable(_) if note.line == 0 => self.messages += 1,
             NoteKind::Unreadable(_) => self.lines += 1,
         }
+    }
+
+    /// Lines and messages that cannot be read.
+    pub(crate) const fn unreadable(&self) -> u64 {
+        self.lines + self.messages
     }
 
     /// Reports it at the end; also what has become of CAN XL frames.
@@ -222,6 +254,7 @@ impl Missing {
         };
         let said = [
             (self.lines, unread),
+            (self.messages, format!("{} could not be read", count(self.messages, "message"))),
             (self.frames, format!("{} frames are missing: the recorder lost them", self.frames)),
             (self.can_xl, format!("CAN XL frames are {can_xl}: {}", self.can_xl)),
         ];

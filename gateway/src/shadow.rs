@@ -266,7 +266,7 @@ fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Re
                     NoteKind::Dropped(lost) if !note.interface.is_empty() => {
                         shadow.missing(note.interface, lost);
                     }
-                    NoteKind::Unreadable(why) if missing.lines == 1 => {
+                    NoteKind::Unreadable(why) if missing.unreadable() == 1 => {
                         output::note(format_args!("{}: {why}", place(&name, note.line)));
                     }
                     NoteKind::Text | NoteKind::CanXl | NoteKind::Dropped(_) | NoteKind::Unreadable(_) => {}
@@ -274,6 +274,9 @@ fn captured(mut reader: Reader, shadow: &mut Shadow, out: &mut impl Write) -> Re
             }
         }
     };
+    if !reader.has_times() {
+        shadow.without_times();
+    }
     missing.tell(&reader, "left out");
     if stop::flag().load(Ordering::Relaxed) {
         output::note(format_args!("{name}: stopped after {frames} frames"));

@@ -17,14 +17,14 @@ use protocol::bus::Kinds;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use robots::Isometry3;
-use trace::capture::{Entry, Format, Reader};
+use trace::capture::{Format, Reader};
 use view::Shell;
 use view::play::{self, play};
 use view::serve::{Options, serve};
 use view::server::Access;
 
 use super::arguments::{BusKinds, bus_names, bus_of, nanos};
-use super::input::{remark_another, skin_for, skin_of, stopped};
+use super::input::{no_frame, read_skin, remark_another, skin_for, skin_of, stopped};
 use super::output::note;
 use super::surface::{Placed, Surface};
 use super::visuals::Packages;
@@ -32,8 +32,6 @@ use super::visuals::Packages;
 /// The most triangles of a robot that a page draws; more are simplified.
 const TRIANGLES: usize = 20_000;
 
-/// Lines among which a candump log has a frame.
-const LINES: u32 = 1_000;
 /// Where a page is served unless it is told.
 const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 
@@ -170,7 +168,7 @@ impl View {
 
     /// The skin in a file, and its robot by its meshes, as far as they are found.
     fn read(&self, path: &Path) -> Result<(Skin, Vec<Shell>), Failure> {
-        let skin = Skin::read(path).map_err(Failure::usage)?;
+        let skin = read_skin(path)?;
         let surface = Surface::read(path, &skin, &self.packages).map(|it| simplified(&it));
         Ok((skin, surface.unwrap_or_default()))
     }
@@ -198,15 +196,14 @@ impl View {
             return Err(Failure::usage(format!("{} {what}", first.display())));
         }
         let mut reader = Reader::open(first).map_err(Failure::usage)?;
-        let mut lines = 0;
-        while reader.format() == Format::Candump && lines < LINES {
-            match reader.next().map_err(Failure::usage)? {
-                Some(Entry::Frame(_)) => return Ok(true),
-                Some(Entry::Note(_)) => lines += 1,
-                None => return Ok(false),
-            }
+        if reader.format() == Format::Mcap || reader.has_frame().map_err(Failure::usage)? {
+            return Ok(true);
         }
-        Ok(reader.format() == Format::Mcap)
+        // What is to be shown with a skin of its own, or of which a moment is, is no skin.
+        if (self.skin.is_some() || self.at.is_some()) && Skin::read(first).is_err() {
+            return Err(no_frame(&reader));
+        }
+        Ok(false)
     }
 }
 

@@ -29,6 +29,8 @@ pub struct Stats {
     /// What grows as frames come.
     counts: Report,
     bus_stats: Vec<LinkId>,
+    /// Whether the times of frames are none.
+    is_untimed: bool,
 }
 
 /// One bus.
@@ -36,6 +38,8 @@ pub struct Stats {
 struct LinkId {
     /// Time of the frame before.
     last: u64,
+    /// All frames but those of simulated wires.
+    all: Count,
     /// What grows as frames come.
     counts: BusReport,
     kinds: [Count; NAMES.len()],
@@ -79,9 +83,14 @@ impl Count {
         self.last = nanos;
     }
 
+    /// From the first to the last, in ns.
+    const fn span(self) -> u64 {
+        self.last.saturating_sub(self.first)
+    }
+
     /// How many a second, from the first to the last; `None` where that is no time.
     fn per_s(self) -> Option<f64> {
-        rate(self.packets.saturating_sub(1), self.last.saturating_sub(self.first))
+        rate(self.packets.saturating_sub(1), self.span())
     }
 }
 
@@ -139,12 +148,14 @@ pub struct BusReport {
     pub bus: String,
     /// All frames but those of simulated wires, which no real bus has.
     pub frames: u64,
-    /// The same by second, over the whole capture.
+    /// The same by second, over the whole capture; `None` where all of them have one time.
     pub frames_per_s: Option<f64>,
     /// Frames of simulated wires.
     pub wires: u64,
     /// The same by second, from the first to the last.
     pub wires_per_s: Option<f64>,
+    /// From the first to the last, in s.
+    pub wires_span_s: f64,
     /// Packets by kind, those that there are.
     pub kinds: Vec<KindReport>,
     /// Epochs of the joints.
@@ -168,6 +179,8 @@ pub struct KindReport {
     pub packets: u64,
     /// The same by second, from the first to the last.
     pub packets_per_s: Option<f64>,
+    /// From the first to the last, in s.
+    pub span_s: f64,
 }
 
 /// Joints by their numbers.
@@ -218,6 +231,8 @@ pub struct CellReport {
     pub torques: u64,
     /// Torques a second, from the first to the last.
     pub torques_per_s: Option<f64>,
+    /// From the first to the last of them, in s.
+    pub torques_span_s: f64,
     /// Sums of its own and its children's torques.
     pub sums: u64,
     /// Of these, sums of the epoch of the one before: with more cells in it.
@@ -286,9 +301,27 @@ impl Stats {
         self.bus_stats.get_mut(at?)
     }
 
+    /// The times of the frames are none: they stand for the order alone, and there are no rates.
+    pub const fn without_times(&mut self) {
+        self.is_untimed = true;
+    }
+
     /// What it comes to so far.
     #[must_use]
     pub fn report(&self) -> Report {
+        let mut report = self.timed();
+        if self.is_untimed {
+            for bus in &mut report.buses {
+                (bus.frames_per_s, bus.wires_per_s) = (None, None);
+                bus.kinds.iter_mut().for_each(|kind| kind.packets_per_s = None);
+                bus.cells.iter_mut().for_each(|cell| cell.torques_per_s = None);
+                bus.foreign.identifiers.iter_mut().for_each(|id| id.frames_per_s = None);
+            }
+        }
+        report
+    }
+
+    fn timed(&self) -> Report {
         let span @ (earliest, latest) = self.span.unwrap_or_default();
         Report {
             duration_s: seconds(latest - earliest),
@@ -313,6 +346,7 @@ impl LinkId {
     fn new(bus: &str) -> Self {
         Self {
             last: 0,
+            all: Count::default(),
             counts: BusReport { bus: bus.to_owned(), ..BusReport::default() },
             kinds: [Count::default(); NAMES.len()],
             wires: Count::default(),
@@ -329,6 +363,7 @@ impl LinkId {
             return;
         }
         self.counts.frames += 1;
+        self.all.take(nanos);
         let refused = &mut self.counts.refused;
         match decoded {
             Decoded::Wire(..) | Decoded::Segment { .. } => {}
@@ -384,12 +419,14 @@ impl LinkId {
             kind,
             packets: count.packets,
             packets_per_s: count.per_s(),
+            span_s: seconds(count.span()),
         });
         let cells = CellId::all().zip(&self.cells);
         BusReport {
-            frames_per_s: rate(self.counts.frames, latest - earliest),
+            frames_per_s: self.all.per_s().and_then(|_| rate(self.counts.frames, latest - earliest)),
             wires: self.wires.packets,
             wires_per_s: self.wires.per_s(),
+            wires_span_s: seconds(self.wires.span()),
             kinds: kinds.collect(),
             foreign: self.foreign.report(earliest),
             cells: cells.filter_map(|(node, cell)| Some(cell.as_ref()?.report(node))).collect(),
@@ -445,6 +482,7 @@ impl Cell {
         CellReport {
             node: node.get(),
             torques_per_s: rate(self.counts.torques.saturating_sub(1), time),
+            torques_span_s: seconds(time),
             parent: tree.and_then(|tree| tree.parent),
             depth: tree.filter(|tree| tree.parent.is_some()).map(|tree| tree.depth),
             first_epoch: span.map(|[first, _]| first.1.0),

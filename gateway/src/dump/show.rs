@@ -71,7 +71,6 @@ pub(super) struct Show<W> {
     /// When the first frame came.
     first: Option<u64>,
     raw: String,
-    is_terminal: bool,
 }
 
 impl<W: Write> Show<W> {
@@ -88,14 +87,7 @@ impl<W: Write> Show<W> {
             left: max,
             first: None,
             raw: String::new(),
-            is_terminal: false,
         }
-    }
-
-    /// The output is a terminal, which obeys controls in the names of buses.
-    pub(super) const fn on_terminal(mut self, is_terminal: bool) -> Self {
-        self.is_terminal = is_terminal;
-        self
     }
 
     /// Takes the units of the skin's buses; of others they stay the default. Before the first frame.
@@ -177,7 +169,7 @@ impl<W: Write> Show<W> {
             return Ok(());
         }
         let said = decoded.in_units(units);
-        let interface = &self.name(record.interface);
+        let interface = &shown(record.interface);
         match &mut self.how {
             How::Stats(stats) => stats.take(record, decoded),
             How::Json => {
@@ -219,16 +211,17 @@ impl<W: Write> Show<W> {
         Ok(())
     }
 
-    /// A bus as it stands in a line: on a terminal without what that obeys, elsewhere as the capture has it, but for what
-    /// ends a line or a column.
-    fn name<'a>(&self, bus: &'a str) -> Cow<'a, str> {
-        if self.is_terminal || bus.contains(['\n', '\t']) { shown(bus) } else { Cow::Borrowed(bus) }
-    }
-
     /// Frames were lost before this point.
     pub(super) fn dropped(&mut self, bus: &str, frames: u64) {
         if let How::Stats(stats) = &mut self.how {
             stats.dropped(bus, frames);
+        }
+    }
+
+    /// The times of the frames are none.
+    pub(super) const fn without_times(&mut self) {
+        if let How::Stats(stats) = &mut self.how {
+            stats.without_times();
         }
     }
 
@@ -267,9 +260,9 @@ mod tests {
     use protocol::candump;
 
     /// What is written of a frame on this bus.
-    fn line(bus: &str, how: How, is_terminal: bool) -> String {
+    fn line(bus: &str, how: How) -> String {
         let pick = Pick { kinds: Vec::new(), nodes: Vec::new(), from: None, to: None };
-        let mut show = Show::new(Vec::new(), None, pick, false, how, 1).on_terminal(is_terminal);
+        let mut show = Show::new(Vec::new(), None, pick, false, how, 1);
         let frame = candump::parse_frame("123#00").unwrap();
         let time = Timestamp::six_digits(1_000_000_000);
         show.frame(&Record { time, interface: bus, frame, direction: None }).unwrap();
@@ -278,23 +271,17 @@ mod tests {
     }
 
     #[test]
-    fn the_name_of_a_bus_makes_no_line_and_no_column_and_a_terminal_does_not_obey_it() {
+    fn the_name_of_a_bus_makes_no_line_and_no_column_and_no_terminal_obeys_it() {
         let forged = "can0 1#\tok\n(2.000000) can1";
-        for is_terminal in [false, true] {
-            for how in [How::Lines { colour: false }, How::Brief { colour: false }] {
-                let said = line(forged, how, is_terminal);
-                assert_eq!(said.matches('\n').count(), 1, "{said}");
-                assert!(said.contains(r"can0 1#\u{9}ok\u{a}(2.000000) can1"), "{said}");
-            }
+        for how in [How::Lines { colour: false }, How::Brief { colour: false }] {
+            let said = line(forged, how);
+            assert_eq!(said.matches('\n').count(), 1, "{said}");
+            assert!(said.contains(r"can0 1#\u{9}ok\u{a}(2.000000) can1"), "{said}");
         }
-        let escapes = "can\x1b[2J\u{9b}";
-        assert!(
-            line(escapes, How::Lines { colour: false }, false)
-                .starts_with("(1.000000) can\x1b[2J\u{9b} 123#00\t")
-        );
-        let said = line(escapes, How::Lines { colour: false }, true);
-        assert!(said.starts_with("(1.000000) can\\u{1b}[2J\\u{9b} 123#00\t"), "{said}");
-        let said = line(escapes, How::Json, false);
-        assert!(said.contains(r#""bus":"can\u001b[2J\u009b""#), "{said}");
+        let escapes = "can\x1b[2J\u{9b}\0\r\u{202e}";
+        let said = line(escapes, How::Lines { colour: false });
+        assert!(said.starts_with("(1.000000) can\\u{1b}[2J\\u{9b}\\u{0}\\u{d}\\u{202e} 123#00\t"), "{said}");
+        let said = line(escapes, How::Json);
+        assert!(said.contains(r#""bus":"can\u001b[2J\u009b\u0000\r\u202e""#), "{said}");
     }
 }

@@ -18,7 +18,7 @@ pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extr
     rows.any("frames missing", report.dropped, "lost by the recorder");
     rows.any("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
     for bus in &report.buses {
-        numbers(&mut rows, bus);
+        numbers(&mut rows, bus, report.duration_s);
     }
     if let Some(extras) = extras {
         beside(&mut rows, extras);
@@ -35,14 +35,20 @@ pub(super) fn text(name: &str, what: &str, report: &Report, extras: Option<&Extr
     text
 }
 
-fn per_s(rate: Option<f64>) -> String {
-    or(rate.map(|rate| format!("{rate:.1} a second")), "")
+/// A rate, and how long the time is that it is of.
+fn per_s(rate: Option<f64>, span_s: f64) -> String {
+    or(rate.map(|rate| format!("{rate:.1} a second in {} s", span(span_s))), "")
 }
 
-fn numbers(rows: &mut Rows, bus: &BusReport) {
-    rows.section(&bus.bus, print::count(bus.frames, "frame"), per_s(bus.frames_per_s));
+/// Seconds with as many digits as tell them from none.
+fn span(span_s: f64) -> String {
+    if span_s < 1e-3 { format!("{span_s:.9}") } else { format!("{span_s:.3}") }
+}
+
+fn numbers(rows: &mut Rows, bus: &BusReport, duration_s: f64) {
+    rows.section(&bus.bus, print::count(bus.frames, "frame"), per_s(bus.frames_per_s, duration_s));
     for kind in &bus.kinds {
-        rows.row(kind.kind, kind.packets, per_s(kind.packets_per_s));
+        rows.row(kind.kind, kind.packets, per_s(kind.packets_per_s, kind.span_s));
     }
     let Epochs { first, last, missing, repeated, jumps } = bus.epochs;
     if let (Some(first), Some(last)) = (first, last) {
@@ -50,7 +56,7 @@ fn numbers(rows: &mut Rows, bus: &BusReport) {
         let odd = list(odd.map(|(count, what)| format!("{count} {what}")));
         rows.row("epochs", format!("{first} to {last}"), odd);
     }
-    rows.any("wires", bus.wires, format!("{}, on no real bus", per_s(bus.wires_per_s)));
+    rows.any("wires", bus.wires, format!("{}, on no real bus", per_s(bus.wires_per_s, bus.wires_span_s)));
     let refused: Vec<_> = bus.refused.by_reason().into_iter().filter(|(_, count)| *count > 0).collect();
     let reasons = list(refused.iter().map(|(reason, count)| format!("{count} {reason}")));
     rows.row("damaged or refused", refused.iter().map(|(_, count)| count).sum::<u64>(), reasons);
@@ -100,7 +106,16 @@ const FOREIGN: usize = 40;
 
 /// One line a foreign identifier, those with the most frames.
 fn foreign(bus: &BusReport) -> Table {
-    let head = [&format!("{} foreign", shown(&bus.bus)), "frames", "per s", "first s", "last s", "bytes", ""];
+    let head = [
+        &format!("{} foreign", shown(&bus.bus)),
+        "frames",
+        "per s",
+        "in s",
+        "first s",
+        "last s",
+        "bytes",
+        "",
+    ];
     let line = |id: &ForeignId| {
         let (min, most) = (id.bytes_min, id.bytes_max);
         let bytes = if min == most { min.to_string() } else { format!("{min}..{most}") };
@@ -111,7 +126,9 @@ fn foreign(bus: &BusReport) -> Table {
             FrameType::Error => "error".to_owned(),
         };
         let [first, last] = [id.first_s, id.last_s].map(|s| format!("{s:.3}"));
-        vec![id.id.clone(), id.frames.to_string(), decimals(id.frames_per_s, 1, ""), first, last, bytes, what]
+        let in_s = id.frames_per_s.map_or_else(String::new, |_| span(id.last_s - id.first_s));
+        let per_s = decimals(id.frames_per_s, 1, "");
+        vec![id.id.clone(), id.frames.to_string(), per_s, in_s, first, last, bytes, what]
     };
     let ForeignFrames { identifiers, frames_of_other_identifiers: unknown, .. } = &bus.foreign;
     let mut lines: Vec<_> = identifiers.iter().take(FOREIGN).map(line).collect();
@@ -122,7 +139,7 @@ fn foreign(bus: &BusReport) -> Table {
         let more = if *unknown > 0 { "more than " } else { "" };
         lines.push(vec![format!("{more}{count} further"), frames.to_string()]);
     }
-    print::table(head, lines, |column| column < 6)
+    print::table(head, lines, |column| column < 7)
 }
 
 /// A column: its head, and the text of a cell, if it has any.
@@ -136,10 +153,11 @@ fn cells(bus: &BusReport) -> Table {
     }
     const STATE: &str = "last state";
     let name = shown(&bus.bus);
-    let columns: [Column<'_>; 16] = [
+    let columns: [Column<'_>; 17] = [
         (&name, |cell| Some(cell.node.to_string())),
         ("torques", |cell| Some(cell.torques.to_string())),
         ("per s", |cell| cell.torques_per_s.map(|rate| format!("{rate:.1}"))),
+        ("in s", |cell| cell.torques_per_s.map(|_| span(cell.torques_span_s))),
         ("epochs", |cell| Some(format!("{}..{}", cell.first_epoch?, cell.last_epoch?))),
         ("unanswered", |cell| some(cell.unanswered)),
         ("twice", |cell| some(cell.repeated)),

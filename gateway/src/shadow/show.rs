@@ -58,13 +58,14 @@ pub(super) fn text(name: &str, what: &str, missing: u64, report: &Report) -> Str
     let beside = if missing > 0 { format!("{missing} frames are missing in it") } else { String::new() };
     let mut rows = Rows::new(name, head, beside).names_in_one_line();
     for bus in &report.buses {
-        one(&mut rows, bus, report.bit_error_rate);
+        one(&mut rows, bus, report);
     }
     rows.any("frames of further buses", report.frames_of_other_buses, "beyond the first 64");
     rows.text()
 }
 
-fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
+fn one(rows: &mut Rows, bus: &BusShadow, report: &Report) {
+    let bit_error_rate = report.bit_error_rate;
     let count = format!("{} frames in {:.3} s", bus.frames, bus.duration_s);
     let missing = if bus.counts.missing > 0 {
         format!("{} more are missing", bus.counts.missing)
@@ -72,7 +73,7 @@ fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
         String::new()
     };
     rows.section(format!("{} at {}", bus.bus, bus.name), count, missing);
-    fit(rows, bus);
+    fit(rows, bus, report.has_times);
     if bus.this_run.is_some() {
         operation(rows, bus);
     }
@@ -93,7 +94,7 @@ fn one(rows: &mut Rows, bus: &BusShadow, bit_error_rate: f64) {
 }
 
 /// Whether it fits, at most and in this run.
-fn fit(rows: &mut Rows, bus: &BusShadow) {
+fn fit(rows: &mut Rows, bus: &BusShadow, has_times: bool) {
     match (&bus.worst_case, &bus.answering) {
         (Some(worst), _) => rows.row(worst.case(), worst.value(), worst.cells),
         (None, Some(_)) => rows.row("worst case", "?", "needs a skin with this bus: --skin"),
@@ -101,6 +102,8 @@ fn fit(rows: &mut Rows, bus: &BusShadow) {
     }
     match &bus.this_run {
         Some(run) => rows.row(run.case(), run.value(), run.cells),
+        None if !has_times => rows.row("this run", "?", "its frames have no times"),
+        None if bus.duration_s == 0.0 => rows.row("this run", "?", "its frames have one time"),
         None => rows.row("this run", "no joints in it", ""),
     }
     match bus.answering {

@@ -8,7 +8,7 @@ use protocol::wire_time::{BitRates, Bits};
 
 use super::epochs::Epochs;
 use super::phase::{Each, Figures, Phase, Phases};
-use super::report::{BusShadow, Counts, Delays};
+use super::report::{BusShadow, Counts, Delays, Loads, Most, Stretches};
 use super::reported::Reported;
 use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
 use crate::bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
@@ -239,8 +239,29 @@ impl LinkId {
         }
     }
 
-    pub(super) fn report(&self) -> BusShadow {
+    pub(super) fn report(&self, has_times: bool) -> BusShadow {
         let (first, last) = self.span.unwrap_or_default();
+        let timed = self.timed(first, last);
+        if has_times && first < last {
+            return timed;
+        }
+        // What is figured of one time, or of none, is said of nothing.
+        BusShadow {
+            this_run: None,
+            start_up: None,
+            load: Loads::default(),
+            stretches: Stretches::default(),
+            delay_us: Delays::default(),
+            kinds: Vec::new(),
+            replies: None,
+            queue: Most::default(),
+            queue_of_one: Most::default(),
+            queue_of_one_id: 0,
+            ..timed
+        }
+    }
+
+    fn timed(&self, first: u64, last: u64) -> BusShadow {
         let Each { start_up, operation } = &self.figures;
         let span = self.phases.spans.operation;
         let overrun = self.wire_end.saturating_sub(self.released);

@@ -103,6 +103,7 @@ pub struct Shadow {
     reported: Option<Reported>,
     frames: u64,
     further: u64,
+    has_times: bool,
 }
 
 impl Shadow {
@@ -113,7 +114,7 @@ impl Shadow {
     pub fn new(options: Options) -> Result<Self, BitErrorsError> {
         BitErrors::new(options.bit_errors, options.seed)?;
         let reported = options.each_frame.then(Reported::default);
-        Ok(Self { options, bus_timings: Vec::new(), reported, frames: 0, further: 0 })
+        Ok(Self { options, bus_timings: Vec::new(), reported, frames: 0, further: 0, has_times: true })
     }
 
     /// Takes the next frame of a bus, with its time in ns. A time after the year 2262 counts as its end: what a bus makes
@@ -155,6 +156,11 @@ impl Shadow {
         }
     }
 
+    /// The times of the frames are none: they stand for the order alone, and say nothing of loads and delays.
+    pub const fn without_times(&mut self) {
+        self.has_times = false;
+    }
+
     /// There is no more: all that waits goes out.
     pub fn finish(&mut self) {
         self.bus_timings.iter_mut().for_each(|bus_timing| bus_timing.finish(self.reported.as_mut()));
@@ -179,7 +185,8 @@ impl Shadow {
             frames: self.frames,
             frames_of_other_buses: self.further,
             bit_error_rate: self.options.bit_errors,
-            buses: self.bus_timings.iter().map(LinkId::report).collect(),
+            has_times: self.has_times,
+            buses: self.bus_timings.iter().map(|bus| bus.report(self.has_times)).collect(),
         }
     }
 

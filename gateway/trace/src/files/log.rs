@@ -100,6 +100,14 @@ impl LogFile {
     /// # Errors
     /// When the file does not take them; then it ends with the lines before.
     pub fn append(&mut self, lines: &str) -> io::Result<()> {
+        self.append_bytes(lines.as_bytes())
+    }
+
+    /// The same of lines that need not be text.
+    ///
+    /// # Errors
+    /// As of [`LogFile::append`].
+    pub fn append_bytes(&mut self, lines: &[u8]) -> io::Result<()> {
         if lines.is_empty() {
             return Ok(());
         }
@@ -107,8 +115,8 @@ impl LogFile {
             self.state = State::Ours(self.take_place()?);
         }
         let written = match &mut self.state {
-            State::Ours(file) | State::Old(file) => file.write_all(lines.as_bytes()),
-            State::Stream(stream) => stream.write_all(lines.as_bytes()),
+            State::Ours(file) | State::Old(file) => file.write_all(lines),
+            State::Stream(stream) => stream.write_all(lines),
         };
         match &self.state {
             _ if written.is_ok() => self.bytes += lines.len() as u64,

@@ -1,0 +1,215 @@
+//! Captures that are made of a pipe: what has come is in the file before a tenth of a second has passed, whatever ends the
+//! program, and whether more comes or not.
+//!
+//! ```text
+//!   pipe ──> convert ──> Shared ──┬──> a log, under its name from the first line on
+//!                          ▲      └──> OUT.mcap.part, which gets its name at the end
+//!                        keep, every 50 ms
+//! ```
+
+use std::fs::File;
+use std::io::{self, BufWriter, Seek, Write};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use trace::capture::convert::{Origin, Output, Target};
+use trace::capture::log::{Style, Wrote};
+use trace::capture::{Entry, Format};
+use trace::files::LogFile;
+use trace::recording::names::{self, Part};
+
+/// How long what was written may wait for the file.
+const KEEP_INTERVAL: Duration = Duration::from_millis(50);
+/// Bytes that go to a recording together.
+const PIECE: usize = 64 << 10;
+/// Room for the thread that keeps, which calls no deep functions.
+const STACK: usize = 256 << 10;
+
+/// The file that grows.
+enum Grown {
+    Log(LogFile),
+    Part(BufWriter<File>),
+}
+
+impl Write for Grown {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self {
+            // All of them or none: they are whole lines.
+            Self::Log(log) => log.append_bytes(bytes).map(|()| bytes.len()),
+            Self::Part(file) => file.write(bytes),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        match self {
+            Self::Log(_) => Ok(()),
+            Self::Part(file) => file.flush(),
+        }
+    }
+}
+
+/// An output, and what became of it since it was kept.
+struct State {
+    output: Output<Grown>,
+    /// Whether something was written since.
+    is_dirty: bool,
+    /// Why it could not be kept.
+    failed: Option<io::Error>,
+    is_over: bool,
+}
+
+#[derive(Default)]
+struct Meeting {
+    state: Mutex<Option<State>>,
+    /// Signalled when it is over.
+    over: Condvar,
+}
+
+impl Meeting {
+    fn with<T>(&self, act: impl FnOnce(&mut State) -> io::Result<T>) -> io::Result<T> {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let state = state.as_mut().ok_or_else(|| io::Error::other("it has ended"))?;
+        match state.failed.take() {
+            Some(error) => Err(error),
+            None => act(state),
+        }
+    }
+
+    /// Keeps what was written, until it is over.
+    fn keep(&self) {
+        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        while let Some(State { output, is_dirty, failed, is_over: false }) = state.as_mut() {
+            if std::mem::take(is_dirty) && failed.is_none() {
+                *failed = output.keep().err();
+            }
+            let waited = self.over.wait_timeout(state, KEEP_INTERVAL);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+}
+
+/// A capture that grows.
+pub(super) struct Live {
+    meeting: Arc<Meeting>,
+    keeper: Option<JoinHandle<()>>,
+    path: PathBuf,
+    force: bool,
+    /// Of a recording the name that it has while it grows, and the file.
+    part: Option<(Part, File)>,
+}
+
+impl Live {
+    /// Begins a file.
+    pub(super) fn create(
+        path: &Path,
+        force: bool,
+        (format, style, of_log): (Format, Style, bool),
+        stopped: &AtomicBool,
+    ) -> io::Result<Self> {
+        let (output, part) = match format {
+            Format::Candump => {
+                (Output::new(Grown::Log(LogFile::create(path, force, stopped)?), format, style)?, None)
+            }
+            Format::Mcap => {
+                let (part, mut file) = Part::create(path.to_owned())?;
+                let begun = file.rewind().and_then(|()| {
+                    let out = Grown::Part(BufWriter::with_capacity(PIECE, file.try_clone()?));
+                    Output::recording(out, Origin { of_log, file: Some(&file.metadata()?) })
+                });
+                (begun.inspect_err(|_| part.remove())?, Some((part, file)))
+            }
+        };
+        let state = State { output, is_dirty: false, failed: None, is_over: false };
+        let meeting = Arc::new(Meeting { state: Mutex::new(Some(state)), ..Meeting::default() });
+        let keeping = Arc::clone(&meeting);
+        let keeper = thread::Builder::new().stack_size(STACK).spawn(move || keeping.keep())?;
+        Ok(Self { meeting, keeper: Some(keeper), path: path.to_owned(), force, part })
+    }
+
+    /// What has what was written, when something has failed.
+    pub(super) fn left(&self) -> String {
+        match &self.part {
+            Some(_) => {
+                let part = format!("{}.part", self.path.display());
+                format!("what was written before is in {part}: gateway recover {part}")
+            }
+            None => format!("{} has what was written before", self.path.display()),
+        }
+    }
+
+    /// Writes the end, and gives a recording its name.
+    pub(super) fn finish(mut self) -> io::Result<()> {
+        let ended = self.end(|state| {
+            state.output.finish()?;
+            Ok(())
+        });
+        ended?;
+        if let Some((part, file)) = &self.part {
+            file.sync_all()?;
+            part.finish(self.force)?;
+            trace::files::sync_folder(&self.path);
+        }
+        Ok(())
+    }
+
+    /// Takes it away: nothing is to be left of it.
+    pub(super) fn discard(mut self) {
+        let is_there = self.part.is_some() || self.meeting.with(|_| Ok(())).is_ok();
+        let _ = self.end(|_| Ok(()));
+        match &self.part {
+            Some((part, _)) => part.remove(),
+            // One that it was to take the place of is there until the first line.
+            None if is_there && !self.force => _ = std::fs::remove_file(&self.path),
+            None => {}
+        }
+    }
+
+    /// Ends the thread, and then the output.
+    fn end(&mut self, end: impl FnOnce(&mut State) -> io::Result<()>) -> io::Result<()> {
+        let ended = self.meeting.with(|state| {
+            state.is_over = true;
+            end(state)
+        });
+        self.meeting.state.lock().unwrap_or_else(PoisonError::into_inner).take();
+        self.meeting.over.notify_all();
+        if let Some(keeper) = self.keeper.take() {
+            // It does not panic.
+            let _ = keeper.join();
+        }
+        ended
+    }
+}
+
+impl Target for Live {
+    fn write(&mut self, entry: &Entry<'_>) -> io::Result<Wrote> {
+        self.meeting.with(|state| {
+            state.is_dirty = true;
+            state.output.write(entry)
+        })
+    }
+
+    fn pass_on(&mut self) -> io::Result<()> {
+        self.meeting.with(|state| state.output.pass_on())
+    }
+}
+
+/// Says what stands in the way of a recording that grows, before its input is waited for.
+pub(super) fn check(path: &Path) -> io::Result<()> {
+    let mut part = path.as_os_str().to_owned();
+    part.push(".part");
+    let part = PathBuf::from(part);
+    match File::open(&part) {
+        Ok(file) if names::is_held(&file) => Err(io::Error::other(format!(
+            "{} is being written by another program: name another file",
+            part.display()
+        ))),
+        Ok(_) => Err(io::Error::other(format!(
+            "{0} is there, of a program that was killed: `gateway recover {0}`, then move it away",
+            part.display()
+        ))),
+        Err(_) => Ok(()),
+    }
+}
