@@ -17,7 +17,7 @@ use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;
 use trace::capture::convert::{ConvertError, Converted, Origin, Output, Shortened, Target, convert};
 use trace::capture::log::{Digits, Style, Wrote};
-use trace::capture::{Entry, Format, Reader};
+use trace::capture::{Entry, Format, NoteKind, Reader};
 use trace::files::WholeFile;
 
 use self::live::Live;
@@ -180,10 +180,26 @@ impl Convert {
             return Ok(());
         }
         let mut reader = captures(&self.from, |file| Box::new(file))?;
-        match reader.has_frame() {
-            Ok(false) if !stop::flag().load(Ordering::Relaxed) => Err(no_frame(&reader)),
-            // What is wrong is reported when it is read again.
-            Ok(_) | Err(_) => Ok(()),
+        let name = reader.name().to_owned();
+        let mut unreadable = Vec::new();
+        loop {
+            match reader.next() {
+                Ok(Some(Entry::Note(line))) => {
+                    if let NoteKind::Unreadable(why) = &line.kind
+                        && (unreadable.len() as u64) < NAMED
+                    {
+                        unreadable.push(format!("{}: {why}", place(&name, line.line)));
+                    }
+                }
+                Ok(None)
+                    if !stop::flag().load(Ordering::Relaxed) && !(self.strict && !unreadable.is_empty()) =>
+                {
+                    unreadable.iter().for_each(note);
+                    return Err(no_frame(&reader));
+                }
+                // What is wrong is reported when it is read again.
+                Ok(_) | Err(_) => return Ok(()),
+            }
         }
     }
 
@@ -320,6 +336,7 @@ impl Sink {
             Self::Whole(..) => why,
             Self::Live(live) => {
                 let left = live.left();
+                live.close();
                 why.and(left)
             }
         }

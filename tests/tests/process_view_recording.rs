@@ -143,7 +143,7 @@ fn what_cannot_be_shown_is_named() {
             "view -",
             "there is no file -: name a skin, whose buses are listened to, a recording, or a bus and its --skin",
         ),
-        ("view text.log text.log", "text.log is no part of a recording"),
+        ("view text.log text.log", "text.log is named twice: name it once"),
     ] {
         let ended = place.start("gateway", words).end();
         assert!(ended.refusal(2).contains(expected), "{words}: {}", ended.refusal(2));

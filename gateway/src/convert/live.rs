@@ -155,6 +155,12 @@ impl Live {
         Ok(())
     }
 
+    /// Ends it without its end; what was written is in it.
+    pub(super) fn close(mut self) {
+        // Why it ends is reported already.
+        let _ = self.end(|state| state.output.keep());
+    }
+
     /// Takes it away: nothing is to be left of it.
     pub(super) fn discard(mut self) {
         let is_there = self.part.is_some() || self.meeting.with(|_| Ok(())).is_ok();

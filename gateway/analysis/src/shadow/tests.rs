@@ -191,6 +191,23 @@ fn bit_errors_cost_time_and_are_the_same_for_the_same_seed() {
 }
 
 #[test]
+fn of_one_time_or_none_there_is_no_verdict() {
+    let of = |step: u64, has_times: bool| {
+        let mut shadow = shadow();
+        (0..9).for_each(|at| shadow.frame("can0", 5 * MS + at * step, &classic(0x123, &[1; 8])));
+        if !has_times {
+            shadow.without_times();
+        }
+        ended(shadow).1.buses.remove(0)
+    };
+    assert!(of(MS, true).this_run.is_some());
+    for bus in [of(0, true), of(0, false), of(MS, false)] {
+        assert_eq!((bus.this_run, bus.load.mean, bus.delay_us.count), (None, None, 0));
+        assert_eq!((bus.load.worst_1_s.value, bus.queue.value, bus.frames), (0.0, 0.0, 9));
+    }
+}
+
+#[test]
 fn nothing_is_nothing() {
     let (frames, report) = ended(shadow());
     assert!(frames.is_empty() && report.buses.is_empty());

@@ -75,7 +75,8 @@ fn joints_that_are_missing_or_come_again_are_counted_around_the_corner() {
     }
     let expected = Epochs { first: Some(254), last: Some(0), missing: 1 + 2, repeated: 1, jumps: 1 };
     assert_eq!(tape.bus().epochs, expected);
-    assert_eq!(tape.bus().kinds, [KindReport { kind: "joints", packets: 6, packets_per_s: Some(1_000.0) }]);
+    let joints = KindReport { kind: "joints", packets: 6, packets_per_s: Some(1_000.0), span_s: 0.005 };
+    assert_eq!(tape.bus().kinds, [joints]);
 }
 
 #[test]
@@ -221,6 +222,28 @@ fn memory_is_bounded_whatever_buses_a_capture_names() {
     }
     let report = tape.stats.report();
     assert_eq!((report.buses.len(), report.frames_of_other_buses, report.frames), (BUSES, 936, 1_000));
+}
+
+#[test]
+fn a_rate_needs_two_times_of_its_own_bus() {
+    let mut stats = Stats::default();
+    let frame = Frame::classic(0x7F0, &[1]).unwrap();
+    for (bus, nanos) in [("a", 5), ("b", 7), ("a", 5), ("a", 5), ("b", 1_000_000_007)] {
+        let mut settler = Settler::new(None);
+        settler.push(Micros(0), bus, &frame, ());
+        settler.finish();
+        let ((), decoded) = settler.pop().unwrap();
+        let time = Timestamp::nine_digits(nanos);
+        stats.take(&Record { time, interface: bus, frame, direction: None }, &decoded);
+    }
+    let rates = |stats: &Stats| {
+        let rate =
+            |bus: &BusReport| (bus.frames_per_s.is_some(), bus.foreign.identifiers[0].frames_per_s.is_some());
+        stats.report().buses.iter().map(rate).collect::<Vec<_>>()
+    };
+    assert_eq!(rates(&stats), [(false, false), (true, true)]);
+    stats.without_times();
+    assert_eq!(rates(&stats), [(false, false); 2]);
 }
 
 #[test]

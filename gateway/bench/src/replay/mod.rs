@@ -56,7 +56,7 @@ use crate::setup::names;
 use crate::signals::caught;
 use model::decode::BUSES;
 use model::decode::pick::Pick;
-use trace::capture::{Entry, Extras, NoteKind, Reader};
+use trace::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
 
 /// The period of wake-ups for which lateness is measured, in ns.
 const GRID_NS: u64 = 2_000_000;
@@ -209,6 +209,9 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     if let Some(what) = &reader.extras().unfinished {
         note(what.to_string());
     }
+    for remark in reader.remarks_beside_order() {
+        note(remark);
+    }
     if let Some((frame, nanos)) = backwards.filter(|(_, nanos)| *nanos > trace::order::WINDOW_NS) {
         let back = Duration::from_nanos(nanos).as_secs_f64();
         note(format!(
@@ -217,7 +220,10 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
         ));
     }
     if survey.frames == 0 {
-        return Err(ReplayError::Empty(name));
+        return Err(match reader.text_kind() {
+            Some((what, hint)) => ReplayError::Open(CaptureError::Other { name, what, hint }),
+            None => ReplayError::Empty(name),
+        });
     }
     let (from, to) = survey.bounds();
     if from > survey.last || from >= to {

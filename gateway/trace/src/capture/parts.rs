@@ -38,6 +38,9 @@ pub enum PartsError {
         /// The recording.
         mcap: PathBuf,
     },
+    /// A text among captures.
+    #[error("{} has no frame in it: name captures alone", .0.display())]
+    NoFrame(PathBuf),
     /// One is named twice.
     #[error("{} is named twice: name it once", .0.display())]
     Same(PathBuf),
@@ -104,11 +107,15 @@ pub(super) struct Named {
     part: Option<Part>,
     /// The time of its first frame, in ns since 1970.
     first: Option<u64>,
+    /// Whether it has lines and no frame.
+    is_text: bool,
 }
 
 impl Named {
-    pub(super) fn new(path: &Path, format: Format, extras: &Extras, first: Option<u64>) -> Self {
-        Self { path: path.to_owned(), format, part: Part::of(path, extras), first }
+    /// A file whose lines up to the first frame have been counted; a recording has none.
+    pub(super) fn new(path: &Path, extras: &Extras, format: Format, first: Option<u64>, lines: u64) -> Self {
+        let (part, is_text) = (Part::of(path, extras), first.is_none() && lines > 0);
+        Self { path: path.to_owned(), format, part, first, is_text }
     }
 }
 
@@ -118,6 +125,9 @@ impl Named {
 /// # Errors
 /// When they are not one capture.
 pub(super) fn together(mut files: Vec<Named>) -> Result<Vec<PathBuf>, PartsError> {
+    if let Some(text) = files.iter().find(|file| file.is_text) {
+        return Err(PartsError::NoFrame(text.path.clone()));
+    }
     let mut places = HashSet::new();
     let mut is_again =
         |file: &&Named| !places.insert(fs::canonicalize(&file.path).unwrap_or_else(|_| file.path.clone()));

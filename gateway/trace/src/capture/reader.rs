@@ -194,7 +194,7 @@ impl Reader {
                 let mut reader = Self::open(path)?;
                 // What is a part says so before its frames.
                 let first = reader.first_time();
-                Ok(Named::new(path, reader.format(), reader.extras(), first))
+                Ok(Named::new(path, reader.extras(), reader.format(), first, reader.lines()))
             }
         };
         Ok(parts::together(paths.iter().map(named).collect::<Result<_, CaptureError>>()?)?)
@@ -396,6 +396,12 @@ impl Reader {
     /// What is to be known of the times, flags and buses of the frames so far, a line each.
     #[must_use]
     pub fn remarks(&self) -> Vec<String> {
+        self.times.backwards().into_iter().chain(self.remarks_beside_order()).collect()
+    }
+
+    /// The same without the order of times.
+    #[must_use]
+    pub fn remarks_beside_order(&self) -> Vec<String> {
         let shared = match &self.source {
             Source::Mcap(mcap) => mcap.buses().is_shared(),
             Source::Log(_) => false,

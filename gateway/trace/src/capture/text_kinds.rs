@@ -114,14 +114,14 @@ fn is_frame_of_cansend(line: &str) -> bool {
     protocol::candump::parse_frame(frame).is_ok()
 }
 
-/// Lines with as many separators each, three at least.
+/// Lines with as many separators each, three at least; a few may be of another kind.
 fn is_table(lines: &[&str]) -> bool {
     // The last one may be cut off.
     let lines = lines.get(..lines.len().saturating_sub(1)).filter(|lines| !lines.is_empty()).unwrap_or(lines);
     [',', ';', '\t'].iter().any(|separator| {
-        let mut counts = lines.iter().map(|line| line.matches(*separator).count());
-        let first = counts.next().unwrap_or(0);
-        first >= 3 && counts.all(|count| count == first)
+        let counts: Vec<_> = lines.iter().map(|line| line.matches(*separator).count()).collect();
+        let same = counts.iter().filter(|count| Some(*count) == counts.first()).count();
+        counts.first().is_some_and(|first| *first >= 3) && 4 * same >= 3 * counts.len()
     })
 }
 

@@ -71,11 +71,14 @@ impl Times {
         self.overlap.get_or_insert_with(|| (file.to_owned(), before.to_owned()));
     }
 
-    /// What is to be known of them, a line each.
+    /// How often they run backwards, if they do.
+    pub(super) fn backwards(&self) -> Option<String> {
+        let (times, first) = self.backwards?;
+        Some(format!("times run backwards {times} times, first at frame {first}; the order is kept"))
+    }
+
+    /// What else is to be known of them, a line each.
     pub(super) fn remarks(&self) -> impl Iterator<Item = String> {
-        let backwards = self.backwards.map(|(times, first)| {
-            format!("times run backwards {times} times, first at frame {first}; the order is kept")
-        });
         let overlap = self.overlap.as_ref().map(|(file, before)| {
             format!(
                 "{file} begins before {before} ends: they are read one after the other, and not in the order of their times"
@@ -88,7 +91,7 @@ impl Times {
                 Seconds(*first)
             )
         });
-        overlap.into_iter().chain(backwards).chain(constant)
+        overlap.into_iter().chain(constant)
     }
 }
 
@@ -108,7 +111,7 @@ mod tests {
     fn remarks(frames: &[(&str, u64)]) -> Vec<String> {
         let mut times = Times::default();
         frames.iter().for_each(|(bus, nanos)| times.take(bus, *nanos));
-        times.remarks().collect()
+        times.backwards().into_iter().chain(times.remarks()).collect()
     }
 
     #[test]

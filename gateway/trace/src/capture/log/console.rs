@@ -55,7 +55,7 @@ pub(super) enum Console<'a> {
 /// When it begins so, and what follows the length is no frame.
 pub(super) fn parse(line: &[u8]) -> Option<Result<Console<'_>, LineError>> {
     let text = line.trim_ascii_end();
-    memchr::memchr2(b'[', b'{', text)?;
+    memchr::memchr3(b'[', b'{', b'#', text)?;
     let mut cursor = Cursor { text, at: 0 };
     cursor.quotes();
     if matches!(cursor.rest().first(), Some(b'#' | b';' | b'/')) {
