@@ -203,7 +203,7 @@ impl Convert {
         }
     }
 
-    /// Whether OUT is a file that is begun, and nothing that is written to as it is.
+    /// Tells a file that is created from a FIFO or a device, which is written to as it is.
     fn is_new(&self) -> bool {
         !is_standard(&self.to) && fs::metadata(&self.to).map_or(true, |there| there.is_file())
     }
@@ -322,7 +322,7 @@ enum Sink {
 }
 
 impl Sink {
-    /// What is left when it ends by an error.
+    /// Says which file has the frames after an error.
     fn left(&self) -> String {
         match self {
             Self::Whole(..) => "nothing is left of it".to_owned(),

@@ -116,7 +116,7 @@ pub(crate) fn read_skin(file: &Path) -> Result<Skin, Failure> {
     Skin::read(file).map_err(|error| as_capture(file).unwrap_or_else(|| Failure::usage(error)))
 }
 
-/// Why a file that is no skin is no skin: what it is, where its name is not that of a description.
+/// The error for a capture or another text in the place of a skin; `None` for a file that is called `.toml`.
 fn as_capture(file: &Path) -> Option<Failure> {
     if file.extension().is_some_and(|end| end == "toml") || !file.is_file() {
         return None;

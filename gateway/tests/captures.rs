@@ -190,7 +190,7 @@ fn notes_before_the_first_frame_have_its_time_in_a_recording() {
     assert_eq!(entries(&mcap).0, entries(log).0);
 }
 
-/// What is said of a log that was read.
+/// Remarks on a log.
 fn backwards(log: &str) -> Vec<String> {
     let mut reader = reader(log.as_bytes());
     while reader.next().unwrap().is_some() {}

@@ -30,6 +30,9 @@ pub const ERROR_STATE: u8 = 2;
 /// FD flag: "this is an FD frame"; kernels set it from 6.1 on.
 pub const FD_FORMAT: u8 = 4;
 
+/// The bits of FD flags that a log has a digit for; the kernel reserves the others.
+const FD_FLAGS: u8 = 0xF;
+
 /// Bytes of `struct can_frame`.
 pub const CLASSIC_BYTES: usize = 16;
 /// Bytes of `struct canfd_frame`.
@@ -75,7 +78,7 @@ pub struct IdentifierError {
     pub got: u32,
     /// Bits of the identifier: 11 or 29.
     pub bits: u8,
-    /// The greatest identifier of that many bits.
+    /// The largest identifier of that many bits.
     pub max: u32,
 }
 
@@ -352,8 +355,12 @@ impl Frame {
         let body = data.get(..got).ok_or(FrameError::Length { got, max: data.len() })?;
         let id = u32::from_ne_bytes([a, b, c, d]);
         match format {
-            Format::Classic => Self::with_data(id, format, 0, body).map(|frame| frame.with_raw_dlc(dlc)),
-            Format::Fd => Self::with_data(id, format, flags, body),
+            // Other values there are padding that nobody cleared.
+            Format::Classic => {
+                let dlc = if got == 8 && matches!(dlc, 9..=15) { dlc } else { 0 };
+                Self::with_data(id, format, 0, body).map(|frame| frame.with_raw_dlc(dlc))
+            }
+            Format::Fd => Self::with_data(id, format, flags & FD_FLAGS, body),
         }
     }
 }
@@ -414,6 +421,17 @@ mod tests {
         }
         let wrong = identifier(0x18F0_10FE, 0).unwrap_err().to_string();
         assert_eq!(wrong, "18F010FE does not fit an identifier of 11 bits: at most 7FF");
+    }
+
+    #[test]
+    fn bytes_of_the_struct_without_a_meaning_are_left_out() {
+        let mut bytes = [0; FD_BYTES];
+        bytes[4..8].copy_from_slice(&[7, 0, 0, 0x55]);
+        assert_eq!(Frame::from_bytes(&bytes[..CLASSIC_BYTES]).unwrap().raw_dlc(), 0);
+        bytes[4] = 8;
+        assert_eq!(Frame::from_bytes(&bytes[..CLASSIC_BYTES]).unwrap().raw_dlc(), 0);
+        bytes[5] = 0xF5;
+        assert_eq!(Frame::from_bytes(&bytes).unwrap().flags(), 5);
     }
 
     #[test]

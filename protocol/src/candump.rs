@@ -252,7 +252,7 @@ mod tests {
         assert!(matches!(parse_bytes("(1.000000) kän 123# \u{A0}".as_bytes()), Ok(Line::Frame(_))));
     }
 
-    /// What another program reads of lines that are written in all manners; see `vectors/candump.tsv`.
+    /// Compares lines in all manners of writing with the values in `vectors/candump.tsv`.
     #[test]
     fn lines_have_the_values_that_can_utils_and_python_can_read() {
         let vectors = include_str!("../tests/vectors/candump.tsv");

@@ -29,7 +29,7 @@ pub struct Stats {
     /// What grows as frames come.
     counts: Report,
     bus_stats: Vec<LinkId>,
-    /// Whether the times of frames are none.
+    /// Set if the frames have no times.
     is_untimed: bool,
 }
 
@@ -148,7 +148,7 @@ pub struct BusReport {
     pub bus: String,
     /// All frames but those of simulated wires, which no real bus has.
     pub frames: u64,
-    /// The same by second, over the whole capture; `None` where all of them have one time.
+    /// Frames a second, over the whole capture; `None` where all of them have one time.
     pub frames_per_s: Option<f64>,
     /// Frames of simulated wires.
     pub wires: u64,

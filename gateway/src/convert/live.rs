@@ -21,7 +21,7 @@ use trace::capture::{Entry, Format};
 use trace::files::LogFile;
 use trace::recording::names::{self, Part};
 
-/// How long what was written may wait for the file.
+/// Time after which written entries are in the file.
 const KEEP_INTERVAL: Duration = Duration::from_millis(50);
 /// Bytes that go to a recording together.
 const PIECE: usize = 64 << 10;
@@ -54,9 +54,9 @@ impl Write for Grown {
 /// An output, and what became of it since it was kept.
 struct State {
     output: Output<Grown>,
-    /// Whether something was written since.
+    /// Set by each write, cleared when everything is in the file.
     is_dirty: bool,
-    /// Why it could not be kept.
+    /// The error of the thread that writes at intervals, for the next call.
     failed: Option<io::Error>,
     is_over: bool,
 }
@@ -97,7 +97,7 @@ pub(super) struct Live {
     keeper: Option<JoinHandle<()>>,
     path: PathBuf,
     force: bool,
-    /// Of a recording the name that it has while it grows, and the file.
+    /// Name and file of a recording while it grows.
     part: Option<(Part, File)>,
 }
 
@@ -129,7 +129,7 @@ impl Live {
         Ok(Self { meeting, keeper: Some(keeper), path: path.to_owned(), force, part })
     }
 
-    /// What has what was written, when something has failed.
+    /// Says which file has the entries so far.
     pub(super) fn left(&self) -> String {
         match &self.part {
             Some(_) => {

@@ -10,7 +10,7 @@ use trace::capture::{Entry, Reader};
 
 use super::Folder;
 
-/// What only a hanging program meets.
+/// A limit that only a hanging program meets.
 const LIMIT: Duration = Duration::from_secs(120);
 
 fn data(name: &str) -> PathBuf {

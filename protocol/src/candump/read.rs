@@ -274,7 +274,7 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// Whether a byte separates words.
+/// Returns true for a byte that separates words.
 pub(super) const fn is_blank(byte: u8) -> bool {
     matches!(byte, b' ' | b'\t')
 }

@@ -17,7 +17,7 @@ pub struct Report {
     pub frames_of_other_buses: u64,
     /// The share of bits that were damaged on purpose.
     pub bit_error_rate: f64,
-    /// Whether the frames say when they were; if not, nothing is said of loads and delays.
+    /// Set if the frames have times; without, loads and delays are unknown.
     pub has_times: bool,
     /// Each bus, in the order in which they were met.
     pub buses: Vec<BusShadow>,

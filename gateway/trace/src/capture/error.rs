@@ -1,4 +1,4 @@
-//! Why captures cannot be read.
+//! Errors of reading captures.
 
 use std::io;
 

@@ -63,7 +63,7 @@ const CSV: Kind = Kind::Other(
 const PCAP: Kind = Kind::Other(
     "a packet capture",
     "write lines like `(1700000000.123456) can0 123#00` from what `tshark -T fields -e frame.time_epoch -e can.id \
-     -e data.data -r FILE` shows, or take the capture with `candump -l`",
+     -e data.data -r FILE` shows (identifiers are decimal there), or take the capture with `candump -l`",
 );
 const UTF_16: Kind = Kind::Other("text in UTF-16", "save it as UTF-8");
 

@@ -107,7 +107,7 @@ pub(super) struct Named {
     part: Option<Part>,
     /// The time of its first frame, in ns since 1970.
     first: Option<u64>,
-    /// Whether it has lines and no frame.
+    /// Set if it has lines and no frame.
     is_text: bool,
 }
 

@@ -48,7 +48,7 @@ pub struct Reader {
     times: Times,
     /// The file before this one, until the first frame of this one is read.
     before: Option<String>,
-    /// What was remarked of the logs before this one.
+    /// Remarks on the logs before this one.
     remarks: Vec<Remark>,
 }
 
@@ -81,7 +81,7 @@ impl Source {
         }
     }
 
-    /// Whether nothing more comes of it.
+    /// Returns true behind its last entry.
     fn is_at_its_end(&mut self, name: &str, entries: u64) -> Result<bool, CaptureError> {
         let at_its_end = match self {
             Self::Log(log) => log.is_at_its_end().map_err(Fault::from),
@@ -169,7 +169,8 @@ impl Reader {
     /// cannot be read report that when they are.
     fn survey<'a>(paths: impl Iterator<Item = &'a PathBuf> + Clone) -> Buses {
         let recording = |path: &&PathBuf| {
-            let mut file = File::open(path).ok().filter(|_| path.is_file())?;
+            // A pipe is not opened twice.
+            let mut file = path.is_file().then(|| File::open(path).ok()).flatten()?;
             is_mcap(&mut file).is_ok_and(|is| is).then_some(file)
         };
         let mut survey = Survey::default();
@@ -393,13 +394,13 @@ impl Reader {
         }
     }
 
-    /// What is to be known of the times, flags and buses of the frames so far, a line each.
+    /// Remarks on times, flags and buses of the frames so far, a line each.
     #[must_use]
     pub fn remarks(&self) -> Vec<String> {
         self.times.backwards().into_iter().chain(self.remarks_beside_order()).collect()
     }
 
-    /// The same without the order of times.
+    /// Remarks without the one on the order of times.
     #[must_use]
     pub fn remarks_beside_order(&self) -> Vec<String> {
         let shared = match &self.source {
@@ -421,13 +422,13 @@ impl Reader {
         remarks
     }
 
-    /// Whether the frames so far say when they were.
+    /// Returns false when lines without a time were read.
     #[must_use]
     pub fn has_times(&self) -> bool {
         !self.log_remarks().contains(&Remark::NoTimes)
     }
 
-    /// What a text without frames is, and what to do with it, by its first lines; `None` where they do not say that.
+    /// Names the kind of a text without frames, and what to do with it, by its first lines.
     #[must_use]
     pub fn text_kind(&self) -> Option<(&'static str, &'static str)> {
         match &self.source {
@@ -436,7 +437,7 @@ impl Reader {
         }
     }
 
-    /// Whether another program wrote frames in it, in a type of its own.
+    /// Returns true when a channel so far has frames of another program's type.
     #[must_use]
     pub fn has_foreign_frames(&self) -> bool {
         match &self.source {

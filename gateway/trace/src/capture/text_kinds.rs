@@ -1,11 +1,11 @@
-//! What a text is in which there is no frame, by its first lines.
+//! Kinds of texts without frames, by their first lines.
 
 const EXPORT: &str =
     "no converter of it is known here: export it as a candump log from the program that wrote it";
 const ASC: (&str, &str) =
     ("a Vector ASC log", "write a candump log with can-utils' `asc2log -I FILE -O NEW.log`");
 
-/// Says what a text is, and what to do with it; `None` where no line says that.
+/// Names the kind of a text, and what to do with it; `None` for an unknown one.
 pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
     let text = String::from_utf8_lossy(text);
     let lines: Vec<_> = text.lines().map(str::trim).filter(|line| !line.is_empty()).collect();
@@ -47,7 +47,7 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
             ),
         ),
         (
-            all(&|line| is_frame_of_cansend(line)),
+            all(&|line| line.starts_with('#') || is_frame_of_cansend(line)) && any(&is_frame_of_cansend),
             (
                 "a list of frames for cansend",
                 "there are no times in it: write lines like `(1700000000.123456) can0 123#00`",
@@ -104,9 +104,6 @@ fn is_canboat(line: &str) -> bool {
 /// `123#00`, `can0 123#00` or `cansend can0 123#00`.
 fn is_frame_of_cansend(line: &str) -> bool {
     let words: Vec<_> = line.split_whitespace().collect();
-    if line.starts_with('#') {
-        return true;
-    }
     let frame = match words.as_slice() {
         [frame] | [_, frame] | ["cansend", _, frame] => frame,
         _ => return false,
@@ -130,7 +127,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn texts_of_other_programs_are_told() {
+    fn texts_of_other_programs_are_recognised() {
         for (text, expected) in [
             ("VERSION \"1.0\"\n\nNS_:\n\nBS_:\n", "a DBC file"),
             ("BO_ 100 MSG: 8 ECU\n SG_ s : 0|8@1+ (1,0) [0|255] \"\" X\n", "a DBC file"),
@@ -166,7 +163,7 @@ mod tests {
 
     #[test]
     fn words_are_no_kind() {
-        for text in ["", "hello\nthis is noise\n", "a, b, c\nd\n", "\u{1b}[31m\0\n"] {
+        for text in ["", "# a comment\n", "hello\nthis is noise\n", "a, b, c\nd\n", "\u{1b}[31m\0\n"] {
             assert_eq!(kind_of(text.as_bytes()), None, "{text}");
         }
     }

@@ -1,4 +1,4 @@
-//! What the times of frames say of themselves: whether they run backwards, and whether they are times at all.
+//! Checks of the times of frames: times that run backwards, and one time for all frames.
 
 use std::fmt;
 
@@ -15,7 +15,7 @@ pub(super) struct Times {
     current: usize,
     frames: u64,
     latest: u64,
-    /// How often a frame is older than the one before it on its bus, and the first of them, counted from 1.
+    /// Count of frames that are older than the one before them on their bus, and the first of them, counted from 1.
     backwards: Option<(u64, u64)>,
     /// Names of a file that begins before the end of the one before it, and of that one.
     overlap: Option<(String, String)>,
@@ -27,7 +27,7 @@ struct Bus {
     first: u64,
     last: u64,
     frames: u64,
-    /// Whether it has frames of several times.
+    /// Set once two of its frames have different times.
     has_several: bool,
 }
 
@@ -71,13 +71,13 @@ impl Times {
         self.overlap.get_or_insert_with(|| (file.to_owned(), before.to_owned()));
     }
 
-    /// How often they run backwards, if they do.
+    /// Remark on times that run backwards.
     pub(super) fn backwards(&self) -> Option<String> {
         let (times, first) = self.backwards?;
         Some(format!("times run backwards {times} times, first at frame {first}; the order is kept"))
     }
 
-    /// What else is to be known of them, a line each.
+    /// Other remarks, a line each.
     pub(super) fn remarks(&self) -> impl Iterator<Item = String> {
         let overlap = self.overlap.as_ref().map(|(file, before)| {
             format!(

@@ -103,7 +103,7 @@ impl LogFile {
         self.append_bytes(lines.as_bytes())
     }
 
-    /// The same of lines that need not be text.
+    /// Appends whole lines that need not be text.
     ///
     /// # Errors
     /// As of [`LogFile::append`].

@@ -3,7 +3,7 @@
 //! There is no convention for CAN in recordings that would bring a candump line back as it was: `can_msgs/Frame`
 //! holds 8 bytes, `ros2_socketcan_msgs/FdFrame` has no flags. These do, and any viewer reads them.
 
-use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Format, Frame, REMOTE, identifier};
+use protocol::can::{ERROR, EXTENDED, Format, Frame, REMOTE, identifier};
 use protocol::candump::{Direction, Record, Timestamp};
 
 use super::cdr::{CdrError, Encode, Reader, Writer};
@@ -21,7 +21,7 @@ impl Encode for Record<'_> {
     fn encode(&self, out: &mut Writer<'_>) {
         let Self { time, interface, frame, direction } = self;
         out.put(Header { nanos: time.nanos, frame_id: interface });
-        out.put(frame.raw_id() & EXTENDED_MASK);
+        out.put(frame.id());
         for flag in [frame.is_extended(), frame.is_remote(), frame.is_error(), frame.format() == Format::Fd] {
             out.put(flag);
         }
@@ -151,7 +151,7 @@ mod tests {
     use super::*;
     use crate::ros2::NANOS;
     use proptest::prelude::*;
-    use protocol::can::STANDARD_MASK;
+    use protocol::can::{EXTENDED_MASK, STANDARD_MASK};
 
     fn back_and_forth(record: Record<'_>) -> Result<Record<'_>, CdrError> {
         let mut buffer = Vec::new();

@@ -147,8 +147,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Whether a dash and a quoted text are behind the data, as isotpsniffer prints messages that are put together of
-    /// frames.
+    /// Looks for a dash and a quoted text behind the data: isotpsniffer prints so the messages that it joins from frames.
     fn is_of_isotpsniffer(&self, has_frame: bool) -> bool {
         if has_frame {
             self.rest().starts_with(b"- '")

@@ -52,7 +52,7 @@ impl LogReader {
         Self { input, buffer, rest, at_end: false, taken, lines: 0, clock, remarks, sample, any_frame }
     }
 
-    /// The same of a log that goes on behind so many lines of others.
+    /// Goes on counting lines behind those of other logs.
     pub(crate) fn behind(self, lines: u64) -> Self {
         Self { lines, ..self }
     }
@@ -85,12 +85,12 @@ impl LogReader {
         &self.sample
     }
 
-    /// Whether no whole line is left of what has been taken from the input.
+    /// Returns true when the buffer has no whole line.
     pub(crate) fn is_drained(&self) -> bool {
         self.buffer.get(self.rest.clone()).is_none_or(|rest| line_end(rest).is_none())
     }
 
-    /// Whether no line is left. Reads more if it has to.
+    /// Returns true behind the last line. Reads more if it has to.
     pub(crate) fn is_at_its_end(&mut self) -> io::Result<bool> {
         while self.rest.is_empty() && !self.at_end {
             self.fill()?;

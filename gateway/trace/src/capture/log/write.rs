@@ -48,7 +48,7 @@ pub enum Wrote {
     Nothing,
 }
 
-/// What the line of a frame does not say.
+/// Properties of a frame that its line does not have.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Less {
     /// Digits of its time.
@@ -96,7 +96,7 @@ struct Names {
 }
 
 impl Names {
-    /// Names that are told apart.
+    /// Names with an entry of their own.
     const MOST: usize = 4_096;
 
     /// Makes `bus` the last one, and returns its name in the log if that is another one.

@@ -50,7 +50,7 @@ impl Buses {
         Self { pairs: self.pairs, ..all }
     }
 
-    /// Whether a `frame_id` is that of several topics.
+    /// Returns true when several topics have one `frame_id`.
     pub(crate) const fn is_shared(&self) -> bool {
         self.is_shared
     }

@@ -19,7 +19,7 @@ use crate::ros2::{Header, nanos};
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Foreign {
     Classic,
-    /// The same as ROS 1 writes it.
+    /// A classic frame in the encoding of ROS 1.
     Ros1,
     Fd,
 }

@@ -72,7 +72,7 @@ impl McapReader {
         self.state.buses()
     }
 
-    /// Whether a channel so far has frames that another program wrote.
+    /// Returns true when a channel so far has frames of another program's type.
     pub(crate) fn has_foreign(&self) -> bool {
         self.state.has_foreign()
     }

@@ -105,7 +105,7 @@ impl State {
         }
     }
 
-    /// The same with the buses that are known already.
+    /// Takes over buses that are known already.
     pub(crate) fn with_buses(self, buses: Buses) -> Self {
         Self { buses, ..self }
     }
@@ -118,7 +118,7 @@ impl State {
         self.buses
     }
 
-    /// Whether a channel so far has frames that another program wrote.
+    /// Returns true when a channel so far has frames of another program's type.
     pub(super) fn has_foreign(&self) -> bool {
         self.channels.values().any(|channel| matches!(channel.what, What::Foreign(_)))
     }

@@ -1,4 +1,4 @@
-//! What frames of other programs a recording holds, before it is read.
+//! A look at the topics of a recording for frames of other programs, before it is read.
 
 use std::collections::HashSet;
 use std::fs::File;
@@ -12,14 +12,14 @@ use super::read::McapReader;
 use super::state::State;
 use crate::container::{LONGEST_DESCRIPTION, MAGIC, Record, find, parse};
 
-/// Topics that are told apart.
+/// Topics that are counted.
 const TOPICS: usize = 4_096;
 
 /// Finds out the buses of recordings whose frames other programs wrote.
 #[derive(Debug, Default)]
 pub(crate) struct Survey {
     topics: HashSet<String>,
-    /// Whether a file does not say its topics outside of its chunks.
+    /// Set by a file without channels outside of its chunks.
     is_silent: bool,
 }
 
@@ -60,7 +60,7 @@ impl Survey {
         Ok(())
     }
 
-    /// Whether the buses have to be found out by reading all messages.
+    /// Returns true when only reading all messages tells the buses.
     pub(crate) fn is_needed(&self) -> bool {
         self.is_silent || self.topics.len() > 1
     }

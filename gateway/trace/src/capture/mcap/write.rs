@@ -17,7 +17,7 @@ const FURTHER: &str = "/further";
 pub const ORIGIN: &str = "capture";
 /// Its content.
 pub(crate) const SOURCE: (&str, &str) = ("from", "candump log");
-/// The same of one that was made of a recording.
+/// Its content in a recording that was made of another one.
 const OTHER_SOURCE: (&str, &str) = ("from", "MCAP recording");
 /// The metadata of a channel: digits of a second, 6 or 9.
 pub(super) const TIME_DIGITS: &str = "time_digits";
@@ -57,10 +57,10 @@ struct Waiting {
     text: Vec<u8>,
 }
 
-/// What a recording is made of, and where.
+/// Source and file of a recording.
 #[derive(Clone, Copy, Debug)]
 pub struct Origin<'a> {
-    /// Whether it is made of a log, and not of a recording.
+    /// Set if the source is a log, and not a recording.
     pub of_log: bool,
     /// The file that it is written to while it grows, whose mark it gets.
     pub file: Option<&'a Metadata>,
