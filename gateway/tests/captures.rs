@@ -152,7 +152,7 @@ fn of_the_odd_lines_nothing_is_lost() {
     // Other spellings of the same: padding, dots, lower case, indentation.
     assert_eq!(
         other.len(),
-        12,
+        17,
         "{:?}",
         other.iter().map(|(line, _)| String::from_utf8_lossy(line)).collect::<Vec<_>>()
     );

@@ -29,7 +29,6 @@ pub struct Stats {
     /// What grows as frames come.
     counts: Report,
     bus_stats: Vec<LinkId>,
-    /// Set if the frames have no times.
     is_untimed: bool,
 }
 
@@ -38,7 +37,6 @@ pub struct Stats {
 struct LinkId {
     /// Time of the frame before.
     last: u64,
-    /// All frames but those of simulated wires.
     all: Count,
     /// What grows as frames come.
     counts: BusReport,
