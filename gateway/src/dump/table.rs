@@ -125,10 +125,10 @@ fn foreign(bus: &BusReport) -> Table {
             FrameType::Remote => "remote".to_owned(),
             FrameType::Error => "error".to_owned(),
         };
-        let [first, last] = [id.first_s, id.last_s].map(|s| format!("{s:.3}"));
-        let in_s = id.frames_per_s.map_or_else(String::new, |_| span(id.last_s - id.first_s));
+        let first = format!("{:.3}", id.first_s);
+        let in_s = if id.frames > 1 { span(id.last_s - id.first_s) } else { String::new() };
         let per_s = decimals(id.frames_per_s, 1, "");
-        vec![id.id.clone(), id.frames.to_string(), per_s, in_s, first, last, bytes, what]
+        vec![id.id.clone(), id.frames.to_string(), per_s, in_s, first, bytes, what]
     };
     let ForeignFrames { identifiers, frames_of_other_identifiers: unknown, .. } = &bus.foreign;
     let mut lines: Vec<_> = identifiers.iter().take(FOREIGN).map(line).collect();
@@ -139,7 +139,7 @@ fn foreign(bus: &BusReport) -> Table {
         let more = if *unknown > 0 { "more than " } else { "" };
         lines.push(vec![format!("{more}{count} further"), frames.to_string()]);
     }
-    print::table(head, lines, |column| column < 7)
+    print::table(head, lines, |column| column < 6)
 }
 
 /// A column: its head, and the text of a cell, if it has any.
