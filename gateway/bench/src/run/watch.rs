@@ -203,7 +203,9 @@ impl Bench<'_> {
     /// Sends the stimuli of all epochs up to [`LEAD`] ahead.
     fn press(&self, script: &mut Script, moved: Option<Moved>) -> Result<(), RunError> {
         let broadcasts = self.shared.broadcasts.load(Ordering::Acquire);
-        let seconds = |touches: &Touches, epoch| Span(touches.time_of(epoch).0).seconds();
+        // Broadcasts that were skipped have no epoch, but took their time.
+        let skipped = self.shared.broadcasts_skipped.load(Ordering::Relaxed);
+        let seconds = |touches: &Touches, epoch: u64| Span(touches.time_of(epoch + skipped).0).seconds();
         while script.epoch < broadcasts + LEAD {
             // Epochs that have passed while this thread was delayed cannot be made up for one by one.
             let epoch = script.epoch.max(broadcasts);

@@ -194,8 +194,8 @@ impl Turn {
                 let _ = line.positions.push((epoch, *positions));
                 line.give(bus, encoded, &self.shared, &mut send);
             }
-            self.shared.broadcasts.fetch_add(1, Ordering::Release);
             self.shared.broadcasts_skipped.fetch_add(outcome.broadcasts_skipped, Ordering::Relaxed);
+            self.shared.broadcasts.fetch_add(1, Ordering::Release);
         }
         if outcome.command == Some(Command::Halt) {
             self.command(Message::Halt, &mut send);
