@@ -1,6 +1,7 @@
 //! `gateway calibrate`.
 
 mod picture;
+mod recorded;
 
 use std::path::PathBuf;
 use std::thread;
@@ -216,6 +217,10 @@ impl Calibrate {
             return Err(Failure::run(last));
         }
         complaints.iter().for_each(|line| note(format_args!("gateway: {line}")));
+        if summary.control.ticks_skipped > 0 {
+            let (ticks, broadcasts) = (summary.control.ticks_skipped, summary.control.broadcasts_skipped);
+            note(format_args!("the loop skipped {ticks} ticks, and {broadcasts} broadcasts with them"));
+        }
         read(&[path], skin, settings)
     }
 
@@ -280,6 +285,9 @@ impl Calibrate {
 fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibration, Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
     let name = reader.name().to_owned();
+    if let Some(Ok(own)) = reader.extras().skin() {
+        recorded::check(&name, skin, &own)?;
+    }
     let mut seen = Observations::new(skin);
     let mut decoder = Decoder::new(None);
     while let Some(entry) = reader.next().map_err(Failure::run)? {
@@ -288,7 +296,7 @@ fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibrati
         if let (Decoded::Message(message), Some(bus)) =
             (decoder.decode(at, record.interface, &record.frame), skin.bus_named(record.interface))
         {
-            seen.take(bus, &message);
+            seen.take(bus, at, &message);
         }
     }
     if seen.cells.iter().all(Vec::is_empty) {
@@ -297,7 +305,7 @@ fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibrati
              acceleration_g = 0"
         )));
     }
-    Ok(calibrate(skin, &seen, settings))
+    calibrate(skin, &seen, settings).map_err(|refusal| Failure::run(format_args!("{name}: {refusal}")))
 }
 
 /// What was found, for people.
@@ -310,10 +318,14 @@ fn report(skin: &Skin, calibration: &Calibration) -> String {
         summary.determined,
         summary.troubled
     )];
-    lines.push(format!(
-        "certain within {:.2} mm and {:.2} degrees (median; 95 of 100 times); readings scatter by {:.1} mg",
-        summary.position_mm, summary.orientation_deg, summary.noise_mg
-    ));
+    if let (Some(mm), Some(degrees), Some(mg)) =
+        (summary.position_mm, summary.orientation_deg, summary.noise_mg)
+    {
+        lines.push(format!(
+            "certain within {mm:.2} mm and {degrees:.2} degrees (median; 95 of 100 times); readings scatter by {mg:.1} mg"
+        ));
+    }
+    lines.push(summary.joints.to_string());
     let changes = calibration.cells.iter().filter(|cell| cell.is_written()).filter_map(|cell| cell.found);
     let mut moved: Vec<_> = changes.filter_map(|found| Some((found.moved_mm?, found.turned_deg?))).collect();
     moved.sort_by(|one, other| one.0.total_cmp(&other.0));

@@ -5,12 +5,14 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 
 use crate::each::each;
-use crate::estimate::{Estimate, Guess, estimate};
+use crate::estimate::{Ages, Estimate, Guess, estimate};
 use crate::help::{Help, helpful};
+use crate::lag::Lags;
 use crate::neighbors::{Known, Spacing, improve};
 use crate::observe::{Observations, Reading};
 use crate::plan::Bounds;
-use crate::result::{Calibration, CellResult, Pose, Summary, Trouble};
+use crate::refusal::{Disturbance, Refusal};
+use crate::result::{Calibration, CellResult, Pose, SensorResult, Summary, Trouble};
 use crate::table::Table;
 use crate::zero::zero_offsets;
 use model::accelerometer::kinematics::G;
@@ -52,8 +54,17 @@ impl Settings {
 const SILENT: f64 = 0.5;
 /// A cell with fewer readings than this is not estimated.
 const FEWEST: usize = 200;
-/// Residuals this many times as large as those of most cells come from a cell that is loose or damaged.
+/// Residuals this many times as large as those of most cells, and as the data sheet says, come from a cell that is loose
+/// or damaged.
 const ROUGH: f64 = 1.5;
+/// Residuals of most cells that are this many times as large as the data sheet says are not those of its sensors.
+const SCATTER: f64 = 1.3;
+/// Rates that differ by more than this part are not the same.
+const OTHER_RATE: f64 = 0.02;
+/// Shifts of more than this part of the time are too many.
+const MUCH_SHIFTED: f64 = 0.005;
+/// Rounds in which shifts of stretches are improved.
+const SHIFTS: usize = 5;
 /// The logarithm of a likelihood ratio above which one joint is better than the next.
 const SURE: f64 = 10.0;
 /// Poses that are less certain than this are not determined: in m, and in rad.
@@ -62,13 +73,179 @@ const ENOUGH: [f64; 2] = [0.02, 0.09];
 const NEARER: f64 = 2.0;
 
 /// Estimates every cell.
-#[must_use]
-pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Calibration {
+///
+/// # Errors
+/// When the recording is not one of this skin with such sensors, or is too disturbed: nothing is estimated from it.
+pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Result<Calibration, Refusal> {
+    let (seen_by, disturbance) = estimated(skin, seen, settings)?;
+    let Seen { tables, lags, estimates } = seen_by;
+    let mut cells: Vec<_> = skin
+        .cells
+        .iter()
+        .zip(&estimates)
+        .zip(&seen.cells)
+        .map(|((cell, estimate), readings)| {
+            let table = tables.get(cell.bus).and_then(Option::as_ref);
+            let usable = table.map_or(0, |table| readings.iter().filter(|it| table.is_known(it)).count());
+            let share = real(usable) / real(table.map_or(0, Table::known)).max(1.0);
+            result(skin, cell, estimate.as_ref(), readings, share)
+        })
+        .collect();
+    rough(&mut cells, &estimates);
+    let wires = with_neighbors(skin, &mut cells, settings);
+    confused(skin, &mut cells);
+    advise(skin, &estimates, &mut cells, settings);
+    for (result, cell) in cells.iter_mut().zip(&skin.cells) {
+        result.settle(skin, cell, tables.get(cell.bus).and_then(Option::as_ref).map(|table| &table.arm));
+    }
+    let summary = Summary::of(&cells, wires, disturbance);
+    let zero_offsets =
+        settings.zero_offsets.then(|| zero_offsets(skin, seen, settings, (&tables, &lags), &estimates));
+    Ok(Calibration { summary, cells, zero_offsets })
+}
+
+/// Estimates of all cells, each by itself.
+struct Seen {
+    /// By bus.
+    tables: Vec<Option<Table>>,
+    lags: Vec<Lags>,
+    /// By cell.
+    estimates: Vec<Option<Estimate>>,
+}
+
+/// Estimates each cell by itself, with the shifts of stretches between gaps.
+fn estimated(skin: &Skin, seen: &Observations, settings: &Settings) -> Result<(Seen, Disturbance), Refusal> {
+    checked(skin, seen)?;
+    let mut lags: Vec<_> = seen.buses.iter().map(Lags::none).collect();
+    let period = settings.sheet.period_s();
+    for round in 0..=SHIFTS {
+        let now = each_alone(skin, seen, settings, lags);
+        let disturbance = disturbed(skin, seen, &now.tables)?;
+        let more: Vec<_> = now
+            .tables
+            .iter()
+            .zip(&now.lags)
+            .enumerate()
+            .map(|(bus, (table, lags))| {
+                let cells = skin.cells.iter().zip(&now.estimates).zip(&seen.cells);
+                let cells = cells.filter(|((cell, _), _)| cell.bus == bus);
+                let cells =
+                    cells.filter_map(|((_, estimate), readings)| Some((estimate.as_ref()?, &readings[..])));
+                lags.more(table.as_ref()?, cells, period)
+            })
+            .collect();
+        let Some((bus, most)) =
+            more.iter().enumerate().find_map(|(bus, more)| Some((bus, more.as_ref()?.most())))
+        else {
+            fitting(&now.estimates, &settings.sheet, disturbance)?;
+            much_shifted(skin, seen, &now.lags, disturbance)?;
+            return Ok((now, disturbance));
+        };
+        if round == SHIFTS {
+            return Err(shifted(skin, seen, (bus, most), disturbance));
+        }
+        lags = now.lags.into_iter().zip(more).map(|(before, more)| more.unwrap_or(before)).collect();
+    }
+    unreachable!("the last round returns")
+}
+
+fn shifted(
+    skin: &Skin,
+    seen: &Observations,
+    (bus, (place, lag)): (usize, (usize, f64)),
+    disturbance: Disturbance,
+) -> Refusal {
+    let gap = seen.buses.get(bus).and_then(|bus| bus.gaps.iter().find(|gap| gap.place == place));
+    let (at_s, ms) = (rounded(gap.map_or(0.0, |gap| gap.at_s), 3), rounded(lag * 1e3, 1));
+    Refusal::Shifted { bus: name(skin, bus), at_s, ms, disturbance }
+}
+
+/// Checks that shifts between stretches are a small part of the time: of many large ones each is known too badly.
+fn much_shifted(
+    skin: &Skin,
+    seen: &Observations,
+    lags: &[Lags],
+    disturbance: Disturbance,
+) -> Result<(), Refusal> {
+    for (bus, (lags, observed)) in lags.iter().zip(&seen.buses).enumerate() {
+        let length_s = real(observed.joints.len()) / skin.timing.broadcast_hz();
+        if lags.range() > MUCH_SHIFTED * length_s {
+            return Err(shifted(skin, seen, (bus, lags.most()), disturbance));
+        }
+    }
+    Ok(())
+}
+
+fn name(skin: &Skin, bus: usize) -> String {
+    skin.buses.get(bus).map_or_else(String::new, |bus| bus.name.clone())
+}
+
+/// Checks that the joints of a recording are those of the skin, at its rate.
+fn checked(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
+    for (bus, observed) in
+        seen.buses.iter().enumerate().filter(|(bus, _)| skin.cells_of(*bus).next().is_some())
+    {
+        if let Some(got) = observed.other_joints {
+            let joints = skin.chain(bus).joints.len();
+            return Err(Refusal::Joints { bus: name(skin, bus), got, joints });
+        }
+        let hz = skin.timing.broadcast_hz();
+        if let Some(got) =
+            observed.period_s().map(f64::recip).filter(|got| (got / hz - 1.0).abs() > OTHER_RATE)
+        {
+            return Err(Refusal::Rate { bus: name(skin, bus), got: rounded(got, 2), hz: rounded(hz, 2) });
+        }
+    }
+    Ok(())
+}
+
+/// Returns the disturbance of a recording, unless it leaves too little.
+fn disturbed(skin: &Skin, seen: &Observations, tables: &[Option<Table>]) -> Result<Disturbance, Refusal> {
+    let mut all = Disturbance::default();
+    for (bus, (observed, table)) in seen.buses.iter().zip(tables).enumerate() {
+        let Some(table) = table else { continue };
+        let disturbance = Disturbance::of(observed, table.known());
+        if table.known() < FEWEST {
+            return Err(Refusal::Disturbed { bus: name(skin, bus), disturbance });
+        }
+        all = all.and(disturbance);
+    }
+    Ok(all)
+}
+
+/// Checks that readings scatter as the data sheet says.
+fn fitting(
+    estimates: &[Option<Estimate>],
+    sheet: &DataSheet,
+    disturbance: Disturbance,
+) -> Result<(), Refusal> {
+    let middle = |pick: fn(&Estimate) -> f64| {
+        let mut all: Vec<_> = estimates.iter().flatten().map(pick).collect();
+        all.sort_by(f64::total_cmp);
+        all.get(all.len() / 2).copied().unwrap_or_default()
+    };
+    let times = middle(|estimate| estimate.noise_times).max(middle(|estimate| estimate.rough_times));
+    if times <= SCATTER {
+        return Ok(());
+    }
+    Err(Refusal::Scatter {
+        times: rounded(times, 1),
+        noise_mg: rounded(middle(|estimate| estimate.noise_g) * 1e3, 1),
+        sheet_mg: rounded(sheet.deviation() * 1e3, 1),
+        disturbance,
+    })
+}
+
+fn each_alone(skin: &Skin, seen: &Observations, settings: &Settings, lags: Vec<Lags>) -> Seen {
     let buses: Vec<_> = (0..skin.buses.len()).collect();
     let tables: Vec<_> = each(buses.len(), settings.threads, |bus| {
         let is_used = skin.cells_of(bus).next().is_some();
-        is_used.then(|| Table::new(skin, bus, seen, &settings.sheet, settings.gravity, &[0.0; MAX_JOINTS]))
+        let (sheet, gravity) = (&settings.sheet, settings.gravity);
+        lags.get(bus)
+            .filter(|_| is_used)
+            .map(|lags| Table::new(skin, bus, seen, sheet, gravity, &[0.0; MAX_JOINTS], lags))
     });
+    let ages = Ages::of(&settings.sheet, 1.0 / skin.timing.broadcast_hz());
     let estimates = each(skin.cells.len(), settings.threads, |index| {
         let cell = skin.cells.get(index)?;
         let table = tables.get(cell.bus)?.as_ref()?;
@@ -82,28 +259,9 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Calib
             rotation: own.rotation * rotation(cell.orientation, cell.normal),
             position: own.transform_point(&cell.position.into()).coords,
         };
-        estimate(table, readings, &guess, &settings.sheet)
+        estimate(table, readings, &guess, &settings.sheet, &ages)
     });
-    let mut cells: Vec<_> = skin
-        .cells
-        .iter()
-        .zip(&estimates)
-        .zip(&seen.cells)
-        .map(|((cell, estimate), readings)| {
-            let known = tables.get(cell.bus).and_then(Option::as_ref).map_or(0, Table::known);
-            result(skin, cell, estimate.as_ref(), readings, known)
-        })
-        .collect();
-    rough(&mut cells);
-    let wires = with_neighbors(skin, &mut cells, settings);
-    confused(skin, &mut cells);
-    advise(skin, &estimates, &mut cells, settings);
-    for (result, cell) in cells.iter_mut().zip(&skin.cells) {
-        result.settle(skin, cell, tables.get(cell.bus).and_then(Option::as_ref).map(|table| &table.arm));
-    }
-    let summary = Summary::of(&cells, wires);
-    let zero_offsets = settings.zero_offsets.then(|| zero_offsets(skin, seen, settings, &tables, &estimates));
-    Calibration { summary, cells, zero_offsets }
+    Seen { tables, lags, estimates }
 }
 
 /// Whether all readings are one value.
@@ -119,10 +277,9 @@ fn result(
     cell: &Cell,
     estimate: Option<&Estimate>,
     readings: &[Reading],
-    known: usize,
+    share: f64,
 ) -> CellResult {
     let mut result = CellResult::unknown(skin, cell, readings.len());
-    let share = real(readings.len()) / real(known).max(1.0);
     if readings.is_empty() {
         result.troubles.push(Trouble::Dead);
     } else if is_stuck(readings) {
@@ -137,10 +294,12 @@ fn result(
         return result;
     };
     let mirror = estimate.model.matrix;
-    result.sensor.bias_g = estimate.model.bias.into();
-    result.sensor.gain = mirror.diagonal().into();
-    result.sensor.noise_g = estimate.noise_g;
-    result.sensor.rough_g = estimate.rough_g;
+    result.sensor = SensorResult {
+        bias_g: Some(estimate.model.bias.into()),
+        gain: Some(mirror.diagonal().into()),
+        noise_g: Some(estimate.noise_g),
+        rough_g: Some(estimate.rough_g),
+    };
     if estimate.joint == 0 {
         result.troubles.push(Trouble::Still);
         return result;
@@ -158,14 +317,16 @@ fn result(
     result
 }
 
-/// Names cells whose readings scatter much more than those of most.
-fn rough(cells: &mut [CellResult]) {
-    let determined = cells.iter().filter(|cell| cell.pose.is_some());
-    let mut all: Vec<_> = determined.map(|cell| cell.sensor.rough_g).collect();
+/// Names cells whose readings scatter much more than those of most, and than the data sheet says.
+fn rough(cells: &mut [CellResult], estimates: &[Option<Estimate>]) {
+    let times = |(cell, estimate): (&CellResult, &Option<Estimate>)| {
+        cell.pose.as_ref().and(estimate.as_ref()).map(|estimate| estimate.rough_times)
+    };
+    let mut all: Vec<_> = cells.iter().zip(estimates).filter_map(times).collect();
     all.sort_by(f64::total_cmp);
     let Some(&most) = all.get(all.len() / 2) else { return };
-    for cell in cells.iter_mut().filter(|cell| cell.pose.is_some()) {
-        let times = cell.sensor.rough_g / most.max(1e-4);
+    for (cell, estimate) in cells.iter_mut().zip(estimates) {
+        let Some(times) = times((cell, estimate)).map(|times| times / most.max(1.0)) else { continue };
         if times > ROUGH {
             cell.troubles.push(Trouble::Loose { times: rounded(times, 1) });
         }

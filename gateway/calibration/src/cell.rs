@@ -34,7 +34,7 @@ pub(crate) const BIAS: Range<usize> = 6..9;
 pub(crate) const GAIN: Range<usize> = 9..12;
 /// What axes show of each other.
 const CROSS: Range<usize> = 12..18;
-const AGE: usize = 18;
+pub(crate) const AGE: usize = 18;
 
 /// Row and column of each of [`CROSS`].
 const OFF_DIAGONAL: [(usize, usize); 6] = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)];

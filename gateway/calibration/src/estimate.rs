@@ -4,9 +4,8 @@
 
 use nalgebra::{Cholesky, Matrix3, UnitQuaternion, Vector3};
 
-use crate::cell::{
-    CellModel, Coefficients, Information, Moment, POSITION, TURN, UNKNOWNS, Unknowns, expected,
-};
+use crate::cell::{AGE, CellModel, Coefficients, Information, Moment, POSITION, TURN, Unknowns, expected};
+use crate::lag::Lags;
 use crate::observe::Reading;
 use crate::sums::{Fit, Free, Sums, at_middle_age};
 use crate::table::Table;
@@ -20,12 +19,22 @@ const SHORTLIST: usize = 3;
 const ROUNDS: usize = 2;
 /// Residuals beyond this many standard deviations of a reading count less: [`weight`].
 const TOLERATED: f64 = 3.5;
-/// Broadcasts whose errors may depend on each other, about 0.5 s.
-const BATCH: u32 = 32;
+/// Broadcasts that are summed before their dependence on others is computed.
+const BATCH: u32 = 4;
+/// Batches whose ages may depend on each other, about 16 s.
+const BATCHES: u32 = 256;
+/// Clocks over which the dependence of ages is averaged.
+const CLOCKS: u32 = 101;
+/// The smallest number of readings for an estimate.
+const FEWEST: f64 = 100.0;
 /// The median of the squared length of three standard normal numbers.
 const MEDIAN_SQUARE: f64 = 2.366;
 /// What that is below, nine of ten times.
 const MOST_SQUARE: f64 = 6.251;
+/// Errors of readings from rounding and smoothing of joints, in g.
+const SMOOTHED_G: f64 = 1e-3;
+/// Standard deviation of a position along each axis from smoothed accelerations, in m.
+const SMOOTHED_M: f64 = 1e-4;
 
 /// What the readings of a cell say of it.
 #[derive(Clone, Debug)]
@@ -41,12 +50,18 @@ pub(crate) struct Estimate {
     pub(crate) noise_g: f64,
     /// The same, from what nine of ten residuals are below.
     pub(crate) rough_g: f64,
+    /// The first in units of what the data sheet says of each reading, by its noise and by how fast it changes.
+    pub(crate) noise_times: f64,
+    /// The second in these units.
+    pub(crate) rough_times: f64,
 }
 
 impl Estimate {
     /// Of the position, in m2.
     pub(crate) fn position_covariance(&self) -> Matrix3<f64> {
-        self.covariance.fixed_view::<3, 3>(POSITION.start, POSITION.start).into_owned()
+        let own: Matrix3<f64> =
+            self.covariance.fixed_view::<3, 3>(POSITION.start, POSITION.start).into_owned();
+        own + Matrix3::identity() * (SMOOTHED_M * SMOOTHED_M)
     }
 
     /// Of the turn in the frame of the cell, in rad2.
@@ -69,6 +84,7 @@ pub(crate) fn estimate(
     readings: &[Reading],
     guess: &Guess,
     sheet: &DataSheet,
+    ages: &Ages,
 ) -> Option<Estimate> {
     let expected = expected(sheet);
     // At the end of its range a sensor shows less than there is.
@@ -89,19 +105,20 @@ pub(crate) fn estimate(
                 coefficients.as_ref().map_or(1.0, |it| weight(&residual(it, moment, &reading.g), spread));
             sums.add(moment, &reading.g, weight);
         }
-        if sums.weight < f64::from(BATCH) {
+        if sums.weight < FEWEST {
             return None;
         }
         let from = fit.take().map_or_else(|| start.clone(), |fit| fit.model);
         let next = sums.fit(from, &expected, spread);
-        (spread, _) = spreads(link, readings, &next.model.coefficients());
+        [spread, _] = spreads(link, readings, &next.model, None);
         spread = spread.max(1e-10);
         fit = Some(next);
     }
     let model = fit?.model;
-    let (median, most) = spreads(link, readings, &model.coefficients());
-    let covariance = covariance(link, readings, &model, &sums, &expected, spread)?;
-    Some(Estimate { joint, margin, model, covariance, noise_g: median.sqrt(), rough_g: most.sqrt() })
+    let [noise_g, rough_g] = spreads(link, readings, &model, None).map(f64::sqrt);
+    let [noise_times, rough_times] = spreads(link, readings, &model, Some(sheet)).map(f64::sqrt);
+    let covariance = covariance(link, readings, &model, &sums, &expected, (spread, ages, &table.lags))?;
+    Some(Estimate { joint, margin, model, covariance, noise_g, rough_g, noise_times, rough_times })
 }
 
 /// The joint whose motion explains the readings best.
@@ -200,79 +217,137 @@ fn square(of: &[f64; 3]) -> f64 {
 }
 
 /// How much a reading counts: one that is further off than noise makes it counts less (Huber).
-fn weight(residual: &[f64; 3], variance: f64) -> f64 {
+pub(crate) fn weight(residual: &[f64; 3], variance: f64) -> f64 {
     let off = (square(residual) / variance).sqrt();
     if off <= TOLERATED { 1.0 } else { TOLERATED / off }
 }
 
 /// The variance of an axis' residuals, from the median of their squares and from what nine of ten are below: single
-/// readings that came late, or not as they were sent, spoil neither.
-fn spreads(link: &[Option<Moment>], readings: &[Reading], coefficients: &Coefficients) -> (f64, f64) {
-    let squares =
-        paired(link, readings).map(|(moment, reading)| square(&residual(coefficients, moment, &reading.g)));
+/// readings that came late, or not as they were sent, spoil neither. With a data sheet each is in units of what that
+/// says of it.
+fn spreads(
+    link: &[Option<Moment>],
+    readings: &[Reading],
+    model: &CellModel,
+    sheet: Option<&DataSheet>,
+) -> [f64; 2] {
+    let (coefficients, derivatives) = (model.coefficients(), model.derivatives());
+    let squares = paired(link, readings).map(|(moment, reading)| {
+        let own = square(&residual(&coefficients, moment, &reading.g));
+        own / sheet.map_or(1.0, |sheet| {
+            let aged = square(&change(&derivatives[AGE], moment)) * sheet.period_s().powi(2) / 12.0;
+            sheet.deviation().powi(2) + SMOOTHED_G * SMOOTHED_G + aged / 3.0
+        })
+    });
     let mut squares: Vec<_> = squares.collect();
     if squares.is_empty() {
-        return (0.0, 0.0);
+        return [0.0; 2];
     }
     let mut below = |part: usize, of: usize| {
         let place = squares.len() * part / of;
         let (_, square, _) = squares.select_nth_unstable_by(place, f64::total_cmp);
         *square
     };
-    (below(1, 2) / MEDIAN_SQUARE, below(9, 10) / MOST_SQUARE)
+    [below(1, 2) / MEDIAN_SQUARE, below(9, 10) / MOST_SQUARE]
 }
 
-/// The covariance of the unknowns. Errors of readings that are close in time depend on each other: clocks drift, and
-/// positions are smoothed. So their sums over half a second are what is compared with the information (a sandwich
-/// estimator), and not each by itself.
+/// The covariance of the unknowns: what noise makes of them, and what ages of readings make of them that change as a
+/// sensor's clock drifts against the broadcasts. Such ages depend on each other over seconds, so that noise alone says
+/// too little.
 fn covariance(
     link: &[Option<Moment>],
     readings: &[Reading],
     model: &CellModel,
     sums: &Sums,
     expected: &Unknowns,
-    variance: f64,
+    (variance, ages, lags): (f64, &Ages, &Lags),
 ) -> Option<Information> {
     let (information, _) = sums.information(model);
-    let prior = Information::from_diagonal(expected);
-    let inverse = Cholesky::new(information / variance + prior)?.inverse();
+    let information = information / variance;
+    let inverse = Cholesky::new(information + Information::from_diagonal(expected))?.inverse();
     let (coefficients, derivatives) = (model.coefficients(), model.derivatives());
-    let mut scores = Information::zeros();
-    let mut batches = 0_u32;
-    let mut batch = None;
+    let mut scores: Vec<(u32, Unknowns)> = Vec::new();
     let mut sum = Coefficients::zeros();
-    let mut close = |sum: &mut Coefficients| {
-        let score = Unknowns::from_fn(|unknown, _| {
-            derivatives.get(unknown).map_or(0.0, |derivative| derivative.dot(sum))
-        });
-        scores.ger(1.0, &score, &score, 1.0);
-        batches += 1;
+    let mut batch = None;
+    let mut close = |batch: Option<u32>, sum: &mut Coefficients| {
+        let Some(batch) = batch else { return };
+        scores.push((batch, Unknowns::from_fn(|unknown, _| derivatives[unknown].dot(sum))));
         sum.fill(0.0);
     };
     for (moment, reading) in paired(link, readings) {
-        if batch.is_some_and(|batch| batch != reading.epoch / BATCH) {
-            close(&mut sum);
+        let now = reading.epoch / BATCH;
+        if batch != Some(now) {
+            close(batch, &mut sum);
         }
-        batch = Some(reading.epoch / BATCH);
-        let left = residual(&coefficients, moment, &reading.g);
-        let weight = weight(&left, variance) / variance;
-        for (column, left) in sum.as_mut_slice().chunks_exact_mut(moment.len()).zip(left) {
-            column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += weight * left * number);
+        batch = Some(now);
+        let weight = weight(&residual(&coefficients, moment, &reading.g), variance) / variance;
+        let change = change(&derivatives[AGE], moment);
+        for (column, change) in sum.as_mut_slice().chunks_exact_mut(moment.len()).zip(change) {
+            column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += weight * change * number);
         }
     }
-    close(&mut sum);
-    let batches = f64::from(batches);
-    let unknowns = count(UNKNOWNS);
-    // With few batches their scatter says nothing.
-    let meat = if batches > 3.0 * unknowns {
-        scores * (batches / (batches - unknowns))
-    } else {
-        information / variance
-    };
-    Some(inverse * (meat + prior) * inverse)
+    close(batch, &mut sum);
+    let mut scatter = information + Information::from_diagonal(expected);
+    for (at, (batch, score)) in scores.iter().enumerate() {
+        let near = scores[at..].iter().take_while(|(other, _)| other - batch < BATCHES);
+        for (other, beside) in near {
+            let share = ages.covariance(other - batch);
+            scatter.ger(share, score, beside, 1.0);
+            if other != batch {
+                scatter.ger(share, beside, score, 1.0);
+            }
+        }
+    }
+    // A lag that was estimated of a stretch is off for all of it.
+    let mut by_stretch = vec![Unknowns::zeros(); lags.deviations().len()];
+    for (batch, score) in &scores {
+        let index = usize::try_from(batch * BATCH).unwrap_or(usize::MAX);
+        by_stretch.get_mut(lags.stretch(index)).into_iter().for_each(|sum| *sum += score);
+    }
+    for (score, deviation) in by_stretch.iter().zip(lags.deviations()) {
+        scatter.ger(deviation * deviation, score, score, 1.0);
+    }
+    Some(inverse * scatter * inverse)
 }
 
-#[expect(clippy::cast_precision_loss, reason = "counts of readings")]
-const fn count(of: usize) -> f64 {
-    of as f64
+/// Returns the change of each axis' reading with its age, in g/s.
+pub(crate) fn change(by_age: &Coefficients, moment: &Moment) -> [f64; 3] {
+    let mut all = [0.0; 3];
+    for (change, column) in all.iter_mut().zip(by_age.column_iter()) {
+        *change = column.iter().zip(moment).map(|(one, other)| one * other).sum();
+    }
+    all
+}
+
+/// Covariance of the ages of readings: samples come at the rate of a clock that is off by an unknown part, so
+/// that the age of the newest one runs through a period again and again.
+#[derive(Clone, Debug)]
+pub(crate) struct Ages {
+    /// By distance in batches, in s2.
+    covariance: Vec<f64>,
+}
+
+impl Ages {
+    /// Those of sensors that are read with broadcasts so far apart.
+    pub(crate) fn of(sheet: &DataSheet, broadcast_s: f64) -> Self {
+        let period = sheet.period_s();
+        if period <= 0.0 {
+            return Self { covariance: Vec::new() };
+        }
+        let covariance = (0..BATCHES).map(|distance| {
+            let mut sum = 0.0;
+            for clock in 0..CLOCKS {
+                let off = sheet.rate_error * ((2.0 * f64::from(clock) + 1.0) / f64::from(CLOCKS) - 1.0);
+                let periods = broadcast_s * f64::from(distance * BATCH) * sheet.rate_hz * (1.0 + off);
+                let part = periods.rem_euclid(1.0);
+                sum += 1.0 / 12.0 - part * (1.0 - part) / 2.0;
+            }
+            period * period * sum / f64::from(CLOCKS)
+        });
+        Self { covariance: covariance.collect() }
+    }
+
+    fn covariance(&self, distance: u32) -> f64 {
+        usize::try_from(distance).ok().and_then(|at| self.covariance.get(at)).copied().unwrap_or_default()
+    }
 }

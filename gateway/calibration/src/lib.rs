@@ -10,6 +10,7 @@
 //! | [`simulate`] | a skin of accelerometers in virtual time |
 //! | [`observe`] | what is kept of the messages of a bus |
 //! | [`mod@calibrate`] | the estimate of every cell, and which of them to distrust |
+//! | [`refusal`] | why a recording says nothing that can be trusted |
 //! | [`zero`] | zero offsets of the robot's joints |
 //! | [`help`] | which motion would tell what was not determined |
 //! | [`neighbors`] | positions made better by the distance of neighbours |
@@ -20,10 +21,12 @@ mod cell;
 mod each;
 mod estimate;
 pub mod help;
+mod lag;
 pub mod motion;
 pub mod neighbors;
 pub mod observe;
 pub mod plan;
+pub mod refusal;
 pub mod result;
 pub mod simulate;
 mod smooth;
@@ -33,4 +36,5 @@ pub mod write;
 pub mod zero;
 
 pub use calibrate::{Settings, calibrate};
+pub use refusal::Refusal;
 pub use result::Calibration;

@@ -1,4 +1,8 @@
 //! What a calibration is made from: the positions of the joints at each broadcast, and what each cell showed then.
+//!
+//! Speeds and accelerations follow from positions at regular times. So the time of each broadcast is compared with that
+//! of the one before: where a control loop skipped ticks, or frames are missing, a place without positions is left, and
+//! no polynomial is fitted across it.
 
 use model::central::Central;
 use protocol::fixed::Q;
@@ -7,9 +11,16 @@ use protocol::message::{Message, SensorPage};
 use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, RowKind};
 use protocol::skin::Skin;
+use protocol::time::Micros;
 
 /// Readings at this value are at the end of their word.
 const FULL: i16 = i16::MAX - 8;
+/// The part of a period by which a broadcast may be early or late, as its frame was received.
+const JITTER: f64 = 0.25;
+/// Broadcasts over which the period is measured.
+const SPAN: usize = 8;
+/// Broadcasts that a reading may come after its own.
+const LATEST: u32 = 100;
 
 /// What all buses of a skin carried.
 #[derive(Clone, Debug)]
@@ -23,12 +34,35 @@ pub struct Observations {
 /// The joints of one bus.
 #[derive(Clone, Debug)]
 pub struct BusObservations {
-    /// By broadcast, the positions in rad or m; `None` for one that is missing.
+    /// By broadcast, the positions in rad or m; `None` for one that is missing, and where times are not regular.
     pub joints: Vec<Option<[f64; MAX_JOINTS]>>,
+    /// Places at which the next broadcast was not in its time, in the order of time.
+    pub gaps: Vec<Gap>,
+    /// Joints that the frames carry, where these are not those of the chain.
+    pub(crate) other_joints: Option<u8>,
     reference: Central,
     revolute: Vec<bool>,
     nodes: Vec<Option<usize>>,
-    last: Option<Epoch>,
+    /// By number of an epoch, the newest broadcast with it.
+    epochs: Vec<Option<u32>>,
+    /// The times of broadcasts that follow each other.
+    times: Vec<Micros>,
+    /// Durations of [`SPAN`] periods, in us.
+    spans: Vec<u64>,
+    period_us: f64,
+    first: Option<Micros>,
+    last: Option<(Epoch, Micros)>,
+}
+
+/// A place at which a broadcast was not in its time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Gap {
+    /// The time of the broadcast before it, in s since the first one.
+    pub at_s: f64,
+    /// The time to the next one, in ms.
+    pub took_ms: f64,
+    /// The place without positions, as an index into [`BusObservations::joints`].
+    pub(crate) place: usize,
 }
 
 /// What a cell showed.
@@ -54,23 +88,33 @@ impl Observations {
             let rows = skin.chain(bus).rows.iter().map(|row| row.kind);
             BusObservations {
                 joints: Vec::new(),
+                gaps: Vec::new(),
+                other_joints: None,
                 reference: Central::unquantised(&skin.part_on(bus)),
                 revolute: rows
                     .filter(|kind| *kind != RowKind::Fixed)
                     .map(|kind| kind == RowKind::Revolute)
                     .collect(),
                 nodes,
+                epochs: vec![None; 256],
+                times: Vec::new(),
+                spans: Vec::new(),
+                period_us: 1e6 / skin.timing.broadcast_hz(),
+                first: None,
                 last: None,
             }
         };
         Self { buses: (0..skin.buses.len()).map(bus).collect(), cells: vec![Vec::new(); skin.cells.len()] }
     }
 
-    /// Takes the next message of a bus, given as an index into [`Skin::buses`], in the order of time.
-    pub fn take(&mut self, bus: usize, message: &Message) {
+    /// Takes the next message of a bus, given as an index into [`Skin::buses`], with the time at which it was on the bus.
+    pub fn take(&mut self, bus: usize, at: Micros, message: &Message) {
         let Some(bus) = self.buses.get_mut(bus) else { return };
         if let Message::Joints { epoch, joints } = message {
-            bus.broadcast(*epoch, &joints.positions);
+            if usize::from(joints.in_use) != bus.revolute.len() {
+                bus.other_joints = Some(joints.in_use);
+            }
+            bus.broadcast(*epoch, at, &joints.positions);
         } else if let Message::Sensors { from, epoch, page: SensorPage::Acceleration(words) } = message {
             let cell = bus.nodes.get(usize::from(from.get())).copied().flatten();
             let cell = cell.and_then(|cell| self.cells.get_mut(cell));
@@ -86,13 +130,26 @@ impl Observations {
 }
 
 impl BusObservations {
-    fn broadcast(&mut self, epoch: Epoch, words: &[protocol::fixed::Q1_14]) {
-        let steps = self.last.map_or(1, |last| epoch.since(last));
-        if steps < 1 {
-            // The same one again, or an old one.
-            return;
+    fn broadcast(&mut self, epoch: Epoch, at: Micros, words: &[protocol::fixed::Q1_14]) {
+        if let Some((last, before)) = self.last {
+            let periods = real(at.0.saturating_sub(before.0)) / self.period_us;
+            let steps = epoch.since(last);
+            // Numbers of epochs repeat after 256 of them.
+            if steps < 1 && periods < f64::from(LATEST) {
+                // The same one again, or an old one.
+                return;
+            }
+            let is_regular = steps >= 1 && (periods - f64::from(steps)).abs() <= JITTER;
+            if is_regular {
+                self.joints.extend((1..steps).map(|_| None));
+                self.follow(at, steps == 1);
+            } else {
+                let (at_s, took_ms) = (self.seconds(before), periods * self.period_us * 1e-3);
+                self.gaps.push(Gap { at_s, took_ms, place: self.joints.len() });
+                self.joints.push(None);
+                self.follow(at, false);
+            }
         }
-        self.joints.extend((1..steps).map(|_| None));
         let mut positions = self.reference.positions(words);
         // Words of angles wrap around at half a turn; joints do not.
         if let Some(before) = self.joints.iter().rev().find_map(Option::as_ref) {
@@ -103,13 +160,48 @@ impl BusObservations {
                 }
             }
         }
+        if let (Some(place), Ok(index)) =
+            (self.epochs.get_mut(usize::from(epoch.0)), u32::try_from(self.joints.len()))
+        {
+            *place = Some(index);
+        }
         self.joints.push(Some(positions));
-        self.last = Some(epoch);
+        self.first.get_or_insert(at);
+        self.last = Some((epoch, at));
+    }
+
+    /// Measures the period over broadcasts that follow each other.
+    fn follow(&mut self, at: Micros, is_next: bool) {
+        if !is_next {
+            self.times.clear();
+        }
+        self.times.push(at);
+        let before = self.times.len().checked_sub(SPAN + 1).and_then(|index| self.times.get(index));
+        self.spans.extend(before.map(|before| at.0.saturating_sub(before.0)));
+    }
+
+    /// The period of broadcasts as it was on the bus, in s; `None` if too few followed each other.
+    pub(crate) fn period_s(&self) -> Option<f64> {
+        let mut spans = self.spans.clone();
+        spans.sort_unstable();
+        let middle = spans.get(spans.len() / 2)?;
+        Some(real(*middle) * 1e-6 / f64::from(u8::try_from(SPAN).unwrap_or(1)))
+    }
+
+    /// The time of the first broadcast to another one, in s.
+    fn seconds(&self, at: Micros) -> f64 {
+        real(at.0.saturating_sub(self.first.map_or(at.0, |first| first.0))) * 1e-6
     }
 
     /// Which broadcast an epoch is: the newest one with this number.
     fn index_of(&self, epoch: Epoch) -> Option<u32> {
-        let age = usize::try_from(self.last?.since(epoch)).ok()?;
-        u32::try_from(self.joints.len().checked_sub(1 + age)?).ok()
+        let index = self.epochs.get(usize::from(epoch.0)).copied().flatten()?;
+        let last = u32::try_from(self.joints.len()).ok()?;
+        (last - index <= LATEST).then_some(index)
     }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
+const fn real(us: u64) -> f64 {
+    us as f64
 }

@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use crate::calibrate::rounded;
 use crate::help::Help;
+use crate::refusal::Disturbance;
 use crate::zero::ZeroOffset;
 use model::accelerometer::kinematics::Arm;
 
@@ -30,12 +31,14 @@ pub struct Summary {
     pub determined: usize,
     /// Of these, to be distrusted.
     pub troubled: usize,
-    /// Median of what positions are certain within, 95 of 100 times, in mm.
-    pub position_mm: f64,
+    /// Median of what positions are certain within, 95 of 100 times, in mm; `None` without a pose that can be used.
+    pub position_mm: Option<f64>,
     /// The same of orientations, in degrees.
-    pub orientation_deg: f64,
+    pub orientation_deg: Option<f64>,
     /// Median of what readings scatter, in mg.
-    pub noise_mg: f64,
+    pub noise_mg: Option<f64>,
+    /// Gaps in the broadcasts of joints.
+    pub joints: Disturbance,
     /// Wires whose length made positions better.
     pub wires: usize,
 }
@@ -64,17 +67,17 @@ pub struct CellResult {
     pub pose: Option<Pose>,
 }
 
-/// What was found of an accelerometer.
+/// An accelerometer as it was found; `None` for one that was not estimated.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct SensorResult {
     /// What each axis shows without a force, in g.
-    pub bias_g: [f64; 3],
+    pub bias_g: Option<[f64; 3]>,
     /// What each axis shows of a force along it.
-    pub gain: [f64; 3],
+    pub gain: Option<[f64; 3]>,
     /// How much a reading of an axis scatters, in g, from the median.
-    pub noise_g: f64,
+    pub noise_g: Option<f64>,
     /// The same from what nine of ten readings are below.
-    pub rough_g: f64,
+    pub rough_g: Option<f64>,
 }
 
 /// Where a cell was found: what a skin file has.
@@ -177,7 +180,7 @@ impl core::fmt::Display for Trouble {
             Self::Loose { times } => {
                 write!(
                     f,
-                    "loose or damaged: its readings scatter {times} times as much as those of most cells"
+                    "loose or damaged: its readings scatter {times} times as much as those of most cells; its description is kept"
                 )
             }
             Self::Swapped { node } => {
@@ -216,6 +219,7 @@ impl CellResult {
                     | Trouble::Stuck
                     | Trouble::Still
                     | Trouble::Joint { .. }
+                    | Trouble::Loose { .. }
                     | Trouble::NotObservable { .. }
             )
         };
@@ -225,7 +229,16 @@ impl CellResult {
     /// The pose as a skin file has it: in the frame of the row that carries the cell by its description, if that is of
     /// the same joint.
     pub(crate) fn settle(&mut self, skin: &Skin, cell: &Cell, arm: Option<&Arm>) {
+        let sensor = &mut self.sensor;
+        sensor.bias_g = sensor.bias_g.map(|bias| bias.map(|it| rounded(it, 5)));
+        sensor.gain = sensor.gain.map(|gain| gain.map(|it| rounded(it, 5)));
+        (sensor.noise_g, sensor.rough_g) =
+            (sensor.noise_g.map(|it| rounded(it, 5)), sensor.rough_g.map(|it| rounded(it, 5)));
         let (Some(pose), Some(arm)) = (&self.pose, arm) else { return };
+        if self.troubles.iter().any(|trouble| matches!(trouble, Trouble::Loose { .. })) {
+            // How far its pose is certain follows from noise, which its readings are not.
+            return;
+        }
         let own = skin.chain(cell.bus).row_of(pose.joint).unwrap_or_default();
         let row = if cell.joint == pose.joint { cell.row } else { own };
         let change = arm.between(own, row);
@@ -246,10 +259,6 @@ impl CellResult {
             moved_mm: same_link.then(|| rounded(way * 1e3, 2)),
             turned_deg: same_link.then(|| rounded(turn.to_degrees(), 2)),
         });
-        let sensor = &mut self.sensor;
-        sensor.bias_g = sensor.bias_g.map(|it| rounded(it, 5));
-        sensor.gain = sensor.gain.map(|it| rounded(it, 5));
-        (sensor.noise_g, sensor.rough_g) = (rounded(sensor.noise_g, 5), rounded(sensor.rough_g, 5));
     }
 }
 
@@ -281,11 +290,11 @@ fn radius_95(covariance: &Matrix3<f64>) -> f64 {
 }
 
 impl Summary {
-    pub(crate) fn of(cells: &[CellResult], wires: usize) -> Self {
+    pub(crate) fn of(cells: &[CellResult], wires: usize, joints: Disturbance) -> Self {
         let median = |pick: &dyn Fn(&CellResult) -> Option<f64>| {
             let mut all: Vec<_> = cells.iter().filter(|cell| cell.is_written()).filter_map(pick).collect();
             all.sort_by(f64::total_cmp);
-            all.get(all.len() / 2).copied().unwrap_or_default()
+            all.get(all.len() / 2).copied()
         };
         Self {
             cells: cells.len(),
@@ -293,7 +302,8 @@ impl Summary {
             troubled: cells.iter().filter(|cell| !cell.troubles.is_empty()).count(),
             position_mm: median(&|cell| Some(cell.found?.position_mm)),
             orientation_deg: median(&|cell| Some(cell.found?.orientation_deg)),
-            noise_mg: rounded(median(&|cell| Some(cell.sensor.noise_g * 1e3)), 2),
+            noise_mg: median(&|cell| cell.sensor.noise_g).map(|noise| rounded(noise * 1e3, 2)),
+            joints,
             wires,
         }
     }

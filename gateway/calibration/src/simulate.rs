@@ -7,6 +7,7 @@ use protocol::message::{Joints, Message, SensorPage};
 use protocol::packet::Epoch;
 use protocol::parameters::{MAX_JOINTS, RowKind};
 use protocol::skin::Skin;
+use protocol::time::Micros;
 
 use crate::motion::Motion;
 use crate::observe::Observations;
@@ -37,6 +38,7 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
     let mut epoch = Epoch::default();
     while index < epochs {
         let now = index * period;
+        let at = micros(now);
         let state = motion.at(now);
         for bus in 0..skin.buses.len() {
             let chain = skin.chain(bus);
@@ -50,7 +52,7 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
                 };
             }
             let in_use = u8::try_from(chain.joints.len()).unwrap_or_default();
-            seen.take(bus, &Message::Joints { epoch, joints: Joints { positions, in_use } });
+            seen.take(bus, at, &Message::Joints { epoch, joints: Joints { positions, in_use } });
         }
         let tilt = |cell: usize, force: &Vector3<f64>| match defects.get(cell) {
             // It rests on one side or on the other, as gravity pulls it.
@@ -61,8 +63,8 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
             _ => *force,
         };
         let shown: Vec<_> = sensors.readings(skin, |time| motion.at(time), now, tilt).collect();
-        for ((at, cell), shown) in skin.cells.iter().enumerate().zip(shown) {
-            let shown = match defects.get(at) {
+        for ((number, cell), shown) in skin.cells.iter().enumerate().zip(shown) {
+            let shown = match defects.get(number) {
                 Some(Defect::Dead) => continue,
                 Some(Defect::Silent(part)) if (index * 0.618_034).fract() >= *part => continue,
                 Some(Defect::Stuck) => Vector3::new(0.0, 0.0, 1.0),
@@ -70,10 +72,20 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
             };
             let words: [f64; 3] = shown.into();
             let page = SensorPage::Acceleration(words.map(Q::nearest));
-            seen.take(cell.bus, &Message::Sensors { from: cell.node, epoch, page });
+            seen.take(cell.bus, at, &Message::Sensors { from: cell.node, epoch, page });
         }
         epoch = epoch.next();
         index += 1.0;
     }
     seen
+}
+
+/// A time in s as frames are stamped.
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "not negative, and below 2^53 us"
+)]
+fn micros(seconds: f64) -> Micros {
+    Micros((seconds * 1e6).round() as u64)
 }

@@ -15,6 +15,11 @@ const WINDOW: usize = 2 * HALF + 1;
 /// Coefficients of the polynomial.
 const TERMS: usize = 7;
 
+/// A step of a position in rad as broadcasts carry it.
+pub(crate) const STEP_RAD: f64 = core::f64::consts::TAU / 65_536.0;
+/// A step of a position in m.
+pub(crate) const STEP_M: f64 = 1.0 / 16_384.0;
+
 /// Positions of the joints of a chain at one broadcast.
 pub(crate) type Positions = [f64; MAX_JOINTS];
 
@@ -23,6 +28,8 @@ pub(crate) type Positions = [f64; MAX_JOINTS];
 pub(crate) struct Smoother {
     /// From positions in a window to coefficients, in units of [`HALF`] periods.
     fit: SMatrix<f64, TERMS, WINDOW>,
+    /// From positions in a window to what the polynomial leaves of them.
+    left: SMatrix<f64, WINDOW, WINDOW>,
     /// Half a window, in s.
     half_s: f64,
 }
@@ -38,7 +45,26 @@ impl Smoother {
         let normal = powers.tr_mul(&powers);
         // Distinct times and fewer terms than times: it has an inverse.
         let fit = normal.try_inverse().map_or_else(SMatrix::zeros, |inverse| inverse * powers.transpose());
-        Self { fit, half_s: period_s * real(HALF) }
+        let left = SMatrix::identity() - powers * fit;
+        Self { fit, left, half_s: period_s * real(HALF) }
+    }
+
+    /// Returns the distance of each of the first `joints` in a window from any smooth motion, root mean square;
+    /// `None` where the window is incomplete.
+    #[must_use]
+    pub(crate) fn roughness(&self, window: &[Option<Positions>], joints: usize) -> Option<Positions> {
+        let middle = window.get(HALF)?.as_ref().filter(|_| window.len() == WINDOW)?;
+        let mut roughness = [0.0; MAX_JOINTS];
+        for (joint, (rough, middle)) in roughness.iter_mut().zip(middle).take(joints).enumerate() {
+            let mut series = SVector::<f64, WINDOW>::zeros();
+            for (value, positions) in series.iter_mut().zip(window) {
+                *value = positions.as_ref()?.get(joint)? - middle;
+            }
+            if series.amax() > 0.0 {
+                *rough = (self.left * series).norm() / real(WINDOW).sqrt();
+            }
+        }
+        Some(roughness)
     }
 
     /// How the first `joints` move `earlier_s` before the middle of a window of positions; `None` where the window is
@@ -148,5 +174,24 @@ mod tests {
         window[3] = None;
         assert!(smoother.state(&window, 2, 0.0).is_none());
         assert!(smoother.state(&window[1..], 2, 0.0).is_none());
+        assert!(smoother.roughness(&window, 2).is_none());
+    }
+
+    #[test]
+    fn one_position_that_lags_is_rough_and_rounding_is_not() {
+        let (smoother, step) = (Smoother::new(0.016), STEP_RAD);
+        let position = |at: usize| 0.12 * (TAU * 0.016 * at as f64).sin();
+        let words: Vec<_> =
+            (0..400).map(|at| Some([(position(at) / step).round() * step; MAX_JOINTS])).collect();
+        for window in words.windows(WINDOW) {
+            assert!(smoother.roughness(window, 1).unwrap()[0] < step / 2.0);
+        }
+        let mut late = words[100..100 + WINDOW].to_vec();
+        for place in 0..WINDOW {
+            let before = late[place];
+            late[place].as_mut().unwrap()[0] -= 10.0 * step;
+            assert!(smoother.roughness(&late, 1).unwrap()[0] > 0.6 * step, "{place}");
+            late[place] = before;
+        }
     }
 }

@@ -1,11 +1,12 @@
 //! The motion of each link of a chain at each broadcast, as numbers for least squares.
 
-use protocol::parameters::MAX_JOINTS;
-use protocol::skin::Skin;
+use protocol::parameters::{MAX_JOINTS, RowKind};
+use protocol::skin::{Chain, Skin};
 
 use crate::cell::{AGE_STEP, AGES, MOMENT, Moment, numbers};
-use crate::observe::Observations;
-use crate::smooth::{HALF, Smoother};
+use crate::lag::Lags;
+use crate::observe::{BusObservations, Observations, Reading};
+use crate::smooth::{HALF, Positions, STEP_M, STEP_RAD, Smoother};
 use model::accelerometer::kinematics::Arm;
 use model::accelerometer::sensor::DataSheet;
 
@@ -13,12 +14,37 @@ use model::accelerometer::sensor::DataSheet;
 #[derive(Debug)]
 pub(crate) struct Table {
     pub(crate) arm: Arm,
+    /// Ages of readings against their joints.
+    pub(crate) lags: Lags,
     /// By joint, from the base, which is 0; then by broadcast. `None` where positions around it are missing.
     links: Vec<Vec<Option<Moment>>>,
 }
 
+/// Windows are left out in which a joint is rougher than this many times what rounding makes at most.
+const ROUGH: f64 = 1.1;
+/// The limit in units of the median window: the positions of real joints scatter.
+const ROUGHER: f64 = 4.0;
+
+/// Periods that differ by less than this part are one.
+const EQUAL: f64 = 5e-4;
+
+/// Returns the largest roughness of a smooth motion, by joint.
+fn limits(chain: &Chain, roughness: &[Option<Positions>]) -> Positions {
+    let mut limits = [f64::INFINITY; MAX_JOINTS];
+    let kinds = chain.rows.iter().map(|row| row.kind).filter(|kind| *kind != RowKind::Fixed);
+    for (joint, (limit, kind)) in limits.iter_mut().zip(kinds).enumerate() {
+        let step = if kind == RowKind::Prismatic { STEP_M } else { STEP_RAD };
+        let of_joint = roughness.iter().flatten().filter_map(|all| all.get(joint).copied());
+        let mut all: Vec<_> = of_joint.collect();
+        all.sort_by(f64::total_cmp);
+        let most = all.get(all.len() / 2).copied().unwrap_or_default();
+        *limit = (ROUGH * step / 2.0).max(ROUGHER * most);
+    }
+    limits
+}
+
 impl Table {
-    /// `offsets` are added to the positions of joints.
+    /// `offsets` are added to the positions of joints; readings are as much older than their joints as `lags` says.
     pub(crate) fn new(
         skin: &Skin,
         bus: usize,
@@ -26,18 +52,40 @@ impl Table {
         sheet: &DataSheet,
         gravity: [f64; 3],
         offsets: &[f64; MAX_JOINTS],
+        lags: &Lags,
     ) -> Self {
         let arm = Arm::new(skin, bus, gravity);
         let chain = skin.chain(bus);
-        let smoother = Smoother::new(1.0 / skin.timing.broadcast_hz());
+        let observed = seen.buses.get(bus);
+        let nominal = 1.0 / skin.timing.broadcast_hz();
+        let period = observed.and_then(BusObservations::period_s).unwrap_or(nominal);
+        // Stamps are no better than the clock that a loop follows.
+        let period = if (period / nominal - 1.0).abs() < EQUAL { nominal } else { period };
+        let smoother = Smoother::new(period);
         let (middle, _) = sheet.age();
         let joints = chain.joints.len();
         let last = u8::try_from(joints).unwrap_or_default();
         let rows: Vec<_> =
             (0..=last).map(|joint| usize::from(chain.row_of(joint).unwrap_or_default())).collect();
-        let series = seen.buses.get(bus).map_or(&[][..], |bus| &bus.joints);
+        let series = observed.map_or(&[][..], |bus| &bus.joints);
         let mut links = vec![vec![None; series.len()]; rows.len()];
-        for (index, window) in series.windows(2 * HALF + 1).enumerate() {
+        let roughness: Vec<_> =
+            series.windows(2 * HALF + 1).map(|window| smoother.roughness(window, joints)).collect();
+        let limits = limits(chain, &roughness);
+        let is_smooth =
+            |roughness: &Positions| !roughness.iter().zip(&limits).any(|(rough, limit)| rough > limit);
+        for index in 0..series.len() {
+            // The window around the time of the reading, which may be that of other joints than those it came after.
+            let lag = lags.at(index);
+            let periods = (lag / period).round();
+            let Some(first) =
+                (0..roughness.len()).nth(index.wrapping_sub(HALF).wrapping_add_signed(-whole(periods)))
+            else {
+                continue;
+            };
+            let known = roughness.get(first).copied().flatten().is_some_and(|it| is_smooth(&it));
+            let (Some(window), true) = (series.get(first..=first + 2 * HALF), known) else { continue };
+            let middle = middle + lag - periods * period;
             let mut moments = vec![[1.0; MOMENT]; rows.len()];
             let mut complete = true;
             for (at, age) in [-AGE_STEP, 0.0, AGE_STEP].into_iter().enumerate() {
@@ -55,14 +103,20 @@ impl Table {
             }
             if complete {
                 for (link, moment) in links.iter_mut().zip(moments) {
-                    if let Some(place) = link.get_mut(index + HALF) {
+                    if let Some(place) = link.get_mut(index) {
                         *place = Some(moment);
                     }
                 }
             }
         }
         debug_assert_eq!(AGES, 3, "as many as the loop above has");
-        Self { arm, links }
+        Self { arm, lags: lags.clone(), links }
+    }
+
+    /// Which broadcasts have a motion.
+    pub(crate) fn is_known(&self, reading: &Reading) -> bool {
+        let index = usize::try_from(reading.epoch).unwrap_or(usize::MAX);
+        self.link(0).get(index).is_some_and(Option::is_some)
     }
 
     /// Joints of the chain.
@@ -79,4 +133,10 @@ impl Table {
     pub(crate) fn known(&self) -> usize {
         self.link(0).iter().flatten().count()
     }
+}
+
+/// A small number of periods.
+#[expect(clippy::cast_possible_truncation, reason = "casts to integers saturate")]
+const fn whole(periods: f64) -> isize {
+    periods as isize
 }

@@ -15,6 +15,7 @@ use crate::calibrate::{Settings, rounded};
 use crate::cell::{Information, MOMENT, UNKNOWNS, Unknowns, expected};
 use crate::each::each;
 use crate::estimate::{Estimate, paired, residual};
+use crate::lag::Lags;
 use crate::observe::{Observations, Reading};
 use crate::table::Table;
 
@@ -66,21 +67,21 @@ pub(crate) fn zero_offsets(
     skin: &Skin,
     seen: &Observations,
     settings: &Settings,
-    tables: &[Option<Table>],
+    (tables, lags): (&[Option<Table>], &[Lags]),
     estimates: &[Option<Estimate>],
 ) -> Vec<ZeroOffset> {
     let size = skin.robot.joints.len();
     let mut information = DMatrix::<f64>::identity(size, size) / (SUPPOSED * SUPPOSED);
     let mut gradient = DVector::<f64>::zeros(size);
     for (bus, table) in tables.iter().enumerate() {
-        let Some(table) = table else { continue };
+        let (Some(table), Some(lags)) = (table, lags.get(bus)) else { continue };
         let joints = &skin.chain(bus).joints;
         let moved: Vec<_> = each(joints.len(), settings.threads, |joint| {
             let mut offsets = [0.0; MAX_JOINTS];
             if let Some(offset) = offsets.get_mut(joint) {
                 *offset = STEP;
             }
-            Table::new(skin, bus, seen, &settings.sheet, settings.gravity, &offsets)
+            Table::new(skin, bus, seen, &settings.sheet, settings.gravity, &offsets, lags)
         });
         let left = each(skin.cells.len(), settings.threads, |index| {
             let (cell, estimate) = (skin.cells.get(index)?, estimates.get(index)?.as_ref()?);

@@ -116,10 +116,16 @@ impl DataSheet {
         step_g: 0.0,
     };
 
+    /// The time from one sample to the next, in s; 0 where samples are taken when they are read.
+    #[must_use]
+    pub fn period_s(&self) -> f64 {
+        if self.rate_hz > 0.0 { self.rate_hz.recip() } else { 0.0 }
+    }
+
     /// Mean and standard deviation of the age of a reading, in s.
     #[must_use]
     pub fn age(&self) -> (f64, f64) {
-        let period = if self.rate_hz > 0.0 { 1.0 / self.rate_hz } else { 0.0 };
+        let period = self.period_s();
         ((self.delay_s + period) / 2.0, self.delay_s.hypot(period) / 12.0_f64.sqrt())
     }
 

@@ -1,0 +1,143 @@
+//! Why a recording says nothing that can be trusted.
+
+use serde::Serialize;
+use thiserror::Error;
+
+use crate::calibrate::rounded;
+use crate::observe::{BusObservations, Gap};
+
+/// Gaps in the broadcasts of a recording.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Disturbance {
+    /// Broadcasts, in time or not.
+    pub broadcasts: usize,
+    /// Broadcasts whose motion is unknown, and whose readings are left out: around gaps and where positions are
+    /// those of no smooth motion; the first and the last ones of a recording are always left out.
+    pub left_out: usize,
+    /// Times that the next broadcast did not come when it was due.
+    pub gaps: usize,
+    /// The longest of these, in ms; `None` without any.
+    pub longest_ms: Option<f64>,
+    /// The begin of that, in s since the first broadcast.
+    pub longest_at_s: Option<f64>,
+}
+
+impl Disturbance {
+    /// Returns the disturbance of a bus, with the number of broadcasts whose motion is known.
+    pub(crate) fn of(bus: &BusObservations, known: usize) -> Self {
+        let broadcasts = bus.joints.iter().flatten().count();
+        let longest = bus.gaps.iter().max_by(|one, other| one.took_ms.total_cmp(&other.took_ms));
+        Self {
+            broadcasts,
+            left_out: broadcasts.saturating_sub(known),
+            gaps: bus.gaps.len(),
+            longest_ms: longest.map(|Gap { took_ms, .. }| rounded(*took_ms, 1)),
+            longest_at_s: longest.map(|Gap { at_s, .. }| rounded(*at_s, 3)),
+        }
+    }
+
+    /// Adds that of another bus.
+    pub(crate) fn and(self, other: Self) -> Self {
+        let is_longer = other.longest_ms > self.longest_ms;
+        let (longest_ms, longest_at_s) = if is_longer {
+            (other.longest_ms, other.longest_at_s)
+        } else {
+            (self.longest_ms, self.longest_at_s)
+        };
+        Self {
+            broadcasts: self.broadcasts + other.broadcasts,
+            left_out: self.left_out + other.left_out,
+            gaps: self.gaps + other.gaps,
+            longest_ms,
+            longest_at_s,
+        }
+    }
+}
+
+impl core::fmt::Display for Disturbance {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        let Self { broadcasts, left_out, gaps, .. } = self;
+        match (gaps, self.longest_ms.zip(self.longest_at_s)) {
+            (1.., Some((ms, at))) => {
+                let of = if *gaps == 1 {
+                    "1 gap in the broadcasts, of"
+                } else {
+                    "gaps in the broadcasts, the longest of"
+                };
+                let many = if *gaps == 1 { String::new() } else { format!("{gaps} ") };
+                write!(f, "{many}{of} {ms} ms after {at} s")?;
+            }
+            _ => f.write_str("no gap in the broadcasts")?,
+        }
+        write!(f, "; {left_out} of {broadcasts} broadcasts are left out")
+    }
+}
+
+/// The reason for which a recording is refused.
+#[derive(Clone, Debug, Error, PartialEq)]
+pub enum Refusal {
+    /// The joints on a bus are those of another robot.
+    #[error(
+        "{bus}: its frames carry {got} joints, the skin has {joints}: calibrate with the skin that was recorded"
+    )]
+    Joints {
+        /// The bus.
+        bus: String,
+        /// Joints in frames.
+        got: u8,
+        /// Joints of the chain.
+        joints: usize,
+    },
+    /// Joints are broadcast at another rate than the skin says.
+    #[error(
+        "{bus}: joints were broadcast {got} times a second, the skin says {hz}: correct joint_broadcast_hz"
+    )]
+    Rate {
+        /// The bus.
+        bus: String,
+        /// The rate in the recording.
+        got: f64,
+        /// The rate of the skin.
+        hz: f64,
+    },
+    /// The motion is known too seldom.
+    #[error(
+        "{bus}: {disturbance}: too little is left to calibrate with; record again with a loop that skips no ticks"
+    )]
+    Disturbed {
+        /// The bus.
+        bus: String,
+        /// Its gaps.
+        disturbance: Disturbance,
+    },
+    /// Readings are not those of such sensors on such a robot.
+    #[error(
+        "readings scatter {times} times as much as the data sheet says ({noise_mg} mg; its noise is {sheet_mg} mg), so no pose can \
+         be trusted; {disturbance}; record again with a loop that skips no ticks, or give the sensors' own --data-sheet"
+    )]
+    Scatter {
+        /// The ratio.
+        times: f64,
+        /// The scatter of readings.
+        noise_mg: f64,
+        /// The noise in the data sheet.
+        sheet_mg: f64,
+        /// The gaps of the recording.
+        disturbance: Disturbance,
+    },
+    /// Readings before and after a gap were not taken at the times of their joints.
+    #[error(
+        "{bus}: after {at_s} s readings are {ms} ms older against their joints than elsewhere, so no pose can be trusted; \
+         {disturbance}; record again with a loop that skips no ticks"
+    )]
+    Shifted {
+        /// The bus.
+        bus: String,
+        /// Since when, in s since the first broadcast.
+        at_s: f64,
+        /// The shift.
+        ms: f64,
+        /// The gaps of the recording.
+        disturbance: Disturbance,
+    },
+}

@@ -1,0 +1,302 @@
+//! Recordings of loops that skip ticks: what is stated of poses holds, or the recording is refused.
+//!
+//! `SKINBUS_RECORDINGS=200` takes so many of each kind instead of a few.
+
+use super::*;
+use model::accelerometer::RobotState;
+use model::generate::{Target, generate};
+use protocol::fixed::{Q, Q1_14};
+use protocol::message::{Joints, Message, SensorPage};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
+use protocol::time::Micros;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+const TICK: f64 = 0.002;
+const TICKS: u64 = 8;
+
+/// Durations of recordings, in s.
+const DURATIONS: [f64; 5] = [20.0, 30.0, 45.0, 80.0, 150.0];
+
+/// The clock of the motion that sensors measure.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Clock {
+    /// The plan, at the time of each broadcast.
+    Plan,
+    /// The plan, at as many periods as there were broadcasts.
+    Counted,
+    /// The plan that stands still during gaps, as the arm does.
+    Paused,
+}
+
+const CLOCKS: [Clock; 3] = [Clock::Plan, Clock::Counted, Clock::Paused];
+
+/// Ticks that are skipped: the first one, and how many.
+fn gaps(dice: &mut Pcg64Mcg, count: u64, longest_ms: u64, length_s: f64) -> Vec<(u64, u64)> {
+    let ticks = (length_s / TICK) as u64;
+    let mut gaps: Vec<_> = (0..count)
+        .map(|_| (dice.random_range(500..ticks - 500), dice.random_range(2..=longest_ms / 2)))
+        .collect();
+    gaps.sort_unstable();
+    gaps
+}
+
+/// A loop that follows a plan as quickly as joints may, and broadcasts in every eighth tick or as soon after it as it can.
+fn messages(
+    skin: &Skin,
+    motion: &Motion,
+    sensors: &Accelerometers,
+    gaps: &[(u64, u64)],
+    measured: Clock,
+) -> Vec<(usize, Micros, Message)> {
+    let mut sent = Vec::new();
+    let joints = skin.robot.joints.len();
+    let mut q = motion.at(0.0).position;
+    let (mut tick, mut paused, mut slot, mut epoch, mut count) = (0_u64, 0_u64, None, Epoch(0), 0_u64);
+    let mut gaps = gaps.iter().copied().peekable();
+    let mut dice = Pcg64Mcg::seed_from_u64(7);
+    while (tick as f64) * TICK < motion.length_s() {
+        while let Some((_, length)) = gaps.next_if(|(at, _)| *at <= tick) {
+            (tick, paused) = (tick + length, paused + length);
+        }
+        let clock = if measured == Clock::Paused { tick - paused } else { tick };
+        let goal = motion.at((clock + 1) as f64 * TICK).position;
+        for ((q, goal), speed) in q.iter_mut().zip(goal).zip(&skin.controller.max_speed).take(joints) {
+            *q += ((goal - *q) / TICK).clamp(-speed, *speed) * TICK;
+        }
+        if slot != Some(tick / TICKS) {
+            slot = Some(tick / TICKS);
+            let late_us = dice.random_range(0..300);
+            let at = Micros(5_000_000 + tick * 2_000 + late_us);
+            let state = RobotState { position: q, ..RobotState::default() };
+            for bus in 0..skin.buses.len() {
+                let chain = &skin.chain(bus).joints;
+                let mut positions = [Q1_14::ZERO; MAX_JOINTS];
+                for (word, q) in positions.iter_mut().zip(state.of_chain(chain).position).take(chain.len()) {
+                    *word = Q1_14::from_radians(q).unwrap();
+                }
+                let joints = Joints { positions, in_use: chain.len() as u8 };
+                sent.push((bus, at, Message::Joints { epoch, joints }));
+            }
+            let now = match measured {
+                Clock::Plan => tick as f64 * TICK,
+                Clock::Counted => (count * TICKS) as f64 * TICK,
+                Clock::Paused => (tick - paused) as f64 * TICK,
+            };
+            let shown: Vec<_> =
+                sensors.readings(skin, |time| motion.at(time), now + TICK, |_, force| *force).collect();
+            for (cell, shown) in skin.cells.iter().zip(shown) {
+                let words: [f64; 3] = shown.into();
+                let page = SensorPage::Acceleration(words.map(Q::nearest));
+                let at = at + protocol::time::Span(900);
+                sent.push((cell.bus, at, Message::Sensors { from: cell.node, epoch, page }));
+            }
+            (epoch, count) = (epoch.next(), count + 1);
+        }
+        tick += 1;
+    }
+    sent
+}
+
+/// Takes the messages as observations.
+fn recording(
+    skin: &Skin,
+    motion: &Motion,
+    sensors: &Accelerometers,
+    gaps: &[(u64, u64)],
+    measured: Clock,
+) -> Observations {
+    let mut seen = Observations::new(skin);
+    let sent = messages(skin, motion, sensors, gaps, measured);
+    sent.iter().for_each(|(bus, at, message)| seen.take(*bus, *at, message));
+    seen
+}
+
+/// Results of the recordings of one kind and length.
+#[derive(Default)]
+struct Tally {
+    recordings: usize,
+    refused: usize,
+    cells: usize,
+    /// Within what is stated: position and orientation.
+    within: [usize; 2],
+    named: usize,
+    unsure: usize,
+    worst: f64,
+}
+
+fn recordings() -> u64 {
+    std::env::var("SKINBUS_RECORDINGS").ok().and_then(|it| it.parse().ok()).unwrap_or(5)
+}
+
+fn campaign(kind: &str, many: impl Fn(f64) -> (u64, u64), refusals: f64, rounds: u64) {
+    let text = generate(&Target { cells: 24, ..Target::default() }).unwrap();
+    let skin = Skin::parse("skin.toml", &text).unwrap();
+    let sheet = DataSheet::default();
+    let mut all: Vec<_> = DURATIONS.iter().map(|_| Tally::default()).collect();
+    let mut motions = std::collections::BTreeMap::new();
+    for round in 0..rounds {
+        let place = round as usize % DURATIONS.len();
+        let settings = Settings {
+            bounds: Bounds { length_s: DURATIONS[place], ..Bounds::of(&skin) },
+            threads: 2,
+            ..Settings::of(&skin)
+        };
+        let motion =
+            motions.entry(place).or_insert_with(|| plan(&skin, &settings.bounds, &sheet, GRAVITY).unwrap());
+        let mut dice = Pcg64Mcg::seed_from_u64(round + 1_000);
+        let (count, longest_ms) = many(motion.length_s());
+        let gaps = gaps(&mut dice, count, longest_ms, motion.length_s());
+        let measured = CLOCKS[(round as usize / DURATIONS.len()) % CLOCKS.len()];
+        let sensors = Accelerometers::new(&skin, &sheet, round + 77, GRAVITY);
+        let seen = recording(&skin, motion, &sensors, &gaps, measured);
+        let tally = &mut all[place];
+        tally.recordings += 1;
+        let calibration = match calibrate(&skin, &seen, &settings) {
+            Ok(calibration) => calibration,
+            Err(refusal) => {
+                println!("{kind}, {} s, {measured:?}: {refusal}", DURATIONS[place]);
+                tally.refused += 1;
+                continue;
+            }
+        };
+        let mut own = [0; 3];
+        for (cell, result) in skin.cells.iter().zip(&calibration.cells) {
+            tally.unsure +=
+                usize::from(result.troubles.iter().any(|it| matches!(it, Trouble::NotObservable { .. })));
+            tally.named +=
+                usize::from(result.troubles.iter().any(|it| !matches!(it, Trouble::NotObservable { .. })));
+            let Some(found) = result.found.filter(|_| result.troubles.is_empty()) else { continue };
+            let [x, y, z, w] = found.orientation;
+            let turned = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+            let turn = turned.angle_to(&rotation(cell.orientation, cell.normal)).to_degrees();
+            let way = (Vector3::from(found.position) - Vector3::from(cell.position)).norm() * 1e3;
+            let is_there = found.joint == cell.joint;
+            tally.cells += 1;
+            tally.within[0] += usize::from(is_there && way <= found.position_mm);
+            tally.within[1] += usize::from(is_there && turn <= found.orientation_deg);
+            tally.worst = tally.worst.max(way / found.position_mm);
+            own[0] += 1;
+            own[1] += usize::from(is_there && way <= found.position_mm);
+        }
+        if own[1] + 6 < own[0] {
+            let joints = calibration.summary.joints;
+            println!("{kind}, round {round}, {} s, {measured:?}: {own:?}, {joints}", DURATIONS[place]);
+        }
+    }
+    let mut total = Tally::default();
+    for (tally, seconds) in all.iter().zip(DURATIONS) {
+        let Tally { recordings, refused, cells, within, named, unsure, worst } = tally;
+        let part = within.map(|within| within as f64 / (*cells).max(1) as f64);
+        println!(
+            "{kind}, {seconds} s: {recordings} recordings, {refused} refused; {cells} cells, within what is stated {:.1} % and \
+             {:.1} %, worst {worst:.2}; {unsure} not observable, {named} named",
+            part[0] * 100.0,
+            part[1] * 100.0
+        );
+        total.cells += cells;
+        total.refused += refused;
+        (total.named, total.unsure) = (total.named + named, total.unsure + unsure);
+        total.within = [total.within[0] + within[0], total.within[1] + within[1]];
+        // Cells of one recording have some of their errors in common.
+        let minimum = if *cells < 500 { 0.75 } else { 0.9 };
+        assert!(
+            *cells == 0
+                || part
+                    .iter()
+                    .all(|part| (minimum..=0.995).contains(part) || *cells < 500 && *part >= minimum),
+            "{kind}, {seconds} s"
+        );
+    }
+    let part = total.within.map(|within| within as f64 / total.cells.max(1) as f64);
+    println!(
+        "{kind}: {} of {rounds} refused; {} cells, {:.1} % and {:.1} %",
+        total.refused,
+        total.cells,
+        part[0] * 100.0,
+        part[1] * 100.0
+    );
+    assert_eq!(total.named, 0, "{kind}: no cell is damaged");
+    assert!(total.refused as f64 <= refusals * rounds as f64, "{kind}");
+    assert!(total.cells == 0 || part.iter().all(|part| (0.9..=0.99).contains(part)), "{kind}: {part:?}");
+}
+
+#[test]
+fn what_is_stated_holds_without_gaps() {
+    campaign("no gaps", |_| (0, 2), 0.05, recordings());
+}
+
+#[test]
+fn what_is_stated_holds_with_a_few_gaps() {
+    campaign("few gaps", |length_s| ((length_s / 4.0) as u64, 18), 0.05, recordings());
+}
+
+#[test]
+fn what_is_stated_holds_with_many_gaps_or_is_refused() {
+    campaign("many gaps", |length_s| ((length_s / 2.0) as u64, 52), 1.0, recordings().min(20));
+}
+
+fn small() -> (Skin, Settings, Motion) {
+    let skin =
+        Skin::parse("skin.toml", &generate(&Target { cells: 6, ..Target::default() }).unwrap()).unwrap();
+    let bounds = Bounds { length_s: 20.0, ..Bounds::of(&skin) };
+    let motion = plan(&skin, &bounds, &DataSheet::default(), GRAVITY).unwrap();
+    let settings = Settings { bounds, ..Settings::of(&skin) };
+    (skin, settings, motion)
+}
+
+#[test]
+fn readings_that_scatter_more_than_the_data_sheet_says_are_refused() {
+    let (skin, settings, motion) = small();
+    let sheet = DataSheet { noise_g: 0.02, ..DataSheet::default() };
+    let sensors = Accelerometers::new(&skin, &sheet, 3, GRAVITY);
+    let seen = recording(&skin, &motion, &sensors, &[], Clock::Plan);
+    let refusal = calibrate(&skin, &seen, &settings).unwrap_err();
+    assert!(matches!(refusal, Refusal::Scatter { .. }), "{refusal}");
+    // By their own data sheet they are as they should be.
+    assert!(calibrate(&skin, &seen, &Settings { sheet, ..settings }).is_ok());
+}
+
+#[test]
+fn joints_of_another_robot_or_at_another_rate_are_refused() {
+    let (skin, settings, motion) = small();
+    let sensors = Accelerometers::new(&skin, &settings.sheet, 3, GRAVITY);
+    // Frames of the one skin, taken as those of another one.
+    let sent = messages(&skin, &motion, &sensors, &[], Clock::Plan);
+    let refused = |described: &Skin| {
+        let mut heard = Observations::new(described);
+        sent.iter().for_each(|(bus, at, message)| heard.take(*bus, *at, message));
+        calibrate(described, &heard, &settings).unwrap_err()
+    };
+    let mut described = skin;
+    described.timing.ticks_per_broadcast = 10;
+    let refusal = refused(&described);
+    assert!(matches!(refusal, Refusal::Rate { got: 62.0..63.0, hz: 50.0, .. }), "{refusal}");
+    let refusal = refused(&testing::panda());
+    assert!(matches!(refusal, Refusal::Joints { got: 6, joints: 7, .. }), "{refusal}");
+}
+
+#[test]
+fn a_recording_of_gaps_alone_is_refused_with_their_number() {
+    let (skin, settings, motion) = small();
+    let sensors = Accelerometers::new(&skin, &settings.sheet, 3, GRAVITY);
+    let gaps: Vec<_> = (0..90).map(|gap| (100 + gap * 100, 12)).collect();
+    let seen = recording(&skin, &motion, &sensors, &gaps, Clock::Plan);
+    let refusal = calibrate(&skin, &seen, &settings).unwrap_err();
+    let said = refusal.to_string();
+    assert!(matches!(refusal, Refusal::Disturbed { .. }), "{said}");
+    assert!(said.contains("gaps in the broadcasts, the longest of"), "{said}");
+}
+
+#[test]
+fn without_a_pose_there_is_no_number() {
+    let (skin, settings, motion) = small();
+    let sensors = Accelerometers::new(&skin, &settings.sheet, 3, GRAVITY);
+    let seen = observe(&skin, &motion, &sensors, &[Defect::Dead; 6]);
+    let calibration = calibrate(&skin, &seen, &settings).unwrap();
+    let summary = calibration.summary;
+    assert_eq!((summary.position_mm, summary.orientation_deg, summary.noise_mg), (None, None, None));
+    let sensors = calibration.cells.iter().map(|cell| cell.sensor);
+    assert!(sensors.into_iter().all(|sensor| sensor.bias_g.is_none() && sensor.noise_g.is_none()));
+}

@@ -1,0 +1,105 @@
+//! Comparison of a skin with the one that a recording was made with.
+
+use protocol::skin::Skin;
+use protocol::usage::Failure;
+
+/// Checks that a recording is one of this skin: the same cells on the same buses, on the same robot, at the same rate.
+/// Poses of cells and zeros of joints may differ: they are what a calibration finds.
+pub(super) fn check(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Failure> {
+    let Some((what, is, was)) = difference(skin, recorded) else { return Ok(()) };
+    Err(Failure::usage(format!(
+        "{name} was recorded with another skin: {what} {is}, recorded {was}; calibrate with the skin that was recorded"
+    )))
+}
+
+/// The first difference, by name, and the two values.
+fn difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
+    let all: [(&str, fn(&Skin) -> String); 6] = [
+        ("buses", |skin| list(skin.buses.iter().map(|bus| bus.name.clone()))),
+        ("joints", |skin| list(skin.robot.joints.iter().map(|joint| joint.name.clone()))),
+        ("cells", |skin| skin.cells.len().to_string()),
+        ("nodes", |skin| sorted(skin, |skin, cell| format!("{} {}", bus(skin, cell.bus), cell.node))),
+        ("serial numbers", |skin| sorted(skin, |_, cell| cell.serial.to_string())),
+        ("joint_broadcast_hz", |skin| skin.timing.broadcast_hz().to_string()),
+    ];
+    let differing = |(what, pick): &(&'static str, fn(&Skin) -> String)| {
+        let (is, was) = (pick(skin), pick(recorded));
+        (is != was).then(|| first(what, &is, &was))
+    };
+    all.iter().find_map(differing).or_else(|| rows(skin, recorded))
+}
+
+/// The first of two lists' items that differ.
+fn first(what: &'static str, is: &str, was: &str) -> (&'static str, String, String) {
+    let [mut left, mut right] = [is.split(", "), was.split(", ")];
+    loop {
+        match (left.next(), right.next()) {
+            (Some(one), Some(other)) if one == other => {}
+            (one, other) => {
+                let text = |it: Option<&str>| it.filter(|it| !it.is_empty()).unwrap_or("none").to_owned();
+                return (what, text(one), text(other));
+            }
+        }
+    }
+}
+
+/// The first row of a table that differs; zeros of joints are left out.
+fn rows(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
+    let all = |skin: &Skin| -> Vec<_> {
+        let chains = skin.robot.chains.iter();
+        chains
+            .flat_map(|chain| &chain.rows)
+            .map(|row| (row.kind, row.table.a, row.table.alpha, row.table.d))
+            .collect()
+    };
+    let (is, was) = (all(skin), all(recorded));
+    let text = |count: usize| format!("of {count} rows");
+    if is.len() != was.len() {
+        return Some(("a table", text(is.len()), text(was.len())));
+    }
+    let differing = is.iter().zip(&was).enumerate().find(|(_, (one, other))| one != other);
+    let row = |(_, a, alpha, d): &(_, f64, f64, f64)| format!("a = {a}, alpha = {alpha}, d = {d}");
+    differing.map(|(_, (one, other))| ("a row of the robot's table", row(one), row(other)))
+}
+
+fn bus(skin: &Skin, bus: usize) -> &str {
+    skin.buses.get(bus).map_or("", |bus| &bus.name)
+}
+
+fn sorted(skin: &Skin, text: fn(&Skin, &protocol::skin::Cell) -> String) -> String {
+    let mut all: Vec<_> = skin.cells.iter().map(|cell| text(skin, cell)).collect();
+    all.sort_unstable();
+    all.join(", ")
+}
+
+fn list(all: impl Iterator<Item = String>) -> String {
+    all.collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn another_skin_is_named_and_other_poses_are_the_same_skin() {
+        let skin = model::testing::skin();
+        let mut found = skin.clone();
+        found.cells[0].position = [0.1, 0.2, 0.3];
+        found.robot.chains[0].rows[1].table.theta_offset += 0.01;
+        assert_eq!(difference(&found, &skin), None);
+        let mut other = skin.clone();
+        other.cells[0].serial += 1;
+        let (what, ..) = difference(&other, &skin).unwrap();
+        assert_eq!(what, "serial numbers");
+        let mut other = skin.clone();
+        other.robot.chains[0].rows[1].table.a = -0.612;
+        let said = check("run.mcap", &other, &skin).unwrap_err().to_string();
+        assert!(
+            said.contains("run.mcap was recorded with another skin: a row of the robot's table a = -0.612"),
+            "{said}"
+        );
+        other.cells.clear();
+        let (what, is, was) = difference(&other, &skin).unwrap();
+        assert_eq!((what, is.as_str(), was.as_str()), ("cells", "0", "1"));
+    }
+}
