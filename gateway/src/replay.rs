@@ -17,7 +17,7 @@ use protocol::usage::{Failure, print};
 
 use super::arguments::{BusKinds, Programs, Word, nanos, one_of};
 use super::output::{self, Force, apart, note};
-use super::print::{Rows, json, list, or, quantiles};
+use super::print::{Rows, count, json, list, or, quantiles};
 use super::view::Page;
 
 /// Bytes for frames that wait: all cells may answer a report at once.
@@ -276,7 +276,7 @@ fn expectation(rows: &mut Rows, expect: &Expect) {
     off(rows, "sum", &tally.sum_words, 1);
     let late = match expect.joints_skipped {
         0 => String::new(),
-        count => format!("cells took joints too late {count} times"),
+        skipped => format!("cells took joints too late {}", count(skipped, "time")),
     };
     rows.row("missing", tally.missing, late);
     rows.row("extra", tally.extra, "");

@@ -9,7 +9,7 @@ use analysis::shadow::{
     Stretches,
 };
 
-use crate::print::{Rows, harmless, list, or};
+use crate::print::{Rows, count, harmless, list, or};
 
 /// Writes the frames that have left the model, one object a line.
 pub(super) fn write_frames(shadow: &mut Shadow, out: &mut impl Write) -> io::Result<()> {
@@ -169,8 +169,8 @@ fn load(rows: &mut Rows, bus: &BusShadow, load: &Loads, (name, beside): (&str, &
 fn pauses(rows: &mut Rows, bus: &BusShadow, stretches: &Stretches) {
     let longest = stretches.longest_s;
     let beside = format!("longest {:.1} ms, {}", 1e3 * longest.value, at(bus, longest));
-    let count = format!("{} times, {:.3} s", stretches.count, stretches.total_s);
-    rows.row("  no pause for 16 ms", count, beside);
+    let times = format!("{}, {:.3} s", count(stretches.count, "time"), stretches.total_s);
+    rows.row("  no pause for 16 ms", times, beside);
 }
 
 fn share(share: Option<f64>) -> String {

@@ -15,17 +15,18 @@ fn own_seconds() -> f64 {
     std::time::Duration::try_from(time).map_or(0.0, |time| time.as_secs_f64())
 }
 
-/// Processor time of another process so far, in s; nothing when it has ended.
+/// Processor time of another process so far, in s; `None` when it has ended.
 ///
 /// From `schedstat`, which counts ns: the usual figures are sampled a hundred times a second, and miss
 /// cells that all wake up together for some µs.
-fn processor_seconds(pid: u32) -> f64 {
-    let Ok(threads) = fs::read_dir(format!("/proc/{pid}/task")) else { return 0.0 };
+fn processor_seconds(pid: u32) -> Option<f64> {
+    let threads = fs::read_dir(format!("/proc/{pid}/task")).ok()?;
     let nanos = threads.flatten().filter_map(|thread| {
         let text = fs::read_to_string(thread.path().join("schedstat")).ok()?;
         text.split_whitespace().next()?.parse::<f64>().ok()
     });
-    nanos.sum::<f64>() * 1e-9
+    // Of a process that has ended and was not waited for there is a folder, and no time in it.
+    nanos.reduce(|all, one| all + one).filter(|nanos| *nanos > 0.0).map(|nanos| nanos * 1e-9)
 }
 
 /// Private memory of a process in KiB.
@@ -48,18 +49,19 @@ pub(super) struct Spent {
 impl Spent {
     /// By this program, cells and buses.
     pub(super) fn by(cells: &Processes, buses: &[ServedBus]) -> Self {
-        let of = |pid: u32| (pid, processor_seconds(pid));
+        let of = |pid: u32| Some((pid, processor_seconds(pid)?));
         Self {
             gateway: own_seconds(),
-            cells: cells.pids().map(of).collect(),
-            buses: buses.iter().map(|bus| of(bus.pid())).collect(),
+            cells: cells.pids().filter_map(of).collect(),
+            buses: buses.iter().filter_map(|bus| of(bus.pid())).collect(),
         }
     }
 
     /// What was spent since, in cores; of processes that are still there.
     pub(super) fn since(&self, before: &Self, seconds: f64) -> Processor {
         let since = |now: &HashMap<u32, f64>, before: &HashMap<u32, f64>| {
-            let one = |(pid, spent): (&u32, &f64)| spent - before.get(pid).copied().unwrap_or(0.0);
+            // A thread that has ended takes its time with it.
+            let one = |(pid, spent): (&u32, &f64)| (spent - before.get(pid).unwrap_or(&0.0)).max(0.0);
             // Not sum(), which is -0.0 of no processes.
             now.iter().map(one).fold(0.0, |all, one| all + one) / seconds
         };
