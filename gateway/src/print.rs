@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::fmt::Display;
 
-use comfy_table::{CellAlignment, ColumnConstraint, ContentArrangement, Table, presets};
+use comfy_table::{CellAlignment, ColumnConstraint, ContentArrangement, Table, Width, presets};
 use model::quantiles::Quantiles;
 use protocol::usage::{Failure, shown, shown_lines};
 use serde::Serialize;
@@ -175,6 +175,15 @@ impl Rows {
 
     pub(crate) fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
         self.section(format!("  {name}"), value, beside);
+    }
+
+    /// The same, whose last text is not broken.
+    pub(crate) fn row_in_one_line(&mut self, name: impl Display, value: impl Display, beside: &str) {
+        self.row(name, value, beside);
+        let width = u16::try_from(beside.chars().count() + 2).unwrap_or(WIDTH);
+        if let Some(texts) = self.table.column_mut(2) {
+            texts.set_constraint(ColumnConstraint::LowerBoundary(Width::Fixed(width)));
+        }
     }
 
     /// A row of something that there is, or none.

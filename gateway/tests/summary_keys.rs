@@ -12,8 +12,11 @@ use model::table::{Accuracy, Event, Status, Table};
 use protocol::can::Format;
 use protocol::fixed::{Q3_12, Q5_10};
 use protocol::id::{CellId, Kind, Node};
-use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::message::{
+    Answer, From, Heartbeat, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors, State,
+};
 use protocol::packet::{Epoch, WORDS};
+use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde_json::Value;
@@ -269,6 +272,14 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
         let word = heartbeat(&table, place, 0);
         say(&mut table, false, &word, false);
     }
+    // Nothing touches them, whatever was there before.
+    let (number, words) = (Parameter::Mode.number(), [1, 0, 0, 0, 0, 0]);
+    let request = Request::Write { number, words };
+    say(&mut table, true, &Message::Configure { to: Node::Everyone, tag: 0, request }, false);
+    for from in cells {
+        let answer = Answer::Value { number, written: true, words };
+        say(&mut table, false, &Message::Configured { from, tag: 0, answer }, false);
+    }
     let press = Message::Stimulus { to: Node::Everyone, from: From::Next, page: SensorPage::Skin(skin_page) };
     say(&mut table, true, &press, false);
     for epoch in 0..8 {
@@ -283,7 +294,7 @@ fn troubled_bus() -> (BusSummary, Vec<CellSummary>, u64) {
             _ => {}
         }
     }
-    for (place, sent) in [(0, 9), (1, 9)] {
+    for (place, sent) in [(0, 10), (1, 10)] {
         let word = heartbeat(&table, place, sent);
         say(&mut table, false, &word, false);
     }
@@ -307,8 +318,11 @@ fn what_the_document_says_adds_up_does() {
         "{up:?}"
     );
     let replies = bus.replies;
-    let RepliesSummary { due, in_time, late, too_late, skipped, not_heard, lost, in_doubt, unknown, unasked } =
+    let RepliesSummary { due, in_time, late, too_late, skipped, not_heard, lost, in_doubt, unknown, .. } =
         replies;
+    let RepliesSummary { unasked, contact_unknown, unexpected, .. } = replies;
+    assert!(contact_unknown + unexpected <= unasked, "{replies:?}");
+    assert_eq!(cells.iter().map(|cell| cell.contact_unknown).sum::<u64>(), contact_unknown, "{cells:?}");
     let missing = too_late + skipped + not_heard + lost + in_doubt + unknown;
     assert_eq!(due, in_time + late + missing, "{replies:?}");
     assert!(bus.epochs_complete <= bus.epochs_due && bus.epochs_due <= broadcasts);

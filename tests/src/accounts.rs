@@ -30,7 +30,18 @@ fn cells(bench: &Bench) {
         let (uplink, replies, node) = (cell.uplink(), cell.replies, cell.node);
         let Uplink { sent, delivered, rejected, lost, surplus, .. } = uplink;
         assert_eq!(sent + surplus, delivered + rejected + lost, "packets of cell {node}: {uplink:?}");
-        let Replies { due, in_time, late, missing, in_doubt, unasked: _, too_late: _ } = replies;
+        let Replies {
+            due,
+            in_time,
+            late,
+            missing,
+            in_doubt,
+            unasked,
+            contact_unknown,
+            unexpected,
+            too_late: _,
+        } = replies;
+        assert!(contact_unknown + unexpected <= unasked, "replies of cell {node}: {replies:?}");
         assert_eq!(due, in_time + late + missing, "replies of cell {node}: {replies:?}");
         assert!(in_doubt <= missing, "replies of cell {node}: {replies:?}");
         let arrived = bench.oracle.arrived(place);

@@ -200,7 +200,11 @@ fn a_lost_stimulus_of_a_release_shows_as_torques_that_are_not_due() {
     let replies = replies(&bench);
     assert!(replies.unasked >= 29 && replies.missing == 0, "{replies:?}");
     let single = bench.gateway.table.accuracy().single;
-    assert!(single.max() > 0.01, "a torque that should not be: {single:?}");
+    assert!(
+        replies.unexpected >= 29 && replies.contact_unknown == 0,
+        "torques that should not be: {replies:?}"
+    );
+    assert!(single.max() < 1e-3, "they are compared with nothing: {single:?}");
 }
 
 #[test]

@@ -6,9 +6,9 @@ mod process;
 use process::log::Log;
 use process::{PRESSED, Place, Running, skin};
 use protocol::can::Format;
-use protocol::fixed::Q;
-use protocol::id::CellId;
-use protocol::message::{Answer, Message, SensorPage};
+use protocol::fixed::{Q, Q5_10};
+use protocol::id::{CellId, Node};
+use protocol::message::{Answer, From, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::touch::contact;
 use rustix::process::Signal;
 
@@ -188,4 +188,56 @@ fn an_invalid_request_is_refused_in_one_line() {
     );
     let nowhere = refusal(&place, "vcan0 event", 2);
     assert!(nowhere.starts_with("gateway: ") && nowhere.contains("vcan0"), "{nowhere}");
+}
+
+/// Cells that have taken stimuli before a gateway listens: from another sender, and from a gateway that was killed.
+#[test]
+fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known() {
+    let place = Place::new();
+    place.skin(8);
+    let head = "version = 1\n[motion]\nkind = \"hold\"\nstart_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-8 --skin skin.toml");
+    let test_client = place.test_client();
+    let third = Node::Cell(process::replay::cell(3));
+    test_client.waits_for("cell 3", |message| {
+        matches!(*message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
+            if from == third && !beat.state.has(State::CLAIMING))
+    });
+    let contact = [Q5_10::nearest(1.0); 3];
+    let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
+    test_client.sends(&Message::Stimulus { to: third, from: From::Next, page });
+
+    // A run that touches nothing leaves the cell as it is, and says that it does not know what touches it.
+    place.scenario(head);
+    let ended = place.bench(1.5, "--no-spawn").end().well();
+    let said = "the contact of these cells is not known, their torques are not compared: 3 on vcan0;";
+    assert!(ended.stderr.contains(said), "{}", ended.stderr);
+    let summary = place.summary();
+    let unknown = summary.of_bus("/replies/contact_unknown");
+    assert!(unknown > 0 && ended.stdout.contains(&format!("{unknown} not due: their contact is not known")));
+    assert_eq!(summary.adds_up().of_bus("/replies/due"), 0, "{:#}", summary.0);
+    assert_eq!(summary.number("/accuracy/single/count"), 0, "{:#}", summary.0);
+
+    // A gateway that is killed leaves stimuli for epochs to come; the next one touches another cell.
+    let touch = "[[touch]]\nat_s = 0.0\nfor_s = 50.0\nforce_n = 3.0\n";
+    place.scenario(&format!("{head}{touch}cells = [3]\nprofile = \"ramp\"\n"));
+    let killed = place.running_bench(60.0, "--no-spawn");
+    let node = process::replay::cell(3);
+    test_client
+        .waits_for("its torque", |message| matches!(*message, Message::Torque { from, .. } if from == node));
+    killed.signal(Signal::KILL);
+    killed.end();
+    place.scenario(&format!("{head}{touch}cells = [5]\n"));
+    place.bench(1.5, "--no-spawn").end().well();
+    let summary = place.summary();
+    summary.adds_up();
+    let due = summary.of_bus("/replies/due");
+    assert!(due > 0, "{:#}", summary.0);
+    assert_eq!(summary.cells()[4]["due"].as_u64(), Some(due), "from the first epoch on: {:#}", summary.0);
+    assert_eq!(summary.of_bus("/replies/contact_unknown"), 0, "{:#}", summary.0);
+    assert_eq!(summary.of_bus("/replies/unexpected"), 0, "{:#}", summary.0);
+    assert!(summary.figure("/accuracy/single/max_nm") < 1e-3, "{:#}", summary.0);
+    drop((cells, server, test_client));
 }

@@ -315,7 +315,8 @@ pub struct SensorsSummary {
     pub touches: u64,
     /// Releases in them.
     pub releases: u64,
-    /// Frames a second of the cell with the fewest, of those that sent at least two.
+    /// Frames a second, without those that a report asked for, of the cell with the fewest; of cells that sent enough for
+    /// a rate.
     pub min_hz: Option<f64>,
     /// The mean over these cells.
     pub mean_hz: Option<f64>,

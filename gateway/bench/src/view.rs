@@ -14,6 +14,8 @@ pub struct View {
     pub cells: Vec<CellView>,
     /// Whether any of them is to be switched to something and has not confirmed it.
     pub lacking: bool,
+    /// Whether any of them may have stimuli that did not come here.
+    pub unclear: bool,
     /// Commands of our own that were read back from the bus, or were lost with it.
     pub commands: u64,
     /// What is known of the network's cells, those that are not described among them; none if cells
@@ -50,6 +52,8 @@ pub struct CellView {
     pub deaf: u8,
     /// What it is to be switched to and has not confirmed.
     pub lacks: [Option<Switch>; SWITCHES],
+    /// Whether it computes with stimuli of which some may not have come here.
+    pub unclear: bool,
 }
 
 impl View {
@@ -57,7 +61,8 @@ impl View {
     #[must_use]
     pub fn new(cells: Vec<CellView>, commands: u64, network: Vec<Seen>) -> Self {
         let lacking = cells.iter().any(CellView::is_lacking);
-        Self { cells, lacking, commands, network }
+        let unclear = cells.iter().any(|cell| cell.unclear);
+        Self { cells, lacking, unclear, commands, network }
     }
 }
 
@@ -89,6 +94,7 @@ impl CellView {
             reply: cell.reply,
             deaf: cell.deaf,
             lacks: cell.lacks(),
+            unclear: ready && cell.has_unseen_stimuli(),
         }
     }
 }

@@ -48,7 +48,7 @@ fn halts(rows: &mut Rows, summary: &Summary) {
     }
     let more = summary.halts.len().saturating_sub(HALTS) as u64 + summary.further_halts;
     if more > 0 {
-        rows.section("halted", format!("{more} times more"), "--summary has when and why");
+        rows.section("halted", format!("{} more", count(more, "time")), "--summary has when and why");
     }
 }
 
@@ -113,7 +113,8 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
         let ticks = format!("{} ticks without it", bus.outages.ticks);
-        rows.row("lost", format!("{} times, {:.1} s{end}", bus.outages.times, bus.outages.lost_s), ticks);
+        let times = count(bus.outages.times, "time");
+        rows.row("lost", format!("{times}, {:.1} s{end}", bus.outages.lost_s), ticks);
     }
     for it in &bus.hosts {
         let gone = (it.gone > 0).then(|| format!("gone {}, {:.1} s", count(it.gone, "time"), it.gone_s));
@@ -131,7 +132,8 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     let complete = format!("{} of {} epochs complete", bus.epochs_complete, bus.epochs_due);
     if let Some(sums) = &bus.sums {
         let (counts, parts) = (sums.counts, sums.contributions);
-        rows.row("cells due in sums", parts.due, complete);
+        let unexpected = parts.unasked - parts.contact_unknown;
+        due(rows, "cells due in sums", parts.due, complete, [parts.contact_unknown, unexpected]);
         rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
         let more =
             format!("{} resent, {} overheard, {} stale", counts.resent, counts.overheard, counts.stale);
@@ -157,7 +159,7 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
         hearing(rows, bus);
         return;
     }
-    rows.row("replies due", replies.due, complete);
+    due(rows, "replies due", replies.due, complete, [replies.contact_unknown, replies.unexpected]);
     rows.row("  in time", replies.in_time, format!("{} late", replies.late));
     let missing = replies.due - replies.in_time - replies.late;
     let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, spoken(why)));
@@ -165,6 +167,21 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     rows.row("last reply after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
     rows.row("  each reply, µs", quantiles(&bus.reply_us), "late ones included");
     hearing(rows, bus);
+}
+
+/// What was due, and torques that came and were not, which are not compared: by reason.
+fn due(rows: &mut Rows, name: &str, due: u64, complete: String, [contact_unknown, unexpected]: [u64; 2]) {
+    let reasons =
+        [(contact_unknown, "their contact is not known"), (unexpected, "nothing touched their cells")];
+    let mut reasons = reasons.into_iter().filter(|(count, _)| *count > 0);
+    let beside = if due == 0 { reasons.next() } else { None };
+    match beside {
+        Some((count, why)) => rows.row_in_one_line(name, due, &format!("{count} not due: {why}")),
+        None => rows.row(name, due, complete),
+    }
+    for (count, why) in reasons {
+        rows.row("  not due", count, why);
+    }
 }
 
 /// How late cells hear what stands on the bus.
@@ -196,6 +213,11 @@ fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
     let measuring: Vec<_> = all().filter(|cell| cell.measures()).map(|cell| cell.node).collect();
     if !measuring.is_empty() {
         rows.row("cells that measure", words(measuring), "not pressed, their torques not compared");
+    }
+    let unclear: Vec<_> =
+        all().filter(|cell| cell.contact_unknown > 0 && !cell.measures()).map(|cell| cell.node).collect();
+    if !unclear.is_empty() {
+        rows.row("cells of unknown contact", words(unclear), "stimuli from before this run, or a baseline");
     }
     let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > OFF_NM);
     let rank =
@@ -237,8 +259,7 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
     rows.any("  restarts of cells", up.restarts, "what they sent last is in doubt");
     rows.row("received", each(&bus.received), "");
     let sensors = &bus.sensors;
-    // A frame or two are answers to reports.
-    if let (Some(min), Some(mean), Some(max @ 1.0..)) = (sensors.min_hz, sensors.mean_hz, sensors.max_hz) {
+    if let (Some(min), Some(mean), Some(max)) = (sensors.min_hz, sensors.mean_hz, sensors.max_hz) {
         let touches = list([count(sensors.touches, "touch"), count(sensors.releases, "release")]);
         rows.row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
     }

@@ -361,6 +361,11 @@ impl LinkId {
                     self.learn(from, heartbeat.configuration);
                 }
             }
+            Message::Network { from: Node::Cell(from), page: NetworkPage::Heard(heard), .. } => {
+                let cell = self.cells.get_mut(from).filter(|cell| cell.contact.obeys() != Some(false));
+                cell.into_iter()
+                    .for_each(|cell| cell.contact.count(heard.stimuli, Origin::Said { at_ns: nanos }));
+            }
             Message::Sensors { from, epoch, page: page @ SensorPage::Skin(skin) } => {
                 let origin = Origin::Said { at_ns: nanos };
                 let cell = self.cells.get_mut(from).filter(|cell| cell.contact.obeys() != Some(false));
@@ -471,10 +476,11 @@ impl Cell {
 
     /// It begins to obey stimuli, and nothing touches it; or to measure, and its contact state is not on the bus.
     fn mode(&mut self, obeys: bool, origin: Origin) {
-        self.contact.reset();
-        self.contact.set_obeys(obeys);
         if obeys {
-            self.contact.learn(SensorPage::Skin(SkinSensors::default()), origin);
+            self.contact.start(origin);
+        } else {
+            self.contact.reset();
         }
+        self.contact.set_obeys(obeys);
     }
 }

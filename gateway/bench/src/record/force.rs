@@ -68,6 +68,8 @@ struct Cell {
     staged: BTreeMap<u8, Arc<PlacedPacket>>,
     requested: Kept,
     contact: Contact<ContactPage>,
+    /// Where the cell showed that all its stimuli are on the bus: its counters, or its answer to a write of its mode.
+    shown: Kept,
 }
 
 /// The packets of one bus that are latched.
@@ -101,8 +103,19 @@ impl Default for Latched {
 impl Cell {
     /// It has started, or its mode was written: its contact state is reset.
     fn clear(&mut self, obeys: bool) {
-        self.contact.reset();
+        self.contact.write_mode();
         self.contact.set_obeys(obeys);
+        self.shown = None;
+    }
+
+    /// It shows that all its stimuli are on the bus, if it does so now.
+    fn show(&mut self, contact_page: ContactPage, show: impl FnOnce(&mut Contact<ContactPage>, ContactPage)) {
+        let placed_packet = Arc::clone(&contact_page.placed_packet);
+        let before = self.contact.known().is_some();
+        show(&mut self.contact, contact_page);
+        if !before && self.contact.known().is_some() {
+            self.shown = Some(placed_packet);
+        }
     }
 
     fn heartbeat(&mut self, heartbeat: &Heartbeat, placed_packet: &Arc<PlacedPacket>) {
@@ -165,8 +178,9 @@ impl Cell {
     }
 
     fn packets(&self) -> impl Iterator<Item = &Arc<PlacedPacket>> {
-        let placed_packet =
-            [&self.heartbeat, &self.tree, &self.commit, &self.requested].into_iter().chain(&self.starts);
+        let placed_packet = [&self.heartbeat, &self.tree, &self.commit, &self.requested, &self.shown]
+            .into_iter()
+            .chain(&self.starts);
         let written = self.switches.values().chain(self.committed.values()).chain(self.staged.values());
         let waiting = self.contact.waiting().iter().map(|(_, _, contact_page)| contact_page);
         let contact_page = self.contact.latched().map(|(_, contact_page)| contact_page).chain(waiting);
@@ -251,16 +265,23 @@ impl Latched {
                 cell.heartbeat(&heartbeat, placed_packet);
             } else if let NetworkPage::Tree(_) = page {
                 cell.tree = Some(Arc::clone(placed_packet));
+            } else if let NetworkPage::Heard(heard) = page {
+                cell.show(contact_page(), |contact, tag| contact.count(heard.stimuli, tag));
             }
         } else if let Message::Configure { to, request: Request::Write { number, words }, .. } = *message {
             let obeys = words.first() == Some(&1);
             self.cells.named(to).iter_mut().for_each(|cell| cell.write(number, placed_packet, obeys));
         } else if let Message::Configured {
-            from, answer: Answer::Value { number, written: true, .. }, ..
+            from,
+            answer: Answer::Value { number, written: true, words },
+            ..
         } = *message
         {
-            if let Some(cell) = self.cells.get_mut(from).filter(|_| number == Parameter::Commit.number()) {
+            let Some(cell) = self.cells.get_mut(from) else { return };
+            if number == Parameter::Commit.number() {
                 cell.commit();
+            } else if number == Parameter::Mode.number() && words.first() == Some(&1) {
+                cell.show(contact_page(), Contact::confirm_mode);
             }
         } else if let Message::Stimulus { to, from, page } = *message {
             let contact_page = contact_page();

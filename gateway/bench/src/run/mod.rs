@@ -15,6 +15,7 @@ mod accelerations;
 mod begin;
 mod bench;
 mod commanded;
+mod contacts;
 mod end;
 mod ended;
 mod error;

@@ -306,6 +306,7 @@ mod tests {
             reply,
             deaf: 0,
             lacks: [None; SWITCHES],
+            unclear: false,
         });
         let network = trees.iter().enumerate().map(|(at, tree)| Seen {
             node: CellId::new(i64::try_from(at + 1).unwrap()).unwrap(),

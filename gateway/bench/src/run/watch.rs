@@ -51,8 +51,8 @@ struct LoopEnd {
 }
 
 /// Faults and touches that are still to come.
-struct Script {
-    touches: Touches,
+pub(super) struct Script {
+    pub(super) touches: Touches,
     accelerations: Option<Accelerations>,
     /// The next epoch whose stimuli are to be sent.
     epoch: u64,
@@ -60,8 +60,17 @@ struct Script {
     fault: usize,
     /// Cells that were switched again.
     announced: Announced,
+    /// Cells whose contact was cleared.
+    pub(super) cleared: Announced,
     /// When the loop began.
     started: Instant,
+}
+
+impl Script {
+    /// Whether no stimulus was sent yet.
+    pub(super) const fn has_not_begun(&self) -> bool {
+        self.epoch == 0
+    }
 }
 
 impl Bench<'_> {
@@ -77,7 +86,9 @@ impl Bench<'_> {
         let touches = Touches::new(&options.scenario, &options.skin);
         let (announced, started) = (Announced::new(SWITCH_AGAIN), Instant::now());
         let accelerations = Accelerations::new(options);
-        let mut script = Script { touches, accelerations, epoch: 0, fault: 0, announced, started };
+        let cleared = Announced::new(SWITCH_AGAIN);
+        let mut script = Script { touches, accelerations, epoch: 0, fault: 0, announced, cleared, started };
+        self.know_contacts(&mut script)?;
         self.press(&mut script, None)?;
 
         let before = Spent::by(&self.processes, &self.served);
@@ -168,6 +179,7 @@ impl Bench<'_> {
             progress.note(&note);
         }
         self.switch_again(&mut script.announced)?;
+        self.clear_contacts(script)?;
         let was_halted = measured.halts.why().is_some();
         measured.take(records, self.began);
         match (was_halted, measured.halts.why()) {
@@ -235,7 +247,7 @@ impl Bench<'_> {
     }
 
     /// Resends to some cells the stimuli of the scenario; stimuli of others are not its business.
-    fn remind(&self, script: &Script, target: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
+    pub(super) fn remind(&self, script: &Script, target: impl Fn(&Cell) -> bool) -> Result<(), RunError> {
         let touched =
             script.touches.cells().filter_map(|place| Some((place, self.options.skin.cells.get(place)?)));
         for (cell, &Cell { bus, node, .. }) in touched.filter(|(_, cell)| target(cell)) {

@@ -27,14 +27,19 @@ pub struct RepliesSummary {
     pub in_doubt: u64,
     /// Missing, for no known reason.
     pub unknown: u64,
-    /// Torques that were not due: ends of contacts, and of cells whose sensors are unknown.
+    /// Torques that were not due: ends of contacts, and the next two.
     pub unasked: u64,
+    /// Of these, torques of cells whose contact was not known.
+    pub contact_unknown: u64,
+    /// Of these, torques other than zero of cells whose contact was known.
+    pub unexpected: u64,
 }
 
 impl RepliesSummary {
     /// Adds those of a cell, and explains its missing ones as far as reasons are known.
     pub(super) fn add(&mut self, cell: &Cell) {
-        let Replies { due, in_time, late, missing, in_doubt, unasked, too_late } = cell.replies;
+        let Replies { due, in_time, late, missing, in_doubt, unasked, contact_unknown, unexpected, too_late } =
+            cell.replies;
         let mut rest = missing.saturating_sub(in_doubt);
         let mut explain = |count: u64| {
             let explained = rest.min(count);
@@ -52,6 +57,8 @@ impl RepliesSummary {
         self.in_doubt += in_doubt;
         self.unknown += rest;
         self.unasked += unasked;
+        self.contact_unknown += contact_unknown;
+        self.unexpected += unexpected;
     }
 
     /// The missing ones by reason, those without a known reason last.
@@ -85,6 +92,8 @@ pub struct CellSummary {
     pub late: u64,
     /// Those that did not come, by reason; zeros are left out.
     pub missing: BTreeMap<&'static str, u64>,
+    /// Torques that were not due because its contact was not known.
+    pub contact_unknown: u64,
     /// Its torques against the central ones, in the joints that move it.
     pub error: Errors,
     /// How often it restarted.
@@ -106,6 +115,7 @@ impl CellSummary {
             in_time: replies.in_time,
             late: replies.late,
             missing: replies.missing().into_iter().filter(|(_, count)| *count > 0).collect(),
+            contact_unknown: replies.contact_unknown,
             error: known.map(Cell::errors).unwrap_or_default(),
             restarts: known.map_or(0, |cell| cell.uplink().restarts),
         }

@@ -10,47 +10,13 @@ use protocol::time::Micros;
 
 use super::accuracy::Errors;
 use super::held::{Change, Held};
-use super::replies::{Outstanding, Replies};
+use super::replies::{Asked, Outstanding, Replies};
 use super::root_totals::RootSums;
 use super::sensed::Sensed;
 use super::sent::Sent;
+use super::status::Status;
 use super::switched::{SWITCHES, Switch, Switched};
 use crate::tracker::{Contact, Pages, Tracked, Update, Uplink, Word};
-
-/// The status of a cell.
-#[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
-pub enum Status {
-    /// Nothing came from it yet.
-    Unknown,
-    /// Alive and not in contact.
-    Quiet,
-    /// In contact, and answered the last epoch that had time for it.
-    Active,
-    /// In contact, and did not answer an epoch.
-    Stale,
-    /// Silent for too long.
-    Dead,
-}
-
-impl Status {
-    /// The name that tables and summaries use.
-    #[must_use]
-    pub const fn name(self) -> &'static str {
-        match self {
-            Self::Unknown => "never heard",
-            Self::Quiet => "quiet",
-            Self::Active => "active",
-            Self::Stale => "stale",
-            Self::Dead => "dead",
-        }
-    }
-
-    /// The number that recordings and snapshots use.
-    #[must_use]
-    pub const fn number(self) -> u8 {
-        self as u8
-    }
-}
 
 /// What a cell has sent since it was requested.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
@@ -174,14 +140,17 @@ impl Cell {
     /// Begins new accounts: what has come so far does not count.
     pub(super) fn begin_accounts(&mut self) {
         self.tracked.account = Default::default();
-        (self.replies, self.sensed, self.outstanding) = Default::default();
+        (self.replies, self.sensed) = Default::default();
+        self.outstanding.begin_accounts();
         self.sent.begin();
     }
 
     /// Its receive counters came, and so many joints passed the page on its way; later pages are compared with the
     /// first one since a start.
     pub(super) fn report(&mut self, passed: u64) {
-        self.sent.report(self.pages().heard, passed);
+        let heard = self.pages().heard;
+        self.sent.report(heard, passed);
+        heard.iter().for_each(|heard| self.contact.count(heard.stimuli, ()));
     }
 
     /// Takes its heartbeat, with what that means.
@@ -206,9 +175,10 @@ impl Cell {
             self.sent = Sent::default();
         }
         if started {
-            self.contact.reset();
-            if word != Word::Shared {
-                self.contact.learn(SensorPage::Skin(SkinSensors::default()), ());
+            if word == Word::Shared {
+                self.contact.reset();
+            } else {
+                self.contact.start(());
             }
             self.sensed.restart();
             self.switched.restart();
@@ -242,18 +212,22 @@ impl Cell {
         self.contact.push(from, page, (), last);
     }
 
-    /// A sensors frame of the cell came.
-    pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, events: &Events) {
+    /// A sensors frame of the cell came, after it took the newest joints or not.
+    pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, is_newest: bool, events: &Events) {
         self.sensed.hear(at, page, events);
         self.switched.subtracts |= matches!(page, SensorPage::Baseline(_));
-        self.contact.learn(*page, ());
+        if is_newest {
+            self.contact.learn(*page, ());
+        }
     }
 
     /// It answered a request.
     pub(super) fn answers(&mut self, answer: &Answer) {
         self.switched.answered(answer);
         let Answer::Value { number, written: true, words } = *answer else { return };
-        if number == Parameter::Reply.number() {
+        if number == Parameter::Mode.number() && words.first() == Some(&1) {
+            self.contact.confirm_mode(());
+        } else if number == Parameter::Reply.number() {
             self.reply = Some(words);
         } else if number == Parameter::LinksDown.number() {
             self.deaf = LinksDown::from_words(words).deaf;
@@ -266,13 +240,23 @@ impl Cell {
         self.switched.lacks()
     }
 
-    /// What it computes with; `None` where that is unknown, because it measures, subtracts a zero of its own, or may not
-    /// be on the bus.
+    /// What it computes with; `None` where that is unknown: it measures, subtracts a zero of its own, may not be on the bus,
+    /// or may have taken stimuli that did not come here.
     pub(super) fn sensors(&self) -> Option<SkinSensors> {
-        let obeys = self.tracked.claim().says(State::TEST_MODE)
+        self.contact.known().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
+    }
+
+    /// Whether its torques follow from stimuli alone.
+    fn computes_with_stimuli(&self) -> bool {
+        self.tracked.claim().says(State::TEST_MODE)
             && !self.switched.subtracts
-            && !self.tracked.account.is_interrupted();
-        self.contact.skin().filter(|_| obeys).map(|(skin, ())| *skin)
+            && !self.tracked.account.is_interrupted()
+    }
+
+    /// Whether its torques follow from stimuli alone, of which some may not have come here. A write of its mode clears them.
+    #[must_use]
+    pub fn has_unseen_stimuli(&self) -> bool {
+        self.is_ready() && self.computes_with_stimuli() && self.contact.known().is_none()
     }
 
     /// Its sensors from the joints of this epoch on; `None` where they are unknown.
@@ -286,11 +270,12 @@ impl Cell {
     pub(super) fn open_epoch(&mut self, number: u64, in_contact: bool, safety: &Safety) -> (Change, u32) {
         self.sent.count();
         let due = in_contact && self.is_ready();
+        let is_known = self.sensors().is_some();
         if let Some(sums) = &mut self.sums {
-            self.outstanding.open_only(due);
+            self.outstanding.open_only(due, is_known);
             sums.open();
         } else {
-            if self.outstanding.open(due) {
+            if self.outstanding.open(due, is_known) {
                 self.replies.miss(1, self.tracked.is_dead());
             }
             self.replies.due += u64::from(due);
@@ -318,17 +303,20 @@ impl Cell {
         self.outstanding.is_due() || self.sensors().is_none() && self.tracked.claim().says(State::ACTIVE)
     }
 
-    /// A torque answers the broadcast `number`, `lag` before the newest. Returns whether it was due.
-    pub(super) const fn answer(&mut self, number: u64, lag: usize) -> bool {
+    /// A torque answers the broadcast `number`, `lag` before the newest; `is_zero` if it only ends a contact. Returns
+    /// whether it was due.
+    pub(super) fn answer(&mut self, number: u64, lag: usize, is_zero: bool) -> Asked {
         self.answered = Some(number);
-        let was_due = self.outstanding.answer(lag);
+        let asked = self.outstanding.answer(lag);
         let replies = &mut self.replies;
-        match (was_due, lag) {
-            (true, 0) => replies.in_time += 1,
-            (true, _) => replies.late += 1,
-            (false, _) => replies.unasked += 1,
+        match (asked, lag) {
+            (Asked::Due, 0) => replies.in_time += 1,
+            (Asked::Due, _) => replies.late += 1,
+            (Asked::Unknown | Asked::NotDue, _) => replies.unasked += 1,
         }
-        was_due
+        replies.contact_unknown += u64::from(asked == Asked::Unknown);
+        replies.unexpected += u64::from(asked == Asked::NotDue && !is_zero);
+        asked
     }
 
     /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next one. One of an older broadcast
@@ -385,12 +373,26 @@ impl Cell {
         self.tracked.account.interrupt();
     }
 
-    /// Its contact state is no longer known, until the next stimulus: what is due is in doubt.
-    pub(super) fn forget_contact(&mut self) {
+    /// Its contact state is no longer known: what is due is in doubt.
+    fn forget_contact(&mut self) {
+        self.doubt_outstanding();
+        self.contact.reset();
+    }
+
+    /// A write of this parameter decides about its answers from now on.
+    pub(super) fn write(&mut self, number: u8) {
+        self.doubt_outstanding();
+        if number == Parameter::Mode.number() {
+            self.contact.write_mode();
+        } else {
+            self.contact.forget();
+        }
+    }
+
+    fn doubt_outstanding(&mut self) {
         let due = self.outstanding.clear();
         // A due contribution to a sum is missing there.
         self.replies.miss(if self.sums.is_some() { 0 } else { due }, true);
-        self.contact.reset();
     }
 
     /// Nothing more will come: outstanding replies are missing.

@@ -26,6 +26,8 @@ pub(super) struct Broadcast {
     at: Micros,
     due: u32,
     pub(super) in_time: u32,
+    /// Only torques came that were due, and ends of contacts.
+    pub(super) is_whole: bool,
     pub(super) last_reply: Option<Micros>,
     pub(super) error: [f64; MAX_JOINTS],
 }
@@ -67,7 +69,7 @@ impl Broadcast {
 
     /// What was due and came so far does not count.
     pub(super) const fn begin_accounts(&mut self) {
-        (self.due, self.in_time, self.last_reply) = (0, 0, None);
+        (self.due, self.in_time, self.is_whole, self.last_reply) = (0, 0, true, None);
     }
 }
 
@@ -128,8 +130,17 @@ impl Table {
         let sums = &mut self.snapshot.sums;
         (sums.stale, sums.age, sums.read_back) = (stale, age, Some(epoch));
         let error = [0.0; MAX_JOINTS];
-        self.broadcast =
-            Some(Broadcast { epoch, recent, number, at, due, in_time: 0, last_reply: None, error });
+        self.broadcast = Some(Broadcast {
+            epoch,
+            recent,
+            number,
+            at,
+            due,
+            in_time: 0,
+            is_whole: true,
+            last_reply: None,
+            error,
+        });
     }
 
     pub(super) fn close_epoch(&mut self) {
@@ -142,7 +153,8 @@ impl Table {
             return self.counters.epoch(due, complete);
         }
         self.counters.epoch(before.due > 0, before.in_time == before.due);
-        let is_compared = self.comparing && before.due > 0 && before.in_time == before.due;
+        let is_complete = before.due > 0 && before.in_time == before.due;
+        let is_compared = self.comparing && is_complete && before.is_whole;
         self.difference = is_compared.then_some(before.error);
         if is_compared {
             self.accuracy.whole_skin(before.error.get(..self.carried.joints).unwrap_or_default());

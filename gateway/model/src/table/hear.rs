@@ -8,6 +8,7 @@ use protocol::time::Micros;
 
 use super::cell::Cell;
 use super::held::Change;
+use super::replies::Asked;
 use super::root_totals::{RootTotals, Sum, Taken};
 use super::{Event, Notice, Positions, Table};
 use crate::tracker::{Update, Word};
@@ -22,6 +23,10 @@ impl Table {
             self.open_epoch(at, epoch, &joints, positions(epoch));
         } else if let Message::Stimulus { to, from, page } = *message {
             self.stimulate(to, from, page);
+        } else if let Message::Configure { to, request: Request::Write { number, .. }, .. } = *message {
+            if number == Parameter::Mode.number() {
+                self.write(to, number);
+            }
         } else if *message == Message::Halt {
             self.each_cell(Cell::halt);
         } else if *message == Message::Sync {
@@ -57,7 +62,7 @@ impl Table {
                 if SWITCHED.iter().any(|parameter| parameter.number() == number) =>
             {
                 self.counters.count(Event::Switched);
-                self.cells.iter_mut().filter(|cell| to.names(cell.node)).for_each(Cell::forget_contact);
+                self.write(to, number);
             }
             Message::Sync | Message::Report | Message::Configure { .. } => {}
             Message::Sum { .. }
@@ -73,6 +78,10 @@ impl Table {
         for cell in self.cells.iter_mut().filter(|cell| to.names(cell.node)) {
             cell.stimulate(from, page, last);
         }
+    }
+
+    fn write(&mut self, to: Node, number: u8) {
+        self.cells.iter_mut().filter(|cell| to.names(cell.node)).for_each(|cell| cell.write(number));
     }
 
     fn hear_cell(&mut self, at: Micros, id: Id, message: &Message) {
@@ -92,19 +101,29 @@ impl Table {
             self.snapshot.sums.dead -= 1;
             self.notices.push_back(Notice::Back(cell.node));
         }
+        let is_answer = matches!(
+            message,
+            Message::Sensors { .. }
+                | Message::Network { page: NetworkPage::Heard(_) | NetworkPage::Refused(_), .. }
+        );
+        if !is_answer {
+            cell.sensed.end_report();
+        }
         if let Message::Network { epoch, page, .. } = *message {
             match page {
                 NetworkPage::Heartbeat(heartbeat) => {
                     self.take_heartbeat(at, place, &update, &heartbeat, epoch)
                 }
                 NetworkPage::Heard(_) => {
+                    cell.sensed.answer_report();
                     cell.report(self.broadcast.as_ref().map_or(0, |newest| newest.since(epoch)));
                 }
                 NetworkPage::Refused(_) => cell.said.counters = true,
                 NetworkPage::Tree(_) | NetworkPage::Ports(_) => {}
             }
-        } else if let Message::Sensors { page, .. } = *message {
-            cell.take_sensors(at, &page, &self.events);
+        } else if let Message::Sensors { epoch, page, .. } = *message {
+            let is_newest = self.broadcast.as_ref().is_none_or(|broadcast| broadcast.epoch == epoch);
+            cell.take_sensors(at, &page, is_newest, &self.events);
         } else if let Message::Configured { answer, .. } = *message {
             cell.answers(&answer);
         } else if let Message::Torque { epoch, torque, .. } = *message {
@@ -167,13 +186,15 @@ impl Table {
             self.counters.count(Event::Saturated);
         }
         let format = self.carried.torque_format;
-        let was_due = cell.answer(number, lag);
+        let is_zero = torque.as_slice().iter().all(|&word| word == 0);
+        let asked = cell.answer(number, lag, is_zero);
         self.delays.reply(at.since(broadcast.stood_at(lag)));
         if lag == 0 {
             broadcast.last_reply = Some(at);
-            broadcast.in_time += u32::from(was_due);
+            broadcast.in_time += u32::from(asked == Asked::Due);
+            broadcast.is_whole &= asked == Asked::Due || is_zero && asked == Asked::NotDue;
         }
-        if let Some(expected) = cell.outstanding.expected(number) {
+        if let (Asked::Due, Some(expected)) = (asked, cell.outstanding.expected(number)) {
             let error =
                 self.accuracy.compare(cell.joint, format, torque, &expected, &mut cell.outstanding.errors);
             if lag == 0 {

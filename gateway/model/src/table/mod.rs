@@ -21,6 +21,7 @@ mod replies;
 mod root_totals;
 mod sensed;
 mod sent;
+mod status;
 mod switched;
 
 use std::collections::VecDeque;
@@ -44,13 +45,14 @@ use root_totals::RootTotals;
 use switched::Switched;
 
 pub use accuracy::{Accuracy, Errors, Rounded};
-pub use cell::{Cell, Said, Status};
+pub use cell::{Cell, Said};
 pub use counters::{Counters, Event};
 pub use delays::Delays;
 pub use epoch::Positions;
 pub use replies::Replies;
 pub use root_totals::{Contributions, SumCounts};
 pub use sensed::Sensed;
+pub use status::Status;
 pub use switched::{SWITCHES, Switch};
 
 pub use crate::tracker::Uplink;

@@ -21,8 +21,13 @@ pub struct Replies {
     pub missing: u64,
     /// Of the missing ones, those of a cell that was dead or restarted, or whose bus was lost.
     pub in_doubt: u64,
-    /// Torques that were not due: ends of contacts, and cells whose sensors are unknown.
+    /// Torques that were not due: ends of contacts, and the next two.
     pub unasked: u64,
+    /// Of these, torques of cells whose contact was not known.
+    pub contact_unknown: u64,
+    /// Of these, torques other than zero of cells whose contact was known: nothing touched them, or they could not be
+    /// expected to answer.
+    pub unexpected: u64,
     /// Torques that came when their epoch, or a later one of the same cell, was over, and were dropped.
     pub too_late: u64,
 }
@@ -40,6 +45,17 @@ impl Replies {
     }
 }
 
+/// Whether a torque that came was to come.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Asked {
+    /// It was due.
+    Due,
+    /// It was not due, by what is known of the cell's contact.
+    NotDue,
+    /// The contact of its cell was not known.
+    Unknown,
+}
+
 /// The central torques of one epoch, in Nm.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Expected {
@@ -53,23 +69,32 @@ pub(super) struct Expected {
 pub(super) struct Outstanding {
     /// Bit n: the n-th broadcast before the newest one was to be answered and is not yet.
     due: u8,
+    /// Bit n: at the n-th broadcast before the newest one the cell's contact was known.
+    known: u8,
     expected: [Option<Expected>; LATEST + 1],
     /// How far its answers were from that.
     pub(super) errors: Errors,
 }
 
 impl Outstanding {
-    /// A new broadcast, to be answered if `due`; whether the oldest one was not answered and no longer can be.
-    pub(super) fn open(&mut self, due: bool) -> bool {
+    /// A new broadcast, to be answered if `due`; `is_known` if the cell's contact is. Returns whether the oldest one was
+    /// not answered and no longer can be.
+    pub(super) fn open(&mut self, due: bool, is_known: bool) -> bool {
         let oldest = 1 << LATEST;
         let unanswered = self.due & oldest != 0;
         self.due = (self.due & (oldest - 1)) << 1 | u8::from(due);
+        self.known = (self.known & (oldest - 1)) << 1 | u8::from(is_known);
         unanswered
     }
 
-    /// A new broadcast, of which the only thing that counts is whether it is to be answered.
-    pub(super) fn open_only(&mut self, due: bool) {
-        self.due = u8::from(due);
+    /// What was due so far does not count.
+    pub(super) fn begin_accounts(&mut self) {
+        *self = Self { known: self.known, ..Self::default() };
+    }
+
+    /// A new broadcast; those before it do not count.
+    pub(super) fn open_only(&mut self, due: bool, is_known: bool) {
+        (self.due, self.known) = (u8::from(due), u8::from(is_known));
     }
 
     /// Whether the newest broadcast is to be answered.
@@ -78,16 +103,23 @@ impl Outstanding {
     }
 
     /// The broadcast `lag` before the newest is answered; whether that was due.
-    pub(super) const fn answer(&mut self, lag: usize) -> bool {
-        let was_due = self.due >> lag & 1 != 0;
-        self.due &= !(1 << lag);
-        was_due
+    pub(super) const fn answer(&mut self, lag: usize) -> Asked {
+        let bit = 1 << lag;
+        let was_due = self.due & bit != 0;
+        self.due &= !bit;
+        if was_due {
+            Asked::Due
+        } else if self.known & bit != 0 {
+            Asked::NotDue
+        } else {
+            Asked::Unknown
+        }
     }
 
-    /// Clears the outstanding replies; how many there were.
+    /// Clears the outstanding replies, and what is known of the contact at their broadcasts; how many there were.
     pub(super) const fn clear(&mut self) -> u32 {
         let due = self.due.count_ones();
-        self.due = 0;
+        (self.due, self.known) = (0, 0);
         due
     }
 
@@ -112,11 +144,15 @@ mod tests {
     #[test]
     fn an_answer_is_to_the_broadcast_so_many_before_the_newest_and_counts_once() {
         let mut outstanding = Outstanding::default();
-        [true, false, true].into_iter().for_each(|due| _ = outstanding.open(due));
+        use Asked::{Due, NotDue, Unknown};
+        let broadcasts = [(false, false), (true, true), (false, true), (true, true)];
+        broadcasts.into_iter().for_each(|(due, is_known)| _ = outstanding.open(due, is_known));
         assert!(outstanding.is_due());
-        assert_eq!([0, 0, 1, 2, 2].map(|lag| outstanding.answer(lag)), [true, false, false, true, false]);
+        let answers = [0, 0, 1, 2, 2, 3].map(|lag| outstanding.answer(lag));
+        assert_eq!(answers, [Due, NotDue, NotDue, Due, NotDue, Unknown]);
         assert_eq!(outstanding.clear(), 0);
-        (0..5).for_each(|_| _ = outstanding.open(true));
+        (0..5).for_each(|_| _ = outstanding.open(true, true));
         assert_eq!(outstanding.clear(), 4, "the newest, and three before it");
+        assert_eq!(outstanding.answer(0), Unknown, "what was known is in doubt");
     }
 }

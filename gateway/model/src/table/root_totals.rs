@@ -36,8 +36,10 @@ pub struct Contributions {
     pub late: u64,
     /// Never in it.
     pub missing: u64,
-    /// In it and not due: cells whose sensors are unknown.
+    /// In it and not due.
     pub unasked: u64,
+    /// Of these, cells in sums of epochs in which the contact of some cell was not known.
+    pub contact_unknown: u64,
 }
 
 /// A root's sum for one epoch.
@@ -191,6 +193,7 @@ impl RootTotals {
         open.in_time = Some(open.came);
         let complete = open.came >= open.due;
         if open.due > 0
+            && open.known
             && open.came == open.due
             && let Some(expected) = &open.expected
         {
@@ -211,7 +214,7 @@ impl RootTotals {
 
 impl Contributions {
     fn settle(&mut self, open: Option<Open>) {
-        let Some(Open { due, came, in_time, .. }) = open else { return };
+        let Some(Open { due, known, came, in_time, .. }) = open else { return };
         let in_time = in_time.unwrap_or(came).min(due);
         let all = came.min(due);
         self.due += u64::from(due);
@@ -219,6 +222,7 @@ impl Contributions {
         self.late += u64::from(all - in_time);
         self.missing += u64::from(due - all);
         self.unasked += u64::from(came - all);
+        self.contact_unknown += if known { 0 } else { u64::from(came - all) };
     }
 }
 

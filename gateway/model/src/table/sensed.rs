@@ -4,7 +4,7 @@
 
 use protocol::message::SensorPage;
 use protocol::parameters::Events;
-use protocol::time::Micros;
+use protocol::time::{Micros, Span};
 use protocol::touch::{Touch, contact};
 
 /// The sensors frames of one cell.
@@ -17,16 +17,50 @@ pub struct Sensed {
     /// Releases: contact fell below the threshold less hysteresis.
     pub releases: u64,
     contact: Touch,
-    /// When the first and the last came.
+    /// Frames that no report asked for.
+    unasked: u64,
+    /// When the first and the last of them came.
     span: Option<(Micros, Micros)>,
+    /// The pages of each kind that are still to come in answer to a report.
+    requested: [bool; KINDS],
+}
+
+/// Kinds of sensors pages.
+const KINDS: usize = 3;
+/// The fewest frames that make a rate.
+const FEWEST: u64 = 3;
+/// The shortest time over which frames make a rate.
+const SHORTEST: Span = Span::from_millis(1_000);
+
+/// The place of a page's kind in [`Sensed`].
+const fn kind(page: &SensorPage) -> usize {
+    match page {
+        SensorPage::Skin(_) => 0,
+        SensorPage::Acceleration(_) => 1,
+        SensorPage::Baseline(_) => 2,
+    }
 }
 
 impl Sensed {
+    /// The cell answers a report: one page of each kind follows at once.
+    pub(super) const fn answer_report(&mut self) {
+        self.requested = [true; KINDS];
+    }
+
+    /// The answer to a report is complete, or its pages were lost.
+    pub(super) const fn end_report(&mut self) {
+        self.requested = [false; KINDS];
+    }
+
     /// A sensors frame came.
     pub(super) fn hear(&mut self, at: Micros, page: &SensorPage, events: &Events) {
         self.frames += 1;
-        let (first, _) = *self.span.get_or_insert((at, at));
-        self.span = Some((first, at));
+        let requested = self.requested.get_mut(kind(page)).is_some_and(core::mem::take);
+        if !requested {
+            self.unasked += 1;
+            let (first, _) = *self.span.get_or_insert((at, at));
+            self.span = Some((first, at));
+        }
         let SensorPage::Skin(skin) = page else { return };
         let before = self.contact;
         self.contact = before.next(contact(skin), events.contact.to_bits(), events.hysteresis);
@@ -39,13 +73,15 @@ impl Sensed {
         self.contact = Touch::Free;
     }
 
-    /// Frames a second, from the first to the last; none of less than two.
+    /// Frames a second that no report asked for, from the first to the last of them; `None` of fewer than three, or of
+    /// less than a second.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
     pub fn rate_hz(&self) -> Option<f64> {
         let (first, last) = self.span?;
-        let span = last.since(first).0;
-        (span > 0).then(|| (self.frames - 1) as f64 * 1e6 / span as f64)
+        let span = last.since(first);
+        let is_enough = self.unasked >= FEWEST && span >= SHORTEST;
+        is_enough.then(|| (self.unasked - 1) as f64 / span.seconds())
     }
 }
 
@@ -75,11 +111,43 @@ mod tests {
     }
 
     #[test]
-    fn a_rate_needs_two_frames_and_pages_of_either_kind_count() {
-        assert_eq!(after(&[]).rate_hz(), None);
-        let mut sensed = after(&[0]);
-        assert_eq!(sensed.rate_hz(), None);
-        sensed.hear(Micros(4_000), &SensorPage::Acceleration([Q3_12::ZERO; 3]), &Events::default());
-        assert!(sensed.rate_hz().is_some_and(|hz| (hz - 250.0).abs() < 1e-9));
+    fn a_rate_needs_three_frames_and_a_second_and_pages_of_either_kind_count() {
+        let rate = |times_us: &[u64]| {
+            let mut sensed = Sensed::default();
+            for (&at, page) in times_us.iter().zip([skin(), ACCELERATION].iter().cycle()) {
+                sensed.hear(Micros(at), page, &Events::default());
+            }
+            sensed.rate_hz()
+        };
+        let none = [&[][..], &[0], &[0, 1], &[0, 2_000_000], &[0, 1, 2], &[0, 1, 999_999]];
+        assert_eq!(none.map(rate), [None; 6]);
+        assert!(rate(&[0, 1, 1_000_000]).is_some_and(|hz| (hz - 2.0).abs() < 1e-9));
+        assert!(rate(&[7, 500_007, 900_007, 2_000_007]).is_some_and(|hz| (hz - 1.5).abs() < 1e-9));
+    }
+
+    #[test]
+    fn answers_to_reports_make_no_rate_and_are_frames() {
+        let mut sensed = Sensed::default();
+        for second in 0..10 {
+            let at = Micros(second * 1_000_000);
+            sensed.answer_report();
+            sensed.hear(at, &skin(), &Events::default());
+            sensed.hear(Micros(at.0 + 1), &ACCELERATION, &Events::default());
+        }
+        assert_eq!((sensed.rate_hz(), sensed.frames), (None, 20));
+        // Its acceleration was lost, and the next one is none of the answer.
+        sensed.answer_report();
+        sensed.hear(Micros(0), &skin(), &Events::default());
+        sensed.end_report();
+        for at in [0, 1_000_000, 2_000_000] {
+            sensed.hear(Micros(at), &ACCELERATION, &Events::default());
+        }
+        assert!(sensed.rate_hz().is_some_and(|hz| (hz - 1.0).abs() < 1e-9));
+    }
+
+    const ACCELERATION: SensorPage = SensorPage::Acceleration([Q3_12::ZERO; 3]);
+
+    fn skin() -> SensorPage {
+        SensorPage::Skin(SkinSensors::default())
     }
 }

@@ -1,7 +1,8 @@
 //! A table of a bus whose cells answer with torques.
 
 use super::*;
-use protocol::message::{Heard, Joints, NetworkPage, SensorPage, State};
+use protocol::message::{Answer, Heard, Joints, NetworkPage, Request, SensorPage, State};
+use protocol::parameters::Parameter;
 
 /// A table that received these, in the frames of the bus, the gateway's own or a cell's.
 fn table(heard: &[(bool, Message)]) -> Table {
@@ -66,7 +67,7 @@ fn a_torque_from_before_an_outage_does_not_come_back_with_the_bus() {
 }
 
 #[test]
-fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_stimulus() {
+fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
     let cell = CellId::new(1).unwrap();
     let joints = |epoch| {
         (true, Message::Joints { epoch: Epoch(epoch), joints: Joints { in_use: 6, ..Joints::default() } })
@@ -89,17 +90,34 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_stimulus() {
         (replies.due, replies.missing, replies.in_doubt)
     };
     let mut table = table(&[]);
-    assert_eq!(hear(&mut table, &[heartbeat(1), press, joints(1), joints(2)]), (2, 0, 0));
+    let untouched = (
+        false,
+        Message::Network {
+            from: Node::Cell(cell),
+            epoch: Epoch(0),
+            page: NetworkPage::Heard(Heard::default()),
+        },
+    );
+    assert_eq!(hear(&mut table, &[heartbeat(1), untouched, press, joints(1), joints(2)]), (2, 0, 0));
     table.interrupt();
     // It may come back later than the bus, and so may not have received this.
     assert_eq!(hear(&mut table, &[joints(3), press, joints(4)]), (2, 2, 2));
     assert_eq!(table.notices().count(), 0);
     assert_eq!(hear(&mut table, &[heartbeat(9), joints(5)]), (2, 2, 2), "its sensors are unknown");
     assert_eq!(table.notices().collect::<Vec<_>>(), [Notice::Returned(cell)]);
-    assert_eq!(hear(&mut table, &[press, joints(6), heartbeat(10), joints(7)]), (4, 2, 2));
+    assert_eq!(hear(&mut table, &[press, joints(6)]), (2, 2, 2), "others may wait in it");
+    let (number, words) = (Parameter::Mode.number(), packet::words([1]));
+    let write = (
+        true,
+        Message::Configure { to: Node::Cell(cell), tag: 0, request: Request::Write { number, words } },
+    );
+    let answer = Answer::Value { number, written: true, words };
+    let confirm = (false, Message::Configured { from: cell, tag: 0, answer });
+    assert_eq!(hear(&mut table, &[write, press, joints(7)]), (2, 2, 2), "it has not confirmed");
+    assert_eq!(hear(&mut table, &[confirm, joints(8), heartbeat(11), joints(9)]), (4, 2, 2));
     assert_eq!(table.notices().count(), 0, "reported once");
     let uplink = table.cells().first().unwrap().uplink();
-    assert_eq!((uplink.lost, uplink.outage), (7, 7));
+    assert_eq!((uplink.lost, uplink.outage), (6, 6));
 }
 
 #[test]
@@ -184,10 +202,12 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
         (true, Message::Joints { epoch: Epoch(epoch), joints })
     };
     let result = |intruded| {
-        let mut said =
-            vec![says(7, 40, settled), (true, press), joints(1), joints(2), says(7, 44, settled), joints(3)];
+        let untouched = NetworkPage::Heard(Heard::default());
+        let untouched = Message::Network { from: Node::Cell(cell), epoch: Epoch(0), page: untouched };
+        let mut said = vec![says(7, 40, settled), (false, untouched), (true, press), joints(1)];
+        said.extend([joints(2), says(7, 44, settled), joints(3)]);
         if intruded {
-            said.insert(3, says(9, 0, State::CLAIMING));
+            said.insert(4, says(9, 0, State::CLAIMING));
         }
         let mut table = table(&said);
         assert_eq!(table.notices().count(), 0, "no restart");
@@ -204,7 +224,7 @@ fn an_address_claim_for_a_taken_node_id_does_not_change_its_owner() {
         )
     };
     assert_eq!(result(true), result(false));
-    assert_eq!((result(true).2.due, result(true).5, result(true).6), (3, 3, 0));
+    assert_eq!((result(true).2.due, result(true).5, result(true).6), (3, 2, 0));
 }
 
 #[test]
@@ -257,4 +277,123 @@ fn a_cell_is_active_stale_or_quiet_by_the_torque_that_is_held() {
     assert_eq!(said.map(&mut hear), [active, active, stale, active]);
     let said = [joints(4), torque(4, 0), joints(5), joints(6)];
     assert_eq!(said.map(&mut hear), [active, quiet, quiet, quiet]);
+}
+
+/// A cell that was there before, and has a stimulus of another sender of which nothing came here.
+struct There {
+    table: Table,
+    epoch: u8,
+}
+
+impl There {
+    const CELL: i64 = 1;
+
+    fn new(stimuli: u16) -> Self {
+        let mut there = Self { table: table(&[]), epoch: 10 };
+        there.table.set_comparing(true);
+        let state = State::CONFIGURED.with(State::TEST_MODE, true);
+        there.says(NetworkPage::Heartbeat(Heartbeat { sent: 70, state, ..Heartbeat::default() }));
+        there.says(NetworkPage::Heard(Heard { stimuli, joints: 50, ..Heard::default() }));
+        there.hear(false, &Message::Sensors { from: Self::cell(), epoch: Epoch(10), page: Self::press(0.0) });
+        there
+    }
+
+    fn cell() -> CellId {
+        CellId::new(Self::CELL).unwrap()
+    }
+
+    fn press(newtons: f64) -> SensorPage {
+        let contact = [protocol::fixed::Q5_10::nearest(newtons / 3.0); 3];
+        SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() })
+    }
+
+    fn hear(&mut self, own: bool, message: &Message) {
+        for frame in message.encode().frames(Format::Fd) {
+            self.table.handle_frame(Micros(0), own, &frame, &mut |_| None);
+        }
+    }
+
+    fn says(&mut self, page: NetworkPage) {
+        self.hear(
+            false,
+            &Message::Network { from: Node::Cell(Self::cell()), epoch: Epoch(self.epoch), page },
+        );
+    }
+
+    fn stimulate(&mut self, newtons: f64) {
+        let from = protocol::message::From::Next;
+        let page = Self::press(newtons);
+        self.hear(true, &Message::Stimulus { to: Node::Cell(Self::cell()), from, page });
+    }
+
+    /// So many joints, each of which the cell answers with 1 Nm.
+    fn answered(&mut self, joints: usize) -> Replies {
+        for _ in 0..joints {
+            self.epoch = self.epoch.wrapping_add(1);
+            let epoch = Epoch(self.epoch);
+            self.hear(true, &Message::Joints { epoch, joints: Joints { in_use: 6, ..Joints::default() } });
+            let torque = [4_096; 6].into();
+            self.hear(false, &Message::Torque { from: Self::cell(), epoch, torque });
+        }
+        self.table.cells().first().unwrap().replies
+    }
+
+    fn compared(&self) -> (u64, u64) {
+        (self.table.accuracy().single.count(), self.table.accuracy().whole.count())
+    }
+}
+
+#[test]
+fn a_cell_that_was_pressed_before_is_neither_due_nor_compared() {
+    let mut there = There::new(1);
+    assert!(there.table.cells()[0].has_unseen_stimuli());
+    let replies = there.answered(125);
+    assert_eq!((replies.due, replies.unasked, replies.contact_unknown, replies.unexpected), (0, 125, 125, 0));
+    assert_eq!(there.compared(), (0, 0));
+    // Not even with a stimulus of our own: one that came before may hold from a later epoch on.
+    there.stimulate(2.0);
+    assert_eq!(there.answered(3).due, 0);
+    // By now all that waited in it is latched; the next stimulus is the last one.
+    there.answered(1);
+    there.stimulate(2.0);
+    assert_eq!((there.answered(5).due, there.compared().0 > 0), (5, true));
+}
+
+#[test]
+fn a_page_of_a_cell_counts_when_no_stimulus_from_before_can_wait() {
+    let mut there = There::new(1);
+    let page = |epoch| Message::Sensors { from: There::cell(), epoch: Epoch(epoch), page: There::press(3.0) };
+    there.answered(128);
+    there.hear(false, &page(there.epoch));
+    assert_eq!(there.answered(1).due, 0, "one may wait for these very joints");
+    there.hear(false, &page(there.epoch.wrapping_sub(1)));
+    assert_eq!(there.answered(1).due, 0, "the page is of joints before the newest");
+    there.hear(false, &page(there.epoch));
+    assert_eq!(there.answered(4).due, 4);
+}
+
+#[test]
+fn a_cell_without_stimuli_before_is_known_at_once_and_a_torque_of_it_is_unexpected() {
+    let mut there = There::new(0);
+    assert!(!there.table.cells()[0].has_unseen_stimuli());
+    let replies = there.answered(5);
+    assert_eq!((replies.due, replies.unasked, replies.contact_unknown, replies.unexpected), (0, 5, 0, 5));
+    assert_eq!(there.compared(), (0, 0), "what is not due is not compared");
+    there.stimulate(2.0);
+    assert_eq!((there.answered(5).due, there.compared().0 > 0), (5, true));
+}
+
+#[test]
+fn epochs_with_a_torque_that_was_not_due_are_not_the_whole_skin() {
+    let mut there = There::new(0);
+    there.stimulate(2.0);
+    there.answered(5);
+    let whole = there.compared().1;
+    assert!(whole > 0);
+    // Another gateway's write: until the next stimulus the contact is not known.
+    let request = Request::Write { number: Parameter::Reply.number(), words: packet::words([0]) };
+    there.hear(false, &Message::Configure { to: Node::Everyone, tag: 0, request });
+    let replies = there.answered(5);
+    assert_eq!((replies.contact_unknown, replies.unasked), (5, 5));
+    assert!(there.compared().1 <= whole + 6, "the epoch before may still close");
 }

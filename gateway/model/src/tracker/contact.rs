@@ -1,5 +1,14 @@
 //! The contact state of a cell in test mode, by the protocol's rules: stimuli that wait for their epochs, and latched
 //! ones. It is independent of the cells' code, so that each is an oracle of the other.
+//!
+//! A stimulus that was sent before a reader listens may still wait in the cell, and no page of the cell reports it. So
+//! the contact state is *known* only where every stimulus that can count was received here:
+//!
+//! ```text
+//!   a start; a confirmed write of the mode ───────────> nothing touches the cell, and nothing waits in it
+//!   as many stimuli counted by the cell as came here ─> those that came here are all
+//!   129 joints; then a stimulus, or the cell's page ──> what waited before them is latched, and replaced
+//! ```
 
 use protocol::fixed::Q3_12;
 use protocol::message::{From, SensorPage, SkinSensors};
@@ -15,17 +24,67 @@ pub struct Contact<T> {
     skin: Option<(SkinSensors, T)>,
     acceleration: Option<([Q3_12; 3], T)>,
     obeys: Option<bool>,
+    /// `skin` follows from all stimuli that the cell has taken.
+    is_known: bool,
+    unseen: Unseen,
+    /// Stimuli since the reader began; `None` once it has lost count of what they led to.
+    came: Option<u16>,
+    /// The cell has counted stimuli that did not come here.
+    is_short: bool,
+    /// The mode was written, and the cell has not confirmed it.
+    clears: bool,
+}
+
+/// Stimuli that were not received here and may wait in the cell.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+enum Unseen {
+    /// No joints came yet.
+    Any,
+    /// Those for one of the next `ahead` epochs after the last joints.
+    Ahead { last: Epoch, ahead: u8 },
+    /// None can wait.
+    None,
+}
+
+/// A stimulus waits for at most half of all epochs.
+const HALF: u8 = 1 << 7;
+
+impl Unseen {
+    /// The joints of an epoch latch all stimuli for it and for half of all epochs before it.
+    fn latch(&mut self, epoch: Epoch) {
+        *self = match *self {
+            Self::None => Self::None,
+            Self::Any => Self::Ahead { last: epoch, ahead: HALF },
+            Self::Ahead { last, ahead } => {
+                match u8::try_from(i32::from(ahead) - i32::from(epoch.since(last))).unwrap_or(0) {
+                    0 => Self::None,
+                    ahead => Self::Ahead { last: epoch, ahead: ahead.min(HALF) },
+                }
+            }
+        };
+    }
 }
 
 impl<T> Default for Contact<T> {
     fn default() -> Self {
-        Self { waiting: Vec::new(), skin: None, acceleration: None, obeys: None }
+        Self {
+            waiting: Vec::new(),
+            skin: None,
+            acceleration: None,
+            obeys: None,
+            is_known: false,
+            unseen: Unseen::Any,
+            came: Some(0),
+            is_short: false,
+            clears: false,
+        }
     }
 }
 
 impl<T> Contact<T> {
     /// Takes a stimulus, unless the cell measures or too many wait; `last` is the epoch of the last joints.
     pub fn push(&mut self, from: From, page: SensorPage, tag: T, last: Option<Epoch>) {
+        self.came = self.came.map(|came| came.wrapping_add(1));
         if self.obeys != Some(false) && self.waiting.len() < PENDING {
             self.waiting.push((if is_late(from, last) { From::Next } else { from }, page, tag));
         }
@@ -33,6 +92,8 @@ impl<T> Contact<T> {
 
     /// Latches the stimuli for the joints of this epoch; the newest of each page counts. Each is passed to `latched`.
     pub fn latch(&mut self, epoch: Epoch, mut latched: impl FnMut(&mut T)) {
+        self.unseen.latch(epoch);
+        self.is_short &= self.unseen != Unseen::None;
         let is_due = move |(from, _, _): &mut (From, SensorPage, T)| match from {
             From::Next => true,
             From::Epoch(first) => epoch.since(*first) >= 0,
@@ -40,7 +101,10 @@ impl<T> Contact<T> {
         for (_, page, mut tag) in self.waiting.extract_if(.., is_due) {
             latched(&mut tag);
             match page {
-                SensorPage::Skin(skin) => self.skin = Some((skin, tag)),
+                SensorPage::Skin(skin) => {
+                    self.skin = Some((skin, tag));
+                    self.is_known |= self.unseen == Unseen::None;
+                }
                 SensorPage::Acceleration(acceleration) => self.acceleration = Some((acceleration, tag)),
                 SensorPage::Baseline(_) => {}
             }
@@ -48,9 +112,13 @@ impl<T> Contact<T> {
     }
 
     /// Takes the cell's own sensors page. It counts only while nothing else is known, because it may be older than the
-    /// joints at which the cell latched the next stimulus.
+    /// joints at which the cell latched the next stimulus; and not while a stimulus that did not come here may wait.
     pub fn learn(&mut self, page: SensorPage, tag: T) {
         match page {
+            SensorPage::Skin(skin) if !self.is_known && self.unseen == Unseen::None => {
+                (self.skin, self.is_known) = (Some((skin, tag)), true);
+            }
+            SensorPage::Skin(_) if self.is_short => {}
             SensorPage::Skin(skin) => _ = self.skin.get_or_insert((skin, tag)),
             SensorPage::Acceleration(acceleration) => {
                 _ = self.acceleration.get_or_insert((acceleration, tag))
@@ -60,7 +128,47 @@ impl<T> Contact<T> {
         }
     }
 
-    /// Its skin sensors, once they are known.
+    /// Takes how many stimuli the cell has counted since its start. If as many came here, there are no others.
+    pub fn count(&mut self, stimuli: u16, tag: T) {
+        if self.came == Some(stimuli) {
+            self.settle(tag);
+        } else if self.came.is_some() {
+            self.is_short = self.unseen != Unseen::None;
+        }
+    }
+
+    /// The cell has started: nothing touches it, and no stimulus waits.
+    pub fn start(&mut self, tag: T) {
+        self.reset();
+        self.settle(tag);
+    }
+
+    /// The mode was written, which clears the contact state as soon as the cell has taken it.
+    pub fn write_mode(&mut self) {
+        self.reset();
+        self.clears = true;
+    }
+
+    /// The cell has confirmed a write of its mode: since then all stimuli came here.
+    pub fn confirm_mode(&mut self, tag: T) {
+        if self.clears {
+            self.settle(tag);
+        }
+    }
+
+    /// All stimuli that count came here.
+    fn settle(&mut self, tag: T) {
+        self.skin.get_or_insert_with(|| (SkinSensors::default(), tag));
+        (self.is_known, self.unseen, self.is_short, self.clears) = (true, Unseen::None, false, false);
+    }
+
+    /// Its skin sensors if no stimulus that was not received here can have changed them.
+    #[must_use]
+    pub fn known(&self) -> Option<&(SkinSensors, T)> {
+        self.skin.as_ref().filter(|_| self.is_known)
+    }
+
+    /// Its skin sensors as far as stimuli and pages that came tell; older stimuli may have changed them.
     #[must_use]
     pub const fn skin(&self) -> Option<&(SkinSensors, T)> {
         self.skin.as_ref()
@@ -78,10 +186,17 @@ impl<T> Contact<T> {
         &self.waiting
     }
 
-    /// Clears the contact state and what waits: the cell has started, or its mode was written.
+    /// Forgets the contact state and what waits: stimuli may have been lost on their way, or came from others.
     pub fn reset(&mut self) {
         self.waiting.clear();
         (self.skin, self.acceleration) = (None, None);
+        (self.is_known, self.unseen, self.came) = (false, Unseen::Any, None);
+        (self.is_short, self.clears) = (false, false);
+    }
+
+    /// Forgets the contact state until the next stimulus; what waits in the cell goes on waiting.
+    pub fn forget(&mut self) {
+        (self.skin, self.acceleration, self.is_known, self.came) = (None, None, false, None);
     }
 
     /// Whether the cell obeys stimuli; `None` while that is not known, and then it is assumed.
@@ -151,6 +266,77 @@ mod tests {
         assert_eq!(latch(&mut contact, 1), Some((1.0, 2)));
         contact.learn(press(3.0), 3);
         assert_eq!(latch(&mut contact, 2), Some((1.0, 2)), "an old page");
+    }
+
+    fn known(contact: &Contact<u64>) -> Option<f64> {
+        contact.known().map(|(skin, _)| skin.contact[0].to_f64())
+    }
+
+    #[test]
+    fn a_contact_is_known_from_a_start_a_confirmed_mode_or_equal_counts_on() {
+        let mut contact = Contact::default();
+        contact.learn(press(3.0), 1);
+        contact.push(From::Next, press(1.0), 1, None);
+        assert_eq!((latch(&mut contact, 1), known(&contact)), (Some((1.0, 1)), None), "others may wait");
+        contact.count(2, 1);
+        assert_eq!(known(&contact), None, "it has taken one that did not come here");
+        contact.count(1, 1);
+        assert_eq!(known(&contact), Some(1.0));
+        contact.reset();
+        contact.count(1, 1);
+        assert_eq!(known(&contact), None, "the count is of stimuli that are forgotten");
+        contact.start(1);
+        assert_eq!(known(&contact), Some(0.0));
+        contact.write_mode();
+        contact.push(From::Next, press(2.0), 1, None);
+        assert_eq!((latch(&mut contact, 2), known(&contact)), (Some((2.0, 1)), None), "not confirmed");
+        contact.confirm_mode(1);
+        assert_eq!(known(&contact), Some(2.0), "the stimulus came after the write");
+        contact.forget();
+        contact.confirm_mode(1);
+        assert_eq!(known(&contact), None, "nothing was written");
+        contact.push(From::Next, press(1.0), 1, None);
+        assert_eq!((latch(&mut contact, 3), known(&contact)), (Some((1.0, 1)), Some(1.0)));
+        contact.reset();
+        contact.confirm_mode(1);
+        assert_eq!(known(&contact), None);
+    }
+
+    /// A cell with one stimulus from before for any epoch: none is left when the reader takes its word.
+    #[test]
+    fn no_stimulus_from_before_waits_when_a_page_is_believed_whatever_epochs_come() {
+        for steps in [&[1_u8][..], &[127], &[3, 1, 255, 1], &[200, 100], &[1, 1, 100], &[254, 7]] {
+            let mut contact = Contact::<u64>::default();
+            let mut waiting: Vec<u8> = (0..=255).collect();
+            let (mut epoch, mut joints) = (77_u8, 0);
+            while contact.unseen != Unseen::None {
+                contact.latch(Epoch(epoch), |_| {});
+                waiting.retain(|&first| Epoch(epoch).since(Epoch(first)) < 0);
+                let ahead = match contact.unseen {
+                    Unseen::Any => 256,
+                    Unseen::Ahead { ahead, .. } => usize::from(ahead),
+                    Unseen::None => 0,
+                };
+                assert!(waiting.len() <= ahead, "{waiting:?} after epoch {epoch}, {:?}", contact.unseen);
+                epoch = epoch.wrapping_add(steps[joints % steps.len()]);
+                joints += 1;
+                assert!(joints < 1_000, "{steps:?}");
+            }
+            assert!(waiting.is_empty());
+            assert!(joints == 129 || steps != [1]);
+            contact.learn(press(3.0), 1);
+            assert_eq!(known(&contact), Some(3.0));
+        }
+    }
+
+    #[test]
+    fn a_page_of_a_cell_that_counted_other_stimuli_tells_nothing() {
+        let mut contact = Contact::default();
+        contact.count(1, 1);
+        contact.learn(press(0.0), 1);
+        assert_eq!(latch(&mut contact, 1), None, "the other one may wait");
+        contact.push(From::Next, press(1.0), 2, None);
+        assert_eq!(latch(&mut contact, 2), Some((1.0, 2)));
     }
 
     #[test]

@@ -1,0 +1,74 @@
+//! The contact of cells that were there before: a stimulus that came before this run listened may still wait in them.
+
+use std::time::Duration;
+
+use protocol::id::{CellId, Node};
+use protocol::parameters::Parameter;
+use protocol::usage::say;
+
+use super::RunError;
+use super::begin::SHOWING;
+use super::bench::Bench;
+use super::watch::Script;
+use crate::view::CellView;
+
+/// How long cells may take to report their counters and to clear their contact; they need milliseconds.
+const ANSWERING: Duration = Duration::from_millis(500);
+/// The value of the mode in which cells obey stimuli.
+const TEST_MODE: i16 = 1;
+
+impl Bench<'_> {
+    /// Waits, not for long, until the contact of all cells in test mode is known: the counters that the report brings show
+    /// whether a cell has taken stimuli before. A scenario that touches the skin begins with cells that nothing touches.
+    pub(super) fn know_contacts(&mut self, script: &mut Script) -> Result<(), RunError> {
+        let unreported = |cell: &CellView| cell.unclear && !cell.said.counters;
+        self.wait(ANSWERING, |bench, timeout| Ok(bench.count(unreported) == 0 || timeout.is_over(0)))?;
+        if script.touches.cells().next().is_some() {
+            self.wait(SHOWING, |bench, timeout| {
+                bench.clear_contacts(script)?;
+                Ok(bench.count(|cell| cell.unclear) == 0 || timeout.is_over(0))
+            })?;
+        }
+        let unclear = self.names(|cell| cell.unclear);
+        if !unclear.is_empty() && !self.options.quiet {
+            say(&format!(
+                "the contact of these cells is not known, their torques are not compared: {unclear}; they have taken \
+                 stimuli before this run (`gateway frame configure --node N --write mode 1` clears one)"
+            ));
+        }
+        Ok(())
+    }
+
+    /// Clears the contact of cells in test mode that may have taken stimuli of others, or lost some of this run, and sends them
+    /// the scenario's stimuli. Only a run that touches the skin does so.
+    pub(super) fn clear_contacts(&self, script: &mut Script) -> Result<(), RunError> {
+        if script.touches.cells().next().is_none() {
+            return Ok(());
+        }
+        let unclear = self.unclear();
+        let due = script.cleared.due(self.now(), unclear);
+        for &(bus, cell) in &due {
+            let Some(bus_link) = self.bus_links.get(bus) else { continue };
+            let mode = core::array::from_fn(|place| if place == 0 { TEST_MODE } else { 0 });
+            bus_link.switch(Node::Cell(cell), (Parameter::Mode.number(), mode))?;
+        }
+        if due.is_empty() || script.has_not_begun() {
+            return Ok(());
+        }
+        self.remind(script, |it| due.contains(&(it.bus, it.node)))
+    }
+
+    /// The cells that may have stimuli that did not come here, on buses that work.
+    fn unclear(&self) -> Vec<(usize, CellId)> {
+        let mut unclear = Vec::new();
+        for (bus, bus_link) in
+            self.bus_links.iter().enumerate().filter(|(_, bus_link)| bus_link.link.state.is_there())
+        {
+            let Ok(view) = bus_link.view.lock() else { continue };
+            // Next to never, and thousands of cells would be looked at a hundred times a second.
+            let cells = view.cells.iter().filter(|cell| view.unclear && cell.unclear);
+            unclear.extend(cells.map(|cell| (bus, cell.node)));
+        }
+        unclear
+    }
+}
