@@ -129,10 +129,15 @@ impl Summary {
     }
 
     fn lost_frames(&self) -> Option<String> {
-        let Recording { errors, lost_write, .. } = self.recording.as_ref()?;
+        let Recording { errors, lost_write, files, .. } = self.recording.as_ref()?;
         let first = errors.first().map_or("", String::as_str);
-        (!errors.is_empty() || *lost_write > 0)
-            .then(|| format!("the recording is incomplete, {lost_write} frames were not written: {first}"))
+        let parts = files.iter().map(|file| &file.path).filter(|path| path.ends_with(".part"));
+        let parts: String = parts
+            .map(|path| format!("; what was recorded is in {path}: repair it with `gateway recover {path}`"))
+            .collect();
+        (!errors.is_empty() || *lost_write > 0).then(|| {
+            format!("the recording is incomplete, {lost_write} frames were not written: {first}{parts}")
+        })
     }
 }
 

@@ -11,7 +11,7 @@ use rustix::fs::{Access, access};
 
 use super::target::{
     Target, hold, identity, is_still, open_stream, open_unfollowed, or_exists, part_of, suffixed,
-    sync_folder, with_hint,
+    sync_folder, with_hint, write_all_patiently,
 };
 
 /// A log. It has its name from the start, is locked against other writers, and holds whole lines only. One that
@@ -115,7 +115,7 @@ impl LogFile {
             self.state = State::Ours(self.take_place()?);
         }
         let written = match &mut self.state {
-            State::Ours(file) | State::Old(file) => file.write_all(lines),
+            State::Ours(file) | State::Old(file) => write_all_patiently(file, lines),
             State::Stream(stream) => stream.write_all(lines),
         };
         match &self.state {
@@ -138,9 +138,10 @@ impl LogFile {
     /// When another program has renamed, removed or truncated it, or written to it.
     pub fn look(&self) -> io::Result<()> {
         let State::Ours(file) = &self.state else { return Ok(()) };
-        let about = file.metadata()?;
+        // Where it cannot be looked at, nothing is known against it.
+        let Ok(about) = file.metadata() else { return Ok(()) };
         let (bytes, written) = (about.len(), self.bytes);
-        let why = if !is_still(&self.path, identity(&about)) {
+        let why = if is_still(&self.path, identity(&about)) == Some(false) {
             "another program renamed, removed or replaced it while it was written; what comes goes on to the file \
              that was opened"
                 .to_owned()
@@ -200,7 +201,8 @@ impl Drop for LogFile {
     /// A log that was never ended, and in which nothing stands, is taken away.
     fn drop(&mut self) {
         let State::Ours(file) = &self.state else { return };
-        let is_there = file.metadata().is_ok_and(|about| is_still(&self.path, identity(&about)));
+        let is_there =
+            file.metadata().is_ok_and(|about| is_still(&self.path, identity(&about)) == Some(true));
         if !self.ended && self.bytes == 0 && is_there {
             // Nothing more can be done.
             let _ = fs::remove_file(&self.path);

@@ -15,7 +15,7 @@ pub use log::LogFile;
 pub use protocol::input::folder_of;
 use target::{Target, open_stream, or_exists, part_of};
 pub use target::{check, check_regular, rename, suffixed, sync_folder, with_hint};
-pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed};
+pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed, write_patiently};
 
 /// A file that has a name only when it is whole. Until then it has none at all, and so is gone with a
 /// program that is killed; where the file system has no such files it is called `.NAME.PID.part`, and a run

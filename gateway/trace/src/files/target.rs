@@ -2,12 +2,12 @@
 
 use std::ffi::{OsStr, OsString};
 use std::fs::{self, File, FileType, OpenOptions};
-use std::io;
+use std::io::{self, Write};
 use std::os::fd::{AsFd, AsRawFd, OwnedFd};
 use std::os::unix::fs::{FileTypeExt, MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use protocol::input::{folder_of, own_descriptor};
 use rustix::fs::{
@@ -139,12 +139,12 @@ pub fn suffixed(path: &Path, suffix: impl AsRef<OsStr>, end: &OsStr) -> PathBuf 
     path.with_file_name(name)
 }
 
-/// A file without a name in a folder, for writing.
+/// A file without a name in a folder, for writing and reading.
 ///
 /// # Errors
 /// When it cannot be written there, or the file system has no such files.
 pub(crate) fn nameless(folder: &Path, mode: u32) -> io::Result<File> {
-    let flags = OFlags::TMPFILE | OFlags::WRONLY | OFlags::CLOEXEC;
+    let flags = OFlags::TMPFILE | OFlags::RDWR | OFlags::CLOEXEC;
     Ok(open(folder, flags, Mode::from_raw_mode(mode))?.into())
 }
 
@@ -179,9 +179,58 @@ pub(crate) fn identity(about: &fs::Metadata) -> (u64, u64) {
     (about.dev(), about.ino())
 }
 
-/// Whether a name is that of a file, and not of a link to it.
-pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> bool {
-    fs::symlink_metadata(path).is_ok_and(|about| identity(&about) == is)
+/// Whether a name is that of a file, and not of a link to it; `None` when it cannot be looked at.
+pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> Option<bool> {
+    match fs::symlink_metadata(path) {
+        Ok(about) => Some(identity(&about) == is),
+        Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => {
+            Some(false)
+        }
+        Err(_) => None,
+    }
+}
+
+/// How long a file that takes nothing is tried again.
+const PATIENCE: Duration = Duration::from_secs(1);
+/// Between two attempts.
+const PAUSE: Duration = Duration::from_millis(2);
+
+/// Writes what a file takes of some bytes. An interruption is none, one that takes nothing now is tried again for a second,
+/// and any other error once.
+///
+/// # Errors
+/// When it stays so.
+pub(crate) fn write_patiently(file: &mut impl Write, bytes: &[u8]) -> io::Result<usize> {
+    let mut since = None;
+    let mut is_second = false;
+    loop {
+        match file.write(bytes) {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                if since.get_or_insert_with(Instant::now).elapsed() >= PATIENCE {
+                    return Err(error);
+                }
+                std::thread::sleep(PAUSE);
+            }
+            Err(error) if is_second => return Err(error),
+            Err(_) => is_second = true,
+            Ok(written) => return Ok(written),
+        }
+    }
+}
+
+/// The same of all bytes.
+///
+/// # Errors
+/// See above; also when the file takes nothing.
+pub(crate) fn write_all_patiently(file: &mut impl Write, mut bytes: &[u8]) -> io::Result<()> {
+    while !bytes.is_empty() {
+        match write_patiently(file, bytes)? {
+            0 => return Err(io::ErrorKind::WriteZero.into()),
+            written => bytes = bytes.get(written..).unwrap_or_default(),
+        }
+    }
+    Ok(())
 }
 
 /// Beside a file, a name that no other program gives.

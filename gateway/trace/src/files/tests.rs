@@ -229,3 +229,46 @@ fn a_numbered_log_takes_the_first_name_that_is_free() {
     let nowhere = folder.path().join("none/demo.log");
     assert!(LogFile::create_numbered(&nowhere, &AtomicBool::new(false)).is_err());
 }
+
+/// A file that gives errors, and takes a byte at a time.
+struct Moody(Vec<io::ErrorKind>, Vec<u8>);
+
+impl Write for Moody {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if let Some(error) = self.0.pop() {
+            return Err(error.into());
+        }
+        self.1.extend(bytes.first());
+        Ok(bytes.len().min(1))
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn what_interrupts_a_write_is_no_error_and_a_single_one_is_tried_again() {
+    use io::ErrorKind::{Interrupted, Other, StorageFull, WouldBlock};
+    for moods in
+        [vec![Interrupted; 5], vec![WouldBlock; 5], vec![Other, Interrupted, WouldBlock], vec![StorageFull]]
+    {
+        let mut file = Moody(moods, Vec::new());
+        target::write_all_patiently(&mut file, b"lines").unwrap();
+        assert_eq!(file.1, b"lines");
+    }
+    let mut file = Moody(vec![Other, Other], Vec::new());
+    assert_eq!(target::write_all_patiently(&mut file, b"lines").unwrap_err().kind(), Other);
+    assert_eq!(file.1, b"");
+}
+
+#[test]
+fn a_name_that_cannot_be_looked_at_is_neither_a_files_own_nor_anothers() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run.log");
+    fs::write(&path, "").unwrap();
+    let is = identity(&fs::metadata(&path).unwrap());
+    assert_eq!(is_still(&path, is), Some(true));
+    assert_eq!(is_still(&folder.path().join("other"), is), Some(false));
+    assert_eq!(is_still(&folder.path().join("n".repeat(300)), is), None);
+}

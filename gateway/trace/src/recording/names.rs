@@ -130,16 +130,16 @@ impl Part {
         rename(&self.path, &self.goal, force)
     }
 
-    /// Whether it still has its name for now.
+    /// Whether it still has its name for now, or that cannot be looked at.
     #[must_use]
     pub fn is_there(&self) -> bool {
-        is_still(&self.path, self.is)
+        is_still(&self.path, self.is) != Some(false)
     }
 
     /// Takes the file away, if it is still there.
     pub fn remove(&self) {
-        if self.is_there() {
-            // The next run takes it away.
+        if is_still(&self.path, self.is) == Some(true) {
+            // Else the next run takes it away.
             let _ = fs::remove_file(&self.path);
         }
     }
@@ -308,7 +308,7 @@ pub fn remove(path: &Path, file: &File) -> io::Result<()> {
 
 /// Makes sure that a name is still that of a file.
 fn is_its_own(path: &Path, file: &File) -> io::Result<()> {
-    if is_still(path, identity(&file.metadata()?)) {
+    if is_still(path, identity(&file.metadata()?)) == Some(true) {
         return Ok(());
     }
     Err(io::Error::other("another file has its name now, and stays"))

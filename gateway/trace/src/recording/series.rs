@@ -1,8 +1,8 @@
 //! A recording's MCAP files, one after the other: each is begun with what makes it readable by itself, flushed,
 //! ended when it is large or old enough, and given its name when it is whole.
 //!
-//! After an error the file takes nothing more. It is kept, repaired at the end, and another one is tried every few
-//! seconds; what comes meanwhile is counted.
+//! After an error the file takes nothing more. It is kept, repaired at the end, and another one is tried at once, then every
+//! few seconds; what comes meanwhile is counted.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -25,7 +25,7 @@ use crate::files::folder_of;
 
 /// Bytes that go to the file together; a chunk is larger and goes by itself.
 const BUFFER: usize = 64 << 10;
-/// Between an error and another attempt.
+/// Between two attempts behind an error.
 const RETRY: Duration = Duration::from_secs(5);
 /// A file that is to end waits so long at most for what holds it: any traffic may look like a segment.
 const HOLD: Duration = Duration::from_millis(500);
@@ -177,6 +177,8 @@ pub struct Series<T> {
     window: Window,
     /// When the last error was.
     failed: Option<Instant>,
+    /// When a file was begun at once behind an error, which is to be done next.
+    prompt: (Option<Instant>, bool),
     broken: Vec<Broken>,
     /// Ends files that are whole, each with what is in it and its bytes.
     publisher: Publisher<(Count, u64)>,
@@ -209,6 +211,7 @@ impl<T> Series<T> {
             open: None,
             window: Window::default(),
             failed: None,
+            prompt: (None, false),
             broken: Vec::new(),
             publisher: Publisher::new(force),
             written: Vec::new(),
@@ -289,7 +292,8 @@ impl<T> Series<T> {
         self.take_published();
         let Some(open) = &mut self.open else {
             let due = self.failed.is_some_and(|at| at.elapsed() >= RETRY);
-            return due && has_room(&self.path);
+            let prompt = std::mem::replace(&mut self.prompt.1, false);
+            return (due || prompt) && has_room(&self.path);
         };
         if let Err(error) = open.release(&mut self.window, false).and_then(|()| open.writer.flush()) {
             self.break_off(&error);
@@ -407,7 +411,12 @@ impl<T> Series<T> {
         self.fail(error);
     }
 
+    /// Another file is begun at once, unless that was done just now: then it is not a single error.
     fn fail(&mut self, error: &io::Error) {
+        let (last, prompt) = &mut self.prompt;
+        if last.is_none_or(|at| at.elapsed() >= RETRY) {
+            (*last, *prompt) = (Some(Instant::now()), true);
+        }
         if self.failed.replace(Instant::now()).is_none() {
             let path = names::numbered(&self.path, self.number);
             self.said.push(Said::BrokeOff(format!("{}: {error}", path.display())));
@@ -442,7 +451,7 @@ impl<T> Series<T> {
                 Err(error) => {
                     let path = part.path.display();
                     self.said.push(Said::Else(format!(
-                        "{path}: {error}; repair it with `gateway recover {path}`"
+                        "{path}: {error}; what was recorded is in it: repair it with `gateway recover {path}`"
                     )));
                     let bytes = file.metadata().map_or(0, |about| about.len());
                     self.written.push(kept.in_file(&part.path, bytes));

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rustix::fs::{FallocateFlags, fallocate};
 
-use crate::files::nameless;
+use crate::files::{nameless, write_patiently};
 
 /// What a file without a single chunk may need for its end, a chunk on the way included.
 const RESERVE: u64 = 512 << 10;
@@ -54,12 +54,9 @@ impl Gauge {
             return;
         }
         let more = target.next_multiple_of(RESERVE);
-        match fallocate(&reserve.file, FallocateFlags::empty(), 0, more) {
-            Ok(()) => reserve.bytes = more,
-            Err(_) => {
-                *held = None;
-                self.full.store(true, Ordering::Relaxed);
-            }
+        // Without more of it, what there is helps as far as it goes; it is tried again.
+        if fallocate(&reserve.file, FallocateFlags::empty(), 0, more).is_ok() {
+            reserve.bytes = more;
         }
     }
 
@@ -81,13 +78,12 @@ pub struct Sink {
 
 impl Sink {
     /// Takes a file of a folder over, and room beside it. What is in the file already is what it begins with; whoever
-    /// writes begins with the same. Where the file system gives none, a full disk is
-    /// like any other error.
+    /// writes begins with the same. Where the file system gives no room, a full disk is like any other error.
     ///
     /// # Errors
-    /// When there is not even the room that an end needs.
+    /// When the file cannot be looked at.
     pub fn new(file: File, folder: &Path) -> io::Result<(Self, Arc<Gauge>)> {
-        let (reserve, there) = (reserve(folder)?, file.metadata()?.len());
+        let (reserve, there) = (reserve(folder), file.metadata()?.len());
         let gauge = Arc::new(Gauge { reserve: Mutex::new(reserve), ..Gauge::default() });
         Ok((Self { file, there, gauge: Arc::clone(&gauge) }, gauge))
     }
@@ -99,14 +95,11 @@ impl Sink {
     }
 }
 
-/// Room for an end; none where the file system has no files without a name, or no room that is held.
-fn reserve(folder: &Path) -> io::Result<Option<Reserve>> {
-    let Ok(file) = nameless(folder, 0o600) else { return Ok(None) };
-    match fallocate(&file, FallocateFlags::empty(), 0, RESERVE) {
-        Ok(()) => Ok(Some(Reserve { file, bytes: RESERVE })),
-        Err(error) if is_full(&error.into()) => Err(error.into()),
-        Err(_) => Ok(None),
-    }
+/// Room for an end; none where the file system has no files without a name, or gives no room.
+fn reserve(folder: &Path) -> Option<Reserve> {
+    let file = nameless(folder, 0o600).ok()?;
+    fallocate(&file, FallocateFlags::empty(), 0, RESERVE).ok()?;
+    Some(Reserve { file, bytes: RESERVE })
 }
 
 /// Whether an error says that there is no room.
@@ -123,8 +116,10 @@ impl Write for Sink {
             self.gauge.bytes.fetch_add(there as u64, Ordering::Relaxed);
             return Ok(there);
         }
-        let written = match self.file.write(bytes) {
-            Err(error) if is_full(&error) && self.gauge.use_reserve() => self.file.write(bytes),
+        let written = match write_patiently(&mut self.file, bytes) {
+            Err(error) if is_full(&error) && self.gauge.use_reserve() => {
+                write_patiently(&mut self.file, bytes)
+            }
             written => written,
         }?;
         self.gauge.bytes.fetch_add(written as u64, Ordering::Relaxed);
