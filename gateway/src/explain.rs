@@ -83,6 +83,9 @@ impl Explain {
                 output::note(format_args!("{name}: {count} {what}"));
             }
         }
+        if let Some(why) = &reader.extras().unfinished {
+            output::note(format_args!("{name}: {why}"));
+        }
         if found.is_empty {
             return Err(no_frame(&reader));
         }

@@ -158,7 +158,10 @@ fn attached(files: &[PathBuf], hint: &str) -> Result<Skin, Failure> {
     let name = reader.name();
     match reader.extras().skin() {
         Some(skin) => skin.map_err(|error| Failure::usage(format!("{name}, {error}"))),
-        None => Err(Failure::usage(format!("{name} has no skin in it: {hint}"))),
+        None => Err(match &reader.extras().unfinished {
+            Some(why) => Failure::run(format!("{name} has no skin in it, and {why}: {hint}")),
+            None => Failure::usage(format!("{name} has no skin in it: {hint}")),
+        }),
     }
 }
 

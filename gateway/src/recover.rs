@@ -14,7 +14,7 @@ use super::output::{Force, apart};
 ///
 /// Copies everything that is whole into a new file with its indexes, and reports what was not. The recording stays as
 /// it is. A run repairs by itself what earlier ones left in its recording's folder. Exit code 0: there is a new file,
-/// or nothing was wrong; 1: it cannot be done; 2: wrong use.
+/// or nothing was wrong; 1: it cannot be done, no message came back, or fewer than are known to be lost; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Example:\n  gateway recover run.mcap.part -o run.mcap")]
 pub(crate) struct Recover {
@@ -44,12 +44,18 @@ impl Recover {
             }
             Failure::run(format!("{name}: {error}"))
         };
-        let line = match repair::copy_unless_sound(&file, &output, self.force.force).map_err(failure)? {
-            (recovered, None) => {
+        let (recovered, bytes) =
+            repair::copy_unless_sound(&file, &output, self.force.force).map_err(failure)?;
+        let line = match bytes {
+            None if recovered.is_sound() => {
                 format!("{name} is whole, there is nothing to recover: {} messages", recovered.messages)
             }
-            (recovered, Some(bytes)) => format!("{out}, {bytes} bytes: {recovered}"),
+            None => return Err(Failure::run(format!("{name}: no message came back: {recovered}"))),
+            Some(bytes) => format!("{out}, {bytes} bytes: {recovered}"),
         };
+        if recovered.is_little() {
+            return Err(Failure::run(format!("more is lost of {name} than came back: {line}")));
+        }
         print(&format!("{}\n", shown(&line)))
     }
 }

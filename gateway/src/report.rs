@@ -72,14 +72,18 @@ impl Report {
             }
             return Err(failure);
         }
-        if let Some(missing) = &report.missing {
+        if let Some(missing) = report.missing.as_ref().filter(|_| !report.is_damaged) {
             note(format_args!("gateway: {}: {missing}", report.name));
         }
         let figures = drawings(&report.page).count();
         let beside =
             self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
         let said = format!("{}: {figures} figures{beside}", output.display());
-        print(&format!("{}\n", shown(&said)))
+        print(&format!("{}\n", shown(&said)))?;
+        match report.missing.filter(|_| report.is_damaged) {
+            Some(missing) => Err(Failure::run(format!("{}: {missing}", report.name))),
+            None => Ok(()),
+        }
     }
 
     /// What is there is not overwritten unless that is asked for.
@@ -91,7 +95,10 @@ impl Report {
 
 /// What is no recording of a run is wrong use; what cannot be read is not.
 fn refused(error: ReportError) -> Failure {
-    if matches!(error, ReportError::Capture(_)) { Failure::run(error) } else { Failure::usage(error) }
+    match error {
+        ReportError::Capture(_) | ReportError::Unfinished { .. } => Failure::run(error),
+        error => Failure::usage(error),
+    }
 }
 
 /// Each figure's file name and drawing.

@@ -17,10 +17,11 @@ use protocol::bus::Kinds;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use robots::Isometry3;
-use trace::capture::{Format, Reader};
+use trace::capture::{CaptureError, Format, Reader};
 use view::Shell;
 use view::play::{self, play};
-use view::serve::{Options, serve};
+use view::player::PlayError;
+use view::serve::{Options, ServeError, serve};
 use view::server::Access;
 
 use super::arguments::{BusKinds, bus_names, bus_of, nanos};
@@ -161,8 +162,14 @@ impl View {
         #[expect(clippy::cast_precision_loss, reason = "to the µs")]
         let at_s = self.at.map(|nanos| nanos as f64 / 1e9);
         let stop = stopped()?;
-        play(play::Options { paths: self.sources, skin, surface, access, at_s }, &stop, says)
-            .map_err(Failure::usage)?;
+        let warns = |what: &str| note(format_args!("{what}"));
+        let options = play::Options { paths: self.sources, skin, surface, access, at_s };
+        play(options, &stop, says, warns).map_err(|error| match error {
+            ServeError::Play(PlayError::Damaged(_) | PlayError::Capture(CaptureError::Damaged { .. })) => {
+                Failure::run(error)
+            }
+            error => Failure::usage(error),
+        })?;
         Ok(())
     }
 

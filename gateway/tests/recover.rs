@@ -7,11 +7,12 @@ use std::io::Cursor;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use mcap::MessageStream;
 use mcap::read::{Summary, attachment, metadata};
+use mcap::records::{MessageHeader, op};
+use mcap::{MessageStream, WriteOptions};
 use protocol::can::Frame;
 use protocol::candump::{Record, Timestamp};
-use trace::recording::file::FileWriter;
+use trace::recording::file::{DESCRIBED_EVERY, FileWriter};
 use trace::recording::recover::{RecoverError, Recovered, recover};
 use trace::ros2::standard::JointState;
 
@@ -105,7 +106,6 @@ fn a_damaged_chunk_is_omitted_and_said_and_the_others_are_kept() {
     let bytes = recording();
     let all = messages(&bytes);
     let chunks = Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
-    // The first one has the channels: without them nothing else has a topic.
     for (number, chunk) in chunks.iter().enumerate().skip(1) {
         let mut bytes = bytes.clone();
         let middle =
@@ -118,10 +118,69 @@ fn a_damaged_chunk_is_omitted_and_said_and_the_others_are_kept() {
         assert_eq!(messages(&copy), [&all[..lost], &all[lost + 20..]].concat());
         assert!(said.to_string().contains(" damaged bytes are lost"), "{said}");
     }
-    let mut bytes = bytes;
-    bytes[usize::try_from(chunks[0].chunk_start_offset + chunks[0].chunk_length - 9).unwrap()] ^= 0x10;
-    let (said, _) = recovered(&bytes).unwrap();
-    assert_eq!((said.messages, said.homeless), (0, 100), "{said:?}");
+    // The first one has the types and topics, which stand outside of chunks too, and in the summary.
+    let mut first = bytes.clone();
+    first[usize::try_from(chunks[0].chunk_start_offset + chunks[0].chunk_length - 9).unwrap()] ^= 0x10;
+    let (said, copy) = recovered(&first).unwrap();
+    assert_eq!((said.messages, said.homeless, said.damaged.0), (100, 0, 1), "{said:?}");
+    assert_eq!(messages(&copy), all);
+    // Without an end they are known from what stands outside of chunks.
+    let end =
+        usize::try_from(chunks.last().unwrap().message_index_offsets.values().max().unwrap() + 1).unwrap();
+    let (said, copy) = recovered(&first[..end]).unwrap();
+    assert_eq!((said.messages, said.homeless, said.stated), (100, 0, None), "{said:?}");
+    assert_eq!(messages(&copy), all);
+}
+
+#[test]
+fn types_and_topics_of_a_recording_by_others_are_known_from_its_summary() {
+    let mut chunks = WriteOptions::new().chunk_size(Some(64)).create(Cursor::new(Vec::new())).unwrap();
+    let schema = chunks.add_schema("a/B", "ros2msg", b"uint8 a").unwrap();
+    let topic = chunks.add_channel(schema, "/b", "cdr", &BTreeMap::new()).unwrap();
+    for sequence in 0..20 {
+        let header = MessageHeader { channel_id: topic, sequence, log_time: 7, publish_time: 7 };
+        chunks.write_to_known_channel(&header, &[1; 40]).unwrap();
+    }
+    chunks.finish().unwrap();
+    let bytes = chunks.into_inner().into_inner();
+    let all = messages(&bytes);
+    let summary = Summary::read(&bytes).unwrap().unwrap();
+    let first = &summary.chunk_indexes[0];
+    let mut damaged = bytes.clone();
+    damaged[usize::try_from(first.chunk_start_offset + first.chunk_length - 9).unwrap()] ^= 1;
+    let (said, copy) = recovered(&damaged).unwrap();
+    let lost = summary.chunk_indexes.len();
+    assert!(said.messages >= 20 - 2 && said.homeless == 0 && lost > 5, "{said:?}");
+    assert!(all.ends_with(&messages(&copy)), "{said}");
+    // Without an end nobody says what the others are.
+    let end = bytes.windows(9).position(|at| at == [15, 4, 0, 0, 0, 0, 0, 0, 0]).unwrap();
+    let (said, _) = recovered(&damaged[..end]).unwrap();
+    assert!(said.messages == 0 && said.homeless >= 18 && said.is_little(), "{said:?}");
+}
+
+#[test]
+fn types_and_topics_are_described_outside_of_chunks_again_and_again() {
+    let mut writer = FileWriter::new(Vec::new()).unwrap();
+    let mut joints = writer.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
+    let state = JointState { nanos: 1, names: &[], position: &[1.0], velocity: &[], effort: &[] };
+    let count = 3 * DESCRIBED_EVERY + 5;
+    for _ in 0..count {
+        writer.write(&mut joints, 1, &state).unwrap();
+        writer.flush().unwrap();
+    }
+    let (mut at, mut chunks, mut since, mut described) = (8, 0, 0, Vec::new());
+    let bytes = writer.into_inner();
+    while at < bytes.len() {
+        let code = bytes[at];
+        at += 9 + usize::try_from(u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap())).unwrap();
+        (chunks, since) = if code == op::CHUNK { (chunks + 1, since + 1) } else { (chunks, since) };
+        if code == op::CHANNEL {
+            described.push(since);
+            since = 0;
+        }
+        assert!(since <= DESCRIBED_EVERY);
+    }
+    assert_eq!((chunks, described), (count, vec![1, DESCRIBED_EVERY, DESCRIBED_EVERY, DESCRIBED_EVERY]));
 }
 
 /// Whether all messages of chunks that these bytes do not belong to are kept, in their order, and none that was not there.
@@ -150,7 +209,6 @@ fn keeps_what_is_intact(original: &[u8], damaged: &[u8], bytes: std::ops::Range<
 #[test]
 fn wherever_damage_is_every_intact_chunk_is_kept() {
     let bytes = recording();
-    // Without the first chunk, which has the channels, nothing else has a topic.
     let first = &Summary::read(&bytes).unwrap().unwrap().chunk_indexes[0];
     let first = usize::try_from(first.chunk_start_offset + first.chunk_length).unwrap();
     for at in first..bytes.len() {
@@ -249,6 +307,23 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
         "whole.mcap is whole, there is nothing to recover: 100 messages"
     );
     assert!(!path("whole-recovered.mcap").exists());
+    // Nothing came back, or too little.
+    let begun = usize::try_from(Summary::read(&bytes).unwrap().unwrap().chunk_indexes[1].chunk_start_offset);
+    fs::write(path("begun.mcap"), &bytes[..begun.unwrap() + 40]).unwrap();
+    let said = says("recover begun.mcap", 1);
+    assert!(said.starts_with("gateway: begun.mcap: no message came back: 0 messages"), "{said}");
+    assert!(!path("begun-recovered.mcap").exists());
+    let index = Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
+    let [from, to] = [1, 4].map(|at| usize::try_from(index[at].chunk_start_offset).unwrap());
+    let mut gap = bytes.clone();
+    gap[from..to + 200].fill(0);
+    fs::write(path("gap.mcap"), &gap).unwrap();
+    let said = says("recover gap.mcap", 1);
+    assert!(
+        said.contains("gap.mcap than came back: gap-recovered.mcap, ")
+            && said.contains(" 20 of 100 messages"),
+        "{said}"
+    );
     let exists = "gateway: -o there.mcap: it exists: name another file, or overwrite it with --force";
     assert_eq!(says("recover run.mcap.part -o there.mcap", 2), exists);
     assert_eq!(fs::read_to_string(path("there.mcap")).unwrap(), "somebody's");

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod mutate;
+mod places;
 mod seeds;
 
 use std::fs::{self, File};

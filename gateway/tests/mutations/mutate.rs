@@ -51,7 +51,7 @@ pub(crate) fn chunk(compression: &str, records: &[u8]) -> Vec<u8> {
 }
 
 /// The records of some bytes; what follows the last whole one is left out.
-fn records(mut bytes: &[u8]) -> Vec<(u8, Vec<u8>)> {
+pub(crate) fn records(mut bytes: &[u8]) -> Vec<(u8, Vec<u8>)> {
     let mut found = Vec::new();
     while let Some((&[opcode, ref length @ ..], rest)) = bytes.split_first_chunk::<9>() {
         let Some((body, rest)) = rest.split_at_checked(usize::try_from(u64::from_le_bytes(*length)).unwrap())
@@ -65,7 +65,7 @@ fn records(mut bytes: &[u8]) -> Vec<(u8, Vec<u8>)> {
 }
 
 /// What a chunk of a sound file unpacks to.
-fn unpacked(body: &[u8]) -> Vec<u8> {
+pub(crate) fn unpacked(body: &[u8]) -> Vec<u8> {
     let number =
         |at: usize| usize::try_from(u64::from_le_bytes(body[at..at + 8].try_into().unwrap())).unwrap();
     let name = usize::try_from(u32::from_le_bytes(body[28..32].try_into().unwrap())).unwrap();

@@ -103,7 +103,7 @@ fn begin(options: WriteOptions) -> File {
 }
 
 /// A recording of a run of three cells.
-fn run(skin: &str, options: WriteOptions, files_last: bool) -> Vec<u8> {
+pub(crate) fn run(skin: &str, options: WriteOptions, files_last: bool) -> Vec<u8> {
     let mut file = begin(options);
     let facts = [("duration_s".to_owned(), "1".to_owned())].into();
     let attached = Attachment {
@@ -172,7 +172,7 @@ fn joints(epoch: u8) -> Packet {
 }
 
 /// Frames as another bridge records them.
-fn bridge() -> Vec<u8> {
+pub(crate) fn bridge() -> Vec<u8> {
     let mut file = begin(WriteOptions::new().compression(None));
     for number in 0..100_u8 {
         let nanos = BEGAN + u64::from(number) * 1_000_000;

@@ -40,6 +40,7 @@ struct Inner {
     at: u64,
     is_over: bool,
     failed: Option<String>,
+    unfinished: Option<String>,
     others: u64,
 }
 
@@ -52,6 +53,8 @@ pub struct Progress {
     pub is_over: bool,
     /// Why nothing more can be read.
     pub failed: Option<String>,
+    /// What is missing at its end.
+    pub unfinished: Option<String>,
     /// Frames of buses that are not the skin's.
     pub others: u64,
     /// Events so far.
@@ -101,6 +104,7 @@ impl Index {
             }
         }
         let mut inner = locked(&self.0);
+        inner.unfinished.clone_from(&reader.extras().unfinished);
         (inner.at, inner.others, inner.is_over) = (tape.at(), tape.others(), true);
         inner.events.extend(watcher.look(tape.at(), tape.live()));
     }
@@ -114,7 +118,8 @@ impl Index {
     pub fn progress(&self) -> Progress {
         let inner = locked(&self.0);
         let Inner { at, is_over, others, .. } = *inner;
-        Progress { at, is_over, failed: inner.failed.clone(), others, events: inner.events.len() }
+        let (failed, unfinished) = (inner.failed.clone(), inner.unfinished.clone());
+        Progress { at, is_over, failed, unfinished, others, events: inner.events.len() }
     }
 
     /// The last kept state at or before a moment.

@@ -10,6 +10,7 @@ use protocol::skin::Skin;
 use trace::capture::Reader;
 
 use crate::command::Command;
+use crate::index::Progress;
 use crate::live::Said;
 use crate::player::{PlayError, Player};
 use crate::pressed::Pressed;
@@ -41,11 +42,18 @@ pub struct Options {
     pub at_s: Option<f64>,
 }
 
-/// Plays a recording until `stop`. `says` is told the page's address once it is served.
+/// Plays a recording until `stop`. `says` is told the page's address once it is served, `warns` once what is wrong with the
+/// recording, when that is known.
 ///
 /// # Errors
-/// When the address cannot be listened on, or the recording cannot be read.
-pub fn play(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Result<Counts, ServeError> {
+/// When the address cannot be listened on, or the recording cannot be read or is damaged: the page shows what is before
+/// that.
+pub fn play(
+    options: Options,
+    stop: &AtomicBool,
+    says: impl FnOnce(&str),
+    warns: impl Fn(&str) + Sync,
+) -> Result<Counts, ServeError> {
     let Options { paths, skin, surface, access, at_s } = options;
     let listen = access.listen;
     let mut player = Player::open(&paths, skin.clone())?;
@@ -56,8 +64,15 @@ pub fn play(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Res
         Server::start(access, scene, corners).map_err(|source| ServeError::Listen { listen, source })?;
     says(&server.url());
     let (index, origin) = (player.index(), player.origin());
+    let name = reader.name().to_owned();
     thread::scope(|scope| {
-        let build = move || index.build(reader, skin, origin, stop);
+        let (index, name, warns) = (&index, &name, &warns);
+        let build = move || {
+            index.build(reader, skin, origin, stop);
+            let Progress { failed, unfinished, .. } = index.progress();
+            let unfinished = unfinished.map(|what| format!("{name}: {what}"));
+            failed.iter().chain(&unfinished).for_each(|what| warns(what));
+        };
         thread::Builder::new().spawn_scoped(scope, build).map_err(ServeError::Thread)?;
         match at_s {
             Some(at_s) => player.seek(at_s).map_err(PlayError::from)?,
@@ -66,7 +81,7 @@ pub fn play(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Res
         publish(&mut player, &server, stop);
         Ok::<_, ServeError>(())
     })?;
-    Ok(server.counts())
+    index.progress().failed.map_or_else(|| Ok(server.counts()), |what| Err(PlayError::Damaged(what).into()))
 }
 
 /// The player's position for the pages, and their commands for the player.

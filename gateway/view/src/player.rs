@@ -68,6 +68,8 @@ pub struct Playback {
     pub read: f64,
     /// Why it cannot be read further.
     pub failed: Option<String>,
+    /// What is missing at its end.
+    pub unfinished: Option<String>,
     /// Frames of buses that are not the skin's.
     pub others: u64,
     /// Events so far.
@@ -90,6 +92,9 @@ pub enum PlayError {
     /// It cannot be read.
     #[error(transparent)]
     Capture(#[from] CaptureError),
+    /// From a place on it cannot be read; what is before that was shown.
+    #[error("{0}")]
+    Damaged(String),
     /// There is nothing in it.
     #[error("{0}: there is no frame in it")]
     Empty(String),
@@ -353,6 +358,7 @@ impl Player {
             exact: self.is_exact,
             read: if progress.is_over { 1.0 } else { (seconds(read) / seconds(of.max(1))).min(1.0) },
             failed: self.failed.clone().or(progress.failed),
+            unfinished: progress.unfinished,
             others: progress.others,
             events: progress.events,
             marks: BTreeMap::new(),

@@ -108,12 +108,12 @@ export class TimeBar {
   }
 
   words() {
-    const { at_s, of_s, read, exact, failed, others } = this.playback;
+    const { at_s, of_s, read, exact, failed, unfinished, others } = this.playback;
     this.at.textContent = `${clock(this.dragged ?? at_s)} of ${clock(of_s)}`;
     this.slider.setAttribute("aria-valuetext", this.at.textContent);
     this.state.className = failed ? "bad" : "faint";
     this.state.textContent = failed ?? (read < 1 ? `${Math.floor(read * 100)} % read${exact ? "" : "; counts are of the last seconds only"}`
-      : others ? `${others} frames are of buses that the skin does not have` : "");
+      : unfinished ?? (others ? `${others} frames are of buses that the skin does not have` : ""));
   }
 
   // What happens when, a row for each kind.

@@ -34,7 +34,10 @@ pub enum CaptureError {
         hint: &'static str,
     },
     /// From here on it is not what it was.
-    #[error("{name} is damaged: {what}; {entries} frames and notes before that were read")]
+    #[error(
+        "{name} is damaged: {what}; {entries} frames and notes before that were read; `gateway recover` makes a new \
+         file of what is whole"
+    )]
     Damaged {
         /// Its name.
         name: String,

@@ -4,8 +4,10 @@ use std::collections::VecDeque;
 use std::fmt;
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
+use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
+use ::mcap::records::op;
 use protocol::input;
 
 use super::log::{Clock, LogReader, Remark};
@@ -16,6 +18,7 @@ use super::places::{Place, Places};
 use super::text_kinds::kind_of;
 use super::times::Times;
 use super::{CaptureError, Entry, Extras, Item, Through};
+use crate::container::{HEAD, MAGIC, own_length};
 
 /// What a capture is written in.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -64,21 +67,34 @@ impl Source {
         let failed = |source| CaptureError::Io { name: name.clone(), source };
         let mut file = input::open(path).map_err(failed)?;
         let about = file.metadata().map_err(failed)?;
+        let mut regular = None;
         if about.is_file() && is_mcap(&mut file).map_err(failed)? {
             state.find_files(&mut file).and_then(|()| file.rewind()).map_err(failed)?;
+            regular = Some(file.try_clone().map_err(failed)?);
         }
-        let source = Self::begin(&name, through(file), state)?;
+        let source = Self::begin(&name, through(file), state, regular)?;
         Ok((name, source))
     }
 
-    fn begin(name: &str, input: impl Read + Send + 'static, state: State) -> Result<Self, CaptureError> {
+    fn begin(
+        name: &str,
+        input: impl Read + Send + 'static,
+        state: State,
+        file: Option<File>,
+    ) -> Result<Self, CaptureError> {
         let (name, mut input) = (name.to_owned(), Box::new(input));
         match magic::look(&mut input) {
+            // A recording whose first bytes are damaged; the reader reports them.
+            Ok((Kind::Text, head)) if file.is_some() => Ok(Self::mcap(&head, input, state, file)),
             Ok((Kind::Text, head)) => Ok(Self::Log(LogReader::new(&head, input))),
-            Ok((Kind::Mcap, head)) => Ok(Self::Mcap(Box::new(McapReader::new(&head, input, state)))),
+            Ok((Kind::Mcap, head)) => Ok(Self::mcap(&head, input, state, file)),
             Ok((Kind::Other(what, hint), _)) => Err(CaptureError::Other { name, what, hint }),
             Err(source) => Err(CaptureError::Io { name, source }),
         }
+    }
+
+    fn mcap(head: &[u8], input: Box<dyn Read + Send>, state: State, file: Option<File>) -> Self {
+        Self::Mcap(Box::new(McapReader::new(head, input, state, file)))
     }
 
     /// Returns true behind its last entry.
@@ -119,7 +135,7 @@ impl Reader {
         input: impl Read + Send + 'static,
     ) -> Result<Self, CaptureError> {
         let name = name.into();
-        let source = Source::begin(&name, input, State::new(false, None))?;
+        let source = Source::begin(&name, input, State::new(false, None), None)?;
         Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), plain(), false))
     }
 
@@ -153,7 +169,7 @@ impl Reader {
             && is_input(one)
         {
             let name = "standard input".to_owned();
-            let source = Source::begin(&name, io::stdin(), State::new(others, None))?;
+            let source = Source::begin(&name, io::stdin(), State::new(others, None), None)?;
             return Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), through, others));
         }
         let ordered = Self::ordered(paths)?;
@@ -309,6 +325,7 @@ impl Reader {
         let failed = |source| CaptureError::Io { name: name.clone(), source };
         if place.offset > 0 {
             let mut file = input::open(path).map_err(failed)?;
+            let regular = file.try_clone().map_err(failed)?;
             file.seek(SeekFrom::Start(place.offset)).map_err(failed)?;
             let input = (self.through)(file);
             let empty = Source::Log(LogReader::new(&[], Box::new(io::empty())));
@@ -317,7 +334,7 @@ impl Reader {
                 Source::Mcap(mcap) => {
                     let mut state = mcap.into_state();
                     places.describe(place.part, &mut state).map_err(|fault| fault.of(&name, self.entries))?;
-                    Source::Mcap(Box::new(McapReader::at(place.offset, input, state)))
+                    Source::Mcap(Box::new(McapReader::at(place.offset, input, state, Some(regular))))
                 }
             };
         }
@@ -467,12 +484,34 @@ impl Reader {
     }
 }
 
-/// Whether a file is an MCAP recording; its place is its beginning.
+/// Whether a file is an MCAP recording, by its first bytes or by its last; its place is its beginning.
 pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
     let (kind, _) = magic::look(file)?;
+    if kind == Kind::Mcap {
+        file.rewind()?;
+        return Ok(true);
+    }
+    let (mut first, mut last) = (vec![0; BEGINNING], [0; MAGIC.len()]);
+    let size = file.metadata()?.len();
+    if kind == Kind::Text && size > 2 * MAGIC.len() as u64 {
+        let came = file.read_at(&mut first, 0)?;
+        first.truncate(came);
+        file.read_exact_at(&mut last, size - MAGIC.len() as u64)?;
+    }
     file.rewind()?;
-    Ok(kind == Kind::Mcap)
+    // A place in one of them, or all of one, may be damaged.
+    let alike = first.iter().zip(MAGIC).filter(|(one, other)| one == other).count();
+    Ok(last == *MAGIC || alike > MAGIC.len() / 2 || is_header(first.get(MAGIC.len()..).unwrap_or_default()))
 }
+
+/// Whether bytes begin with the record that a recording begins with.
+fn is_header(bytes: &[u8]) -> bool {
+    let Some((&[code, ref length @ ..], body)) = bytes.split_first_chunk::<HEAD>() else { return false };
+    code == op::HEADER && own_length(code, body) == Some(u64::from_le_bytes(*length))
+}
+
+/// Bytes among which a recording's first record is.
+const BEGINNING: usize = 4 << 10;
 
 fn is_input(path: &Path) -> bool {
     path.as_os_str() == "-"

@@ -32,6 +32,7 @@ pub struct Chunk {
     /// Of all chunks so far.
     total_bytes: u64,
     total_records: u64,
+    is_checked: bool,
     zstd: Option<DCtx<'static>>,
 }
 
@@ -75,6 +76,12 @@ impl Chunk {
         self.bytes.get(self.at - self.body..self.at).unwrap_or_default()
     }
 
+    /// Whether the chunk that was unpacked last has a checksum, which then is right.
+    #[must_use]
+    pub const fn is_checked(&self) -> bool {
+        self.is_checked
+    }
+
     /// Goes back to the first record.
     pub const fn rewind(&mut self) {
         (self.at, self.body) = (0, 0);
@@ -108,6 +115,7 @@ impl Chunk {
         if found != claimed {
             return Err(Damage::Unpacked { claimed, found });
         }
+        self.is_checked = saved != 0;
         if saved != 0 {
             let found = crc32fast::hash(&self.bytes);
             if found != saved {

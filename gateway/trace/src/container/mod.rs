@@ -118,9 +118,44 @@ pub enum Damage {
     /// An operation code that the format does not have.
     #[error("no record has the operation code {0:02x}")]
     Unknown(u8),
-    /// A record that leads beyond the end of the file.
-    #[error("{0} bytes at the end are no whole record")]
-    Cut(u64),
+    /// An operation code that no record has at this place, or with this content.
+    #[error("a record has the operation code {0:02x}, and is none of that kind")]
+    Code(u8),
+    /// A record's length is not that of its content.
+    #[error(
+        "a record of operation code {code:02x} has {own} bytes by its content, and {bytes} by its length"
+    )]
+    Length {
+        /// Its operation code.
+        code: u8,
+        /// By its length.
+        bytes: u64,
+        /// By its content.
+        own: u64,
+    },
+    /// A message's length leads over the records behind it.
+    #[error("a message of {0} bytes contains the records behind it")]
+    Swallowed(u64),
+    /// A record that leads beyond the end of a file that is not cut off in it.
+    #[error("a record of {bytes} bytes leads beyond the file's end, and others follow where it begins")]
+    Beyond {
+        /// By its length.
+        bytes: u64,
+    },
+    /// The magic bytes of the end, and no footer before them.
+    #[error("it ends with the magic bytes of an MCAP file, and without the footer before them")]
+    Footer,
+    /// The file has something behind its end.
+    #[error("something follows behind its end")]
+    Behind,
+    /// Another number of messages than the file says at its end.
+    #[error("it has {found} messages, and {stated} by its statistics")]
+    Messages {
+        /// That came.
+        found: u64,
+        /// By its statistics.
+        stated: u64,
+    },
     /// Far more comes out than went in.
     #[error("{read} bytes unpack to more than {limit} {what}")]
     Bomb {

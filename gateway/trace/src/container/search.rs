@@ -19,6 +19,8 @@ const WINDOW: usize = 1 << 20;
 const BEGINNING: usize = 512;
 /// Records in a row that are no accident.
 const ROW: usize = 4;
+/// Bytes of a message's record before its content.
+const MESSAGE_HEAD: u64 = 22;
 
 /// Whether the format knows records of this operation code; those of 80 and more are an application's own.
 #[must_use]
@@ -33,7 +35,7 @@ const fn min_length(opcode: u8) -> Option<u64> {
         op::FOOTER => 20,
         op::SCHEMA => 14,
         op::CHANNEL => 16,
-        op::MESSAGE => 22,
+        op::MESSAGE => MESSAGE_HEAD,
         op::CHUNK => 40,
         op::MESSAGE_INDEX => 6,
         op::CHUNK_INDEX => 64,
@@ -98,17 +100,41 @@ fn head(bytes: &[u8], leftover: u64) -> Option<(u8, u64)> {
 fn is_certain(bytes: &[u8], leftover: u64) -> bool {
     let Some((opcode, length)) = head(bytes, leftover) else { return false };
     let body = bytes.get(HEAD..).unwrap_or_default();
-    (opcode != op::CHUNK || length <= LONGEST) && own_length(opcode, body) == Some(length)
+    let is_of_two = opcode == op::ATTACHMENT || (opcode == op::CHUNK && length <= LONGEST);
+    is_of_two && own_length(opcode, body) == Some(length)
 }
 
-/// The length of a chunk or an attachment by the fields that it begins with; of others none.
+/// The length of a record by the fields in it; `None` when its kind does not say, or the bytes end before they do.
 #[must_use]
 pub fn own_length(opcode: u8, body: &[u8]) -> Option<u64> {
     match opcode {
         op::CHUNK => chunk(body),
         op::ATTACHMENT => attachment(body),
+        op::HEADER => lengths(body, 0, "ss"),
+        op::SCHEMA => lengths(body, 2, "sss"),
+        op::CHANNEL => lengths(body, 4, "sss"),
+        op::METADATA => lengths(body, 0, "ss"),
+        op::MESSAGE_INDEX => lengths(body, 2, "s").filter(|own| own % INDEX_ENTRY == 6),
+        op::DATA_END => Some(4),
+        op::FOOTER => Some(20),
+        op::SUMMARY_OFFSET => Some(17),
+        op::STATISTICS => lengths(body, 42, "s"),
+        op::METADATA_INDEX => lengths(body, 16, "s"),
+        op::ATTACHMENT_INDEX => lengths(body, 40, "ss"),
         _ => None,
     }
+}
+
+/// Bytes of an entry in a message index.
+const INDEX_ENTRY: u64 = 16;
+
+/// The length of so many bytes and, behind them, strings, each behind its length in 32 bits.
+fn lengths(body: &[u8], fixed: u64, strings: &str) -> Option<u64> {
+    strings.bytes().try_fold(fixed, |at, _| {
+        let from = usize::try_from(at).ok()?;
+        let length = body.get(from..)?.first_chunk::<4>()?;
+        Some(at + 4 + u64::from(u32::from_le_bytes(*length)))
+    })
 }
 
 /// The length of a chunk's record by the fields in it.
@@ -130,6 +156,30 @@ fn attachment(body: &[u8]) -> Option<u64> {
     let (name, media_type) = (from.text("").ok()?, from.text("").ok()?);
     let data = from.u64("").ok()?;
     data.checked_add(36 + name.len() as u64 + media_type.len() as u64)
+}
+
+/// Whether the content of a record of an application's own kind is that of a chunk, an attachment or metadata: a bit of
+/// its operation code is wrong.
+#[must_use]
+pub(super) fn is_disguised(body: &[u8], length: u64) -> bool {
+    let kinds = [op::CHUNK, op::ATTACHMENT, op::METADATA];
+    length > 8 && kinds.iter().any(|&code| own_length(code, body) == Some(length))
+}
+
+/// Whether records stand behind each other in the content of a message, up to its end: its length leads over others.
+#[must_use]
+pub(super) fn has_records(message: &[u8]) -> bool {
+    let first = usize::try_from(MESSAGE_HEAD).unwrap_or(usize::MAX);
+    (first..message.len().saturating_sub(HEAD)).any(|start| {
+        let mut rest = message.get(start..).unwrap_or_default();
+        let mut row = 0;
+        while let Some((_, length)) = head(rest, rest.len() as u64) {
+            row += 1;
+            rest =
+                usize::try_from(length).ok().and_then(|length| rest.get(HEAD + length..)).unwrap_or_default();
+        }
+        row >= ROW || (row > 0 && rest.is_empty())
+    })
 }
 
 /// Whether records follow each other from here on.

@@ -5,11 +5,13 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::field::{Record, attachment_name, parse};
-use super::search::is_known;
+use super::search::{HEAD, has_records, is_disguised, is_known, own_length};
 use super::{Damage, LONGEST, MAGIC};
 
-/// Bytes that are kept of a record that is longer than anything that is taken into memory.
+/// Bytes that are kept of a record that is longer than anything that is taken into memory, or that nobody reads.
 const BEGINNING: u64 = 64 << 10;
+/// Bytes that are kept of an index, which nobody reads.
+const INDEX: u64 = 64;
 
 /// Bytes of a footer that its checksum is of; that stands behind them.
 const FOOTER_CHECKED: usize = 16;
@@ -19,35 +21,61 @@ const FOOTER_CHECKED: usize = 16;
 pub enum Framed {
     /// A record of this operation code, in [`Source::body`].
     Record(u8),
+    /// A record of this operation code and length that was passed over: an index, statistics, an application's own. Its
+    /// beginning is in [`Source::body`].
+    Passed(u8, u64),
     /// A record of this operation code and length that is too long for memory; its beginning is in [`Source::body`].
     Long(u8, u64),
     /// A record of an operation code that the format does not know, and its length.
     Unknown(u8, u64),
-    /// So many bytes of a record that is not whole, and nothing behind them. 0 when the file ends between two records.
+    /// A record of this operation code and length that ends behind the input; as much of its beginning as is kept is in
+    /// [`Source::body`].
+    Cut(u8, u64),
+    /// So many bytes that are no operation code and length, and nothing behind them. 0 when the file ends between two
+    /// records.
     End(u64),
 }
 
-/// The records of an input, framed. Only what is looked at by anybody is taken into memory: indexes, statistics and
-/// records that are not known are passed over.
+/// The records of an input, framed. Only what is looked at by anybody is taken into memory: of indexes, statistics and
+/// records that are not known only the beginning is.
 #[derive(Debug)]
 pub struct Source<R> {
     input: R,
     body: Vec<u8>,
     /// Bytes that came.
     read: u64,
-    /// Where the record that was read last begins, and the one before it.
-    began: [u64; 2],
+    /// Where the record that was read last begins, and its operation code.
+    began: u64,
+    code: u8,
     /// The longest attachment that is taken into memory.
     attachments: u64,
     /// Of everything before the end of the data section.
     checksum: Option<crc32fast::Hasher>,
+    /// Whether a chunk came.
+    has_chunks: bool,
+    /// Whether the data section is over.
+    in_summary: bool,
+    /// The last bytes that came.
+    last: [u8; MAGIC.len()],
 }
 
 impl<R: Read> Source<R> {
     /// Reads from an input, attachments of so many bytes at most.
     pub fn new(input: R, attachments: u64) -> Self {
         let checksum = Some(crc32fast::Hasher::new());
-        Self { input, body: Vec::new(), read: 0, began: [0; 2], attachments, checksum }
+        let (body, last) = (Vec::new(), [0; MAGIC.len()]);
+        Self {
+            input,
+            body,
+            read: 0,
+            began: 0,
+            code: 0,
+            attachments,
+            checksum,
+            has_chunks: false,
+            in_summary: false,
+            last,
+        }
     }
 
     /// The same in the middle of a file, behind so many bytes.
@@ -78,10 +106,55 @@ impl<R: Read> Source<R> {
         self.read
     }
 
-    /// Where the record that was read last begins, and the one before it.
+    /// Where the record that was read last begins.
     #[must_use]
-    pub const fn began(&self) -> [u64; 2] {
+    pub const fn began(&self) -> u64 {
         self.began
+    }
+
+    /// Whether what was read last are the magic bytes of the end.
+    #[must_use]
+    pub fn ends_with_magic(&self) -> bool {
+        self.last == *MAGIC
+    }
+
+    /// Whether the record that was read last is a chunk, as far as it is there: records in it are its own.
+    #[must_use]
+    pub fn is_chunk(&self) -> bool {
+        self.code == op::CHUNK && own_length(op::CHUNK, &self.body).is_some()
+    }
+
+    /// Compares what was framed last with what it says of itself, and with its place in the file.
+    ///
+    /// # Errors
+    /// When its operation code or its length is wrong.
+    pub fn check(&self, framed: Framed) -> Result<(), Damage> {
+        let (code, bytes) = match framed {
+            Framed::Unknown(code, _) => return Err(Damage::Unknown(code)),
+            Framed::End(_) => return Ok(()),
+            Framed::Record(code) => (code, self.body.len() as u64),
+            Framed::Passed(code, bytes) | Framed::Long(code, bytes) | Framed::Cut(code, bytes) => {
+                (code, bytes)
+            }
+        };
+        let is_index = matches!(
+            code,
+            op::CHUNK_INDEX | op::ATTACHMENT_INDEX | op::STATISTICS | op::METADATA_INDEX | op::SUMMARY_OFFSET
+        );
+        let is_elsewhere =
+            (is_index && !self.in_summary) || (code == op::HEADER && self.began > MAGIC.len() as u64);
+        // Messages stand in chunks or between descriptions; behind a chunk its indexes do.
+        let is_index = self.has_chunks
+            && code == op::MESSAGE
+            && own_length(op::MESSAGE_INDEX, &self.body) == Some(bytes);
+        if is_elsewhere || is_index || (code >= 0x80 && is_disguised(&self.body, bytes)) {
+            return Err(Damage::Code(code));
+        }
+        match own_length(code, &self.body) {
+            Some(own) if own != bytes => Err(Damage::Length { code, bytes, own }),
+            _ if code == op::MESSAGE && has_records(&self.body) => Err(Damage::Swallowed(bytes)),
+            _ => Ok(()),
+        }
     }
 
     /// The name of an attachment that is too long.
@@ -111,9 +184,15 @@ impl<R: Read> Source<R> {
     /// The summary section begins here: what is compared next is that, and the footer before its checksum.
     pub fn begin_summary(&mut self) {
         self.checksum = Some(crc32fast::Hasher::new());
+        self.in_summary = true;
     }
 
-    /// The next record that anybody looks at.
+    /// It was none: the data section goes on.
+    pub const fn end_summary(&mut self) {
+        self.in_summary = false;
+    }
+
+    /// The next record.
     ///
     /// # Errors
     /// When the input fails.
@@ -122,61 +201,60 @@ impl<R: Read> Source<R> {
         reason = "a record borrows from the source; an iterator's cannot"
     )]
     pub fn next(&mut self) -> io::Result<Framed> {
-        loop {
-            let began = self.read;
-            let [last, _] = self.began;
-            self.began = [began, last];
-            self.body.clear();
-            self.take(9)?;
-            let Some(&[opcode, ref length @ ..]) = self.body.first_chunk::<9>() else {
-                return Ok(Framed::End(self.read - began));
-            };
-            let length = u64::from_le_bytes(*length);
-            if opcode != op::DATA_END {
-                self.update();
-            }
-            self.body.clear();
-            let limit = match opcode {
-                op::ATTACHMENT => self.attachments,
-                op::HEADER
-                | op::FOOTER
-                | op::SCHEMA
-                | op::CHANNEL
-                | op::MESSAGE
-                | op::CHUNK
-                | op::METADATA
-                | op::DATA_END => LONGEST,
-                _ => 0,
-            };
-            let is_long = length > limit;
-            let kept = if is_long { limit.min(BEGINNING) } else { length };
-            let mut there = self.take(kept)? == kept;
-            match opcode {
-                op::DATA_END => {}
-                op::FOOTER => self.update_to(FOOTER_CHECKED),
-                _ => self.update(),
-            }
-            if is_long && there {
-                there = self.pass_over(length - kept)?;
-            }
-            if !there {
-                return Ok(Framed::End(self.read - began));
-            }
-            match (is_long, limit) {
-                _ if !is_known(opcode) => return Ok(Framed::Unknown(opcode, length)),
-                (false, _) => return Ok(Framed::Record(opcode)),
-                (true, 1..) => return Ok(Framed::Long(opcode, length)),
-                (true, 0) => {}
-            }
+        (self.began, self.code) = (self.read, 0);
+        self.body.clear();
+        self.take(9)?;
+        let Some(&[opcode, ref length @ ..]) = self.body.first_chunk::<9>() else {
+            return Ok(Framed::End(self.read - self.began));
+        };
+        self.code = opcode;
+        self.has_chunks |= opcode == op::CHUNK;
+        let length = u64::from_le_bytes(*length);
+        if opcode != op::DATA_END {
+            self.update();
         }
+        self.body.clear();
+        let (limit, beginning) = match opcode {
+            op::ATTACHMENT => (self.attachments, BEGINNING),
+            op::HEADER
+            | op::FOOTER
+            | op::SCHEMA
+            | op::CHANNEL
+            | op::MESSAGE
+            | op::CHUNK
+            | op::METADATA
+            | op::DATA_END => (LONGEST, BEGINNING),
+            op::MESSAGE_INDEX => (0, INDEX),
+            _ => (0, BEGINNING),
+        };
+        let is_long = length > limit;
+        let kept = if is_long { length.min(beginning) } else { length };
+        let mut there = self.take(kept)? == kept;
+        match opcode {
+            op::DATA_END => {}
+            op::FOOTER => self.update_to(FOOTER_CHECKED),
+            _ => self.update(),
+        }
+        if is_long && there {
+            there = self.pass_over(length - kept)?;
+        }
+        Ok(match limit {
+            _ if !is_known(opcode) => Framed::Unknown(opcode, length),
+            _ if !there => Framed::Cut(opcode, length),
+            0 if opcode != op::ATTACHMENT => Framed::Passed(opcode, length),
+            _ if is_long => Framed::Long(opcode, length),
+            _ => Framed::Record(opcode),
+        })
     }
 
     /// Reads so many bytes behind those that are there, or what there is; it grows with that, not with what was asked
     /// for.
     fn take(&mut self, bytes: u64) -> io::Result<u64> {
-        let came = (&mut self.input).take(bytes).read_to_end(&mut self.body)? as u64;
-        self.read += came;
-        Ok(came)
+        let came = (&mut self.input).take(bytes).read_to_end(&mut self.body)?;
+        self.read += came as u64;
+        let from = self.body.len().saturating_sub(came.min(MAGIC.len()));
+        remember(&mut self.last, self.body.get(from..).unwrap_or_default());
+        Ok(came as u64)
     }
 
     fn update(&mut self) {
@@ -201,6 +279,7 @@ impl<R: Read> Source<R> {
             if let Some(checksum) = &mut self.checksum {
                 checksum.update(came);
             }
+            remember(&mut self.last, came);
             self.read += came.len() as u64;
             leftover -= came.len() as u64;
         }
@@ -231,9 +310,31 @@ impl<R: Read + Seek> Source<R> {
     pub fn move_to(&mut self, place: u64) -> io::Result<()> {
         self.input.seek(SeekFrom::Start(place))?;
         if place != self.read {
-            (self.read, self.began, self.checksum) = (place, [place; 2], None);
+            (self.read, self.began, self.checksum) = (place, place, None);
         }
         Ok(())
+    }
+
+    /// Takes the content of a record that begins at a place into [`Source::body`], with another length than it says;
+    /// whether all of it is there.
+    ///
+    /// # Errors
+    /// When the input fails.
+    pub fn read_as(&mut self, began: u64, length: u64) -> io::Result<bool> {
+        self.move_to(began + HEAD as u64)?;
+        self.began = began;
+        self.body.clear();
+        Ok(self.take(length)? == length)
+    }
+}
+
+/// Keeps the last bytes of all that came.
+fn remember(last: &mut [u8; MAGIC.len()], came: &[u8]) {
+    let came = came.get(came.len().saturating_sub(last.len())..).unwrap_or_default();
+    last.rotate_left(came.len());
+    let from = last.len() - came.len();
+    if let Some(place) = last.get_mut(from..) {
+        place.copy_from_slice(came);
     }
 }
 

@@ -4,6 +4,7 @@ pub mod account;
 pub mod file;
 pub mod layout;
 pub mod names;
+mod output;
 mod publish;
 pub mod recover;
 pub mod repair;

@@ -9,7 +9,7 @@ use rustix::fs::{Gid, fchown};
 
 use super::names;
 use super::recover::{RecoverError, Recovered, recover};
-use crate::files::WholeFile;
+use crate::files::{WholeFile, folder_of, nameless};
 
 /// Names that are tried for a new file, when somebody else takes one after the other.
 const NAMES: u32 = 100;
@@ -61,8 +61,8 @@ pub fn repair(
     Ok(Repaired { original, ..repaired })
 }
 
-/// Makes a whole file of another one, unless that is whole itself. What it came to, and the new one's bytes if
-/// there is a new one. It takes another file's place only when `force` says so.
+/// Makes a whole file of another one, unless that is whole itself or no message comes of it. What it came to, and the new
+/// one's bytes if there is a new one. It takes another file's place only when `force` says so.
 ///
 /// # Errors
 /// When nothing can be recovered or written.
@@ -71,7 +71,7 @@ pub fn copy_unless_sound(
     to: &Path,
     force: bool,
 ) -> Result<(Recovered, Option<u64>), RecoverError> {
-    copy(from, to, force, |recovered| !recovered.is_sound())
+    copy(from, to, force, |recovered| !recovered.is_sound() && recovered.messages > 0)
 }
 
 fn copy(
@@ -84,9 +84,13 @@ fn copy(
     as_private(from, &file).map_err(RecoverError::Write)?;
     let mut out = BufWriter::new(file);
     let mut from = from;
-    // A pipe is where it is.
-    let _ = from.rewind();
-    let recovered = recover(BufReader::with_capacity(1 << 20, from), &mut out)?;
+    // A pipe is read once, and a recording twice.
+    let kept = if from.rewind().is_err() {
+        Some(kept(from, folder_of(to)).map_err(RecoverError::Read)?)
+    } else {
+        None
+    };
+    let recovered = recover(BufReader::with_capacity(1 << 20, kept.as_ref().unwrap_or(from)), &mut out)?;
     if !is_worth_it(&recovered) {
         return Ok((recovered, None));
     }
@@ -96,6 +100,14 @@ fn copy(
         Ok(file.metadata()?.len())
     };
     Ok((recovered, Some(finish().map_err(RecoverError::Write)?)))
+}
+
+/// All that comes of a pipe, in a file without a name.
+fn kept(mut from: &File, folder: &Path) -> io::Result<File> {
+    let mut file = nameless(folder, 0o600)?;
+    io::copy(&mut from, &mut file)?;
+    file.rewind()?;
+    Ok(file)
 }
 
 /// Lets nobody read a copy who could not read the original.

@@ -59,6 +59,14 @@ pub enum ReportError {
         /// What is missing.
         what: String,
     },
+    /// It ends before there is anything to report.
+    #[error("{name} holds no run that can be shown: {what}")]
+    Unfinished {
+        /// Its name.
+        name: String,
+        /// What is missing.
+        what: String,
+    },
     /// Bit rates that CAN does not have.
     #[error("{bus}: {source}; give others with --nominal and --data")]
     Rates {
@@ -76,6 +84,8 @@ pub struct Report {
     pub page: Page,
     /// A sentence, when the recording is cut off or damaged.
     pub missing: Option<String>,
+    /// Whether it is damaged, and the report of what stands before that.
+    pub is_damaged: bool,
     /// What the recording is called.
     pub name: String,
 }
@@ -115,10 +125,10 @@ impl Options {
 /// # Errors
 /// When it is no recording of a run, or has nothing in it; bit rates that CAN does not have.
 pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportError> {
-    let (run, broken) = read(paths, options)?;
+    let (run, broken, is_damaged) = read(paths, options)?;
     let missing = broken.map(|why| run.missing(&why));
     let page = page::page(&run, &options.command, missing.as_deref());
-    Ok(Report { page, missing, name: run.name })
+    Ok(Report { page, missing, is_damaged, name: run.name })
 }
 
 /// Sees that these are recordings, without reading them.
@@ -147,15 +157,13 @@ fn open(paths: &[PathBuf]) -> Result<(Reader, Option<u64>), ReportError> {
     Ok((items, bytes))
 }
 
-/// Reads it all; also why it has no proper end, if it has none.
-fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), ReportError> {
+/// Reads it all; also why it has no proper end, if it has none, and whether that is damage.
+fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bool), ReportError> {
     let (mut items, bytes) = open(paths)?;
     let name = items.name().to_owned();
-    // What stands before the first message is known when it is open, unless it is damaged there.
+    // What stands before the first message is known when it is open, unless the file is damaged: that is the reason then.
     let begun = Run::begin(&name, bytes.unwrap_or(0), items.extras(), options);
-    if items.extras().skin().is_none() {
-        items.next_item()?;
-    }
+    while items.extras().skin().is_none() && items.next_item()?.is_some() {}
     let mut run = begun?;
     run.files = paths.iter().map(|path| path.display().to_string()).collect();
     let damaged = loop {
@@ -171,10 +179,14 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>), R
         let nothing = || "it has no tick and no frame of its skin's buses".to_owned();
         return Err(match damaged {
             Some(error) => error.into(),
-            None => ReportError::Foreign { name, what: unfinished.unwrap_or_else(nothing) },
+            None => match unfinished {
+                Some(what) => ReportError::Unfinished { name, what },
+                None => ReportError::Foreign { name, what: nothing() },
+            },
         });
     }
-    Ok((run, damaged.map(|error| error.to_string()).or(unfinished)))
+    let is_damaged = damaged.is_some();
+    Ok((run, damaged.map(|error| error.to_string()).or(unfinished), is_damaged))
 }
 
 /// What a real bus would make of these buses.
@@ -219,8 +231,13 @@ impl Run {
     fn begin(name: &str, bytes: u64, extras: &Extras, options: &Options) -> Result<Self, ReportError> {
         let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what };
         let Some(skin) = extras.skin() else {
-            let why = extras.unfinished.as_ref().map_or_else(String::new, |why| format!(" ({why})"));
-            return Err(foreign(format!("{SKIN} is not attached to it{why}")));
+            let what = format!("{SKIN} is not attached to it");
+            return Err(match &extras.unfinished {
+                Some(why) => {
+                    ReportError::Unfinished { name: name.to_owned(), what: format!("{what} ({why})") }
+                }
+                None => foreign(what),
+            });
         };
         let skin = skin.map_err(|error| foreign(format!("the attached {error}")))?;
         let layout = Layout::new(&skin);

@@ -1,6 +1,8 @@
 //! The entries of an MCAP recording, and what else it has.
 
-use std::io::{BufReader, Chain, Cursor, Read};
+use std::fs::File;
+use std::io::{self, BufReader, Chain, Cursor, Read, Seek, SeekFrom};
+use std::os::unix::fs::FileExt;
 
 use ::mcap::records::op;
 
@@ -8,7 +10,7 @@ use super::Fault;
 use super::buses::Buses;
 use super::state::{KEPT, State, Target};
 use crate::capture::{Extras, Item};
-use crate::container::{Chunk, Damage, Framed, LONGEST, MAGIC, Record, Source, parse};
+use crate::container::{Chunk, Damage, Framed, LONGEST, MAGIC, Record, Source, first_record, parse};
 
 /// Bytes that are read at once.
 const PIECE: usize = 1 << 18;
@@ -25,6 +27,12 @@ pub(crate) struct McapReader {
     first: Option<Result<Target, Fault>>,
     /// Where the record begins from which the next messages are, and how many of its messages were given out.
     anchor: (u64, u32),
+    /// The file itself, where it can be looked at behind a place.
+    file: Option<File>,
+    /// Messages so far, from the beginning; `None` when it was begun elsewhere.
+    messages: Option<u64>,
+    /// Messages by the statistics.
+    stated: Option<u64>,
 }
 
 /// Where a reader is in its file.
@@ -37,21 +45,41 @@ enum Place {
 }
 
 impl McapReader {
-    /// Goes on behind `head`, which has been read already.
-    pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, state: State) -> Self {
+    /// Goes on behind `head`, which has been read already; of a regular file with the `file`.
+    pub(crate) fn new(head: &[u8], input: Box<dyn Read + Send>, state: State, file: Option<File>) -> Self {
         let input = BufReader::with_capacity(PIECE, Cursor::new(head.to_vec()).chain(input));
         let (source, chunk) = (Source::new(input, KEPT as u64), Chunk::default());
-        let mut reader = Self { source, chunk, place: Place::Magic, state, first: None, anchor: (0, 0) };
+        let mut reader = Self {
+            source,
+            chunk,
+            place: Place::Magic,
+            state,
+            first: None,
+            anchor: (0, 0),
+            file,
+            messages: Some(0),
+            stated: None,
+        };
         // What stands before the first message is known from the beginning.
         reader.first = reader.advance().transpose();
         reader
     }
 
     /// Goes on at a record, which begins behind so many bytes, with what is known of the file.
-    pub(crate) fn at(bytes: u64, input: Box<dyn Read + Send>, state: State) -> Self {
+    pub(crate) fn at(bytes: u64, input: Box<dyn Read + Send>, state: State, file: Option<File>) -> Self {
         let input = BufReader::with_capacity(PIECE, Cursor::new(Vec::new()).chain(input));
         let (source, chunk) = (Source::at(bytes, input, KEPT as u64), Chunk::default());
-        Self { source, chunk, place: Place::Records, state, first: None, anchor: (bytes, 0) }
+        Self {
+            source,
+            chunk,
+            place: Place::Records,
+            state,
+            first: None,
+            anchor: (bytes, 0),
+            file,
+            messages: None,
+            stated: None,
+        }
     }
 
     pub(crate) fn into_state(self) -> State {
@@ -115,8 +143,14 @@ impl McapReader {
 
     /// Reads on by a record.
     fn step(&mut self) -> Result<Option<Target>, Fault> {
-        let Self { source, chunk, place, state, anchor, .. } = self;
+        let Self { source, chunk, place, state, anchor, messages, .. } = self;
         let began = source.read();
+        let mut take = |opcode, body: &[u8], in_chunk| {
+            if let Some(messages) = messages.as_mut().filter(|_| opcode == op::MESSAGE) {
+                *messages += 1;
+            }
+            state.take(opcode, body, in_chunk)
+        };
         match place {
             Place::Over => {}
             Place::Magic => {
@@ -125,35 +159,52 @@ impl McapReader {
             }
             Place::InChunk => match chunk.next() {
                 Some((opcode @ (op::SCHEMA | op::CHANNEL | op::MESSAGE), body)) => {
-                    return state.take(opcode, body, true);
+                    return take(opcode, body, true);
                 }
                 Some(_) => {}
                 None => *place = Place::Records,
             },
-            Place::Records => match source.next()? {
-                Framed::Record(op::CHUNK) => {
-                    chunk.unpack(source.body(), source.read())?;
-                    (*place, *anchor) = (Place::InChunk, (began, 0));
-                }
-                Framed::Record(op::DATA_END) => source.check_section(op::DATA_END)?,
-                Framed::Record(op::FOOTER) => {
-                    *place = Place::Over;
-                    self.take_magic()?;
-                }
-                Framed::Record(opcode) => {
-                    let target = state.take(opcode, source.body(), false)?;
-                    if target.is_some() {
-                        *anchor = (began, 0);
+            Place::Records => {
+                let framed = source.next()?;
+                source.check(framed)?;
+                match framed {
+                    Framed::Record(op::CHUNK) => {
+                        chunk.unpack(source.body(), source.read())?;
+                        (*place, *anchor) = (Place::InChunk, (began, 0));
                     }
-                    return Ok(target);
+                    Framed::Record(op::DATA_END) => {
+                        source.check_section(op::DATA_END)?;
+                        source.begin_summary();
+                    }
+                    Framed::Record(op::FOOTER) => {
+                        *place = Place::Over;
+                        // Of a damaged summary nothing is needed.
+                        if source.check_section(op::FOOTER).is_err() {
+                            self.stated = None;
+                        }
+                        self.take_magic()?;
+                        self.end()?;
+                    }
+                    Framed::Record(opcode) => {
+                        let target = take(opcode, source.body(), false)?;
+                        if target.is_some() {
+                            *anchor = (began, 0);
+                        }
+                        return Ok(target);
+                    }
+                    Framed::Passed(op::STATISTICS, _) => {
+                        let count = source.body().first_chunk();
+                        self.stated = count.map(|count| u64::from_le_bytes(*count));
+                    }
+                    Framed::Passed(..) | Framed::Unknown(..) => {}
+                    Framed::Long(op::ATTACHMENT, _) => state.attachment(source.attachment_name(), &[]),
+                    Framed::Long(_, bytes) => {
+                        return Err(Damage::Long { what: "record", bytes, limit: LONGEST }.into());
+                    }
+                    Framed::Cut(_, bytes) => self.truncated(bytes)?,
+                    Framed::End(bytes) => self.truncated(bytes)?,
                 }
-                Framed::Long(op::ATTACHMENT, _) => state.attachment(source.attachment_name(), &[]),
-                Framed::Long(_, bytes) => {
-                    return Err(Damage::Long { what: "record", bytes, limit: LONGEST }.into());
-                }
-                Framed::Unknown(..) => {}
-                Framed::End(_) => self.truncated(),
-            },
+            }
         }
         Ok(None)
     }
@@ -164,13 +215,69 @@ impl McapReader {
             if !MAGIC.starts_with(self.source.body()) {
                 return Err(Damage::Magic.into());
             }
-            self.truncated();
+            self.truncated(0)?;
         }
         Ok(())
     }
 
-    fn truncated(&mut self) {
+    /// Compares what came with the file's statistics, and that nothing follows.
+    fn end(&self) -> Result<(), Fault> {
+        if let (Some(found), Some(stated)) = (self.messages, self.stated)
+            && found != stated
+        {
+            return Err(Damage::Messages { found, stated }.into());
+        }
+        match &self.file {
+            Some(file) if file.metadata()?.len() > self.source.read() => Err(Damage::Behind.into()),
+            _ => Ok(()),
+        }
+    }
+
+    /// Nothing more comes, within a record of so many bytes: it is cut off, unless its end is there or other records are,
+    /// and so it is a length that is wrong.
+    fn truncated(&mut self, bytes: u64) -> Result<(), Fault> {
         self.place = Place::Over;
-        self.state.truncated(self.source.read());
+        if self.source.ends_with_magic() && self.source.read() > 2 * MAGIC.len() as u64 {
+            let is_footer = bytes == MAGIC.len() as u64;
+            return Err(if is_footer { Damage::Footer } else { Damage::Beyond { bytes } }.into());
+        }
+        let read = self.source.read();
+        if let Some(file) = &self.file
+            && file.metadata()?.len() == read
+        {
+            let began = self.source.began();
+            let any = !self.source.is_chunk();
+            if first_record(&mut Apart { file, at: 0 }, began + 1, read, any)?.is_some() {
+                return Err(Damage::Beyond { bytes }.into());
+            }
+        }
+        self.state.truncated(read);
+        Ok(())
+    }
+}
+
+/// A file that is read without moving its own place.
+struct Apart<'a> {
+    file: &'a File,
+    at: u64,
+}
+
+impl Read for Apart<'_> {
+    fn read(&mut self, room: &mut [u8]) -> io::Result<usize> {
+        let came = self.file.read_at(room, self.at)?;
+        self.at += came as u64;
+        Ok(came)
+    }
+}
+
+impl Seek for Apart<'_> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        let (from, by) = match to {
+            SeekFrom::Start(at) => (at, 0),
+            SeekFrom::End(by) => (self.file.metadata()?.len(), by),
+            SeekFrom::Current(by) => (self.at, by),
+        };
+        self.at = from.checked_add_signed(by).ok_or(io::ErrorKind::InvalidInput)?;
+        Ok(self.at)
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::fmt::Display;
-use std::io::{self, BufReader, Read, Seek};
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
 use ::mcap::records::op;
 use protocol::candump::{Direction, Record, Timestamp};
@@ -134,8 +134,17 @@ impl State {
     }
 
     /// Takes the attachments and metadata of a file that can be gone through without reading all of it: they are known
-    /// from the beginning then, wherever they stand.
+    /// from the beginning then, wherever they stand; and that it has no end.
     pub(crate) fn find_files(&mut self, file: &mut (impl Read + Seek)) -> io::Result<()> {
+        let size = file.seek(SeekFrom::End(0))?;
+        file.seek(SeekFrom::Start(size.saturating_sub(MAGIC.len() as u64)))?;
+        let mut end = Vec::new();
+        file.take(MAGIC.len() as u64).read_to_end(&mut end)?;
+        file.rewind()?;
+        let has_end = end == MAGIC && size > MAGIC.len() as u64;
+        if !has_end {
+            self.truncated(size);
+        }
         if self.knows_files {
             return Ok(());
         }
@@ -145,8 +154,10 @@ impl State {
             return Ok(());
         }
         let mut body = Vec::new();
+        let mut footer = None;
         while let Some((opcode, length)) = find(&mut from, &[op::ATTACHMENT, op::METADATA, op::FOOTER])? {
             if opcode == op::FOOTER {
+                footer = from.stream_position()?.checked_add(length);
                 break;
             }
             body.clear();
@@ -164,7 +175,13 @@ impl State {
                 _ => {}
             }
         }
-        self.knows_files = true;
+        // A wrong length may have led over some: then they are taken as they are read.
+        self.knows_files = !has_end || footer.is_some_and(|end| end + MAGIC.len() as u64 == size);
+        if !self.knows_files {
+            self.extras.attachments.clear();
+            self.extras.metadata.clear();
+            self.kept = 0;
+        }
         Ok(())
     }
 

@@ -67,7 +67,7 @@ impl Survey {
 
     /// Reads the frames of a recording for their buses, beside those that are known.
     pub(crate) fn buses_of(&self, input: Box<dyn Read + Send>, known: Buses) -> Buses {
-        let mut reader = McapReader::new(&[], input, State::new(false, None).with_buses(known));
+        let mut reader = McapReader::new(&[], input, State::new(false, None).with_buses(known), None);
         // Where topics are not known, the first messages are of the frames' type.
         if self.topics.len() > 1 || reader.has_foreign() {
             // Its faults are reported when it is read.

@@ -1,0 +1,117 @@
+//! The output below the crate's writer, into which records can be written that the crate cannot: descriptions outside of
+//! chunks.
+//!
+//! ```text
+//!   crate's writer ── bytes ──┐
+//!                             ├──> Output: place and checksum of all bytes ──> file
+//!   descriptions ── records ──┘
+//! ```
+
+use std::io::{self, Seek, SeekFrom, Write};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use mcap::records::op;
+
+/// Bytes of the record that ends the data section: its head, and a checksum of the section.
+const DATA_END: usize = 13;
+
+/// What all handles write to.
+struct Inner<W> {
+    out: W,
+    place: u64,
+    /// Of all bytes of the data section.
+    checksum: crc32fast::Hasher,
+    /// The record that ends the data section, as the crate writes it, once that is to come.
+    end: Option<Vec<u8>>,
+}
+
+impl<W: Write> Inner<W> {
+    fn put(&mut self, bytes: &[u8]) -> io::Result<()> {
+        self.out.write_all(bytes)?;
+        self.place += bytes.len() as u64;
+        self.checksum.update(bytes);
+        Ok(())
+    }
+
+    /// Takes the record that ends the data section, and writes it with the checksum of all bytes; how many bytes belonged
+    /// to it.
+    fn put_end(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let Some(end) = &mut self.end else { return Ok(0) };
+        let taken = bytes.get(..bytes.len().min(DATA_END - end.len())).unwrap_or_default();
+        end.extend_from_slice(taken);
+        if end.len() == DATA_END {
+            let checksum = self.checksum.clone().finalize();
+            let record = [&[op::DATA_END][..], &4_u64.to_le_bytes(), &checksum.to_le_bytes()].concat();
+            self.end = None;
+            self.put(&record)?;
+        }
+        Ok(taken.len())
+    }
+}
+
+/// A handle of the output. What the crate flushes is not handed on: it does so with each chunk.
+pub(super) struct Output<W>(Arc<Mutex<Inner<W>>>);
+
+impl<W> Clone for Output<W> {
+    fn clone(&self) -> Self {
+        Self(Arc::clone(&self.0))
+    }
+}
+
+impl<W: Write> Output<W> {
+    pub(super) fn new(out: W) -> Self {
+        let checksum = crc32fast::Hasher::new();
+        Self(Arc::new(Mutex::new(Inner { out, place: 0, checksum, end: None })))
+    }
+
+    fn inner(&self) -> MutexGuard<'_, Inner<W>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Writes whole records, while the crate's writer is between two.
+    pub(super) fn records(&self, records: &[u8]) -> io::Result<()> {
+        self.inner().put(records)
+    }
+
+    /// The crate ends the data section next.
+    pub(super) fn begin_end(&self) {
+        self.inner().end = Some(Vec::new());
+    }
+
+    /// Hands on what was written.
+    pub(super) fn hand_on(&self) -> io::Result<()> {
+        self.inner().out.flush()
+    }
+
+    /// What was written to, when this is the last handle.
+    pub(super) fn into_inner(self) -> Option<W> {
+        let inner = Arc::into_inner(self.0)?;
+        Some(inner.into_inner().unwrap_or_else(PoisonError::into_inner).out)
+    }
+}
+
+impl<W: Write> Write for Output<W> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let mut inner = self.inner();
+        match inner.put_end(bytes)? {
+            0 => inner.put(bytes).map(|()| bytes.len()),
+            taken => Ok(taken),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl<W: Write> Seek for Output<W> {
+    /// Tells the place; there is no other to go to.
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        match to {
+            SeekFrom::Current(0) => Ok(self.inner().place),
+            SeekFrom::Start(_) | SeekFrom::End(_) | SeekFrom::Current(_) => {
+                Err(io::ErrorKind::NotSeekable.into())
+            }
+        }
+    }
+}

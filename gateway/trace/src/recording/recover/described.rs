@@ -1,0 +1,112 @@
+//! What a file says of its types and topics, wherever it says it.
+//!
+//! A writer may say it in the chunk of the first message, again between chunks, and in the summary. A statement that a
+//! checksum covers counts more than any number of those that none does; of these the one that stands there most often
+//! counts. Where they contradict each other equally, none does: a message under another's topic is worse than none.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+
+use mcap::records::op;
+use protocol::candump::Record as Frame;
+
+use crate::container::{Damage, Names, Record, parse};
+use crate::recording::TOPIC_OF_BUS;
+use crate::recording::file::FileWriter;
+use crate::ros2::Message;
+
+/// How far a statement is to be trusted.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Trust {
+    /// A checksum covers it.
+    Certain,
+    /// No checksum does.
+    Plain,
+    /// The checksum over it is wrong.
+    Doubtful,
+}
+
+/// A statement, as its record has it.
+#[derive(Debug)]
+struct Statement {
+    body: Vec<u8>,
+    /// How often it stands under a checksum, and how often under none that is wrong.
+    certain: u32,
+    times: u32,
+}
+
+/// Statements by the number of what they describe.
+type Statements = BTreeMap<u16, Vec<Statement>>;
+
+/// Types and topics.
+#[derive(Debug, Default)]
+pub(super) struct Described {
+    schemas: Statements,
+    channels: Statements,
+    names: Names,
+}
+
+impl Described {
+    /// Takes a statement. Other records are none.
+    pub(super) fn take(&mut self, code: u8, body: &[u8], trust: Trust) -> Result<(), Damage> {
+        let (id, statements) = match parse(code, body)? {
+            Record::Schema { id, .. } => (id, &mut self.schemas),
+            Record::Channel { id, .. } => (id, &mut self.channels),
+            Record::Header { .. }
+            | Record::Message { .. }
+            | Record::Attachment { .. }
+            | Record::Metadata { .. }
+            | Record::DataEnd { .. }
+            | Record::Footer { .. }
+            | Record::Other => return Ok(()),
+        };
+        let known = statements.entry(id).or_default();
+        let place = known.iter().position(|it| it.body == body);
+        let place = match place {
+            Some(place) => place,
+            None => {
+                self.names.add(body.len())?;
+                known.push(Statement { body: body.to_vec(), certain: 0, times: 0 });
+                known.len() - 1
+            }
+        };
+        if let Some(statement) = known.get_mut(place) {
+            statement.times = statement.times.saturating_add(u32::from(trust != Trust::Doubtful));
+            statement.certain = statement.certain.saturating_add(u32::from(trust == Trust::Certain));
+        }
+        Ok(())
+    }
+
+    /// Writes all that is known into a new file; the topics in it, and whether their messages are frames.
+    pub(super) fn write<W: Write>(&self, writer: &mut FileWriter<W>) -> io::Result<BTreeMap<u16, bool>> {
+        let mut types = BTreeMap::new();
+        for body in self.schemas.values().filter_map(|all| chosen(all)) {
+            if let Ok(Record::Schema { id, name, encoding, data }) = parse(op::SCHEMA, body)
+                && id != 0
+            {
+                writer.schema_as(id, (name, encoding), data)?;
+                types.insert(id, name == Frame::TYPE);
+            }
+        }
+        let mut topics = BTreeMap::new();
+        for body in self.channels.values().filter_map(|all| chosen(all)) {
+            let Ok(Record::Channel { id, schema, topic, encoding, facts }) = parse(op::CHANNEL, body) else {
+                continue;
+            };
+            let of_frames = types.get(&schema).copied();
+            if schema == 0 || of_frames.is_some() {
+                writer.channel_as((id, schema), (topic, encoding), &facts.into())?;
+                topics.insert(id, of_frames == Some(true) && topic.starts_with(TOPIC_OF_BUS));
+            }
+        }
+        Ok(topics)
+    }
+}
+
+/// The statement that counts, unless another one counts as much.
+fn chosen(all: &[Statement]) -> Option<&[u8]> {
+    let weight = |it: &Statement| (it.certain, it.times);
+    let best = all.iter().max_by_key(|it| weight(it))?;
+    let equal = all.iter().filter(|it| weight(it) == weight(best)).count();
+    (equal == 1).then_some(best.body.as_slice())
+}

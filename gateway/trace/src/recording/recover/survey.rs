@@ -1,0 +1,432 @@
+//! Where in a damaged file the records are that are whole and right.
+//!
+//! ```text
+//!   magic │ head │ chunk │ index │ ch#nk │ index │ chunk │ … │ summary │ footer
+//!   ──────┴──────┴───────┴───────┼───────┼───────┴───────┴───┴─────────┴───────
+//!              a piece           └ wrong ┘        a piece      found from its end
+//! ```
+
+use std::io::{self, Read, Seek, SeekFrom};
+
+use mcap::records::op;
+
+use super::described::{Described, Trust};
+use super::{LONGEST_ATTACHMENT, RecoverError, Recovered};
+use crate::container::{
+    Chunk, Damage, Framed, HEAD, LONGEST, MAGIC, Record, Source, first_record, is_record, own_length, parse,
+};
+
+/// Bytes of a footer's record.
+const FOOTER: usize = 29;
+
+/// Records of a file that are right.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Piece {
+    /// All from a place to another.
+    Records { from: u64, to: u64 },
+    /// One whose length is wrong, and what it is by its content.
+    Record { at: u64, code: u8, length: u64 },
+}
+
+/// What a file contains.
+#[derive(Debug, Default)]
+pub(super) struct Survey {
+    pub(super) profile: String,
+    pub(super) pieces: Vec<Piece>,
+    pub(super) described: Described,
+    pub(super) recovered: Recovered,
+}
+
+/// The summary of a file, found from its end.
+struct Summary {
+    /// Where the data section ends: behind its last record.
+    data_end: u64,
+    /// Messages by the statistics.
+    stated: Option<u64>,
+    /// Whether its checksum is not wrong.
+    is_right: bool,
+}
+
+/// A record that was examined.
+enum Found {
+    /// It is right, and ends where its length says.
+    Right,
+    /// It is right, and its length is not: it has this one.
+    As(u8, u64),
+    /// The data section, or the file, ends here.
+    End,
+    /// It looks like the end, and records follow, where the source is.
+    NoEnd,
+    /// It is wrong. Where it ends by its length, if that may be right; and from where on records in a row are taken for
+    /// some: those in a damaged chunk are none.
+    Wrong { end: Option<u64>, rows: u64 },
+}
+
+/// A survey on its way.
+struct Surveyor<R> {
+    source: Source<R>,
+    size: u64,
+    /// Where nothing of the data section follows.
+    limit: u64,
+    /// Whether the file ends with the magic bytes.
+    has_magic: bool,
+    chunk: Chunk,
+    survey: Survey,
+    /// Where the last record begins, if no checksum says that its length is right; and from where on records in a row
+    /// that stand in it are taken for some.
+    unsure: Option<(u64, u64)>,
+}
+
+impl Survey {
+    /// Goes through a file.
+    pub(super) fn of(from: impl Read + Seek) -> Result<Self, RecoverError> {
+        let mut source = Source::new(from, LONGEST_ATTACHMENT);
+        let is_begun = source.magic().map_err(RecoverError::Read)?;
+        let first = source.body().to_vec();
+        let size = source.size().map_err(RecoverError::Read)?;
+        if !is_begun && first.len() < MAGIC.len() && MAGIC.starts_with(&first) {
+            return Err(RecoverError::Empty(size));
+        }
+        let (chunk, survey) = (Chunk::default(), Self::default());
+        let mut surveyor =
+            Surveyor { source, size, limit: size, has_magic: false, chunk, survey, unsure: None };
+        let done = surveyor.go(is_begun).map_err(RecoverError::Read)?;
+        match done {
+            false => Err(RecoverError::NoMcap { got: first }),
+            true if surveyor.survey.pieces.is_empty() => Err(RecoverError::Empty(size)),
+            true => Ok(surveyor.survey),
+        }
+    }
+}
+
+impl<R: Read + Seek> Surveyor<R> {
+    /// Goes through all of it; whether it is a recording.
+    fn go(&mut self, is_begun: bool) -> io::Result<bool> {
+        let summary = self.summary()?;
+        let mut at = MAGIC.len() as u64;
+        if !is_begun {
+            let known = summary.is_some() || self.is_header(at)?;
+            if !known {
+                // A chunk says that it is one; other records may stand before that.
+                let Some(certain) = self.first(0, self.size, false)? else { return Ok(false) };
+                at = self.first(0, certain, true)?.unwrap_or(certain);
+            }
+            self.lost(at);
+        }
+        if let Some(summary) = &summary {
+            (self.limit, self.survey.recovered.stated) = (summary.data_end, summary.stated);
+            self.survey.recovered.checksum |= !summary.is_right;
+        }
+        self.source.move_to(at)?;
+        let mut is_ended = false;
+        while self.source.read() < self.limit {
+            let began = self.source.read();
+            match self.examine()? {
+                Found::Right => self.right(began),
+                Found::As(code, length) => {
+                    self.survey.pieces.push(Piece::Record { at: began, code, length });
+                    self.lost(0);
+                    self.unsure = None;
+                }
+                Found::End => {
+                    is_ended = true;
+                    break;
+                }
+                Found::NoEnd => {}
+                Found::Wrong { end, rows } => {
+                    if !self.resume(began, end, rows)? {
+                        break;
+                    }
+                }
+            }
+        }
+        self.survey.recovered.whole |= summary.is_some();
+        // The record that ends the data section has its checksum.
+        self.survey.recovered.checksum |= summary.is_some() && !is_ended;
+        Ok(true)
+    }
+
+    /// The header's record begins here.
+    fn is_header(&mut self, at: u64) -> io::Result<bool> {
+        self.source.move_to(at)?;
+        let framed = self.source.next()?;
+        let is_header = framed == Framed::Record(op::HEADER) && self.source.check(framed).is_ok();
+        let end = self.source.read();
+        Ok(is_header && is_record(self.source.input(), end, self.size)?)
+    }
+
+    fn first(&mut self, from: u64, until: u64, any: bool) -> io::Result<Option<u64>> {
+        first_record(self.source.input(), from, until, any)
+    }
+
+    /// The first record from a place on; from another one on also the first of some in a row.
+    fn first_of_two(&mut self, from: u64, rows: u64, until: u64) -> io::Result<Option<u64>> {
+        match self.first(from, rows.min(until), false)? {
+            None => self.first(rows, until, true),
+            found => Ok(found),
+        }
+    }
+
+    /// So many bytes are lost at a damaged place.
+    fn lost(&mut self, bytes: u64) {
+        self.survey.recovered.damaged.0 += 1;
+        self.survey.recovered.damaged.1 += bytes;
+    }
+
+    /// A record is right up to where the source is.
+    fn right(&mut self, began: u64) {
+        let to = self.source.read();
+        match self.survey.pieces.last_mut() {
+            Some(Piece::Records { to: end, .. }) if *end == began => *end = to,
+            _ => self.survey.pieces.push(Piece::Records { from: began, to }),
+        }
+    }
+
+    /// Reads and examines the next record.
+    fn examine(&mut self) -> io::Result<Found> {
+        let framed = self.source.next()?;
+        let (began, end) = (self.source.began(), self.source.read());
+        let checked = self.source.check(framed);
+        let content = began + HEAD as u64;
+        let own = own_length(op::CHUNK, self.source.body()).filter(|_| self.source.is_chunk());
+        let rows = own.map_or(0, |own| content.saturating_add(own));
+        let wrong = Found::Wrong { end: Some(end), rows };
+        let code = match framed {
+            Framed::End(_) => return Ok(Found::Wrong { end: None, rows: 0 }),
+            Framed::Unknown(_, length) => {
+                let end = content.checked_add(length).filter(|by_length| *by_length == end);
+                return Ok(Found::Wrong { end, rows: 0 });
+            }
+            Framed::Cut(code, _) => {
+                let found = self.by_content(code, &checked)?;
+                return Ok(found.unwrap_or(Found::Wrong { end: None, rows }));
+            }
+            Framed::Record(code) | Framed::Passed(code, _) | Framed::Long(code, _) => code,
+        };
+        if let Err(Damage::Swallowed(_)) = checked {
+            self.unsure = Some((began, content));
+            return Ok(Found::Wrong { end: None, rows: 0 });
+        }
+        if checked.is_err() {
+            return Ok(self.by_content(code, &checked)?.unwrap_or(wrong));
+        }
+        match (framed, code) {
+            (Framed::Record(_), op::DATA_END) => return self.data_end(began),
+            (Framed::Record(_), op::FOOTER) => {
+                let ends = end + MAGIC.len() as u64 == self.size && self.source.magic()?;
+                self.survey.recovered.whole |= ends;
+                return Ok(if ends { Found::End } else { wrong });
+            }
+            (Framed::Record(_), _) if self.take(code).is_err() => return Ok(wrong),
+            (Framed::Long(..), _) => return Ok(wrong),
+            _ => {}
+        }
+        self.unsure = match code {
+            op::CHUNK => (!self.chunk.is_checked()).then_some((began, end)),
+            _ => Some((began, content)),
+        };
+        Ok(Found::Right)
+    }
+
+    /// The record that was framed last, whose length is wrong, if its content is right and says where it ends.
+    fn by_content(&mut self, code: u8, checked: &Result<(), Damage>) -> io::Result<Option<Found>> {
+        let &Err(Damage::Length { own, .. }) = checked else { return Ok(None) };
+        let began = self.source.began();
+        let limit = if code == op::ATTACHMENT { LONGEST_ATTACHMENT } else { LONGEST };
+        let end = began + HEAD as u64 + own.min(limit + 1);
+        if own > limit || end > self.limit || matches!(code, op::DATA_END | op::FOOTER) {
+            return Ok(None);
+        }
+        // Of these a checksum says that all of it is there.
+        let is_sure = matches!(code, op::CHUNK | op::ATTACHMENT);
+        if !is_sure && !is_record(self.source.input(), end, self.limit)? {
+            return Ok(None);
+        }
+        let is_right = self.source.read_as(began, own)? && self.take(code).is_ok();
+        Ok(is_right.then_some(Found::As(code, own)))
+    }
+
+    /// Looks into a record that the source has; its types and topics are noted.
+    fn take(&mut self, code: u8) -> Result<(), Damage> {
+        let Self { source, chunk, survey, .. } = self;
+        let Survey { described, profile, .. } = survey;
+        let body = source.body();
+        if code != op::CHUNK {
+            if let Record::Header { profile: of_file, .. } = parse(code, body)? {
+                of_file.clone_into(profile);
+            }
+            return described.take(code, body, Trust::Plain);
+        }
+        chunk.unpack(body, source.read())?;
+        while let Some((code, body)) = chunk.next() {
+            parse(code, body)?;
+        }
+        chunk.rewind();
+        let trust = if chunk.is_checked() { Trust::Certain } else { Trust::Plain };
+        while let Some((code, body)) = chunk.next() {
+            if matches!(code, op::SCHEMA | op::CHANNEL) {
+                described.take(code, body, trust)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The end of the data section, unless damage looks like it: then records follow.
+    fn data_end(&mut self, began: u64) -> io::Result<Found> {
+        let checked = self.source.check_section(op::DATA_END).is_ok();
+        let end = self.source.read();
+        if self.limit < self.size && end < self.limit {
+            return Ok(Found::Wrong { end: Some(end), rows: 0 });
+        }
+        self.survey.recovered.checksum |= !checked;
+        if self.limit < self.size {
+            return Ok(Found::End);
+        }
+        self.source.begin_summary();
+        let (mut all, mut of_all) = (Vec::new(), Trust::Doubtful);
+        loop {
+            let framed = self.source.next()?;
+            if self.source.check(framed).is_err() {
+                break;
+            }
+            match framed {
+                Framed::Record(code @ (op::SCHEMA | op::CHANNEL)) => {
+                    all.push((code, self.source.body().to_vec()));
+                }
+                Framed::Record(op::FOOTER) => {
+                    let has_none = self.source.body().ends_with(&[0; 4]);
+                    of_all = trust(self.source.check_section(op::FOOTER).is_ok(), has_none);
+                    self.survey.recovered.whole = self.source.magic()?;
+                    break;
+                }
+                Framed::Passed(..) => {}
+                Framed::Record(_)
+                | Framed::Long(..)
+                | Framed::Unknown(..)
+                | Framed::Cut(..)
+                | Framed::End(_) => break,
+            }
+        }
+        for (code, body) in all {
+            // What it describes wrongly is not described.
+            let _ = self.survey.described.take(code, &body, of_all);
+        }
+        self.source.end_summary();
+        let Some(more) = self.first(began + 1, self.size, false)? else { return Ok(Found::End) };
+        self.lost(more - began);
+        self.source.move_to(more)?;
+        self.survey.recovered.whole = false;
+        Ok(Found::NoEnd)
+    }
+
+    /// Goes to where records go on behind a wrong one; whether they do.
+    fn resume(&mut self, began: u64, end: Option<u64>, rows: u64) -> io::Result<bool> {
+        let end = match end.filter(|end| *end <= self.limit) {
+            Some(end) => is_record(self.source.input(), end, self.limit)?.then_some(end),
+            None => None,
+        };
+        // The length of the record before it may have led over others.
+        let unsure = self.unsure.take();
+        if let Some((at, within)) = unsure
+            && let Some(found) = self.first_of_two(at + 1, within.max(at + 1), began)?
+        {
+            self.cut(at);
+            self.lost(found - at);
+            self.source.move_to(found)?;
+            return Ok(true);
+        }
+        let from = began + 1;
+        let found = match end {
+            Some(end) => self.first(from, end, false)?.or(Some(end)),
+            None => self.first_of_two(from, rows.max(from), self.limit)?,
+        };
+        let Some(found) = found else {
+            let rest = self.limit.saturating_sub(began);
+            if self.has_magic {
+                self.lost(rest);
+            } else {
+                self.survey.recovered.unfinished = rest;
+            }
+            return Ok(false);
+        };
+        self.lost(found.saturating_sub(began));
+        self.source.move_to(found)?;
+        Ok(true)
+    }
+
+    /// The last record is none: it contains others.
+    fn cut(&mut self, at: u64) {
+        if let Some(Piece::Records { from, to }) = self.survey.pieces.last_mut() {
+            *to = at;
+            if from == to {
+                self.survey.pieces.pop();
+            }
+        }
+    }
+
+    /// The summary, where the file has its end: what it describes is taken.
+    fn summary(&mut self) -> io::Result<Option<Summary>> {
+        let Some(footer) = self.size.checked_sub((FOOTER + MAGIC.len()) as u64) else { return Ok(None) };
+        let mut at_end = [0; FOOTER + MAGIC.len()];
+        let input = self.source.input();
+        input.seek(SeekFrom::Start(footer))?;
+        input.read_exact(&mut at_end)?;
+        self.has_magic = at_end.ends_with(MAGIC);
+        let Some((&head, rest)) = at_end.split_first_chunk::<HEAD>() else { return Ok(None) };
+        let Some((&start, _)) = rest.split_first_chunk::<8>() else { return Ok(None) };
+        let is_footer = head == [op::FOOTER, 20, 0, 0, 0, 0, 0, 0, 0] && rest.ends_with(MAGIC);
+        let start = match u64::from_le_bytes(start) {
+            0 => footer,
+            start => start,
+        };
+        if !is_footer || start > footer || start < MAGIC.len() as u64 {
+            return Ok(None);
+        }
+        input.seek(SeekFrom::Start(start))?;
+        let mut of_summary = Source::at(start, input, 0);
+        of_summary.begin_summary();
+        let (mut stated, mut all) = (None, Vec::new());
+        let checksum = loop {
+            let framed = of_summary.next()?;
+            if of_summary.check(framed).is_err() {
+                return Ok(None);
+            }
+            match framed {
+                Framed::Record(op::FOOTER) => break of_summary.check_section(op::FOOTER),
+                Framed::Record(code @ (op::SCHEMA | op::CHANNEL)) => {
+                    all.push((code, of_summary.body().to_vec()))
+                }
+                Framed::Passed(op::STATISTICS, _) => {
+                    stated = of_summary.body().first_chunk().map(|count| u64::from_le_bytes(*count));
+                }
+                Framed::Passed(..) => {}
+                Framed::Record(_)
+                | Framed::Long(..)
+                | Framed::Unknown(..)
+                | Framed::Cut(..)
+                | Framed::End(_) => {
+                    return Ok(None);
+                }
+            }
+        };
+        if of_summary.read() != footer + FOOTER as u64 {
+            return Ok(None);
+        }
+        let is_right = checksum.is_ok();
+        let trust = trust(is_right, at_end.ends_with(&[&[0; 4][..], MAGIC].concat()));
+        for (code, body) in all {
+            // What it describes wrongly is not described.
+            let _ = self.survey.described.take(code, &body, trust);
+        }
+        Ok(Some(Summary { data_end: start, stated: stated.filter(|_| is_right), is_right }))
+    }
+}
+
+/// How far statements of a summary are to be trusted whose checksum is right, or missing.
+const fn trust(is_right: bool, has_none: bool) -> Trust {
+    match (is_right, has_none) {
+        (false, _) => Trust::Doubtful,
+        (true, true) => Trust::Plain,
+        (true, false) => Trust::Certain,
+    }
+}
