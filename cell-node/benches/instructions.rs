@@ -2,7 +2,12 @@
 //!
 //! Counted by valgrind, so that they are the same on a busy machine. `docs/explanation/benchmarks.md` says what has to be installed.
 
-#![expect(missing_docs, unused_qualifications, reason = "gungraun's macros write them")]
+#![expect(
+    missing_docs,
+    unused_qualifications,
+    clippy::disallowed_methods,
+    reason = "gungraun's macros write them"
+)]
 
 use std::hint::black_box;
 

@@ -192,7 +192,7 @@ impl Convert {
                     }
                 }
                 Ok(None)
-                    if !stop::flag().load(Ordering::Relaxed) && !(self.strict && !unreadable.is_empty()) =>
+                    if !stop::flag().load(Ordering::Relaxed) && (!self.strict || unreadable.is_empty()) =>
                 {
                     unreadable.iter().for_each(note);
                     return Err(no_frame(&reader));

@@ -97,7 +97,11 @@ impl Report {
 fn refused(error: ReportError) -> Failure {
     match error {
         ReportError::Capture(_) | ReportError::Unfinished { .. } => Failure::run(error),
-        error => Failure::usage(error),
+        ReportError::Open(_)
+        | ReportError::Log { .. }
+        | ReportError::Foreign { .. }
+        | ReportError::Rates { .. }
+        | _ => Failure::usage(error),
     }
 }
 

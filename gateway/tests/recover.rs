@@ -119,7 +119,7 @@ fn a_damaged_chunk_is_omitted_and_said_and_the_others_are_kept() {
         assert!(said.to_string().contains(" damaged bytes are lost"), "{said}");
     }
     // The first one has the types and topics, which stand outside of chunks too, and in the summary.
-    let mut first = bytes.clone();
+    let mut first = bytes;
     first[usize::try_from(chunks[0].chunk_start_offset + chunks[0].chunk_length - 9).unwrap()] ^= 0x10;
     let (said, copy) = recovered(&first).unwrap();
     assert_eq!((said.messages, said.homeless, said.damaged.0), (100, 0, 1), "{said:?}");
@@ -315,7 +315,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     assert!(!path("begun-recovered.mcap").exists());
     let index = Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
     let [from, to] = [1, 4].map(|at| usize::try_from(index[at].chunk_start_offset).unwrap());
-    let mut gap = bytes.clone();
+    let mut gap = bytes;
     gap[from..to + 200].fill(0);
     fs::write(path("gap.mcap"), &gap).unwrap();
     let said = says("recover gap.mcap", 1);

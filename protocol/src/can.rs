@@ -415,7 +415,7 @@ mod tests {
             (0x1FFF_FFFF, EXTENDED | REMOTE, 29, EXTENDED_MASK),
         ] {
             assert_eq!(identifier(number, flags), Ok(number | flags));
-            for got in [number + 1, number + 1 | EXTENDED, u32::MAX] {
+            for got in [number + 1, (number + 1) | EXTENDED, u32::MAX] {
                 assert_eq!(identifier(got, flags), Err(IdentifierError { got, bits, max }));
             }
         }

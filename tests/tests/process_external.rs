@@ -1,5 +1,5 @@
 //! Another program closes the loop of a bench of real processes, well and badly.
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod process;
 

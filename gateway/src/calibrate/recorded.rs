@@ -14,7 +14,8 @@ pub(super) fn check(name: &str, skin: &Skin, recorded: &Skin) -> Result<(), Fail
 
 /// The first difference, by name, and the two values.
 fn difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, String)> {
-    let all: [(&str, fn(&Skin) -> String); 6] = [
+    type Pick = fn(&Skin) -> String;
+    let all: [(&str, Pick); 6] = [
         ("buses", |skin| list(skin.buses.iter().map(|bus| bus.name.clone()))),
         ("joints", |skin| list(skin.robot.joints.iter().map(|joint| joint.name.clone()))),
         ("cells", |skin| skin.cells.len().to_string()),
@@ -22,7 +23,7 @@ fn difference(skin: &Skin, recorded: &Skin) -> Option<(&'static str, String, Str
         ("serial numbers", |skin| sorted(skin, |_, cell| cell.serial.to_string())),
         ("joint_broadcast_hz", |skin| skin.timing.broadcast_hz().to_string()),
     ];
-    let differing = |(what, pick): &(&'static str, fn(&Skin) -> String)| {
+    let differing = |(what, pick): &(&'static str, Pick)| {
         let (is, was) = (pick(skin), pick(recorded));
         (is != was).then(|| first(what, &is, &was))
     };

@@ -117,7 +117,7 @@ pub const SETTLE: &str = "seconds from 0 to 60, such as 2 or 0.5";
 #[must_use]
 pub fn settle_time(word: &str) -> Option<Duration> {
     let seconds = word.parse().ok().filter(|seconds| (0.0..=MAX_SETTLE).contains(seconds))?;
-    Some(Duration::from_secs_f64(seconds))
+    Duration::try_from_secs_f64(seconds).ok()
 }
 
 impl LineOptions {

@@ -14,7 +14,7 @@ pub struct Output<W: Write>(Form<W>);
 
 #[derive(Debug)]
 enum Form<W: Write> {
-    Log(LogWriter<W>),
+    Log(Box<LogWriter<W>>),
     Mcap(Box<McapWriter<W>>),
 }
 
@@ -25,7 +25,7 @@ impl<W: Write> Output<W> {
     /// When its beginning cannot be written.
     pub fn new(out: W, format: Format, style: Style) -> io::Result<Self> {
         Ok(match format {
-            Format::Candump => Self(Form::Log(LogWriter::new(out, style))),
+            Format::Candump => Self(Form::Log(Box::new(LogWriter::new(out, style)))),
             Format::Mcap => Self::recording(out, Origin { of_log: true, file: None })?,
         })
     }

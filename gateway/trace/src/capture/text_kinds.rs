@@ -104,10 +104,7 @@ fn is_canboat(line: &str) -> bool {
 /// `123#00`, `can0 123#00` or `cansend can0 123#00`.
 fn is_frame_of_cansend(line: &str) -> bool {
     let words: Vec<_> = line.split_whitespace().collect();
-    let frame = match words.as_slice() {
-        [frame] | [_, frame] | ["cansend", _, frame] => frame,
-        _ => return false,
-    };
+    let ([frame] | [_, frame] | ["cansend", _, frame]) = words.as_slice() else { return false };
     protocol::candump::parse_frame(frame).is_ok()
 }
 
