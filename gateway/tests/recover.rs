@@ -262,6 +262,96 @@ fn a_length_that_leads_over_others_or_beyond_the_end_hides_nothing() {
 }
 
 #[test]
+fn a_description_is_never_taken_for_a_message() {
+    let bytes = recording();
+    let (mut at, mut places) = (8, Vec::new());
+    while bytes[at] != op::DATA_END {
+        if matches!(bytes[at], op::SCHEMA | op::CHANNEL) {
+            places.push(at);
+        }
+        at += 9 + usize::try_from(u64::from_le_bytes(bytes[at + 1..at + 9].try_into().unwrap())).unwrap();
+    }
+    assert_eq!(places.len(), 4);
+    for at in places {
+        let mut damaged = bytes.clone();
+        damaged[at] = op::MESSAGE;
+        keeps_what_is_intact(&bytes, &damaged, at..at + 1, &format!("a description at {at}"));
+    }
+}
+
+/// Adds to the eight bytes of a number in a file.
+fn add(file: &mut [u8], at: usize, more: u64) {
+    let number = u64::from_le_bytes(file[at..at + 8].try_into().unwrap());
+    file[at..at + 8].copy_from_slice(&number.wrapping_add(more).to_le_bytes());
+}
+
+#[test]
+fn a_wrong_length_within_a_chunk_hides_none_behind_it() {
+    let bytes = recording();
+    let chunks = Summary::read(&bytes[..]).unwrap().unwrap().chunk_indexes;
+    let [at, next, last] =
+        [2, 3, 5].map(|number| usize::try_from(chunks[number].chunk_start_offset).unwrap());
+    // Behind its times, sizes, checksum and the name of its compression.
+    let packed = at + 9 + 36;
+    let wrong = [1, 40, 1 << 10, next - at, last - at, 1 << 40].map(|more| more as u64);
+    for more in wrong.into_iter().chain([1, 100].map(u64::wrapping_neg)) {
+        let mut damaged = bytes.clone();
+        add(&mut damaged, packed, more);
+        keeps_what_is_intact(&bytes, &damaged, packed..packed + 8, &format!("{more} more bytes"));
+    }
+}
+
+#[test]
+fn descriptions_that_moved_into_the_place_of_a_chunk_are_found() {
+    let bytes = recording();
+    let summary = Summary::read(&bytes).unwrap().unwrap();
+    let [first, second] = [0, 1].map(|number| {
+        let chunk = &summary.chunk_indexes[number];
+        usize::try_from(chunk.chunk_start_offset + chunk.chunk_length).unwrap()
+    });
+    // The writer was killed: they stand in the first chunk and behind it.
+    let killed = &bytes[..second];
+    for gone in [9, 100, 300] {
+        let damaged = [&killed[..first - gone], &killed[first..]].concat();
+        let (said, _) = recovered(&damaged).unwrap();
+        assert_eq!((said.messages, said.homeless), (20, 0), "{gone}: {said}");
+    }
+}
+
+#[test]
+fn a_message_outside_of_chunks_that_leads_over_others_hides_none() {
+    let options = WriteOptions::new().use_chunks(false);
+    let mut writer = options.create(Cursor::new(Vec::new())).unwrap();
+    let schema = writer.add_schema("a/B", "ros2msg", b"uint8 a").unwrap();
+    let channel = writer.add_channel(schema, "/b", "cdr", &BTreeMap::new()).unwrap();
+    for sequence in 0..40 {
+        let header = MessageHeader { channel_id: channel, sequence, log_time: 7, publish_time: 7 };
+        writer.write_to_known_channel(&header, &[0xFF; 60]).unwrap();
+    }
+    writer.finish().unwrap();
+    let bytes = writer.into_inner().into_inner();
+    let record = 31 + 60;
+    let first = bytes.windows(9).position(|head| head == [op::MESSAGE, 82, 0, 0, 0, 0, 0, 0, 0]).unwrap();
+    let killed = &bytes[..first + 40 * record];
+    let sequences = |damaged: &[u8]| {
+        let (said, copy) = recovered(damaged).unwrap();
+        assert_eq!(said.damaged.0, 1, "{said}");
+        messages(&copy).into_iter().map(|(.., sequence, _)| sequence).collect::<Vec<_>>()
+    };
+    for place in [3, 20, 36, 37, 38] {
+        let at = first + usize::try_from(place).unwrap() * record;
+        let others = (0..40).filter(|number| *number != place).collect::<Vec<_>>();
+        for more in [10, 91, 100] {
+            let mut damaged = killed.to_vec();
+            add(&mut damaged, at + 1, more);
+            assert_eq!(sequences(&damaged), others, "{more} more bytes of {place}");
+        }
+        let damaged = [&killed[..at + 20], &killed[at + 70..]].concat();
+        assert_eq!(sequences(&damaged), others, "bytes gone of {place}");
+    }
+}
+
+#[test]
 fn what_is_no_recording_is_named() {
     let says = |bytes: &[u8]| recovered(bytes).unwrap_err().to_string();
     assert_eq!(

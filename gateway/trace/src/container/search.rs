@@ -149,6 +149,12 @@ fn chunk(body: &[u8]) -> Option<u64> {
         .then(|| packed.checked_add(fields))?
 }
 
+/// Whether a chunk's records stand in it as they are.
+#[must_use]
+pub(super) fn is_plain(chunk: &[u8]) -> bool {
+    chunk.get(28..32).is_some_and(|length| length == [0; 4])
+}
+
 /// The length of an attachment's record by the fields in it.
 fn attachment(body: &[u8]) -> Option<u64> {
     let mut from = Fields::new("attachment", body);
@@ -182,9 +188,12 @@ pub(super) fn has_records(message: &[u8]) -> bool {
     })
 }
 
-/// Whether records follow each other from here on.
+/// Whether records follow each other from here on, or up to where the file ends.
 fn is_row(input: &mut (impl Read + Seek), mut at: u64, size: u64) -> io::Result<bool> {
-    for _ in 0..ROW {
+    for before in 0..ROW {
+        if before > 0 && at == size {
+            return Ok(true);
+        }
         let Some((opcode, end)) = next(input, at, size)? else { return Ok(false) };
         if opcode == op::FOOTER {
             return Ok(end + MAGIC.len() as u64 == size);

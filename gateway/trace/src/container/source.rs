@@ -5,7 +5,7 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::field::{Record, attachment_name, parse};
-use super::search::{HEAD, has_records, is_disguised, is_known, own_length};
+use super::search::{HEAD, has_records, is_disguised, is_known, is_plain, own_length};
 use super::{Damage, LONGEST, MAGIC};
 
 /// Bytes that are kept of a record that is longer than anything that is taken into memory, or that nobody reads.
@@ -47,6 +47,8 @@ pub struct Source<R> {
     /// Where the record that was read last begins, and its operation code.
     began: u64,
     code: u8,
+    /// Where the one before it begins, if that is a message: no checksum says that its length is right.
+    message_before: Option<u64>,
     /// The longest attachment that is taken into memory.
     attachments: u64,
     /// Of everything before the end of the data section.
@@ -70,6 +72,7 @@ impl<R: Read> Source<R> {
             read: 0,
             began: 0,
             code: 0,
+            message_before: None,
             attachments,
             checksum,
             has_chunks: false,
@@ -112,16 +115,23 @@ impl<R: Read> Source<R> {
         self.began
     }
 
+    /// Where the record before the one that was read last begins, if that is a message.
+    #[must_use]
+    pub const fn message_before(&self) -> Option<u64> {
+        self.message_before
+    }
+
     /// Whether what was read last are the magic bytes of the end.
     #[must_use]
     pub fn ends_with_magic(&self) -> bool {
         self.last == *MAGIC
     }
 
-    /// Whether the record that was read last is a chunk, as far as it is there: records in it are its own.
+    /// The length by its content of the record that was read last, if that is a chunk, as far as it is there, and not
+    /// compressed: records in it are its own.
     #[must_use]
-    pub fn is_chunk(&self) -> bool {
-        self.code == op::CHUNK && own_length(op::CHUNK, &self.body).is_some()
+    pub fn plain_chunk(&self) -> Option<u64> {
+        own_length(op::CHUNK, &self.body).filter(|_| self.code == op::CHUNK && is_plain(&self.body))
     }
 
     /// Compares what was framed last with what it says of itself, and with its place in the file.
@@ -144,10 +154,10 @@ impl<R: Read> Source<R> {
         let is_elsewhere =
             (is_index && !self.in_summary) || (code == op::HEADER && self.began > MAGIC.len() as u64);
         // Messages stand in chunks or between descriptions; behind a chunk its indexes do.
-        let is_index = self.has_chunks
-            && code == op::MESSAGE
-            && own_length(op::MESSAGE_INDEX, &self.body) == Some(bytes);
-        if is_elsewhere || is_index || (code >= 0x80 && is_disguised(&self.body, bytes)) {
+        let is_of = |kind| own_length(kind, &self.body) == Some(bytes);
+        let is_other = code == op::MESSAGE
+            && (is_of(op::SCHEMA) || is_of(op::CHANNEL) || (self.has_chunks && is_of(op::MESSAGE_INDEX)));
+        if is_elsewhere || is_other || (code >= 0x80 && is_disguised(&self.body, bytes)) {
             return Err(Damage::Code(code));
         }
         match own_length(code, &self.body) {
@@ -201,6 +211,7 @@ impl<R: Read> Source<R> {
         reason = "a record borrows from the source; an iterator's cannot"
     )]
     pub fn next(&mut self) -> io::Result<Framed> {
+        self.message_before = (self.code == op::MESSAGE).then_some(self.began);
         (self.began, self.code) = (self.read, 0);
         self.body.clear();
         self.take(9)?;

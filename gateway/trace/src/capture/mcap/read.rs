@@ -245,8 +245,10 @@ impl McapReader {
         if let Some(file) = &self.file
             && file.metadata()?.len() == read
         {
-            let began = self.source.began();
-            let any = !self.source.is_chunk();
+            let any = self.source.plain_chunk().is_none();
+            // A message before it may have led over others, into the middle of one.
+            let before = self.source.message_before().filter(|_| any);
+            let began = before.unwrap_or_else(|| self.source.began());
             if first_record(&mut Apart { file, at: 0 }, began + 1, read, any)?.is_some() {
                 return Err(Damage::Beyond { bytes }.into());
             }

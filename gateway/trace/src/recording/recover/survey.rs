@@ -6,6 +6,7 @@
 //!              a piece           └ wrong ┘        a piece      found from its end
 //! ```
 
+use std::collections::VecDeque;
 use std::io::{self, Read, Seek, SeekFrom};
 
 use mcap::records::op;
@@ -13,8 +14,11 @@ use mcap::records::op;
 use super::described::{Described, Trust};
 use super::{LONGEST_ATTACHMENT, RecoverError, Recovered};
 use crate::container::{
-    Chunk, Damage, Framed, HEAD, LONGEST, MAGIC, Record, Source, first_record, is_record, own_length, parse,
+    Chunk, Damage, Framed, HEAD, LONGEST, MAGIC, Record, Source, first_record, is_record, parse,
 };
+
+/// Records before a wrong one that are looked into for others.
+const UNSURE: usize = 4;
 
 /// Bytes of a footer's record.
 const FOOTER: usize = 29;
@@ -51,14 +55,14 @@ struct Summary {
 enum Found {
     /// It is right, and ends where its length says.
     Right,
-    /// It is right, and its length is not: it has this one.
-    As(u8, u64),
+    /// It is right, and one of its lengths is not: its operation code, the length by its content, and where it ends.
+    As(u8, u64, u64),
     /// The data section, or the file, ends here.
     End,
     /// It looks like the end, and records follow, where the source is.
     NoEnd,
     /// It is wrong. Where it ends by its length, if that may be right; and from where on records in a row are taken for
-    /// some: those in a damaged chunk are none.
+    /// some: those in a damaged chunk that is not compressed are none.
     Wrong { end: Option<u64>, rows: u64 },
 }
 
@@ -72,9 +76,9 @@ struct Surveyor<R> {
     has_magic: bool,
     chunk: Chunk,
     survey: Survey,
-    /// Where the last record begins, if no checksum says that its length is right; and from where on records in a row
-    /// that stand in it are taken for some.
-    unsure: Option<(u64, u64)>,
+    /// The last records of whose lengths no checksum says that they are right, one behind the other: where each begins,
+    /// and from where on records in a row that stand in it are taken for some.
+    unsure: VecDeque<(u64, u64)>,
 }
 
 impl Survey {
@@ -89,7 +93,7 @@ impl Survey {
         }
         let (chunk, survey) = (Chunk::default(), Self::default());
         let mut surveyor =
-            Surveyor { source, size, limit: size, has_magic: false, chunk, survey, unsure: None };
+            Surveyor { source, size, limit: size, has_magic: false, chunk, survey, unsure: VecDeque::new() };
         let done = surveyor.go(is_begun).map_err(RecoverError::Read)?;
         match done {
             false => Err(RecoverError::NoMcap { got: first }),
@@ -123,10 +127,11 @@ impl<R: Read + Seek> Surveyor<R> {
             let began = self.source.read();
             match self.examine()? {
                 Found::Right => self.right(began),
-                Found::As(code, length) => {
+                Found::As(code, length, end) => {
                     self.survey.pieces.push(Piece::Record { at: began, code, length });
                     self.lost(0);
-                    self.unsure = None;
+                    self.unsure.clear();
+                    self.source.move_to(end)?;
                 }
                 Found::End => {
                     is_ended = true;
@@ -188,7 +193,8 @@ impl<R: Read + Seek> Surveyor<R> {
         let (began, end) = (self.source.began(), self.source.read());
         let checked = self.source.check(framed);
         let content = began + HEAD as u64;
-        let own = own_length(op::CHUNK, self.source.body()).filter(|_| self.source.is_chunk());
+        // What is compressed looks like no records, and where bytes are gone others have moved up to where it would end.
+        let own = self.source.plain_chunk();
         let rows = own.map_or(0, |own| content.saturating_add(own));
         let wrong = Found::Wrong { end: Some(end), rows };
         let code = match framed {
@@ -204,7 +210,6 @@ impl<R: Read + Seek> Surveyor<R> {
             Framed::Record(code) | Framed::Passed(code, _) | Framed::Long(code, _) => code,
         };
         if let Err(Damage::Swallowed(_)) = checked {
-            self.unsure = Some((began, content));
             return Ok(Found::Wrong { end: None, rows: 0 });
         }
         if checked.is_err() {
@@ -221,29 +226,43 @@ impl<R: Read + Seek> Surveyor<R> {
             (Framed::Long(..), _) => return Ok(wrong),
             _ => {}
         }
-        self.unsure = match code {
-            op::CHUNK => (!self.chunk.is_checked()).then_some((began, end)),
-            _ => Some((began, content)),
-        };
+        match code {
+            op::CHUNK if self.chunk.is_checked() => self.unsure.clear(),
+            op::ATTACHMENT if !self.source.body().ends_with(&[0; 4]) => self.unsure.clear(),
+            op::CHUNK | op::ATTACHMENT => self.doubt(began, end),
+            _ => self.doubt(began, content),
+        }
         Ok(Found::Right)
     }
 
-    /// The record that was framed last, whose length is wrong, if its content is right and says where it ends.
+    /// No checksum says that the length of a record is right.
+    fn doubt(&mut self, began: u64, rows: u64) {
+        if self.unsure.len() == UNSURE {
+            self.unsure.pop_front();
+        }
+        self.unsure.push_back((began, rows));
+    }
+
+    /// The record that was framed last, if its content is right and says that it has another length.
     fn by_content(&mut self, code: u8, checked: &Result<(), Damage>) -> io::Result<Option<Found>> {
-        let &Err(Damage::Length { own, .. }) = checked else { return Ok(None) };
-        let began = self.source.began();
+        let &Err(Damage::Length { own, bytes, .. }) = checked else { return Ok(None) };
+        let content = self.source.began() + HEAD as u64;
         let limit = if code == op::ATTACHMENT { LONGEST_ATTACHMENT } else { LONGEST };
-        let end = began + HEAD as u64 + own.min(limit + 1);
+        let end = content + own.min(limit + 1);
         if own > limit || end > self.limit || matches!(code, op::DATA_END | op::FOOTER) {
             return Ok(None);
         }
+        // Either of them may be the wrong one: records stand behind the right one, and none before that.
+        let by_length = content.saturating_add(bytes);
+        let is_shorter = by_length < end && is_record(self.source.input(), by_length, self.limit)?;
         // Of these a checksum says that all of it is there.
         let is_sure = matches!(code, op::CHUNK | op::ATTACHMENT);
         if !is_sure && !is_record(self.source.input(), end, self.limit)? {
             return Ok(None);
         }
-        let is_right = self.source.read_as(began, own)? && self.take(code).is_ok();
-        Ok(is_right.then_some(Found::As(code, own)))
+        let is_right = self.source.read_as(content - HEAD as u64, own)? && self.take(code).is_ok();
+        let end = if is_shorter { by_length } else { end };
+        Ok(is_right.then_some(Found::As(code, own, end)))
     }
 
     /// Looks into a record that the source has; its types and topics are noted.
@@ -295,7 +314,9 @@ impl<R: Read + Seek> Surveyor<R> {
                 }
                 Framed::Record(op::FOOTER) => {
                     let has_none = self.source.body().ends_with(&[0; 4]);
-                    of_all = trust(self.source.check_section(op::FOOTER).is_ok(), has_none);
+                    let is_right = self.source.check_section(op::FOOTER).is_ok();
+                    self.survey.recovered.checksum |= !is_right;
+                    of_all = trust(is_right, has_none);
                     self.survey.recovered.whole = self.source.magic()?;
                     break;
                 }
@@ -325,15 +346,17 @@ impl<R: Read + Seek> Surveyor<R> {
             Some(end) => is_record(self.source.input(), end, self.limit)?.then_some(end),
             None => None,
         };
-        // The length of the record before it may have led over others.
-        let unsure = self.unsure.take();
-        if let Some((at, within)) = unsure
-            && let Some(found) = self.first_of_two(at + 1, within.max(at + 1), began)?
-        {
-            self.cut(at);
-            self.lost(found - at);
-            self.source.move_to(found)?;
-            return Ok(true);
+        // The length of one of the records before it may have led over others, to what looked like some.
+        let mut until = began;
+        while let Some((at, within)) = self.unsure.pop_back() {
+            if let Some(found) = self.first_of_two(at + 1, within.max(at + 1), until)? {
+                self.unsure.clear();
+                self.cut(at);
+                self.lost(found - at);
+                self.source.move_to(found)?;
+                return Ok(true);
+            }
+            until = at;
         }
         let from = began + 1;
         let found = match end {
