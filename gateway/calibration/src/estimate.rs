@@ -289,14 +289,14 @@ fn covariance(
     close(batch, &mut sum);
     let mut scatter = information + Information::from_diagonal(expected);
     for (at, (batch, score)) in scores.iter().enumerate() {
-        let near = scores[at..].iter().take_while(|(other, _)| other - batch < BATCHES);
-        for (other, beside) in near {
-            let share = ages.covariance(other - batch);
-            scatter.ger(share, score, beside, 1.0);
-            if other != batch {
-                scatter.ger(share, beside, score, 1.0);
-            }
+        // The sum over later batches first: one product of vectors instead of one for each pair.
+        let mut beside = score * (ages.covariance(0) / 2.0);
+        let later = scores.iter().skip(at + 1).map(|(other, score)| (other - batch, score));
+        for (distance, score) in later.take_while(|(distance, _)| *distance < BATCHES) {
+            beside.axpy(ages.covariance(distance), score, 1.0);
         }
+        scatter.ger(1.0, score, &beside, 1.0);
+        scatter.ger(1.0, &beside, score, 1.0);
     }
     // A lag that was estimated of a stretch is off for all of it.
     let mut by_stretch = vec![Unknowns::zeros(); lags.deviations().len()];

@@ -187,10 +187,11 @@ mod tests {
             assert!(smoother.roughness(window, 1).unwrap()[0] < step / 2.0);
         }
         let mut late = words[100..100 + WINDOW].to_vec();
-        for place in 0..WINDOW {
+        // Polynomials of so many terms follow the first and the last position.
+        for place in 1..WINDOW - 1 {
             let before = late[place];
             late[place].as_mut().unwrap()[0] -= 10.0 * step;
-            assert!(smoother.roughness(&late, 1).unwrap()[0] > 0.6 * step, "{place}");
+            assert!(smoother.roughness(&late, 1).unwrap()[0] > 1.2 * step, "{place}");
             late[place] = before;
         }
     }
