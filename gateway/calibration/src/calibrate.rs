@@ -155,8 +155,10 @@ fn shifted(
     (bus, (place, lag)): (usize, (usize, f64)),
     disturbance: Disturbance,
 ) -> Refusal {
-    let gap = seen.buses.get(bus).and_then(|bus| bus.gaps.iter().find(|gap| gap.place == place));
-    let (at_s, ms) = (rounded(gap.map_or(0.0, |gap| gap.at_s), 3), rounded(lag * 1e3, 1));
+    let gap = seen.buses.get(bus).and_then(|bus| bus.gaps.iter().rev().find(|gap| gap.place <= place));
+    let (from, from_s) = gap.map_or((0, 0.0), |gap| (gap.place, gap.at_s));
+    let at_s = from_s + real(place - from) / skin.timing.broadcast_hz();
+    let (at_s, ms) = (rounded(at_s, 3), rounded(lag * 1e3, 1));
     Refusal::Shifted { bus: name(skin, bus), at_s, ms, disturbance }
 }
 

@@ -2,7 +2,8 @@
 //!
 //! Where joints were not broadcast in time, what follows may be shifted: sensors of simulated cells follow a plan, the loop
 //! counts broadcasts. All cells of a bus are shifted alike, so that the shift of each stretch between gaps is known
-//! well from all of them, while the age that a single sensor has of its own is not touched.
+//! well from all of them, while the age that a single sensor has of its own is not touched. Long stretches are divided:
+//! broadcasts that were a little late, or clocks that differ, shift readings without a gap.
 
 use crate::cell::AGE;
 use crate::estimate::{Estimate, change, paired, residual, weight};
@@ -15,6 +16,9 @@ const SHIFTED: f64 = 1e-3;
 const CERTAIN: f64 = 5.0;
 /// Standard deviations of readings beyond which they count less.
 const CHANGING: f64 = 0.05;
+
+/// Broadcasts of a stretch at most, about 4 s.
+const LONGEST: usize = 256;
 
 /// By stretch of a bus, how much older its readings are than the others', in s.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -29,7 +33,15 @@ pub(crate) struct Lags {
 impl Lags {
     /// Returns lags of zero.
     pub(crate) fn none(bus: &BusObservations) -> Self {
-        let starts: Vec<_> = bus.gaps.iter().map(|gap| gap.place).collect();
+        let mut starts = Vec::new();
+        let mut begin = 0;
+        for end in bus.gaps.iter().map(|gap| gap.place).chain([bus.joints.len()]) {
+            let parts = end.saturating_sub(begin).div_ceil(LONGEST).max(1);
+            starts.extend((1..parts).map(|part| begin + (end - begin) * part / parts));
+            starts.push(end);
+            begin = end;
+        }
+        starts.pop();
         let none = vec![0.0; starts.len() + 1];
         Self { by_stretch: none.clone(), deviations: none, starts }
     }
@@ -60,7 +72,9 @@ impl Lags {
             return None;
         }
         let mut all = vec![Sum::default(); self.by_stretch.len()];
+        let (mut ages, mut count) = (0.0, 0.0);
         for (estimate, readings) in cells {
+            (ages, count) = (ages + estimate.model.age, count + 1.0);
             let (coefficients, derivatives) = (estimate.model.coefficients(), estimate.model.derivatives());
             let mut own = vec![Sum::default(); all.len()];
             for (moment, reading) in paired(table.link(estimate.joint), readings) {
@@ -77,19 +91,23 @@ impl Lags {
                 all.weight += own.weight;
                 all.product += own.product;
                 all.squares += own.weight * own.weight;
+                all.noise += own.weight * estimate.noise_g * estimate.noise_g;
             }
         }
         let weight: f64 = all.iter().map(|sum| sum.weight).sum();
         let mean = all.iter().map(|sum| sum.product).sum::<f64>() / weight.max(1e-12);
+        // Ages of single cells are anywhere: what they have in common is a shift of all stretches.
+        let common =
+            if self.by_stretch.iter().any(|lag| *lag != 0.0) { ages / f64::max(count, 1.0) } else { 0.0 };
         let mut is_certain = false;
         let mut deviations = vec![0.0; all.len()];
         let by_stretch = self.by_stretch.iter().zip(&all).zip(&mut deviations).map(|((before, sum), own)| {
             if sum.weight < 1e-3 * weight {
                 return *before;
             }
-            let off = sum.product / sum.weight - mean;
+            let off = sum.product / sum.weight - mean + common;
             // Each cell's own age is anywhere in a period, all the time.
-            let deviation = period / 12.0_f64.sqrt() * sum.squares.sqrt() / sum.weight;
+            let deviation = (period * period / 12.0 * sum.squares + sum.noise).sqrt() / sum.weight;
             *own = deviation;
             is_certain |= off.abs() > SHIFTED.max(CERTAIN * deviation);
             before + off
@@ -116,4 +134,6 @@ struct Sum {
     weight: f64,
     product: f64,
     squares: f64,
+    /// Variance of the product by the noise of readings.
+    noise: f64,
 }
