@@ -10,7 +10,7 @@ use protocol::time::Micros;
 
 use super::accuracy::Errors;
 use super::held::{Change, Held};
-use super::replies::{Asked, Outstanding, Replies};
+use super::replies::{Outstanding, Replies, Requested};
 use super::root_totals::RootSums;
 use super::sensed::Sensed;
 use super::sent::Sent;
@@ -246,6 +246,11 @@ impl Cell {
         self.contact.known().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
     }
 
+    /// Its sensors for people, as far as stimuli and pages that came tell; older stimuli may have changed them.
+    pub(super) fn presumed_sensors(&self) -> Option<SkinSensors> {
+        self.contact.skin().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
+    }
+
     /// Whether its torques follow from stimuli alone.
     fn computes_with_stimuli(&self) -> bool {
         self.tracked.claim().says(State::TEST_MODE)
@@ -305,17 +310,17 @@ impl Cell {
 
     /// A torque answers the broadcast `number`, `lag` before the newest; `is_zero` if it only ends a contact. Returns
     /// whether it was due.
-    pub(super) fn answer(&mut self, number: u64, lag: usize, is_zero: bool) -> Asked {
+    pub(super) fn answer(&mut self, number: u64, lag: usize, is_zero: bool) -> Requested {
         self.answered = Some(number);
         let asked = self.outstanding.answer(lag);
         let replies = &mut self.replies;
         match (asked, lag) {
-            (Asked::Due, 0) => replies.in_time += 1,
-            (Asked::Due, _) => replies.late += 1,
-            (Asked::Unknown | Asked::NotDue, _) => replies.unasked += 1,
+            (Requested::Due, 0) => replies.in_time += 1,
+            (Requested::Due, _) => replies.late += 1,
+            (Requested::Unknown | Requested::NotDue, _) => replies.unasked += 1,
         }
-        replies.contact_unknown += u64::from(asked == Asked::Unknown);
-        replies.unexpected += u64::from(asked == Asked::NotDue && !is_zero);
+        replies.contact_unknown += u64::from(asked == Requested::Unknown);
+        replies.unexpected += u64::from(asked == Requested::NotDue && !is_zero);
         asked
     }
 

@@ -8,7 +8,7 @@ use protocol::time::Micros;
 
 use super::cell::Cell;
 use super::held::Change;
-use super::replies::Asked;
+use super::replies::Requested;
 use super::root_totals::{RootTotals, Sum, Taken};
 use super::{Event, Notice, Positions, Table};
 use crate::tracker::{Update, Word};
@@ -191,10 +191,10 @@ impl Table {
         self.delays.reply(at.since(broadcast.stood_at(lag)));
         if lag == 0 {
             broadcast.last_reply = Some(at);
-            broadcast.in_time += u32::from(asked == Asked::Due);
-            broadcast.is_whole &= asked == Asked::Due || is_zero && asked == Asked::NotDue;
+            broadcast.in_time += u32::from(asked == Requested::Due);
+            broadcast.is_whole &= asked == Requested::Due || is_zero && asked == Requested::NotDue;
         }
-        if let (Asked::Due, Some(expected)) = (asked, cell.outstanding.expected(number)) {
+        if let (Requested::Due, Some(expected)) = (asked, cell.outstanding.expected(number)) {
             let error =
                 self.accuracy.compare(cell.joint, format, torque, &expected, &mut cell.outstanding.errors);
             if lag == 0 {

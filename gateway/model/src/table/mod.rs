@@ -478,9 +478,16 @@ impl Table {
         self.broadcast.as_ref().map(Broadcast::joints)
     }
 
-    /// The sensors of each cell since those joints, as far as they are known, and its status now.
+    /// The sensors of each cell since those joints, as far as stimuli and pages that came tell, and its status now.
+    ///
+    /// They are for people: what is compared needs the sensors that are known ([`Snapshot::sensors`]).
     pub fn sensors(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, Status)> {
-        self.statuses(now).map(|(cell, status)| (cell.sensors(), status))
+        self.statuses(now).map(|(cell, status)| (cell.presumed_sensors(), status))
+    }
+
+    /// The same of each cell without its status; no contact where nothing is known.
+    pub fn presumed_sensors(&self) -> impl Iterator<Item = SkinSensors> {
+        self.cells.iter().map(|cell| cell.presumed_sensors().unwrap_or_default())
     }
 
     /// The cells' statuses now.

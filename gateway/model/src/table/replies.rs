@@ -47,7 +47,7 @@ impl Replies {
 
 /// Whether a torque that came was to come.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub(super) enum Asked {
+pub(super) enum Requested {
     /// It was due.
     Due,
     /// It was not due, by what is known of the cell's contact.
@@ -103,16 +103,16 @@ impl Outstanding {
     }
 
     /// The broadcast `lag` before the newest is answered; whether that was due.
-    pub(super) const fn answer(&mut self, lag: usize) -> Asked {
+    pub(super) const fn answer(&mut self, lag: usize) -> Requested {
         let bit = 1 << lag;
         let was_due = self.due & bit != 0;
         self.due &= !bit;
         if was_due {
-            Asked::Due
+            Requested::Due
         } else if self.known & bit != 0 {
-            Asked::NotDue
+            Requested::NotDue
         } else {
-            Asked::Unknown
+            Requested::Unknown
         }
     }
 
@@ -144,7 +144,7 @@ mod tests {
     #[test]
     fn an_answer_is_to_the_broadcast_so_many_before_the_newest_and_counts_once() {
         let mut outstanding = Outstanding::default();
-        use Asked::{Due, NotDue, Unknown};
+        use Requested::{Due, NotDue, Unknown};
         let broadcasts = [(false, false), (true, true), (false, true), (true, true)];
         broadcasts.into_iter().for_each(|(due, is_known)| _ = outstanding.open(due, is_known));
         assert!(outstanding.is_due());

@@ -135,7 +135,8 @@ impl LiveBus {
     fn close(&mut self) {
         let Some(heard) = self.heard else { return };
         let frames = self.central.frames(&heard.positions);
-        let central = self.central.total(&frames, &self.table.snapshot().sensors).torque;
+        let sensors: Vec<_> = self.table.presumed_sensors().collect();
+        let central = self.central.total(&frames, &sensors).torque;
         let distributed = self.table.snapshot().sums.torque;
         for ((torque, distributed), central) in self.torques.iter_mut().zip(distributed).zip(central) {
             *torque = (distributed, central);
