@@ -1,9 +1,15 @@
 //! What a file is, by its first bytes.
 
-use std::io::{self, Read};
+use std::fs::File;
+use std::io::{self, Read, Seek};
+use std::os::unix::fs::FileExt;
 
-use crate::container::read_some;
+use ::mcap::records::op;
 
+use crate::container::{self, read_some};
+
+/// Bytes among which a recording's first record is.
+const BEGINNING: usize = 4 << 10;
 const UNPACK: &str = "unpack it first";
 const EXPORT: &str = "write a candump log with python-can's can_logconvert";
 
@@ -97,6 +103,36 @@ pub(super) fn look(input: &mut impl Read) -> io::Result<(Kind, Vec<u8>)> {
         }
         head.extend_from_slice(free.get(..got).unwrap_or_default());
     }
+}
+
+/// Returns true for an MCAP recording, by its first bytes or by its last, and leaves the file at its beginning.
+pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
+    let (kind, _) = look(file)?;
+    if kind == Kind::Mcap {
+        file.rewind()?;
+        return Ok(true);
+    }
+    let (mut first, mut last) = (vec![0; BEGINNING], [0; container::MAGIC.len()]);
+    let size = file.metadata()?.len();
+    if kind == Kind::Text && size > 2 * container::MAGIC.len() as u64 {
+        let came = file.read_at(&mut first, 0)?;
+        first.truncate(came);
+        file.read_exact_at(&mut last, size - container::MAGIC.len() as u64)?;
+    }
+    file.rewind()?;
+    // A place in one of them, or all of one, may be damaged.
+    let alike = first.iter().zip(container::MAGIC).filter(|(one, other)| one == other).count();
+    Ok(last == *container::MAGIC
+        || alike > container::MAGIC.len() / 2
+        || is_header(first.get(container::MAGIC.len()..).unwrap_or_default()))
+}
+
+/// Returns true for bytes that begin with a whole header record.
+fn is_header(bytes: &[u8]) -> bool {
+    let Some((&[code, ref length @ ..], body)) = bytes.split_first_chunk::<{ container::HEAD }>() else {
+        return false;
+    };
+    code == op::HEADER && container::own_length(code, body) == Some(u64::from_le_bytes(*length))
 }
 
 #[cfg(test)]

@@ -14,8 +14,8 @@ use ::mcap::records::op;
 use protocol::input;
 
 use super::log::{Clock, LONGEST as LONGEST_LINE, LogReader, known_time};
+use super::magic::is_mcap;
 use super::mcap::{Fault, State};
-use super::reader::is_mcap;
 use super::{CaptureError, Entry, Reader};
 use crate::container::{LONGEST_DESCRIPTION, MAGIC, find};
 use crate::order::WINDOW_NS;

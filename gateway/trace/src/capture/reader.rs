@@ -4,21 +4,18 @@ use std::collections::VecDeque;
 use std::fmt;
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
-use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
-use ::mcap::records::op;
 use protocol::input;
 
 use super::log::{Clock, LogReader, Remark};
-use super::magic::{self, Kind};
+use super::magic::{self, Kind, is_mcap};
 use super::mcap::{Buses, Fault, McapReader, ORIGIN, SOURCE, State, Survey};
 use super::parts::{self, Named, PartsError};
 use super::places::{Place, Places};
 use super::text_kinds::kind_of;
 use super::times::Times;
 use super::{CaptureError, Entry, Extras, Item, Through};
-use crate::container::{HEAD, MAGIC, own_length};
 
 /// What a capture is written in.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -483,35 +480,6 @@ impl Reader {
         }
     }
 }
-
-/// Whether a file is an MCAP recording, by its first bytes or by its last; its place is its beginning.
-pub(super) fn is_mcap(file: &mut File) -> io::Result<bool> {
-    let (kind, _) = magic::look(file)?;
-    if kind == Kind::Mcap {
-        file.rewind()?;
-        return Ok(true);
-    }
-    let (mut first, mut last) = (vec![0; BEGINNING], [0; MAGIC.len()]);
-    let size = file.metadata()?.len();
-    if kind == Kind::Text && size > 2 * MAGIC.len() as u64 {
-        let came = file.read_at(&mut first, 0)?;
-        first.truncate(came);
-        file.read_exact_at(&mut last, size - MAGIC.len() as u64)?;
-    }
-    file.rewind()?;
-    // A place in one of them, or all of one, may be damaged.
-    let alike = first.iter().zip(MAGIC).filter(|(one, other)| one == other).count();
-    Ok(last == *MAGIC || alike > MAGIC.len() / 2 || is_header(first.get(MAGIC.len()..).unwrap_or_default()))
-}
-
-/// Whether bytes begin with the record that a recording begins with.
-fn is_header(bytes: &[u8]) -> bool {
-    let Some((&[code, ref length @ ..], body)) = bytes.split_first_chunk::<HEAD>() else { return false };
-    code == op::HEADER && own_length(code, body) == Some(u64::from_le_bytes(*length))
-}
-
-/// Bytes among which a recording's first record is.
-const BEGINNING: usize = 4 << 10;
 
 fn is_input(path: &Path) -> bool {
     path.as_os_str() == "-"

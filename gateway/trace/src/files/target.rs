@@ -191,7 +191,7 @@ pub(crate) fn is_still(path: &Path, is: (u64, u64)) -> Option<bool> {
 }
 
 /// How long a file that takes nothing is tried again.
-const PATIENCE: Duration = Duration::from_secs(1);
+const RETRY_TIMEOUT: Duration = Duration::from_secs(1);
 /// Between two attempts.
 const PAUSE: Duration = Duration::from_millis(2);
 
@@ -207,7 +207,7 @@ pub(crate) fn write_patiently(file: &mut impl Write, bytes: &[u8]) -> io::Result
         match file.write(bytes) {
             Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
-                if since.get_or_insert_with(Instant::now).elapsed() >= PATIENCE {
+                if since.get_or_insert_with(Instant::now).elapsed() >= RETRY_TIMEOUT {
                     return Err(error);
                 }
                 std::thread::sleep(PAUSE);
