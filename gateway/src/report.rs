@@ -100,8 +100,8 @@ fn refused(error: ReportError) -> Failure {
         ReportError::Open(_)
         | ReportError::Log { .. }
         | ReportError::Foreign { .. }
-        | ReportError::Rates { .. }
-        | _ => Failure::usage(error),
+        | ReportError::Rates { .. } => Failure::usage(error),
+        _ => Failure::usage(error),
     }
 }
 

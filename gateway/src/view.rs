@@ -168,7 +168,9 @@ impl View {
             ServeError::Play(PlayError::Damaged(_) | PlayError::Capture(CaptureError::Damaged { .. })) => {
                 Failure::run(error)
             }
-            error => Failure::usage(error),
+            ServeError::Bus(_) | ServeError::Play(_) | ServeError::Thread(_) | ServeError::Listen { .. } => {
+                Failure::usage(error)
+            }
         })?;
         Ok(())
     }

@@ -200,7 +200,8 @@ fn no_frame_that_somebody_sends_changes_an_account_or_a_torque() {
             assert_eq!(uplink.outsiders, outsiders, "{what:?}: {uplink:?}");
             let Replies { due, in_time, missing, in_doubt, .. } = cell.replies;
             assert_eq!(missing, in_doubt, "{what:?}: {:?}", cell.replies);
-            assert!(in_time * 100 >= due * 99, "{what:?}: {:?}", cell.replies);
+            // Few are due of a cell whose contact a second holder of its node id made unknown.
+            assert!(due - in_time <= (due / 100).max(1), "{what:?}: {:?}", cell.replies);
         }
         assert!(table.accuracy().single.max() < 1e-3, "{what:?}: {:?}", table.accuracy());
     }

@@ -282,14 +282,18 @@ fn broke_off(place: &Place, ended: &process::Ended, why: &str) {
     assert!(ended.stdout.contains("8 cells"), "the table is complete: {ended:#?}");
     let said: Vec<_> =
         ended.stderr.lines().filter(|line| line.contains("the run goes on without it")).collect();
-    assert!(said.len() == 1 && said[0].contains(why) && said[0].starts_with("run.mcap: "), "{ended:#?}");
+    assert!(said.iter().all(|line| line.contains(why)), "{ended:#?}");
+    assert!(said.first().is_some_and(|line| line.starts_with("run.mcap: ")), "{ended:#?}");
     assert!(
         ended.stderr.lines().last().unwrap().starts_with("gateway: the recording is incomplete, "),
         "{ended:#?}"
     );
     let summary = place.summary();
-    let recorded = Recorded::read(&place.path("run.mcap"));
-    let lines = recorded.lines("/can/vcan0");
+    let files = summary.0["recording"]["files"].as_array().unwrap();
+    let recordings =
+        files.iter().filter_map(|file| file["path"].as_str().filter(|path| path.ends_with(".mcap")));
+    let lines = recordings.flat_map(|path| Recorded::read(&place.path(path)).lines("/can/vcan0"));
+    let lines: Vec<_> = lines.collect();
     let packets =
         ["received", "sent"].map(|route| summary.total(&format!("/buses/0/{route}"))).iter().sum::<u64>();
     let [frames, lost, unwritten] =
@@ -297,10 +301,11 @@ fn broke_off(place: &Place, ended: &process::Ended, why: &str) {
     assert_eq!((frames, frames + lost, lost), (lines.len() as u64, packets, unwritten), "{:#}", summary.0);
     assert!(frames > 100 && lost > 100, "{:#}", summary.0);
     assert!(summary.number("/recording/messages_lost/unwritten") > 100, "{:#}", summary.0);
-    assert_eq!(summary.0["recording"]["files"][0]["frames"], frames);
-    // The log is on another disk, and has all of it.
+    assert!(files[0]["frames"].as_u64().unwrap() > 100, "{:#}", summary.0);
+    // The log is on another disk, and has all of it; a part that follows begins behind what was lost.
     let log = place.read("run.log");
-    assert!(log.lines().zip(&lines).all(|(log, line)| log == line));
+    let mut logged = log.lines();
+    assert!(lines.iter().all(|line| logged.any(|logged| logged == line)));
     assert_eq!(log.lines().count() as u64, packets);
 }
 

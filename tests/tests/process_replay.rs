@@ -312,7 +312,7 @@ fn a_killed_cell_is_named_and_its_replies_are_missing() {
     place.is_left_clean();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert!(ended.stderr.contains("cell 1 on vcan0 does not answer within "), "{ended:#?}");
-    assert!(ended.stderr.contains("the process of cell 1 ended (signal: 9"), "{ended:#?}");
+    assert!(ended.stderr.contains("the process of cell 1 on vcan0 ended (signal: 9"), "{ended:#?}");
     let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
     assert_eq!(replayed.0["lockstep"]["silent_cells"], serde_json::json!(["1 on vcan0"]));
     let [_, different, missing, extra] = replayed.replies();

@@ -43,7 +43,8 @@ fn refusal(place: &Place, words: &str, code: i32) -> String {
 fn a_skin_switches_its_cells_to_events_and_the_summary_has_every_touch() {
     let place = place("sensing = \"event\"", PRESSED);
     let bench = place.running_bench(60.0, "");
-    place.test_client().waits_for_epoch(40);
+    // A rate needs a second.
+    place.test_client().waits_for_epoch(120);
     ends(bench);
     place.is_left_clean();
     let summary = place.summary();

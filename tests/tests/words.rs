@@ -81,7 +81,8 @@ const NAMES: &[(&str, &str)] = &[
 const AFTER: &[(&str, &str)] = &[("least", "at")];
 const BEFORE: &[(&str, &str)] = &[("least", "significant"), ("least", "squares")];
 /// Former names of faults, which are still read.
-const FORMER: &[(&str, &str)] = &[("cut", "scenario"), ("mend", "scenario")];
+const FORMER: &[(&str, &str)] =
+    &[("cut", "scenario"), ("mend", "scenario"), ("ear", "mesh/polygon"), ("ears", "mesh/polygon")];
 
 struct Word<'a> {
     text: &'a str,

@@ -205,7 +205,7 @@ fn too_few_files_are_refused_before_anything_is_started() {
     command.arg(env!("CARGO_BIN_EXE_gateway")).arg(&skin).env("SKINBUS_DIR", parent.path().join("skinbus"));
     let Output { status, stderr, .. } = command.output().unwrap();
     let said =
-        "gateway: 12 files may be open at once, and this bench needs 31: say `ulimit -n 31` before it\n";
+        "gateway: 12 files may be open at once, and this bench needs 33: say `ulimit -n 33` before it\n";
     assert_eq!((status.code(), text(&stderr)), (Some(2), said));
 }
 

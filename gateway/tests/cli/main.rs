@@ -140,7 +140,9 @@ fn lines_that_cannot_be_read_are_named_and_the_others_shown() {
 fn a_reader_that_leaves_ends_it_quietly() {
     let directory = TempDir::new().unwrap();
     let file = directory.path().join("long.log");
-    std::fs::write(&file, FD.repeat(200)).unwrap();
+    let (_, frame) = FD.lines().find(|line| line.starts_with('(')).unwrap().split_once(' ').unwrap();
+    let lines: Vec<_> = (0..40_000).map(|second| format!("({second}.000000) {frame}\n")).collect();
+    std::fs::write(&file, lines.concat()).unwrap();
     let mut child = gateway("dump").arg(&file).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut line = String::new();
     BufReader::with_capacity(16, child.stdout.take().unwrap()).read_line(&mut line).unwrap();

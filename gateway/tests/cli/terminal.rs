@@ -35,7 +35,7 @@ fn is_harmless(text: &str) -> bool {
 fn no_name_that_a_file_chose_is_obeyed() {
     let folder = TempDir::new().unwrap();
     let path = |name: &str| folder.path().join(name).to_str().unwrap().to_owned();
-    let bus = "c\x1b[2J\x1b]0;x\x07\u{9b}1m\u{202e}\x7f\r";
+    let bus = "c\x1b[2J\x1b]0;x\x07\u{9b}1m\u{202e}\x7f";
     let log = format!(
         "(1.000000) {bus} 123#11\n(2.000000) {bus} 1z\n(3.000000) {bus} 20C##5001000F80100000000000000070175D6\n"
     );

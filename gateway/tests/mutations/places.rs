@@ -339,8 +339,8 @@ fn is_given(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<u
         let (_, whole, _) = run(folder, &line.replace("m.mcap", "seed.mcap"));
         match line.split(' ').next() {
             Some("convert") => {
-                let (least, most) = (lines.len().min(whole.len()), intact);
-                assert!(least >= most, "{what}: {line}: {least} entries of {intact}: {stderr}");
+                let (smallest, most) = (lines.len().min(whole.len()), intact);
+                assert!(smallest >= most, "{what}: {line}: {smallest} entries of {intact}: {stderr}");
             }
             Some("shadow") => {
                 assert!(lines.len() >= frames, "{what}: {line}: {} of {frames}: {stderr}", lines.len())

@@ -34,12 +34,12 @@ pub(crate) struct Serve {
 
 impl Serve {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        serve(&self.name, self.until_eof).map_err(|error| Failure::run(told(&error)))
+        serve(&self.name, self.until_eof).map_err(|error| Failure::run(with_causes(&error)))
     }
 }
 
 /// Returns an error with its causes, each once: some name their cause themselves.
-fn told(error: &anyhow::Error) -> String {
+fn with_causes(error: &anyhow::Error) -> String {
     error.chain().skip(1).fold(error.to_string(), |text, cause| match cause.to_string() {
         cause if text.contains(&cause) => text,
         cause => format!("{text}: {cause}"),

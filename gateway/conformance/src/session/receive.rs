@@ -13,11 +13,11 @@ impl Session<'_> {
     /// Takes the next frame, if one comes until then.
     pub(super) fn pump(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
         let Some(seen) = self.bus.receive(until)? else {
-            self.look_at_halves(self.bus.now());
+            self.look_at_segments(self.bus.now());
             self.look_at_time()?;
             return Ok(None);
         };
-        self.look_at_halves(seen.at);
+        self.look_at_segments(seen.at);
         if seen.own {
             self.log.frames.push(seen);
             let joints = (self.known.hash != Some(0)).then_some(self.known.joints);
@@ -47,7 +47,7 @@ impl Session<'_> {
     }
 
     /// Checks that no segment has waited longer for the others of its packet than any answer takes.
-    fn look_at_halves(&mut self, now: Micros) {
+    fn look_at_segments(&mut self, now: Micros) {
         if self.held.is_some() {
             // Of a life that was cut off.
             return;

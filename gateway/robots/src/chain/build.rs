@@ -29,10 +29,10 @@ pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain,
     let path = path(urdf, root, urdf.index(tip)?)?;
     let joints = joints(urdf, urdf.link_name(root), tip, &path)?;
     let build = |row_cost| with_rows(urdf, root, tip, &path, &joints, row_cost);
-    let [usual, least] = rows::ROW_COSTS_M;
+    let [usual, smallest] = rows::ROW_COSTS_M;
     build(usual).or_else(|error| {
         let is_long = matches!(*error.problem, Problem::Reach { .. } | Problem::Length { .. });
-        if is_long { build(least) } else { Err(error) }
+        if is_long { build(smallest) } else { Err(error) }
     })
 }
 

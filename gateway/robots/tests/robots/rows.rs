@@ -171,7 +171,7 @@ fn rows_do_not_fold_back_beside_the_robot() {
     assert!(long.to_string().contains("can come 2."), "{long}");
 }
 
-/// No way is longer than the one from joint to joint, with a fixed row for each.
+/// The way from joint to joint, with a fixed row for each, bounds all others.
 #[test]
 fn rows_are_no_longer_than_the_way_from_joint_to_joint() {
     let mut state = 7_u32;

@@ -165,7 +165,7 @@ fn a_cell_that_is_wrong_about_its_packets_is_still_found() {
     let without = |frames: &[Frame], place: usize| -> Vec<_> {
         frames.iter().enumerate().filter(|(at, _)| *at != place).map(|(_, frame)| *frame).collect()
     };
-    // Half a packet in either life, but for the first and the last of its identifier in the former one.
+    // A packet without its other segment in either life, but for the first and the last of its identifier in the former one.
     for place in 4..8 {
         let failed = failed(format, takes, &without(&former, place), 0, &new);
         assert!(failed.contains(&"SEND-1"), "former, without {place}: {failed:?}");
