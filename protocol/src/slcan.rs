@@ -21,6 +21,7 @@
 //! an acknowledgement, and who reads passes over lines that it does not know.
 
 mod decoder;
+#[cfg(feature = "host")]
 mod report;
 #[cfg(test)]
 mod tests;
@@ -28,6 +29,7 @@ mod tests;
 use crate::can::{BIT_RATE_SWITCH, Format, Frame, dlc_len, fd_dlc};
 
 pub use decoder::{Decoder, Line, Refusal, Refused};
+#[cfg(feature = "host")]
 pub use report::{BusState, ErrorCounters, Fault, Report};
 
 /// Bytes of the longest line without its end: a switched FD frame of 64 bytes, 29 bits, 8 digits of time and the state of

@@ -1,6 +1,8 @@
 //! Bytes of a serial line become frames, commands and acknowledgements.
 
-use super::{BEL, CR, Command, MAX_LINE, Report, digit, dlc_len, number};
+#[cfg(feature = "host")]
+use super::Report;
+use super::{BEL, CR, Command, MAX_LINE, digit, dlc_len, number};
 use crate::can::{
     BIT_RATE_SWITCH, ERROR_STATE, EXTENDED, EXTENDED_MASK, FD_FORMAT, Format, Frame, STANDARD_MASK,
 };
@@ -18,7 +20,8 @@ pub enum Line {
     Sent,
     /// BEL: the adapter refused a line.
     Failed,
-    /// A fault, or a state of the adapter's bus.
+    /// A fault, or a state of the adapter's bus. A board's own line has no adapter behind it.
+    #[cfg(feature = "host")]
     Reported(Report),
     /// A line of printable characters that is none of these, such as an adapter's version: to be passed over.
     Other,
@@ -218,8 +221,11 @@ fn read(line: &[u8], endings: &mut Endings) -> Line {
         b'b' => Some(FD_FORMAT | BIT_RATE_SWITCH),
         b'z' if rest.is_empty() => return Line::Sent,
         _ => {
-            let command = || Command::decode(line).map_or(Line::Other, Line::Command);
-            return Report::read(line).map_or_else(command, Line::Reported);
+            #[cfg(feature = "host")]
+            if let Some(report) = Report::read(line) {
+                return Line::Reported(report);
+            }
+            return Command::decode(line).map_or(Line::Other, Line::Command);
         }
     };
     let is_remote = kind.eq_ignore_ascii_case(&b'r');
