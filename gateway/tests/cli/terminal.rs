@@ -80,7 +80,7 @@ fn no_name_that_a_file_chose_is_obeyed() {
     let said = text(&stderr);
     assert!(said.ends_with("empty\\u{a}\\u{1b}[2J.log: it is empty: there is no frame in it\n"), "{said}");
     assert_eq!(said.matches('\n').count(), 1, "{said}");
-    // A pipe gets the log as it was.
+    // A pipe leads to a terminal sooner or later.
     let shown = gateway(&format!("dump {x}")).output().unwrap();
-    assert!(text(&shown.stdout).starts_with("(1.000000) c\x1b[2J"), "{shown:?}");
+    assert!(text(&shown.stdout).starts_with(r"(1.000000) c\u{1b}[2J"), "{shown:?}");
 }

@@ -247,7 +247,8 @@ impl Cell {
     }
 
     /// Its sensors for people, as far as stimuli and pages that came tell; older stimuli may have changed them.
-    pub(super) fn presumed_sensors(&self) -> Option<SkinSensors> {
+    #[must_use]
+    pub fn presumed_sensors(&self) -> Option<SkinSensors> {
         self.contact.skin().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
     }
 

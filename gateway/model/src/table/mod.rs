@@ -485,11 +485,6 @@ impl Table {
         self.statuses(now).map(|(cell, status)| (cell.presumed_sensors(), status))
     }
 
-    /// The same of each cell without its status; no contact where nothing is known.
-    pub fn presumed_sensors(&self) -> impl Iterator<Item = SkinSensors> {
-        self.cells.iter().map(|cell| cell.presumed_sensors().unwrap_or_default())
-    }
-
     /// The cells' statuses now.
     pub fn statuses(&self, now: Micros) -> impl Iterator<Item = (&Cell, Status)> {
         let newest = self.broadcast.map(|broadcast| broadcast.number);

@@ -135,7 +135,8 @@ impl LiveBus {
     fn close(&mut self) {
         let Some(heard) = self.heard else { return };
         let frames = self.central.frames(&heard.positions);
-        let sensors: Vec<_> = self.table.presumed_sensors().collect();
+        let cells = self.table.cells().iter();
+        let sensors: Vec<_> = cells.map(|cell| cell.presumed_sensors().unwrap_or_default()).collect();
         let central = self.central.total(&frames, &sensors).torque;
         let distributed = self.table.snapshot().sums.torque;
         for ((torque, distributed), central) in self.torques.iter_mut().zip(distributed).zip(central) {
