@@ -11,7 +11,7 @@ use cell_node::kernel::{Kernel, Operations, PaperWord, Projection, Scalar, Word,
 use cell_node::sine::{cosine, paper_cosine, paper_sine, sine};
 use protocol::fixed::{Q1_14, Q3_12};
 
-#[path = "../tests/oracle/mod.rs"]
+#[path = "../src/tests/kernel/oracle.rs"]
 mod oracle;
 
 use oracle::{Case, Errors};

@@ -13,3 +13,10 @@ pub mod node;
 mod phase;
 pub mod sine;
 pub mod sum;
+
+// Its oracle is shared with benchmarks and examples, which name the crate.
+#[cfg(test)]
+extern crate self as cell_node;
+
+#[cfg(test)]
+mod tests;

@@ -30,3 +30,6 @@ pub mod touch;
 pub mod usage;
 pub mod wire;
 pub mod wire_time;
+
+#[cfg(test)]
+mod tests;

@@ -15,7 +15,10 @@
 
 pub mod accounts;
 mod agenda;
+#[cfg(test)]
+mod architecture;
 pub mod bench;
+pub mod can_raw;
 pub mod cell_slot;
 pub mod fault;
 pub mod fuzz;
@@ -23,6 +26,9 @@ pub mod gateway;
 mod life;
 pub mod network;
 pub mod oracle;
+pub mod process;
 pub mod real_bus;
 pub mod skins;
+#[cfg(test)]
+mod words;
 pub mod workshop;

@@ -22,5 +22,5 @@ pub use served::Served;
 pub use server::{ServeError, Server, Totals};
 
 #[cfg(test)]
-#[path = "../tests/cases/mod.rs"]
+#[path = "../../tests/src/can_raw.rs"]
 mod cases;

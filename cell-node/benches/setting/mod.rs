@@ -1,6 +1,6 @@
 //! One cell on the last link of a UR5, for each way to compute its Jacobian.
 
-#[path = "../../tests/oracle/mod.rs"]
+#[path = "../../src/tests/kernel/oracle.rs"]
 mod oracle;
 mod peer;
 

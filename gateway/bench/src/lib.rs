@@ -26,3 +26,6 @@ mod setup;
 pub mod signals;
 pub mod summary;
 pub mod view;
+
+#[cfg(test)]
+mod tests;

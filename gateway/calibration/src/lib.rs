@@ -38,3 +38,6 @@ pub mod zero;
 pub use calibrate::{Settings, calibrate};
 pub use refusal::Refusal;
 pub use result::Calibration;
+
+#[cfg(test)]
+mod tests;

@@ -12,3 +12,6 @@ pub mod cycle;
 pub mod external;
 pub mod motion;
 pub mod robot;
+
+#[cfg(test)]
+mod tests;

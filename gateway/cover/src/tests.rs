@@ -1,3 +1,5 @@
+mod panda;
+
 use std::collections::BTreeMap;
 
 use nalgebra::{Point3, Translation3, UnitQuaternion, Vector3};

@@ -28,3 +28,6 @@ pub mod table;
 #[doc(hidden)]
 pub mod testing;
 pub mod tracker;
+
+#[cfg(test)]
+mod tests;

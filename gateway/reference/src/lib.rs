@@ -57,3 +57,6 @@ impl Reference {
         Torque::new(&self.jacobian(joints), force).words(self.format)
     }
 }
+
+#[cfg(test)]
+mod tests;

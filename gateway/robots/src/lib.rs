@@ -48,3 +48,6 @@ pub use protocol::skin::JointKind;
 pub use rows::{Row, frames, pose_of};
 pub use urdf::{Geometry, Shape, Urdf};
 pub use written::{Written, word, written};
+
+#[cfg(test)]
+mod tests;

@@ -16,3 +16,6 @@ mod note;
 pub mod order;
 pub mod recording;
 pub mod ros2;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,57 @@
+//! Sums of children that come late.
+#![allow(clippy::unwrap_used, reason = "a test may stop")]
+
+use crate::sum::{Begin, Sum, Words};
+use protocol::fixed::Q7_8;
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
+use protocol::parameters::Slots;
+use protocol::time::{Micros, Span};
+
+/// A parent that feels nothing itself, at the root of a tree of two, with its child at port 0.
+fn begin(sum: &mut Sum, epoch: u8, at: u64) {
+    let begin = Begin {
+        epoch: Epoch(epoch),
+        at: Micros(at),
+        period: Span(16_000),
+        depth: Some(0),
+        speaks: true,
+        children: 1,
+    };
+    sum.begin(&begin, None);
+}
+
+fn words(bits: i16) -> Words {
+    Words { torque: [Q7_8::from_bits(bits); MAX_JOINTS], count: 1 }
+}
+
+/// What is sent until half a period later.
+fn said(sum: &mut Sum, after: u64) -> Option<Words> {
+    sum.say(Micros(after + 8_000)).map(|(_, words, _)| words)
+}
+
+// LEASE-1, LEASE-2
+#[test]
+fn a_sum_that_arrives_after_its_epoch_is_not_taken_for_another_epoch() {
+    let mut sum = Sum::default();
+    sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry: true }));
+    begin(&mut sum, 129, 0);
+    // A machine that was late delivers it late; then the child's state message arrives.
+    sum.take(Micros(100), 0, Epoch(126), words(-154));
+    sum.state(Micros(200), 0, Epoch(129));
+    assert_eq!(said(&mut sum, 0), None, "nothing of this epoch has come");
+    sum.take(Micros(9_000), 0, Epoch(129), words(-151));
+    assert_eq!(said(&mut sum, 9_000), Some(words(-151)));
+}
+
+// LEASE-2
+#[test]
+fn a_sum_that_arrives_before_its_state_is_taken_when_the_state_arrives() {
+    let mut sum = Sum::default();
+    sum.set_slots(Some(Slots { slot_us: 1_000, deepest: 1, carry: true }));
+    begin(&mut sum, 7, 0);
+    sum.take(Micros(100), 0, Epoch(7), words(3));
+    assert_eq!((said(&mut sum, 0), sum.dropped), (None, 1));
+    sum.state(Micros(200), 0, Epoch(7));
+    assert_eq!((said(&mut sum, 200), sum.taken, sum.dropped), (Some(words(3)), 1, 0));
+}

@@ -1,0 +1,4 @@
+//! Tests of the whole crate.
+
+mod orphans;
+mod summary_keys;

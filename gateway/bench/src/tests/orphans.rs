@@ -1,0 +1,197 @@
+//! A run repairs what runs before it left in its recording's folder, and touches nothing else there.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use std::fs::{self, File, Permissions};
+use std::io::Write;
+use std::os::unix::fs::{FileTypeExt, MetadataExt, PermissionsExt, symlink};
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+use crate::record::{Mcap, Options, Outputs};
+use rustix::fs::{FlockOperation, Mode, flock};
+use tempfile::TempDir;
+use trace::recording::file::FileWriter;
+use trace::recording::names::Part;
+use trace::ros2::standard::JointState;
+
+/// What a writer that is still at it has in its file.
+fn begun(mut writer: FileWriter<Vec<u8>>) -> Vec<u8> {
+    let mut joints = writer.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();
+    let state = JointState { nanos: 1, names: &[], position: &[1.0], velocity: &[], effort: &[] };
+    writer.write(&mut joints, 1, &state).unwrap();
+    writer.flush().unwrap();
+    writer.into_inner()
+}
+
+/// What a run leaves that is killed while it records to a name.
+fn left(folder: &TempDir, name: &str) {
+    let (_, mut file) = Part::create(folder.path().join(name)).unwrap();
+    let there = usize::try_from(file.metadata().unwrap().len()).unwrap();
+    let bytes = begun(FileWriter::in_file(Vec::new(), &file.metadata().unwrap()).unwrap());
+    file.write_all(&bytes[there..]).unwrap();
+}
+
+/// The messages of the next run when it claims its files.
+fn claims(folder: &Path, name: &str) -> (Result<Outputs, String>, Vec<String>) {
+    let mcap = Mcap {
+        path: folder.join(name),
+        split: trace::recording::series::Split::default(),
+        attachments: Vec::new(),
+        robot: None,
+        command_line: Vec::new(),
+    };
+    let options = Options { mcap: Some(mcap), ..Options::default() };
+    let mut said = Vec::new();
+    let claimed = Outputs::claim(&options, &AtomicBool::new(false), |line| {
+        said.push(line.replace(&format!("{}/", folder.display()), ""));
+    });
+    (claimed.map_err(|error| error.to_string()), said)
+}
+
+#[test]
+fn what_a_killed_run_left_is_repaired_and_nobody_may_read_more_of_it_than_before() {
+    let folder = tempfile::tempdir().unwrap();
+    left(&folder, "run.mcap");
+    let part = folder.path().join("run.mcap.part");
+    fs::set_permissions(&part, Permissions::from_mode(0o600)).unwrap();
+    fs::write(folder.path().join("run-recovered.mcap"), "somebody's").unwrap();
+    let (claimed, said) = claims(folder.path(), "run.mcap");
+    assert!(claimed.is_ok() && said.len() == 1, "{said:?}");
+    let repaired =
+        "run.mcap.part was left by a run that was killed; repaired, it is run-recovered-1.mcap: 1 messages";
+    assert!(said[0].starts_with(repaired), "{said:?}");
+    let about = fs::metadata(folder.path().join("run-recovered-1.mcap")).unwrap();
+    assert_eq!(about.mode() & 0o777, 0o600);
+    assert_eq!(fs::read(folder.path().join("run-recovered.mcap")).unwrap(), b"somebody's");
+}
+
+#[test]
+fn an_original_that_is_damaged_before_its_end_is_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    for number in ["", "-1"] {
+        left(&folder, "run.mcap");
+        let part = folder.path().join("run.mcap.part");
+        let mut bytes = fs::read(&part).unwrap();
+        // A bit of the only chunk.
+        let chunk = bytes.windows(4).position(|at| at == b"zstd").unwrap();
+        bytes[chunk + 60] ^= 0x10;
+        File::options().write(true).open(&part).unwrap().write_all(&bytes).unwrap();
+        let (claimed, said) = claims(folder.path(), "next.mcap");
+        assert!(claimed.is_ok() && said.len() == 1, "{said:?}");
+        let repaired = format!("repaired, it is run-recovered{number}.mcap: 0 messages");
+        let kept = format!(" damaged bytes are lost; the damaged original is run.mcap.damaged{number}");
+        assert!(said[0].contains(&repaired) && said[0].ends_with(&kept), "{said:?}");
+        assert!(!part.exists());
+        assert_eq!(fs::read(folder.path().join(format!("run.mcap.damaged{number}"))).unwrap(), bytes);
+        drop(claimed);
+        assert_eq!(claims(folder.path(), "next.mcap").1, [""; 0], "nothing is repaired twice");
+    }
+}
+
+#[test]
+fn what_was_killed_before_it_recorded_anything_is_taken_away() {
+    let folder = tempfile::tempdir().unwrap();
+    let (part, file) = Part::create(folder.path().join("run.mcap")).unwrap();
+    drop((part, file));
+    let (claimed, said) = claims(folder.path(), "run.mcap");
+    assert!(claimed.is_ok());
+    assert_eq!(
+        said,
+        ["run.mcap.part was left by a run that was killed; nothing was recorded in it, it is gone"]
+    );
+}
+
+#[test]
+fn what_is_not_ours_is_named_and_stays_as_it_is() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let away = tempfile::tempdir().unwrap();
+    // A recording of ours that another program is just copying, and one of another program.
+    left(&folder, "copy.mcap");
+    let ours = fs::read(path("copy.mcap.part")).unwrap();
+    fs::rename(path("copy.mcap.part"), away.path().join("original")).unwrap();
+    fs::write(path("copy.mcap.part"), &ours).unwrap();
+    // A copy that has got the inode of the one that it was made from, which is gone.
+    left(&folder, "again.mcap");
+    let mut again = fs::read(path("again.mcap.part")).unwrap();
+    let born = again.windows(7).position(|bytes| bytes == b"born_ns").unwrap();
+    again[born + 11] = if again[born + 11] == b'1' { b'2' } else { b'1' };
+    fs::write(path("again.mcap.part"), again).unwrap();
+    fs::write(path("download.mcap.part"), begun(FileWriter::new(Vec::new()).unwrap())).unwrap();
+    fs::write(path("empty.mcap.part"), "").unwrap();
+    fs::write(path("text.mcap.part"), "not even that").unwrap();
+    fs::create_dir(path("folder.mcap.part")).unwrap();
+    rustix::fs::mknodat(
+        rustix::fs::CWD,
+        path("pipe.mcap.part"),
+        rustix::fs::FileType::Fifo,
+        Mode::from_raw_mode(0o600),
+        0,
+    )
+    .unwrap();
+    let _socket = std::os::unix::net::UnixListener::bind(path("socket.mcap.part")).unwrap();
+    symlink(away.path().join("original"), path("link.mcap.part")).unwrap();
+    symlink("nowhere", path("lost.mcap.part")).unwrap();
+    left(&folder, "two.mcap");
+    fs::hard_link(path("two.mcap.part"), away.path().join("two")).unwrap();
+    left(&folder, "locked.mcap");
+    let held = File::open(path("locked.mcap.part")).unwrap();
+    flock(&held, FlockOperation::LockExclusive).unwrap();
+    let all = || {
+        let mut all: Vec<_> = fs::read_dir(folder.path())
+            .unwrap()
+            .map(|entry| {
+                let path = entry.unwrap().path();
+                let about = fs::symlink_metadata(&path).unwrap();
+                let bytes = if about.is_file() { fs::read(&path).unwrap() } else { Vec::new() };
+                (path, about.ino(), about.mode(), bytes)
+            })
+            .collect();
+        all.sort();
+        all
+    };
+    let before = all();
+    let (claimed, said) = claims(folder.path(), "run.mcap");
+    drop(claimed.unwrap());
+    assert_eq!(all(), before, "{said:?}");
+    let reason = |name: &str| {
+        let begin = format!("{name}.mcap.part is left alone: ");
+        let mut lines = said.iter().filter_map(|line| line.strip_prefix(&begin));
+        let why = lines.next().unwrap_or_else(|| panic!("{name}: {said:?}"));
+        assert_eq!(lines.next(), None);
+        why.split(';').next().unwrap().to_owned()
+    };
+    for name in ["again", "copy", "download", "empty", "text"] {
+        assert_eq!(reason(name), "no run of this program has begun it here");
+    }
+    for name in ["folder", "pipe", "socket"] {
+        assert_eq!(reason(name), "it is no regular file");
+    }
+    assert_eq!(["link", "lost"].map(reason), ["it is a symlink", "it is a symlink"]);
+    assert_eq!(reason("two"), "it has 2 names (hard links)");
+    assert_eq!(reason("locked"), "another program is writing it");
+    assert_eq!(said.len(), 12);
+    assert!(fs::symlink_metadata(path("pipe.mcap.part")).unwrap().file_type().is_fifo());
+    // Under the name of one of them nothing is recorded.
+    let (claimed, _) = claims(folder.path(), "download.mcap");
+    let why = claimed.unwrap_err();
+    assert!(
+        why.ends_with("no run that was killed has left it: move it away, or record to another name"),
+        "{why}"
+    );
+    assert_eq!(all(), before);
+}
+
+#[test]
+fn a_file_that_takes_a_name_meanwhile_keeps_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let goal = folder.path().join("run.mcap");
+    let (part, _file) = Part::create(goal.clone()).unwrap();
+    fs::remove_file(&part.path).unwrap();
+    fs::write(&part.path, "somebody's").unwrap();
+    assert!(part.finish(true).unwrap_err().to_string().ends_with("run.mcap.part is another file now"));
+    assert!(part.open().is_err());
+    part.remove();
+    assert_eq!(fs::read(&part.path).unwrap(), b"somebody's");
+    assert!(!goal.exists());
+}

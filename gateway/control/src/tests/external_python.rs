@@ -1,0 +1,54 @@
+//! The example in Python closes the loop over the real socket.
+#![allow(clippy::unwrap_used, reason = "a test may stop")]
+
+use std::io::{BufRead, BufReader};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use crate::controller::{Controller, Input, Step};
+use crate::external::External;
+use protocol::packet::padded;
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+/// A process that ends with the test.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+#[test]
+fn the_example_in_python_makes_the_arm_give_way() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("controller.sock");
+    let skin = Skin::parse("ur5-253.toml", include_str!("../../../examples/ur5-253.toml")).unwrap();
+    let mut gateway = External::listen(&path, &skin).unwrap();
+    let example = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/external_controller.py");
+    let python = Command::new("python3").arg(example).arg(&path).stdout(Stdio::piped()).spawn();
+    let mut python = Running(python.expect("python3 is needed: apt install python3"));
+    let torque = [2.0, -1.0, 0.5, 0.0, 0.0, 0.0];
+    let target = Step::Move(padded(&[0.5, -0.25, 0.125, 0.0, 0.0, 0.0]));
+    let (start, mut tick, mut answers) = (Instant::now(), 0, 0);
+    // A tick as soon as the last one is answered, so that the first report comes after a second.
+    while answers < 100 || start.elapsed() < Duration::from_millis(1_500) {
+        assert!(start.elapsed() < Duration::from_secs(20), "no answers from python3");
+        let time = Micros(u64::try_from(start.elapsed().as_micros()).unwrap());
+        let input =
+            Input { tick, time, torque: padded(&torque), contributing: 3, valid: true, ..Input::default() };
+        tick += 1;
+        if let Step::Move(velocity) = gateway.step(&input) {
+            assert_eq!(Step::Move(velocity), target);
+            answers += 1;
+        }
+        std::thread::yield_now();
+    }
+    let counts = gateway.counts();
+    assert!(counts.iter().all(|(name, count)| !name.starts_with("nonsense") || *count == 0), "{counts:?}");
+    let mut report = String::new();
+    BufReader::new(python.0.stdout.take().unwrap()).read_line(&mut report).unwrap();
+    assert!(report.contains("3 cells") && report.contains("torque +2.00 -1.00 +0.50"), "{report}");
+}

@@ -1,0 +1,91 @@
+//! The ready-made scenarios do what they are there for: played here without a bus, with the central
+//! computation as the skin.
+#![allow(clippy::unwrap_used, reason = "a test may stop")]
+
+use crate::controller::{Input, Step};
+use crate::motion::controller_of;
+use crate::robot::{Robot, SimulatedArm};
+use model::central::Central;
+use model::scenario::{Scenario, Touches};
+use protocol::fixed::Q1_14;
+use protocol::message::SkinSensors;
+use protocol::packet::padded;
+use protocol::parameters::MAX_JOINTS;
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+/// What a run had at its most.
+#[derive(Debug, Default)]
+struct Most {
+    /// Nm, of one cell in one joint.
+    torque: f64,
+    /// Nm, of all cells in one joint.
+    sum: f64,
+    /// Cells at once, in every epoch.
+    active: Vec<u32>,
+    /// Joints that came to a limit.
+    at_limit: u32,
+    /// rad, from the start, of the joint that went farthest.
+    way: f64,
+}
+
+fn play(scenario: &str) -> Most {
+    let skin = Skin::parse("ur5-253.toml", include_str!("../../../examples/ur5-253.toml")).unwrap();
+    let scenario = Scenario::parse("scenario", scenario, &skin).unwrap();
+    let start = scenario.motion.start;
+    let mut controller = controller_of(&skin, &scenario.motion).unwrap();
+    let central = Central::new(&skin);
+    let mut arm = SimulatedArm::new(&skin, start);
+    let mut touches = Touches::new(&scenario, &skin);
+    let mut sensors = vec![SkinSensors::default(); skin.cells.len()];
+    let mut most = Most::default();
+    let mut torque = [0.0; MAX_JOINTS];
+    let per_broadcast = u64::from(skin.timing.ticks_per_broadcast);
+    for tick in 0..scenario.duration.0 / 2_000 {
+        if tick % per_broadcast == 0 {
+            for stimulus in touches.stimuli_for(tick / per_broadcast) {
+                *sensors.get_mut(stimulus.cell).unwrap() = stimulus.sensors;
+            }
+            let joints: Vec<_> = arm.positions().map(|angle| Q1_14::from_radians(angle).unwrap()).to_vec();
+            let frames = central.frames(&joints);
+            let total = central.total(&frames, &sensors);
+            torque = total.torque;
+            most.active.push(total.active);
+            for (cell, sensors) in sensors.iter().enumerate() {
+                let own = central.torque(cell, &frames, central.force(cell, sensors));
+                most.torque = own.iter().fold(most.torque, |most, torque| most.max(torque.abs()));
+            }
+            most.sum = torque.iter().fold(most.sum, |most, torque| most.max(torque.abs()));
+        }
+        let (q, qdot) = (arm.positions(), arm.velocities());
+        let time = Micros(tick * 2_000);
+        let input = Input { tick, time, q, qdot, torque: padded(&torque), valid: true, ..Input::default() };
+        let Step::Move(velocity) = controller.step(&input) else { unreachable!("the input is valid") };
+        most.at_limit |= arm.step(&velocity, 0.002).at_limit;
+        for (q, start) in arm.positions().iter().zip(start) {
+            most.way = most.way.max((q - start).abs());
+        }
+    }
+    most
+}
+
+#[test]
+fn the_demo_moves_the_arm_within_reason_and_grips_a_hundred_cells() {
+    let most = play(include_str!("../../../examples/demo.toml"));
+    assert!(most.torque < 8.0, "fits Q3.12: {}", most.torque);
+    assert!(most.sum < 20.0, "{}", most.sum);
+    assert_eq!(most.at_limit, 0);
+    assert!((0.3..2.0).contains(&most.way), "{}", most.way);
+    assert!(most.active.iter().filter(|&&active| active >= 100).count() > 60, "a second of the grip");
+    assert!(most.active.iter().filter(|&&active| active == 20).count() > 150, "palms");
+    assert!(most.active.iter().filter(|&&active| active == 0).count() > 50, "and rest");
+}
+
+#[test]
+fn all_active_presses_every_cell_all_the_time() {
+    let most = play(include_str!("../../../examples/all-active.toml"));
+    assert!(most.active.iter().all(|&active| active == 253));
+    assert_eq!(most.active.len(), 1_875);
+    assert!(most.torque < 4.0, "far from the end of Q3.12: {}", most.torque);
+    assert!(most.way > 0.49, "{}", most.way);
+}

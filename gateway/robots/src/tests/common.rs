@@ -1,0 +1,56 @@
+//! What the tests share: torques and differences, computed without the crate's own code where that matters.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use crate::{Chain, RowKind};
+use nalgebra::{Isometry3, Point3, Vector3};
+
+/// The folder of example-robot-data, from the environment.
+pub(crate) fn folder() -> PathBuf {
+    let folder = std::env::var_os("SKINBUS_ROBOTS");
+    PathBuf::from(folder.expect("SKINBUS_ROBOTS is the folder `robots` of example-robot-data"))
+}
+
+/// The torque of each joint in Nm, or the force in N, of a contact with `force` newtons against `normal` at `point`, both in a link's
+/// frame: the transposed Jacobian, from rows.
+pub(crate) fn torques(
+    chain: &Chain,
+    link: &str,
+    point: &Point3<f64>,
+    normal: &Vector3<f64>,
+    force: f64,
+    positions: &[f64],
+) -> Vec<f64> {
+    let place = chain.link(link).unwrap();
+    let frames = chain.frames(positions);
+    let pose = frames[place.row] * place.frame;
+    let (point, force) = (pose * point, pose * normal * -force);
+    let mut all = Vec::new();
+    for (row, frame) in chain.rows.iter().zip(&frames) {
+        let axis = frame * Vector3::z();
+        let lever = point.coords - frame.translation.vector;
+        match row.kind {
+            RowKind::Revolute => all.push(axis.cross(&lever).dot(&force)),
+            RowKind::Prismatic => all.push(axis.dot(&force)),
+            RowKind::Fixed => {}
+        }
+    }
+    for beyond in all.iter_mut().skip(place.joint) {
+        *beyond = 0.0;
+    }
+    all
+}
+
+/// The greater of the distance in m and the difference of the rotations' matrices.
+pub(crate) fn difference(one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
+    let turn = one.rotation.to_rotation_matrix().matrix() - other.rotation.to_rotation_matrix().matrix();
+    (one.translation.vector - other.translation.vector).norm().max(turn.norm())
+}
+
+/// Positions by the joints' names.
+pub(crate) fn named<'a>(chain: &'a Chain, positions: &[f64]) -> impl Fn(&str) -> f64 + use<'a> {
+    let names = chain.joints.iter().map(|joint| joint.name.as_str());
+    let all: BTreeMap<_, _> = names.zip(positions.to_vec()).collect();
+    move |name| all.get(name).copied().unwrap_or_default()
+}

@@ -1,0 +1,3 @@
+//! A loop under an allocator that counts.
+
+mod tick;

@@ -1,0 +1,480 @@
+//! `gateway dump`, `frame`, `ack` and `skin` as processes.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+mod live;
+mod names;
+mod terminal;
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+
+use protocol::can::{Format, Frame};
+use protocol::candump;
+use protocol::message::Message;
+use protocol::packet::{Lengths, Packet, Reassembly, Segment, data_id};
+use protocol::time::Micros;
+use tempfile::TempDir;
+
+/// The documents that spell out frames.
+const DOCUMENT: &str = concat!(
+    include_str!("../../../docs/reference/protocol.md"),
+    include_str!("../../../docs/reference/cell.md"),
+    include_str!("../../../docs/reference/sensing.md"),
+);
+const FD: &str = include_str!("../../../protocol/tests/golden/fd.log");
+
+fn gateway(arguments: &str) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    command.args(arguments.split(' ').filter(|word| !word.is_empty()));
+    command.env("NO_COLOR", "1").env("SKINBUS_DIR", "/nowhere/skinbus");
+    command
+}
+
+fn golden(name: &str) -> String {
+    format!("{}/../protocol/tests/golden/{name}", env!("CARGO_MANIFEST_DIR"))
+}
+
+fn text(bytes: &[u8]) -> &str {
+    std::str::from_utf8(bytes).unwrap()
+}
+
+/// Standard output of a command that is done well and has nothing to complain of.
+fn output(mut command: Command) -> String {
+    let Output { status, stdout, stderr } = command.output().unwrap();
+    assert_eq!((status.code(), text(&stderr)), (Some(0), ""), "{command:?}");
+    text(&stdout).to_owned()
+}
+
+/// The one-line error of a command that ends with this code and prints nothing.
+fn refusal(arguments: &str, code: i32) -> String {
+    let Output { status, stdout, stderr } = gateway(arguments).output().unwrap();
+    let said = text(&stderr);
+    assert_eq!((status.code(), text(&stdout)), (Some(code), ""), "{arguments}: {said}");
+    assert_eq!(said.matches('\n').count(), 1, "{arguments}: {said}");
+    said.trim_end().to_owned()
+}
+
+/// The decoded part of each line.
+fn decoded(shown: &str) -> Vec<&str> {
+    shown.lines().map(|line| line.split_once('\t').unwrap().1).collect()
+}
+
+#[test]
+fn a_log_is_shown_as_it_is_with_its_meaning_beside_it() {
+    for name in ["fd.log", "classic.log", "bad.log", "session.log"] {
+        let log = std::fs::read_to_string(golden(name)).unwrap();
+        let frames: Vec<&str> = log.lines().filter(|line| line.starts_with('(')).collect();
+        let shown = output(gateway(&format!("dump {}", golden(name))));
+        let raw: Vec<&str> = shown.lines().map(|line| line.split_once('\t').unwrap().0).collect();
+        assert_eq!(raw, frames, "{name}");
+    }
+    let shown = output(gateway(&format!("dump {} --max 5", golden("document.log"))));
+    let expected = "(1700000000.001000) vcan0 20C##5001000F80100000000000000070175D6\t\
+                    ok      torque 12 epoch 7: 1.0000 -0.5000 0.0002 0.0000 0.0000 0.0000 Nm";
+    assert_eq!((shown.lines().count(), shown.lines().next()), (5, Some(expected)));
+}
+
+#[test]
+fn times_names_and_directions_are_those_of_the_log() {
+    let mut child = gateway("dump -").stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let log = "(0000000012.000034567)   can0  123#11.22 T\r\n# more\n\n(1.000000) slcan0 20c##1 R";
+    child.stdin.take().unwrap().write_all(log.as_bytes()).unwrap();
+    let Output { status, stdout, .. } = child.wait_with_output().unwrap();
+    let expected = "(0000000012.000034567) can0 123#1122 T\tforeign no packet: 2 data bytes, not 8\n\
+                    (1.000000) slcan0 20C##1 R\tforeign no packet: 0 data bytes, not 16\n";
+    assert_eq!((status.code(), text(&stdout)), (Some(0), expected));
+}
+
+#[test]
+fn filters_pick_by_kind_node_and_time() {
+    let dump = |filters: &str| {
+        let shown = output(gateway(&format!("dump {} {filters}", golden("session.log"))));
+        decoded(&shown).into_iter().map(str::to_owned).collect::<Vec<_>>()
+    };
+    let torques = [
+        "ok      torque 12 epoch 7: -0.2625 0.7800 0.0000 0.0000 0.0000 0.0000 Nm",
+        "ok      torque 12 epoch 8: 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 Nm",
+    ];
+    assert_eq!(dump("--kind torque"), torques);
+    assert_eq!(dump("--kind torque --max 1"), torques[..1]);
+    assert_eq!(dump("--kind sync,report --node gateway"), ["ok      sync", "ok      report"]);
+    assert_eq!(dump("--kind torque --node 13"), [""; 0]);
+    assert_eq!(dump("--node 12,gateway").len(), dump("").len());
+    // Frames come 1 ms apart.
+    assert_eq!(dump("--from 0.002 --to 0.005"), dump("")[2..5]);
+    let classic = output(gateway(&format!("dump {} --from 0.0005 --max 2", golden("classic.log"))));
+    let pair =
+        ["segment joints", "ok      joints epoch 255: -3.1416 3.1415 -0.0001 0.0001 1.5708 -1.5708 rad"];
+    assert_eq!(decoded(&classic), pair);
+    let only_fd = output(gateway(&format!("dump {} --format fd --max 1", golden("classic.log"))));
+    assert_eq!(decoded(&only_fd), ["foreign no packet: 8 data bytes, not 16"]);
+}
+
+#[test]
+fn lines_that_cannot_be_read_are_named_and_the_others_shown() {
+    let directory = TempDir::new().unwrap();
+    let file = directory.path().join("odd.log");
+    let log = b"(1.000000) vcan0 000##500000000000000000000000000000A6A\n\
+                (1.000000) vcan0 12#11\n\
+                DROPCOUNT: dropped 12 CAN frames on 'vcan0' socket (total drops 40)\n\
+                (1.000000) vcan0 \xff\n\
+                (1.000000) vcan0 00242###81000000000011.\n\
+                (1.000000) vcan0 1F334455#R4\n";
+    std::fs::write(&file, log).unwrap();
+    let Output { status, stdout, stderr } = gateway("dump").arg(&file).output().unwrap();
+    assert_eq!(status.code(), Some(0));
+    assert_eq!(decoded(text(&stdout)), ["ok      halt", "foreign remote frame"]);
+    let name = file.display();
+    let expected = format!(
+        "{name}:2: column 18: an identifier of 3 or 8 hexadecimal digits\n\
+         {name}:3: 12 frames are missing here: the recorder lost them\n\
+         {name}:4: column 18: an identifier of 3 or 8 hexadecimal digits\n\
+         {name}: 2 of 6 lines could not be read\n\
+         {name}: CAN XL frames are not shown: 1\n"
+    );
+    assert_eq!(text(&stderr), expected);
+}
+
+#[test]
+fn a_reader_that_leaves_ends_it_quietly() {
+    let directory = TempDir::new().unwrap();
+    let file = directory.path().join("long.log");
+    let (_, frame) = FD.lines().find(|line| line.starts_with('(')).unwrap().split_once(' ').unwrap();
+    let lines: Vec<_> = (0..40_000).map(|second| format!("({second}.000000) {frame}\n")).collect();
+    std::fs::write(&file, lines.concat()).unwrap();
+    let mut child = gateway("dump").arg(&file).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut line = String::new();
+    BufReader::with_capacity(16, child.stdout.take().unwrap()).read_line(&mut line).unwrap();
+    assert!(line.ends_with("\tok      halt\n"), "{line}");
+    let Output { status, stderr, .. } = child.wait_with_output().unwrap();
+    assert_eq!((status.code(), text(&stderr)), (Some(0), ""));
+}
+
+#[test]
+fn frames_are_those_of_the_document() {
+    let pose = "0.1 0.05 0.06 0 0.8 0.6";
+    let half_pi = "1.5707963267948966";
+    for (arguments, tag) in [
+        ("halt".to_owned(), None),
+        ("sync".to_owned(), None),
+        ("resume".to_owned(), None),
+        ("joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0".to_owned(), None),
+        ("joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0".to_owned(), None),
+        ("configure --node 12 --write mount 2 6".to_owned(), Some(1)),
+        (format!("configure --node 12 --write pose {pose}"), Some(2)),
+        ("configure --node 12 --write contact 1 0 0.1 0.05 0.1".to_owned(), Some(3)),
+        ("configure --node 12 --write timing 16000".to_owned(), Some(4)),
+        (format!("configure --node 12 --write row1 0 0.089159 {half_pi} 0"), Some(5)),
+        ("configure --node 12 --write row2 -0.425 0 0 0".to_owned(), Some(6)),
+        ("configure --node 12 --write row3 -0.39225 0 0 0".to_owned(), Some(7)),
+        (format!("configure --node 12 --write row4 0 0.10915 {half_pi} 0"), Some(8)),
+        (format!("configure --node 12 --write row5 0 0.09465 -{half_pi} 0"), Some(9)),
+        ("configure --node 12 --write row6 0 0.0823 0 0".to_owned(), Some(10)),
+        ("configure --node 12 --write commit 266D".to_owned(), Some(11)),
+        ("configure --node 12 --write mode 1".to_owned(), Some(12)),
+        ("stimulus --node 12 --force 3.0".to_owned(), None),
+        ("stimulus --node 12".to_owned(), None),
+    ] {
+        let tag = tag.map(|tag| format!(" --tag {tag}")).unwrap_or_default();
+        let line = output(gateway(&format!("frame {arguments}{tag}")));
+        let (id, data) = line.trim_end().split_once("##1").unwrap();
+        let there = [1, 5].iter().any(|flags| DOCUMENT.contains(&format!("{id}##{flags}{data}")));
+        assert!(there, "{arguments}: {line}is not in the document");
+    }
+    // The document writes these with the very flags.
+    let line = output(gateway("frame stimulus --node 12 --force 3.0"));
+    assert!(DOCUMENT.contains(&format!("cansend vcan0 {}", line.trim_end())), "{line}");
+}
+
+#[test]
+fn frames_mean_what_was_requested() {
+    for (arguments, meaning) in [
+        ("report", "report"),
+        (
+            "stimulus --node everyone --epoch 7 --force 1 --proximity 0.5 --temperature 25 -40",
+            "stimulus everyone from epoch 7 on: force 1.000 N (0.334 0.333 0.333), proximity 0.5000, temperature 25.00 -40.00 °C",
+        ),
+        (
+            "stimulus --node 254 --acceleration 0 -1 0.5",
+            "stimulus 254 from the next joints on: acceleration 0.0000 -1.0000 0.5000 g",
+        ),
+        ("configure --node everyone --read identity --tag 255", "configure everyone tag 255: read identity"),
+        (
+            "configure --node 1 --write 99 1 -1 0x7FFF",
+            "configure 1 tag 0: write parameter 99: words 1 -1 32767 0 0 0",
+        ),
+    ] {
+        for format in [Format::Fd, Format::Classic] {
+            let name = if format == Format::Fd { "fd" } else { "classic" };
+            let lines = output(gateway(&format!("frame {arguments} --format {name}")));
+            let frames: Vec<_> = lines.lines().map(|line| candump::parse_frame(line).unwrap()).collect();
+            Message::decode(&packet(&frames, format)).unwrap();
+            let log: String = lines.lines().map(|line| format!("(1.000000) vcan0 {line}\n")).collect();
+            let directory = TempDir::new().unwrap();
+            let file = directory.path().join("frames.log");
+            std::fs::write(&file, log).unwrap();
+            let shown = output(gateway(&format!("dump {}", file.display())));
+            assert_eq!(*decoded(&shown).last().unwrap(), format!("ok      {meaning}"), "{arguments}");
+        }
+    }
+}
+
+/// The packet in one FD frame or two classic ones.
+fn packet(frames: &[Frame], format: Format) -> Packet {
+    match (format, frames) {
+        (Format::Fd, [frame]) => Packet::from_fd(frame).unwrap(),
+        (Format::Classic, [first, second]) => {
+            let mut segment = Segment::NONE;
+            let mut push = |frame: &Frame| {
+                segment.push(Micros(0), data_id(frame).unwrap(), Lengths::ALL, frame.data()).unwrap()
+            };
+            assert_eq!(push(first), Reassembly::Waiting);
+            let Reassembly::Complete(packet) = push(second) else { panic!("{frames:?}") };
+            packet
+        }
+        (Format::Fd | Format::Classic, _) => panic!("{frames:?}"),
+    }
+}
+
+#[test]
+fn wrong_use_is_one_line_and_exit_code_2() {
+    for (arguments, expected) in [
+        ("frame stimulus --node 300", "--node 300: a node id, 1 to 254, or everyone is possible"),
+        ("frame stimulus --node 12 --force 100", "--force 100: three contact words hold -96 to 95.997 N"),
+        ("frame stimulus", "the following required arguments were not provided: --node <NODE>; try '--help'"),
+        (
+            "frame joints --epoch 256 --rad 0",
+            "invalid value '256' for '--epoch <E>': 256 is not in 0..=255; try '--help'",
+        ),
+        ("frame configure --node 12 --write mode 2", "mode = 2: 0 measures, 1 obeys stimuli"),
+        (
+            "dump run.log --from -1",
+            "invalid value '-1' for '--from <S>': a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h); try '--help'",
+        ),
+        ("dump / ", "/ is a directory: name a candump log or a bus"),
+        (
+            "skin generate --cells 255",
+            "255 cells do not fit on one bus: a bus has 254 node ids; use --buses 2",
+        ),
+        ("skin check /nowhere.toml", "/nowhere.toml: No such file or directory (os error 2)"),
+        (
+            "run skin.toml scenario.toml",
+            "scenario.toml comes after the skin: a scenario is given by --scenario scenario.toml",
+        ),
+        ("skin chek", "unrecognized subcommand 'chek'; a similar subcommand exists: 'check'; try '--help'"),
+        ("dump nosuch.mcap", "there is no file nosuch.mcap, and no bus of that name: say where the file is"),
+        ("dump a/b.log", "there is no file a/b.log, and no bus of that name: say where the file is"),
+    ] {
+        assert_eq!(refusal(arguments, 2), format!("gateway: {expected}"), "{arguments}");
+    }
+    for command in ["dump", "ack"] {
+        let said = refusal(&format!("{command} nosuch --bus-kind embedded"), 2);
+        let expected = "gateway: there is no file nosuch, and as a bus: no embedded bus nosuch is served in ";
+        assert!(said.starts_with(expected), "{said}");
+    }
+    let said = refusal("list", 2);
+    assert!(said.starts_with("gateway: there is no command list; there are demo, run, "), "{said}");
+    assert!(said.contains(", cells, "), "{said}");
+    let skin = format!("{}/Cargo.toml", env!("CARGO_MANIFEST_DIR"));
+    let said = refusal(&format!("dump {skin}"), 1);
+    assert!(said.contains("there is no frame in "), "{said}");
+}
+
+#[test]
+fn the_example_is_what_the_command_in_its_header_prints() {
+    let example = include_str!("../../examples/ur5-253.toml");
+    let command = example.lines().next().unwrap().strip_prefix("# gateway ").unwrap();
+    assert!(output(gateway(command)) == example, "generate it with gateway {command}");
+}
+
+#[test]
+fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
+    let directory = TempDir::new().unwrap();
+    let file = directory.path().join("skin.toml");
+    let generate = "skin generate --cells 3 --buses 2 --reply sum";
+    assert_eq!(output(gateway(&format!("{generate} -o {}", file.display()))), "");
+    assert_eq!(std::fs::read_to_string(&file).unwrap(), output(gateway(generate)));
+    assert_eq!(names(directory.path()), ["skin.toml"]);
+    let nowhere = directory.path().join("none/skin.toml");
+    let nowhere = format!("-o {}", nowhere.display());
+    let why = "No such file or directory (os error 2); name a file in a folder that can be written";
+    assert_eq!(refusal(&format!("{generate} {nowhere}"), 2), format!("gateway: {nowhere}: {why}"));
+
+    let shown = output(gateway(&format!("skin check {}", file.display())));
+    let (hash, lines): (Vec<_>, Vec<_>) = shown.lines().partition(|line| line.starts_with("hash: "));
+    let expected = [
+        "ur5-3: 3 cells, 2 buses",
+        "robot: UR5, 6 joints",
+        "timing: control loop 500 Hz, joints 62.5 Hz (every 16000 us), kinesthetic controller",
+        "bus vcan0 (fd, sum, slots of 6000 us): 2 cells: 2 on joint 2; root 1",
+        "bus vcan1 (fd, sum, slots of 12000 us): 1 cell: 1 on joint 3; root 1",
+    ];
+    assert_eq!((hash.len(), lines), (1, expected.to_vec()));
+
+    let skin = protocol::skin::Skin::read(&file).unwrap();
+    let shown = output(gateway(&format!("skin check --cells {}", file.display())));
+    let hash = skin.parameters(&skin.cells[2]).hash();
+    let ([x, y, z], line) = (skin.cells[2].position, shown.lines().last().unwrap());
+    assert!(line.starts_with(&format!("vcan1 1 joint 3 at {x} {y} {z} m normal ")), "{line}");
+    assert!(line.ends_with(&format!(" ports - - - - root serial 200001 hash {hash:04X}")), "{line}");
+    assert_eq!(output(gateway(&format!("skin check --node 2 {}", file.display()))).lines().count(), 1);
+    let said = refusal(&format!("skin check --node 9 {}", file.display()), 2);
+    assert!(said.ends_with("has no such cell on vcan0, vcan1; --cells lists all"), "{said}");
+}
+
+#[test]
+fn a_check_shows_bit_rates_and_cells_at_one_place() {
+    let directory = TempDir::new().unwrap();
+    let file = directory.path().join("skin.toml");
+    let text = output(gateway("skin generate --cells 3 --buses 2"));
+    let text = text.replacen("format = \"fd\"", "format = \"fd\"\nbitrate = 500000", 1);
+    let last = &text[text.rfind("[[cell]]").unwrap()..];
+    let another = last.replace("node = 1", "node = 7").replace("serial = 200001", "serial = 200007");
+    std::fs::write(&file, format!("{text}\n{another}")).unwrap();
+    let shown = output(gateway(&format!("skin check {}", file.display())));
+    assert!(shown.contains("bus vcan0 (fd, 500000 bit/s, torque): 2 cells"), "{shown}");
+    assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 sit at one place"), "{shown}");
+}
+
+/// A scenario's file beside a skin of three cells, and what is said of it.
+fn checked(scenario: &str, options: &str) -> Output {
+    let directory = TempDir::new().unwrap();
+    let [skin, file] = ["skin.toml", "s.toml"].map(|name| directory.path().join(name));
+    output(gateway(&format!("skin generate --cells 3 -o {}", skin.display())));
+    std::fs::write(&file, scenario).unwrap();
+    let line = format!("scenario check s.toml --skin skin.toml {options}");
+    gateway(&line).current_dir(directory.path()).output().unwrap()
+}
+
+#[test]
+fn a_scenario_is_shown_in_the_order_of_time() {
+    let scenario = "[[fault]]\nat_s = 3.0\nkind = \"kill\"\ncells = [2]\n\
+                    [[touch]]\nat_s = 1.0\nfor_s = 0.5\nall = true\nforce_n = 2.0\nprofile = \"ramp\"\n\
+                    [[touch]]\ncells = [1, 3]\nforce_n = 3.0\n";
+    let Output { status, stdout, stderr } = checked(scenario, "--json");
+    assert_eq!((status.code(), text(&stderr)), (Some(0), ""));
+    let plan: serde_json::Value = serde_json::from_slice(&stdout).unwrap();
+    assert_eq!((&plan["duration_s"], &plan["motion"]["kind"]), (&10.0.into(), &"kinesthetic".into()));
+    let events: Vec<_> =
+        plan["events"].as_array().unwrap().iter().map(|it| (&it["what"], &it["cells"])).collect();
+    let cells = |nodes: &[u8]| serde_json::json!(nodes);
+    let expected = [("touch", cells(&[1, 3])), ("touch", cells(&[1, 2, 3])), ("kill", cells(&[2]))];
+    let expected = expected.map(|(what, cells)| (serde_json::json!(what), cells));
+    assert_eq!(events, expected.each_ref().map(|(what, cells)| (what, cells)));
+    assert_eq!((&plan["events"][1]["force_n"], &plan["events"][1]["for_s"]), (&2.0.into(), &0.5.into()));
+    let Output { stdout, .. } = checked(scenario, "");
+    let shown = text(&stdout);
+    let rows: Vec<_> = shown.lines().filter(|line| line.contains("vcan0")).collect();
+    assert!(
+        rows.len() == 3 && rows[1].contains("1-3") && rows[1].contains("force_n 2.0, profile ramp"),
+        "{shown}"
+    );
+}
+
+#[test]
+fn what_is_wrong_with_a_scenario_has_a_line_and_a_column() {
+    let said = |scenario: &str| {
+        let Output { status, stderr, .. } = checked(scenario, "");
+        assert_eq!(status.code(), Some(2));
+        text(&stderr).trim_end().to_owned()
+    };
+    let wrong = said("[[touch]]\ncells = [1, 9]\nforce_n = 3.0\n");
+    assert_eq!(wrong, "gateway: s.toml:2:13: touch[0].cells[1] = 9: no cell of \"vcan0\" has this node");
+    let drop = "[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\n";
+    let refused = said(drop);
+    assert!(refused.starts_with("gateway: the fault \"drop\" of vcan0 at 1 s: a run"), "{refused}");
+}
+
+#[test]
+fn times_are_taken_with_and_without_a_unit() {
+    let shown = |from: &str| output(gateway(&format!("dump {} --from {from}", golden("session.log"))));
+    assert_eq!(shown("0.002"), shown("2ms"));
+    assert_ne!(shown("2ms"), shown("2s"));
+    for wrong in ["10x", "s", "0s", "-1min"] {
+        let said = refusal(&format!("run skin.toml --duration={wrong}"), 2);
+        assert!(said.contains("a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h)"), "{said}");
+    }
+    let said = refusal("run nosuch.toml --duration 10s --record-split 1.5min --record x.mcap", 2);
+    assert!(said.contains("nosuch.toml: No such file"), "both are taken: {said}");
+}
+
+#[test]
+fn a_report_says_that_it_is_no_recording_before_that_the_page_is_there() {
+    let directory = TempDir::new().unwrap();
+    let file = directory.path().join("x.json");
+    std::fs::write(&file, "{}").unwrap();
+    std::fs::write(file.with_extension("html"), "").unwrap();
+    let said = refusal(&format!("report {}", file.display()), 2);
+    assert!(said.contains("x.json is no MCAP recording"), "{said}");
+}
+
+fn names(directory: &Path) -> Vec<String> {
+    let entries = std::fs::read_dir(directory).unwrap();
+    entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect()
+}
+
+/// The skin's URDF is looked at as a run that records looks at it.
+#[test]
+fn a_check_refuses_what_a_recorded_run_would_refuse() {
+    let folder = TempDir::new().unwrap();
+    let skin = folder.path().join("skin.toml");
+    let text = output(gateway("skin generate --cells 8"));
+    let with = |urdf: &str| text.replacen("[robot]\n", &format!("[robot]\nurdf = \"{urdf}\"\n"), 1);
+    std::fs::write(folder.path().join("empty.urdf"), "").unwrap();
+    for (urdf, why) in
+        [("/dev/zero", "it is a device"), ("nothing.urdf", "No such file"), ("empty.urdf", "empty.urdf")]
+    {
+        std::fs::write(&skin, with(urdf)).unwrap();
+        let said = refusal(&format!("skin check {}", skin.display()), 2);
+        assert!(said.starts_with("gateway: robot.urdf: ") && said.contains(why), "{said}");
+    }
+}
+
+#[test]
+fn every_command_has_help_with_an_example() {
+    for command in [
+        "dump",
+        "frame",
+        "frame halt",
+        "frame resume",
+        "frame sync",
+        "frame report",
+        "frame joints",
+        "frame stimulus",
+        "frame configure",
+        "ack",
+        "skin generate",
+        "skin check",
+        "skin import",
+        "skin show",
+        "torque",
+        "scenario check",
+    ] {
+        let help = output(gateway(&format!("{command} --help")));
+        assert!(
+            help.contains("Example") && help.contains(&format!("  gateway {command}")),
+            "{command}: {help}"
+        );
+    }
+}
+
+#[test]
+fn what_is_no_file_or_too_long_is_not_read() {
+    let urdf = format!("{}/examples/panda.urdf", env!("CARGO_MANIFEST_DIR"));
+    let folder = tempfile::tempdir().unwrap();
+    let long = folder.path().join("long.toml");
+    std::fs::File::create(&long).unwrap().set_len((16 << 20) + 1).unwrap();
+    let long = long.to_str().unwrap();
+    let too_long = "it is longer than 16777216 bytes, the most that are read";
+    for (file, why) in [("/dev/zero", "it is a device, a file is needed"), (long, too_long)] {
+        for command in [
+            format!("skin check {file}"),
+            format!("skin import {file} --tip hand"),
+            format!("skin import {urdf} --tip hand --cells {file}"),
+        ] {
+            let said = refusal(&command, 2);
+            assert!(said.contains(&format!("{file}: {why}")), "{said}");
+        }
+    }
+}

@@ -1,0 +1,103 @@
+//! `gateway fit` as a process: its output as in the documents, and its errors.
+#![allow(clippy::unwrap_used, reason = "a test may stop")]
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+const BUS_MD: &str = include_str!("../../../docs/how-to/size-a-bus.md");
+
+fn gateway(arguments: &str) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    command.args(arguments.split_whitespace()).current_dir(root).env("NO_COLOR", "1").output().unwrap()
+}
+
+fn output(arguments: &str) -> String {
+    let Output { status, stdout, stderr } = gateway(arguments);
+    let said = String::from_utf8(stderr).unwrap();
+    assert_eq!((status.code(), said.as_str()), (Some(0), ""), "{arguments}");
+    String::from_utf8(stdout).unwrap()
+}
+
+/// The one-line error of a command that ends with 2 and prints nothing.
+fn refusal(arguments: &str) -> String {
+    let Output { status, stdout, stderr } = gateway(arguments);
+    let said = String::from_utf8(stderr).unwrap();
+    assert_eq!((status.code(), stdout.as_slice()), (Some(2), b"".as_slice()), "{arguments}: {said}");
+    assert_eq!(said.matches('\n').count(), 1, "{arguments}: {said}");
+    said.trim_end().to_owned()
+}
+
+#[test]
+fn the_documents_show_what_is_printed() {
+    let table = output("fit gateway/examples/ur5-253.toml");
+    assert!(BUS_MD.contains(&table), "docs/how-to/size-a-bus.md has another table than\n{table}");
+    let one = output("fit gateway/examples/ur5-253.toml --nominal 1M --data 5M");
+    assert!(BUS_MD.contains(&one), "docs/how-to/size-a-bus.md has another page than\n{one}");
+}
+
+#[test]
+fn rates_are_those_of_the_command_line_or_of_the_description_or_common_ones() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    let plain = output("skin generate --cells 90 --buses 2");
+    let with_rates =
+        plain.replace("format = \"fd\"", "format = \"fd\"\nbitrate = 500000\ndata_bitrate = 2000000");
+    let mixed = with_rates.replacen("\nbitrate = 500000\ndata_bitrate = 2000000", "", 1);
+    for (name, text) in [("plain", &plain), ("rates", &with_rates), ("mixed", &mixed)] {
+        std::fs::write(path(name), text).unwrap();
+    }
+    let json = |arguments: &str| -> Value { serde_json::from_str(&output(arguments)).unwrap() };
+    let names = |json: &Value, list: &str| -> Vec<String> {
+        let list = json[list].as_array().unwrap();
+        list.iter().map(|it| it["name"].as_str().unwrap().to_owned()).collect()
+    };
+    let described = json(&format!("fit {} --json", path("rates")));
+    assert_eq!(names(&described, "buses"), ["500k/2M", "500k/2M"]);
+    assert_eq!(described["whole"]["cells"], 90);
+    let given = json(&format!("fit {} --nominal 1M --data 8M --json", path("rates")));
+    assert_eq!(names(&given, "buses"), ["1M/8M", "1M/8M"]);
+    let classic = json(&format!("fit {} --nominal 1M --format classic --json", path("plain")));
+    assert_eq!(names(&classic, "buses"), ["classic 1M", "classic 1M"]);
+    let all = ["classic 500k", "classic 1M", "500k/2M", "500k/5M", "1M/2M", "1M/5M", "1M/8M"];
+    for arguments in [path("plain"), path("mixed"), format!("{} --table", path("rates"))] {
+        assert_eq!(names(&json(&format!("fit {arguments} --json")), "table"), all);
+    }
+    let said = |name: &str| String::from_utf8(gateway(&format!("fit {}", path(name))).stderr).unwrap();
+    assert_eq!(said("mixed"), "no bitrate of vcan0: these are common bit rates, not those of ur5-90\n");
+    assert_eq!(said("plain") + &said("rates"), "");
+    let only = json(&format!("fit {} --format classic --json", path("plain")));
+    assert_eq!(names(&only, "table"), all[..2]);
+    // A cell that computes longer answers later by that.
+    let last = |arguments: &str| {
+        let json = json(&format!("fit {} {arguments} --json", path("rates")));
+        json["buses"][0]["last_answer_us"].as_f64().unwrap()
+    };
+    assert!((last("--computation 168.5") - last("") - 100.0).abs() < 1e-6);
+}
+
+#[test]
+fn what_can_does_not_allow_is_refused_in_one_line() {
+    let skin = "gateway/examples/ur5-253.toml";
+    for (arguments, said) in [
+        ("--nominal 0", "nominal bit rate 0 bit/s: CAN allows 10000 to 1000000 (10k to 1M)"),
+        ("--nominal 2M --data 5M", "nominal bit rate 2000000 bit/s: CAN allows 10000 to 1000000 (10k to 1M)"),
+        (
+            "--nominal 1M --data 9M",
+            "data bit rate 9000000 bit/s: CAN FD allows 1000000 (the nominal one) to 8000000 (8M)",
+        ),
+        ("--nominal 1M", "CAN FD needs a data bit rate: add --data, 1000000 to 8000000, or --format classic"),
+        (
+            "--nominal 1M --data 5M --format classic",
+            "--data is for CAN FD, and here all buses are classic: leave it out, or add --format fd",
+        ),
+    ] {
+        assert_eq!(refusal(&format!("fit {skin} {arguments}")), format!("gateway: {said}"));
+    }
+    for arguments in ["--data 5M", "--nominal fast --data 5M", "--table --nominal 1M", "--computation nan"] {
+        assert!(refusal(&format!("fit {skin} {arguments}")).ends_with("try '--help'"));
+    }
+    assert!(refusal("fit nothing.toml").contains("nothing.toml"));
+}

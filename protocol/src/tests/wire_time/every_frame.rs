@@ -1,0 +1,195 @@
+//! The worst and the best classic frame, by going through every frame there is.
+//!
+//! A frame's stuff bits depend on its past only through the state of the run (8 of them) and, for what the CRC will be, through
+//! its register (2^15). Whatever identifier and data lead to the same pair are the same from there on, so all of
+//! them are gone through together: backwards from the CRC over the data, and forwards over the identifier.
+
+use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Frame};
+use crate::wire_time::{Bits, Coding, Shape};
+
+/// States of a run times values of the register.
+const PAIRS: usize = 8 << 15;
+/// Nothing leads here.
+const NEVER: [u8; 2] = [u8::MAX, 0];
+
+/// The minimum and the maximum number of stuff bits, for each pair.
+type Counts = Vec<[u8; 2]>;
+
+/// A run of one to four equal bits, and one bit more: the run that follows, and whether a stuff bit came.
+fn run_on(run: usize, bit: usize) -> (usize, u8) {
+    let (last, length) = (run / 4, run % 4 + 1);
+    match (last == bit, length) {
+        (false, _) => (bit * 4, 0),
+        (true, 4) => ((1 - bit) * 4, 1),
+        (true, _) => (run + 1, 0),
+    }
+}
+
+/// For each pair and bit the pair that follows, and whether a stuff bit came.
+struct Steps(Vec<[(u32, u8); 2]>);
+
+impl Steps {
+    fn all() -> Self {
+        let step = |pair: usize, bit: usize| {
+            let (register, (run, stuffed)) = (pair / 8, run_on(pair % 8, bit));
+            let shifted = (register << 1) & 0x7FFF;
+            let register = if register >> 14 == bit { shifted } else { shifted ^ 0x4599 };
+            (u32::try_from(register * 8 + run).unwrap(), stuffed)
+        };
+        Self((0..PAIRS).map(|pair| [step(pair, 0), step(pair, 1)]).collect())
+    }
+
+    fn follow(&self, pair: usize, bit: usize) -> (usize, u8) {
+        let (next, stuffed) = self.0[pair][bit];
+        (next as usize, stuffed)
+    }
+
+    /// Adds what one free bit before them adds.
+    fn with_a_free_bit(&self, after: &Counts) -> Counts {
+        let mut counts = Vec::with_capacity(PAIRS);
+        for &[(zero, if_zero), (one, if_one)] in &self.0 {
+            let ([min_zero, max_zero], [min_one, max_one]) = (after[zero as usize], after[one as usize]);
+            let min = (min_zero + if_zero).min(min_one + if_one);
+            counts.push([min, (max_zero + if_zero).max(max_one + if_one)]);
+        }
+        counts
+    }
+
+    /// Goes forward over some bits: each fixed, or (`None`) both ways.
+    fn forward(&self, mut reached: Counts, bits: impl IntoIterator<Item = Option<usize>>) -> Counts {
+        for bit in bits {
+            let mut then = vec![NEVER; PAIRS];
+            for (pair, &counts) in reached.iter().enumerate() {
+                if counts == NEVER {
+                    continue;
+                }
+                for bit in bit.map_or(0..=1, |bit| bit..=bit) {
+                    let (next, stuffed) = self.follow(pair, bit);
+                    then[next] = wider(then[next], plus(counts, stuffed));
+                }
+            }
+            reached = then;
+        }
+        reached
+    }
+
+    /// Up to the DLC: of requests and of data frames.
+    fn heads(&self, extended: bool) -> [Counts; 2] {
+        let mut idle = vec![NEVER; PAIRS];
+        // One recessive bit, which the first bit of the frame ends.
+        idle[4] = [0, 0];
+        let (one, zero) = (Some(1), Some(0));
+        let reached = self.forward(idle, [zero].into_iter().chain([None; 11]));
+        if extended {
+            let reached = self.forward(reached, [one, one].into_iter().chain([None; 18]));
+            [self.forward(reached.clone(), [one, zero, zero]), self.forward(reached, [zero; 3])]
+        } else {
+            [self.forward(reached.clone(), [one, zero, zero]), self.forward(reached, [zero; 3])]
+        }
+    }
+
+    /// Over all identifiers and all that follows the DLC.
+    fn over_all(&self, heads: &Counts, dlc: usize, rest: &Counts) -> [u32; 2] {
+        let mut over_all = NEVER;
+        for (pair, &[min, max]) in heads.iter().enumerate().filter(|&(_, &counts)| counts != NEVER) {
+            let (pair, stuffed) = (0..4).rev().fold((pair, 0), |(pair, sum), place| {
+                let (pair, stuffed) = self.follow(pair, dlc >> place & 1);
+                (pair, sum + stuffed)
+            });
+            let [rest_min, rest_max] = rest[pair];
+            over_all = wider(over_all, [min + stuffed + rest_min, max + stuffed + rest_max]);
+        }
+        over_all.map(u32::from)
+    }
+}
+
+fn wider([min, max]: [u8; 2], [other_min, other_max]: [u8; 2]) -> [u8; 2] {
+    [min.min(other_min), max.max(other_max)]
+}
+
+fn plus([min, max]: [u8; 2], stuffed: u8) -> [u8; 2] {
+    [min + stuffed, max + stuffed]
+}
+
+/// What the 15 bits of the CRC add.
+fn of_the_crc() -> Counts {
+    let count = |pair: usize| {
+        let step = |(run, sum), place: usize| {
+            let (run, stuffed) = run_on(run, (pair / 8) >> place & 1);
+            (run, sum + stuffed)
+        };
+        (0..15).rev().fold((pair % 8, 0), step).1
+    };
+    (0..PAIRS).map(|pair| [count(pair); 2]).collect()
+}
+
+/// The bits of a classic frame that are not stuff bits.
+fn plain(extended: bool, bytes: usize) -> u32 {
+    let head_and_tail = if extended { 67 } else { 47 };
+    head_and_tail + 8 * u32::try_from(bytes).unwrap()
+}
+
+#[test]
+fn no_classic_frame_is_longer_or_shorter_and_one_is_as_long_and_one_as_short() {
+    let steps = Steps::all();
+    let heads = [steps.heads(false), steps.heads(true)];
+    let compare = |coding, extended, len: usize, bytes, [min, max]: [u32; 2]| {
+        let shape = Shape { coding, extended, len: u8::try_from(len).unwrap() };
+        let plain = plain(extended, bytes);
+        assert_eq!((shape.best().nominal, shape.worst().nominal), (plain + min, plain + max), "{shape:?}");
+        assert_eq!((shape.best().data, shape.worst().data), (0, 0));
+    };
+    let mut rest = of_the_crc();
+    for ([remote, _], extended) in heads.iter().zip([false, true]) {
+        for requested in 0..=8 {
+            compare(Coding::Remote, extended, requested, 0, steps.over_all(remote, requested, &rest));
+        }
+    }
+    for len in 0..=8 {
+        for ([_, data], extended) in heads.iter().zip([false, true]) {
+            compare(Coding::Classic, extended, len, len, steps.over_all(data, len, &rest));
+        }
+        for _ in 0..if len < 8 { 8 } else { 0 } {
+            rest = steps.with_a_free_bit(&rest);
+        }
+    }
+}
+
+/// The minimum and the maximum of all bits, and of the data bits, of some frames.
+fn ends(frames: impl Iterator<Item = Frame>) -> (Bits, Bits) {
+    let start = (Bits { nominal: u32::MAX, data: u32::MAX }, Bits::default());
+    frames.map(|frame| Bits::of(&frame).unwrap()).fold(start, |(best, worst), bits| {
+        (
+            Bits { nominal: best.nominal.min(bits.nominal), data: best.data.min(bits.data) },
+            Bits { nominal: worst.nominal.max(bits.nominal), data: worst.data.max(bits.data) },
+        )
+    })
+}
+
+#[test]
+fn short_frames_one_by_one_are_within_the_bounds_and_reach_them() {
+    let flags = [0, BIT_RATE_SWITCH].map(|switch| [switch, switch | ERROR_STATE]);
+    // Each identifier with each byte.
+    let short = || (0..0x800_u32).flat_map(|id| (0..=u8::MAX).map(move |byte| (id, byte)));
+    let classic = short().map(|(id, byte)| Frame::classic(id, &[byte]).unwrap());
+    let shape = Shape { coding: Coding::Classic, extended: false, len: 1 };
+    assert_eq!(ends(classic), (shape.best(), shape.worst()));
+    for (coding, flags) in [Coding::Fd, Coding::FdSwitched].into_iter().zip(flags) {
+        // What follows BRS does not know the identifier: every identifier, then every content.
+        let ids = (0..0x800).flat_map(|id| flags.map(|flags| Frame::fd(id, flags, &[0x55]).unwrap()));
+        let ids = ends(ids);
+        let id = (0..0x800).find(|&id| {
+            let bits = Bits::of(&Frame::fd(id, flags[0], &[0x55]).unwrap()).unwrap();
+            bits.nominal == ids.1.nominal
+        });
+        for len in 0..=2_u8 {
+            let contents = 0..=(if len == 0 { 0 } else { u16::MAX });
+            let frames = contents.flat_map(|word| {
+                let bytes = word.to_be_bytes();
+                flags.map(|flags| Frame::fd(id.unwrap(), flags, &bytes[..usize::from(len)]).unwrap())
+            });
+            let shape = Shape { coding, extended: false, len };
+            assert_eq!(ends(frames).1, shape.worst(), "{shape:?}");
+        }
+    }
+}

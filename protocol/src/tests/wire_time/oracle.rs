@@ -1,0 +1,86 @@
+//! A frame written out bit by bit, with nothing clever in it.
+
+use crate::can::{BIT_RATE_SWITCH, ERROR_STATE, Format, Frame};
+use crate::wire_time::Bits;
+
+/// The `count` lowest bits of a word, the most significant first.
+fn push(to: &mut Vec<bool>, word: u32, count: u32) {
+    to.extend((0..count).rev().map(|place| (word >> place) & 1 == 1));
+}
+
+/// CRC-15/CAN by its shift register, as ISO 11898-1 gives it.
+pub(crate) fn crc15(bits: &[bool]) -> u32 {
+    bits.iter().fold(0, |register, &bit| {
+        let feedback = bit != (register >> 14 & 1 == 1);
+        let shifted = (register << 1) & 0x7FFF;
+        if feedback { shifted ^ 0x4599 } else { shifted }
+    })
+}
+
+/// Where stuff bits come: the number of plain bits before each.
+fn stuff_bits(bits: &[bool]) -> Vec<usize> {
+    let (mut places, mut last, mut run) = (Vec::new(), None, 0);
+    for (at, &bit) in bits.iter().enumerate() {
+        run = if last == Some(bit) { run + 1 } else { 1 };
+        last = Some(bit);
+        if run == 5 {
+            places.push(at + 1);
+            (last, run) = (Some(!bit), 1);
+        }
+    }
+    places
+}
+
+/// The bits of a frame.
+pub(crate) fn bits(frame: &Frame) -> Bits {
+    let mut plain = Vec::new();
+    let (fd, id) = (frame.format() == Format::Fd, frame.id());
+    let remote = u32::from(frame.is_remote());
+    push(&mut plain, 0, 1);
+    if frame.is_extended() {
+        push(&mut plain, id >> 18, 11);
+        push(&mut plain, 0b11, 2);
+        push(&mut plain, id, 18);
+    } else {
+        push(&mut plain, id, 11);
+    }
+    let count = |bits: usize| u32::try_from(bits).unwrap();
+    if fd {
+        let lengths = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64];
+        let dlc = lengths.iter().position(|&length| length >= usize::from(frame.len())).unwrap();
+        let switched = frame.flags() & BIT_RATE_SWITCH != 0;
+        // RRS, and IDE where the identifier has 11 bits; FDF, res.
+        push(&mut plain, 0, if frame.is_extended() { 1 } else { 2 });
+        push(&mut plain, 0b10, 2);
+        push(&mut plain, u32::from(switched), 1);
+        let head = plain.len();
+        push(&mut plain, u32::from(frame.flags() & ERROR_STATE != 0), 1);
+        push(&mut plain, count(dlc), 4);
+        for at in 0..lengths[dlc] {
+            push(&mut plain, u32::from(*frame.data().get(at).unwrap_or(&0)), 8);
+        }
+        let places = stuff_bits(&plain);
+        let early = places.iter().filter(|&&at| at < head).count();
+        let late = places.iter().filter(|&&at| at >= head && at < plain.len()).count();
+        // Stuff bit count, CRC, fixed stuff bits, delimiter.
+        let check = if lengths[dlc] > 16 { 4 + 21 + 7 + 1 } else { 4 + 17 + 6 + 1 };
+        // ACK, delimiter, end of frame, intermission.
+        let (nominal, data) = (head + early + 1 + 1 + 7 + 3, plain.len() - head + late + check);
+        return if switched {
+            Bits { nominal: count(nominal), data: count(data) }
+        } else {
+            Bits { nominal: count(nominal + data), data: 0 }
+        };
+    }
+    push(&mut plain, remote, 1);
+    push(&mut plain, 0, 2);
+    push(&mut plain, u32::from(frame.raw_dlc().max(frame.len())), 4);
+    for &byte in frame.data() {
+        push(&mut plain, u32::from(byte), 8);
+    }
+    let crc = crc15(&plain);
+    push(&mut plain, crc, 15);
+    // Delimiter, ACK, delimiter, end of frame, intermission.
+    let bits = plain.len() + stuff_bits(&plain).len() + 1 + 1 + 1 + 7 + 3;
+    Bits { nominal: count(bits), data: 0 }
+}

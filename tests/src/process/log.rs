@@ -1,0 +1,194 @@
+//! What a recorded log shows of its run.
+
+use std::collections::BTreeMap;
+
+use protocol::can::{Format, Frame};
+use protocol::candump::{self, Line};
+use protocol::fixed::Q;
+use protocol::id::{Kind, Node};
+use protocol::message::{From, Heartbeat, Message, NetworkPage, SensorPage, SkinSensors};
+use protocol::packet::{Epoch, Lengths, Packet, Reassembly, Segment, data_id};
+use protocol::parameters::MAX_JOINTS;
+use protocol::time::Micros;
+
+/// A whole log.
+pub struct Log {
+    pub frames: Vec<Frame>,
+    /// What could be decoded, in the bus' order, with its packet.
+    pub messages: Vec<(Message, Packet)>,
+}
+
+/// What a torque is a function of, beside the cell's parameters: its node id, the joints, and its contact state.
+pub type Cause = (u8, [i16; MAX_JOINTS], [i16; 6]);
+
+impl Log {
+    /// Reads a log of one bus; every line must be a frame, or a comment of the recorder.
+    pub fn read(text: &str, format: Format) -> Self {
+        let frame = |line: &str| match candump::parse(line) {
+            Ok(Line::Frame(record)) => record.frame,
+            other => panic!("{line}: {other:?}"),
+        };
+        Self::of(text.lines().filter(|line| !line.starts_with("# ")).map(frame).collect(), format)
+    }
+
+    /// Reads frames of one bus.
+    pub fn of(frames: Vec<Frame>, format: Format) -> Self {
+        let mut segments = BTreeMap::new();
+        let packet = |frame: &Frame| match format {
+            Format::Fd => Packet::from_fd(frame).ok(),
+            Format::Classic => {
+                let id = data_id(frame).ok()?;
+                let segment = segments.entry(id).or_insert(Segment::NONE);
+                match segment.push(Micros(0), id, Lengths::ALL, frame.data()) {
+                    Ok(Reassembly::Complete(packet)) => Some(packet),
+                    _ => None,
+                }
+            }
+        };
+        let messages = frames.iter().filter_map(packet);
+        let messages = messages.filter_map(|packet| Some((Message::decode(&packet).ok()?, packet)));
+        Self { messages: messages.collect(), frames }
+    }
+
+    /// What each sender has sent, in its order; of heartbeats, which are periodic and not caused by events, only
+    /// what they report of a new cell.
+    pub fn by_sender(&self) -> BTreeMap<(Kind, u8, u8), Vec<String>> {
+        let mut all = BTreeMap::<_, Vec<String>>::new();
+        for (message, packet) in &self.messages {
+            let said = match message {
+                Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
+                    format!("{:?}", Heartbeat { sent: 0, ..*heartbeat })
+                }
+                // The epoch of these is that of the joints before them, which depends on time.
+                Message::Network { page, .. } => format!("{page:?}"),
+                Message::Sensors { page, .. } => format!("{page:?}"),
+                other => format!("{other:?}"),
+            };
+            let page = if packet.id.kind == Kind::Network { packet.count } else { 0 };
+            let sayings = all.entry((packet.id.kind, page, packet.id.node)).or_default();
+            let heartbeat = packet.id.kind == Kind::Network && page == 0;
+            if !(heartbeat && sayings.last() == Some(&said)) {
+                sayings.push(said);
+            }
+        }
+        all
+    }
+
+    /// Checks that each heartbeat counts exactly the packets of its cell before it in the log, which
+    /// begins before the cells do.
+    pub fn heartbeats_count_what_came(&self) {
+        let mut sent = BTreeMap::<u8, u16>::new();
+        for (message, packet) in &self.messages {
+            if !packet.id.kind.is_from_cells() {
+                continue;
+            }
+            let sent = sent.entry(packet.id.node).or_default();
+            if let Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } = message {
+                assert_eq!(heartbeat.sent, *sent, "packets of cell {}", packet.id.node);
+            }
+            *sent = sent.wrapping_add(1);
+        }
+        assert!(!sent.is_empty());
+    }
+
+    /// Each broadcast's words.
+    pub fn joints(&self) -> Vec<[i16; MAX_JOINTS]> {
+        let joints = self.messages.iter().filter_map(|(message, _)| match message {
+            Message::Joints { joints, .. } => Some(joints.positions.map(Q::to_bits)),
+            _ => None,
+        });
+        joints.collect()
+    }
+
+    /// How many torques of a cell are after the message at an index.
+    pub fn torques_after(&self, index: usize, cell: u8) -> usize {
+        let torque =
+            |message: &Message| matches!(message, Message::Torque { from, .. } if from.get() == cell);
+        self.messages.iter().skip(index).filter(|(message, _)| torque(message)).count()
+    }
+
+    /// Every torque with its cause and the number of the broadcast that it answers.
+    pub fn torques(&self) -> Vec<(usize, Cause, Packet)> {
+        let mut contact_state: BTreeMap<u8, ContactState> = BTreeMap::new();
+        let mut causes: BTreeMap<(u8, u8), (usize, Cause)> = BTreeMap::new();
+        let (mut number, mut last) = (0, None);
+        let mut torques = Vec::new();
+        for (message, packet) in &self.messages {
+            match *message {
+                Message::Stimulus { to, from, page: SensorPage::Skin(skin) } => {
+                    let Node::Cell(cell) = to else { panic!("a stimulus to {to:?}") };
+                    contact_state.entry(cell.get()).or_default().push(from, skin, last);
+                }
+                Message::Joints { epoch, joints } => {
+                    last = Some(epoch);
+                    for (&cell, contact_state) in &mut contact_state {
+                        contact_state.latch(epoch);
+                        let cause = (cell, joints.positions.map(Q::to_bits), words(&contact_state.now));
+                        causes.insert((cell, epoch.0), (number, cause));
+                    }
+                    number += 1;
+                }
+                Message::Torque { from, epoch, .. } => {
+                    let (number, cause) = causes[&(from.get(), epoch.0)];
+                    torques.push((number, cause, *packet));
+                }
+                _ => {}
+            }
+        }
+        torques
+    }
+}
+
+fn words(skin: &SkinSensors) -> [i16; 6] {
+    let SkinSensors { contact: [a, b, c], proximity, temperature: [d, e] } = *skin;
+    [a.to_bits(), b.to_bits(), c.to_bits(), proximity.to_bits(), d.to_bits(), e.to_bits()]
+}
+
+/// The contact state of a cell, by the protocol's rules, as the document has them.
+#[derive(Default)]
+struct ContactState {
+    waiting: Vec<(From, SkinSensors)>,
+    now: SkinSensors,
+}
+
+impl ContactState {
+    fn push(&mut self, from: From, skin: SkinSensors, last: Option<Epoch>) {
+        let late = matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0);
+        self.waiting.push((if late { From::Next } else { from }, skin));
+    }
+
+    fn latch(&mut self, epoch: Epoch) {
+        for (from, skin) in std::mem::take(&mut self.waiting) {
+            match from {
+                From::Epoch(first) if epoch.since(first) < 0 => self.waiting.push((from, skin)),
+                From::Epoch(_) | From::Next => self.now = skin,
+            }
+        }
+    }
+}
+
+/// Checks that the same causes have the same torques in both runs, bit for bit, and that the same causes at the
+/// same broadcast have the same packets; returns how many causes they share, and how many the smaller has.
+pub fn same_torques(one: &Log, other: &Log) -> (usize, usize) {
+    let [one, other] = [one, other].map(Log::torques);
+    let mut by_cause: BTreeMap<Cause, [i16; MAX_JOINTS]> = BTreeMap::new();
+    let mut by_number: BTreeMap<(usize, Cause), Packet> = BTreeMap::new();
+    for (number, cause, packet) in &one {
+        let words = *by_cause.entry(*cause).or_insert_with(|| packet.words.padded());
+        assert_eq!(words, packet.words.padded(), "one run, twice the same cause: {cause:?}");
+        by_number.insert((*number, *cause), *packet);
+    }
+    let mut shared = BTreeMap::new();
+    let mut causes = BTreeMap::new();
+    for (number, cause, packet) in &other {
+        causes.insert(*cause, ());
+        if let Some(words) = by_cause.get(cause) {
+            assert_eq!(*words, packet.words.padded(), "the same cause in two runs: {cause:?}");
+            shared.insert(*cause, ());
+        }
+        if let Some(before) = by_number.get(&(*number, *cause)) {
+            assert_eq!(before, packet, "broadcast {number}, {cause:?}");
+        }
+    }
+    (shared.len(), by_cause.len().min(causes.len()))
+}

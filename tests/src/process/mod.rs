@@ -1,0 +1,146 @@
+//! A bench of real processes on a bus of its own, embedded or a real kernel's: what all tests of this kind share.
+//!
+//! Nothing here waits for a fixed time: conditions are polled until they hold, or until [`TIMEOUT`]
+//! is over, which a slow machine never needs and a hanging program does.
+#![allow(
+    missing_docs,
+    missing_debug_implementations,
+    clippy::missing_panics_doc,
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::wildcard_enum_match_arm,
+    reason = "what tests share: it may stop, and short helpers explain themselves"
+)]
+
+pub mod browser;
+pub mod buses;
+pub mod external;
+pub mod log;
+pub mod page;
+mod place;
+pub mod recorded;
+pub mod replay;
+mod running;
+pub mod served;
+pub mod setup;
+pub mod slcan;
+mod summary;
+pub mod sums;
+pub mod test_client;
+pub mod vcan;
+pub mod whole;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use model::generate::{Format, Target, generate};
+use rustix::process::{Pid, Signal, kill_process};
+
+use running::proc;
+
+pub use place::Place;
+pub use running::{Ended, Running};
+pub use summary::Summary;
+
+/// How long anything may take that should happen at once.
+pub const TIMEOUT: Duration = Duration::from_secs(40);
+
+/// Every cell is pressed, harder and softer, while the arm stands.
+pub const PRESSED: &str = r#"version = 1
+duration_s = 60.0
+
+[motion]
+kind = "hold"
+start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]
+
+[[mode]]
+at_s = 0.0
+kind = "compare"
+
+[[touch]]
+at_s = 0.0
+for_s = 60.0
+all = true
+force_n = 1.5
+profile = "step"
+"#;
+
+/// Polls until something is there.
+pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
+    let give_up = Instant::now() + TIMEOUT;
+    loop {
+        if let Some(found) = look() {
+            return found;
+        }
+        assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// A program of this build, which `cargo test` of this package alone does not make; or one from the folder that
+/// `SKINBUS_PROGRAMS` names.
+pub fn program(name: &str) -> PathBuf {
+    if let Some(folder) = std::env::var_os("SKINBUS_PROGRAMS") {
+        let path = Path::new(&folder).join(name);
+        assert!(path.is_file(), "{} is missing: build it, or unset SKINBUS_PROGRAMS", path.display());
+        return path;
+    }
+    let own = std::env::current_exe().unwrap();
+    let folder = own.parent().and_then(Path::parent).expect("tests lie in target/PROFILE/deps");
+    let path = folder.join(name);
+    let build = match folder.file_name().and_then(|name| name.to_str()) {
+        Some("debug") | None => "cargo build --workspace".to_owned(),
+        Some(profile) => format!("cargo build --workspace --profile {profile}"),
+    };
+    assert!(path.is_file(), "{} is missing: `{build}` makes it", path.display());
+    path
+}
+
+/// An example of the gateway's.
+pub fn example(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../gateway/examples").join(name)
+}
+
+/// A skin's text: some cells on an arm, on one bus.
+pub fn skin(cells: usize) -> String {
+    generate(&Target { cells, ..Target::default() }).unwrap()
+}
+
+/// Some cells over some buses in another format.
+pub fn skin_of(cells: usize, buses: usize, format: Format) -> String {
+    generate(&Target { cells, buses, format, ..Target::default() }).unwrap()
+}
+
+pub fn names(folder: &Path) -> Vec<String> {
+    let entries = fs::read_dir(folder).unwrap();
+    let mut names: Vec<_> = entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+/// Whether a process is stopped.
+pub fn is_stopped(pid: Pid) -> bool {
+    fs::read_to_string(proc(pid, "stat")).is_ok_and(|stat| stat.contains(") T "))
+}
+
+pub fn signal(pid: Pid, signal: Signal) {
+    kill_process(pid, signal).unwrap();
+}
+
+/// Whether a bench has reported of a cell, alone or with others, that it has done something.
+pub fn tells(text: &str, cell: u8, what: &str) -> bool {
+    tells_on(text, "vcan0", cell, what)
+}
+
+/// The same on another bus.
+pub fn tells_on(text: &str, bus: &str, cell: u8, what: &str) -> bool {
+    let on_bus = format!(" on {bus} ha");
+    let names = |line: &str| {
+        let cells = line.strip_prefix("cell ").or_else(|| line.strip_prefix("cells "))?;
+        let (cells, rest) = cells.split_once(&on_bus)?;
+        rest.ends_with(what).then(|| cells.split(", ").any(|name| name == cell.to_string()))
+    };
+    text.lines().any(|line| names(line) == Some(true))
+}

@@ -1,0 +1,153 @@
+//! The page of a run, without the browser: its WebSocket.
+
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+use tungstenite::client::IntoClientRequest;
+use tungstenite::{Error, Message, WebSocket, client};
+
+use super::{Place, Running, TIMEOUT};
+
+/// Nothing happens by itself; the arm gives way.
+pub const QUIET: &str = "version = 1\nduration_s = 60.0\n\n[motion]\nkind = \"kinesthetic\"\n\
+                     start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
+
+/// A page, without the browser.
+pub struct Page {
+    pub socket: WebSocket<TcpStream>,
+    pub scene: Value,
+}
+
+/// A snapshot of six joints.
+pub struct Snapshot {
+    pub time: f64,
+    /// Position, distributed and central torque.
+    pub joints: Vec<[f32; 3]>,
+    /// Status, flags, force in mN.
+    pub cells: Vec<(u8, u8, u16)>,
+}
+
+/// Where the server of a run or a view says that it is: `127.0.0.1:8100`.
+pub fn address(served: &Running) -> String {
+    served.hears("view: http://");
+    let said = served.stderr();
+    let (_, rest) = said.split_once("view: http://").unwrap();
+    rest.split('/').next().unwrap().to_owned()
+}
+
+/// Asks to be a page, with these headers more or other ones.
+pub fn ask(address: &str, headers: &[(&'static str, &str)]) -> Result<(WebSocket<TcpStream>, u16), Error> {
+    let stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+    let mut request = format!("ws://{address}/live").into_client_request()?;
+    for (name, value) in headers {
+        request.headers_mut().insert(*name, value.parse().unwrap());
+    }
+    match client(request, stream) {
+        Ok((socket, response)) => Ok((socket, response.status().as_u16())),
+        Err(tungstenite::HandshakeError::Failure(error)) => Err(error),
+        Err(tungstenite::HandshakeError::Interrupted(_)) => panic!("no answer"),
+    }
+}
+
+impl Page {
+    pub fn new(address: &str) -> Self {
+        let (mut socket, _) = ask(address, &[("Origin", &format!("http://{address}"))]).unwrap();
+        let scene = serde_json::from_str(socket.read().unwrap().to_text().unwrap()).unwrap();
+        Self { socket, scene }
+    }
+
+    pub fn say(&mut self, command: &str) {
+        self.socket.send(Message::text(command)).unwrap();
+    }
+
+    pub fn press(&mut self, node: u8, force_n: f64) {
+        self.say(&format!(r#"{{"do":"press","bus":0,"node":{node},"force_n":{force_n}}}"#));
+    }
+
+    /// Commands the bench: `"on":"bus","down":true,"bus":0`.
+    pub fn command(&mut self, command: &str) {
+        self.say(&format!(r#"{{"do":"bench",{command}}}"#));
+    }
+
+    /// Does something to the process of a cell on the first bus.
+    pub fn act(&mut self, action: &str, node: u8) {
+        self.command(&format!(r#""on":"process","action":"{action}","bus":0,"node":{node}"#));
+    }
+
+    /// Waits for the answer to a command: whether it was carried out, and its text.
+    pub fn answer(&mut self, text: &str) -> bool {
+        let is_it = |answer: &&Value| answer["text"].as_str().unwrap().contains(text);
+        let answers = |said: &Value| said["bench"]["answers"].as_array().cloned().unwrap_or_default();
+        let said = self.hears(text, |said| answers(said).iter().any(|answer| is_it(&answer)));
+        answers(&said).iter().rfind(is_it).unwrap()["done"].as_bool().unwrap()
+    }
+
+    /// Waits for a snapshot at which this holds.
+    pub fn sees(&mut self, what: &str, mut is: impl FnMut(&Snapshot) -> bool) -> Snapshot {
+        let give_up = Instant::now() + TIMEOUT;
+        loop {
+            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
+            // What was before a position is no snapshot.
+            if let Message::Binary(bytes) = self.socket.read().unwrap()
+                && bytes[12] == 0
+            {
+                let snapshot = Snapshot::read(&bytes);
+                if is(&snapshot) {
+                    return snapshot;
+                }
+            }
+        }
+    }
+
+    /// Waits for words at which this holds.
+    pub fn hears(&mut self, what: &str, mut is: impl FnMut(&Value) -> bool) -> Value {
+        let give_up = Instant::now() + TIMEOUT;
+        loop {
+            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
+            if let Message::Text(text) = self.socket.read().unwrap() {
+                let said = serde_json::from_str(text.as_str()).unwrap();
+                if is(&said) {
+                    return said;
+                }
+            }
+        }
+    }
+}
+
+impl Snapshot {
+    pub fn read(bytes: &[u8]) -> Self {
+        let word = |at: usize| u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap());
+        let (joints, cells) = (word(4) as usize, word(8) as usize);
+        assert_eq!(bytes.len(), 24 + 12 * joints + 8 * cells);
+        let of_joint = |joint| [0, 4, 8].map(|at| f32::from_bits(word(24 + 12 * joint + at)));
+        let of_cell = |cell| {
+            let at = 24 + 12 * joints + 8 * cell;
+            (bytes[at], bytes[at + 1], u16::from_le_bytes([bytes[at + 2], bytes[at + 3]]))
+        };
+        Self {
+            time: f64::from_le_bytes(bytes[16..24].try_into().unwrap()),
+            joints: (0..joints).map(of_joint).collect(),
+            cells: (0..cells).map(of_cell).collect(),
+        }
+    }
+}
+
+/// A run that is watched, and where its page is.
+pub fn watched(place: &Place, cells: usize, more: &str) -> (Running, String) {
+    place.skin(cells);
+    watched_skin(place, more)
+}
+
+/// The same of `skin.toml`.
+pub fn watched_skin(place: &Place, more: &str) -> (Running, String) {
+    place.scenario(QUIET);
+    let words = format!(
+        "run skin.toml --bus-kind {} --scenario scenario.toml --view --summary run.json {more}",
+        place.kind()
+    );
+    let run = place.start("gateway", &words);
+    let address = address(&run);
+    (run, address)
+}

@@ -1,0 +1,166 @@
+//! Where a test's benches run: a directory of its own.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+use protocol::bus::BusKind;
+use rustix::process::Pid;
+use tempfile::TempDir;
+
+use super::running::{Running, all_processes, command_line, proc};
+use super::test_client::TestClient;
+use super::{PRESSED, Summary, TIMEOUT, names, program, skin, vcan};
+
+/// A directory of its own for a test, and in it its embedded buses.
+pub struct Place {
+    directory: TempDir,
+    /// What its benches run on.
+    kind: BusKind,
+}
+
+impl Place {
+    pub fn new() -> Self {
+        Self { directory: TempDir::new().unwrap(), kind: BusKind::Embedded }
+    }
+
+    /// One whose benches run on `vcan0` of a network that is the test's own.
+    pub fn on_vcan() -> Self {
+        vcan::own_network();
+        Self { kind: BusKind::SocketCan, ..Self::new() }
+    }
+
+    /// What its benches run on.
+    pub const fn kind(&self) -> BusKind {
+        self.kind
+    }
+
+    pub fn path(&self, name: &str) -> PathBuf {
+        self.directory.path().join(name)
+    }
+
+    /// Where its buses are: `SKINBUS_DIR`.
+    pub fn buses(&self) -> PathBuf {
+        self.path("buses")
+    }
+
+    pub fn write(&self, name: &str, text: &str) -> PathBuf {
+        let path = self.path(name);
+        fs::write(&path, text).unwrap();
+        path
+    }
+
+    /// Writes a script that can be run. A process of its own writes it: a child that another test starts meanwhile
+    /// would inherit the open file, and until its `exec` the script is busy (ETXTBSY).
+    pub fn script(&self, name: &str, text: &str) -> PathBuf {
+        let path = self.path(name);
+        let mut writer = Command::new("install");
+        writer.args(["-m", "700", "/dev/stdin"]).arg(&path).stdin(Stdio::piped());
+        let mut writer = writer.spawn().unwrap();
+        writer.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+        assert!(writer.wait().unwrap().success(), "{}", path.display());
+        path
+    }
+
+    pub fn read(&self, name: &str) -> String {
+        fs::read_to_string(self.path(name)).unwrap()
+    }
+
+    /// The files in it, in order.
+    pub fn files(&self) -> Vec<String> {
+        names(self.directory.path())
+    }
+
+    /// `skin.toml`: some cells on an arm, on one bus.
+    pub fn skin(&self, cells: usize) -> PathBuf {
+        self.write("skin.toml", &skin(cells))
+    }
+
+    /// `scenario.toml`.
+    pub fn scenario(&self, text: &str) -> PathBuf {
+        self.write("scenario.toml", text)
+    }
+
+    /// `skin.toml` and `scenario.toml` for a bench of eight cells that are all pressed.
+    pub fn pressed(&self) {
+        self.skin(8);
+        self.scenario(PRESSED);
+    }
+
+    /// A command in this place; words are parted by spaces.
+    pub fn command(&self, name: &str, words: &str) -> Command {
+        self.command_of(&program(name), words)
+    }
+
+    /// The same of any program.
+    pub fn command_of(&self, program: &Path, words: &str) -> Command {
+        let mut command = Command::new(program);
+        command.args(words.split(' ').filter(|word| !word.is_empty()));
+        command.current_dir(self.directory.path()).env("SKINBUS_DIR", self.buses()).env("NO_COLOR", "1");
+        command
+    }
+
+    pub fn start(&self, name: &str, words: &str) -> Running {
+        Running::start(self.command(name, words))
+    }
+
+    /// A bench of `skin.toml` and `scenario.toml` for some seconds, with a log and a summary.
+    pub fn bench(&self, seconds: f64, more: &str) -> Running {
+        self.start(
+            "gateway",
+            &format!(
+                "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} \
+                 --candump run.log --force --summary run.json {more}",
+                self.kind
+            ),
+        )
+    }
+
+    /// The same, once its loop runs.
+    pub fn running_bench(&self, seconds: f64, more: &str) -> Running {
+        let bench = self.bench(seconds, more);
+        bench.hears_the_loop();
+        bench
+    }
+
+    /// What a bench left.
+    pub fn summary(&self) -> Summary {
+        Summary(serde_json::from_str(&self.read("run.json")).unwrap())
+    }
+
+    /// Another client of its bus.
+    pub fn test_client(&self) -> TestClient {
+        self.test_client_of(protocol::can::Format::Fd)
+    }
+
+    /// The same on a bus of another format.
+    pub fn test_client_of(&self, format: protocol::can::Format) -> TestClient {
+        TestClient::on(self, "vcan0", format)
+    }
+
+    /// Processes of this place that live, with their command lines.
+    pub fn processes(&self) -> Vec<(Pid, String)> {
+        let mark = format!("SKINBUS_DIR={}", self.buses().display());
+        let ours = |pid: &Pid| {
+            let environment = fs::read(proc(*pid, "environ")).unwrap_or_default();
+            environment.split(|&byte| byte == 0).any(|word| word == mark.as_bytes())
+        };
+        all_processes().into_iter().filter(ours).map(|pid| (pid, command_line(pid))).collect()
+    }
+
+    /// Checks that soon no process and no socket of this place remains.
+    pub fn is_left_clean(&self) {
+        let left = || {
+            let processes = self.processes();
+            if processes.is_empty() && !self.buses().exists() { None } else { Some(processes) }
+        };
+        let give_up = Instant::now() + TIMEOUT;
+        while let Some(processes) = left() {
+            let sockets = if self.buses().exists() { names(&self.buses()) } else { Vec::new() };
+            assert!(Instant::now() < give_up, "left behind: {processes:?} {sockets:?}");
+            std::thread::sleep(Duration::from_millis(10));
+        }
+    }
+}

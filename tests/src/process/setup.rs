@@ -1,0 +1,44 @@
+//! Commands as processes, and a sender on their bus: what the tests of commands share.
+
+use std::process::Command;
+use std::sync::mpsc::{RecvTimeoutError, channel};
+use std::time::Duration;
+
+use protocol::bus::Bus;
+use protocol::can::Frame;
+use protocol::id::Id;
+
+/// The output of a command.
+#[derive(Debug)]
+pub struct Said {
+    pub code: i32,
+    pub out: String,
+    pub err: String,
+}
+
+impl Said {
+    /// Runs it to its end.
+    pub fn by(command: &mut Command) -> Self {
+        let output = command.output().unwrap();
+        let [out, err] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
+        Self { code: output.status.code().unwrap(), out, err }
+    }
+}
+
+/// Does something while frames with these identifiers come on a bus all the time.
+pub fn while_somebody_says<T>(bus: &Bus, ids: &[Id], act: impl FnOnce() -> T) -> T {
+    let frames: Vec<_> = ids.iter().map(|id| Frame::fd(id.to_bits().into(), 1, &[0; 16]).unwrap()).collect();
+    std::thread::scope(|scope| {
+        // It goes when this is over, also by a panic, for which the scope would else wait without end.
+        let (_going, over) = channel::<()>();
+        scope.spawn(move || {
+            loop {
+                bus.send(&frames).unwrap();
+                if over.recv_timeout(Duration::from_millis(10)) != Err(RecvTimeoutError::Timeout) {
+                    break;
+                }
+            }
+        });
+        act()
+    })
+}

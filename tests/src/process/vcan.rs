@@ -1,0 +1,266 @@
+//! A real kernel's vcan, and the stock tools beside us.
+//!
+//! `tests/vcan` runs the tests that need it, each in a network of its own with `lo` and `vcan0` (MTU 72, up).
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{Read, Seek, SeekFrom};
+use std::os::fd::AsFd;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+
+use model::generate::{Target, generate};
+use protocol::can::Frame;
+use protocol::candump::{Line, parse, parse_frame};
+use protocol::id::{Id, Kind};
+
+use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
+
+use super::{Place, until};
+
+/// Moves this thread, and the processes it starts from now on, into a new network with `lo` and `vcan0`. In a lab
+/// machine the network is the machine's, with its controllers: there `SKINBUS_NETWORK` is `here`.
+pub fn own_network() {
+    match std::env::var("SKINBUS_NETWORK").as_deref() {
+        Ok("new") => {
+            // The network lasts as long as a thread or a process is in it.
+            let mut holder = command("unshare --net cat").stdin(Stdio::piped()).spawn().unwrap();
+            let network = until("a new network", || {
+                let [own, new] =
+                    ["thread-self", &holder.id().to_string()].map(|id| format!("/proc/{id}/ns/net"));
+                let new = File::open(new).ok()?;
+                (new.metadata().ok()?.ino() != fs::metadata(own).ok()?.ino()).then_some(new)
+            });
+            move_into_link_name_space(network.as_fd(), Some(LinkNameSpaceType::Network)).unwrap();
+            drop(holder.stdin.take());
+            holder.wait().unwrap();
+            tool("ip link set lo up");
+            tool("ip link add vcan0 type vcan");
+            tool("ip link set vcan0 mtu 72 up");
+        }
+        Ok("here") => {
+            // Not /sys, which may show another network.
+            let found = tool("ip -json link show vcan0").stdout;
+            assert_eq!(serde_json::from_slice::<serde_json::Value>(&found).unwrap()[0]["mtu"], 72, "vcan0");
+        }
+        _ => panic!("this test needs vcan in a network of its own: `tests/vcan testrelease` runs it there"),
+    }
+}
+
+/// Another program, which must succeed: `ip link set vcan0 down`.
+pub fn tool(words: &str) -> Output {
+    let output = command(words).output().unwrap_or_else(|error| missing(words, &error));
+    assert!(output.status.success(), "{words}: {output:?}");
+    output
+}
+
+/// The same, to be started; words are parted by spaces.
+pub fn command(words: &str) -> Command {
+    let mut words = words.split(' ');
+    let mut command = Command::new(words.next().unwrap());
+    command.args(words).stdin(Stdio::null());
+    command
+}
+
+fn missing(words: &str, error: &std::io::Error) -> ! {
+    panic!("{words}: {error}; install can-utils, iproute2 and util-linux")
+}
+
+/// An interface of a test's own, beside `vcan0`; what the kernel routes to and from it goes with it.
+pub struct Vcan(&'static str);
+
+impl Vcan {
+    /// One that carries CAN FD, and is up.
+    pub fn make(name: &'static str) -> Self {
+        Self::with_mtu(name, 72)
+    }
+
+    pub fn with_mtu(name: &'static str, mtu: u32) -> Self {
+        tool(&format!("ip link add {name} type vcan"));
+        tool(&format!("ip link set {name} mtu {mtu} up"));
+        Self(name)
+    }
+
+    /// Removes it while it may be in use.
+    pub fn remove(&self) {
+        tool(&format!("ip link del {}", self.0));
+    }
+}
+
+impl Drop for Vcan {
+    fn drop(&mut self) {
+        // It may be gone already.
+        let _ = command(&format!("ip link del {}", self.0)).stderr(Stdio::null()).status();
+    }
+}
+
+/// Frames of one bus that match a filter go to the other, changed by `change`. The kernel's rules are for CAN FD
+/// frames here, and what they send is seen by every socket on that bus (vcan needs that to be asked for).
+pub fn route(from: &str, to: &str, filter: &str, change: &str) {
+    tool(format!("cangw -A -s {from} -d {to} -X -e -f {filter} {change}").trim_end());
+}
+
+/// Frames that the kernel has dropped on their way from senders to sockets, of any interface: the second
+/// column, in hexadecimal, of a line for each processor.
+pub fn backlog_drops() -> u64 {
+    let text = fs::read_to_string("/proc/net/softnet_stat").unwrap();
+    text.lines().map(|line| u64::from_str_radix(line.split(' ').nth(1).unwrap(), 16).unwrap()).sum()
+}
+
+/// A skin of a few cells at a rate that an emulated machine keeps up.
+pub fn small_skin(cells: usize) -> String {
+    generate(&Target { cells, broadcast_hz: 20.0, ..Target::default() }).unwrap()
+}
+
+/// `cansend vcan0 $(gateway frame ...)`, as a person would.
+pub fn cansend(place: &Place, frame: &str) {
+    let printed = place.start("gateway", &format!("frame {frame}")).end().well().stdout;
+    for line in printed.lines() {
+        tool(&format!("cansend vcan0 {line}"));
+    }
+}
+
+/// `vcan0`, which is as it should be again when this is dropped, however a test ends.
+pub struct Vcan0;
+
+impl Vcan0 {
+    pub fn down(&self) {
+        tool("ip link set vcan0 down");
+    }
+
+    pub fn up(&self) {
+        tool("ip link set vcan0 up");
+    }
+
+    /// Lets it take no frame at all: a transmit queue without room, as a real controller's is without any
+    /// acknowledge. Senders get ENOBUFS.
+    pub fn fill(&self) {
+        tool("tc qdisc add dev vcan0 root pfifo limit 0");
+    }
+
+    pub fn empty(&self) {
+        tool("tc qdisc del dev vcan0 root");
+    }
+}
+
+impl Drop for Vcan0 {
+    fn drop(&mut self) {
+        // There may be none.
+        let _ = command("tc qdisc del dev vcan0 root").stderr(Stdio::null()).status();
+        let _ = command("ip link set vcan0 mtu 72 up").status();
+    }
+}
+
+/// Another program that runs beside a test, and ends with it.
+pub struct Beside(pub Child);
+
+impl Beside {
+    pub fn start(words: &str) -> Self {
+        let mut command = command(words);
+        command.stdout(Stdio::null()).stderr(Stdio::null());
+        Self(command.spawn().unwrap_or_else(|error| missing(words, &error)))
+    }
+}
+
+impl Drop for Beside {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// `candump -L`, which has room for 300 MB of frames and preempts no process: on one processor it would else be
+/// woken by every single frame.
+pub struct Candump {
+    child: Beside,
+    bus: String,
+    log: PathBuf,
+    marks: u32,
+}
+
+impl Candump {
+    /// When this returns, it listens.
+    pub fn start(bus: &str, log: &Path) -> Self {
+        // -d: what its socket drops is a line of the log, which no test that counts frames lets pass.
+        // The two filters let pass every frame, and every error frame, which are else left out.
+        let words = format!("chrt --batch 0 candump -L -d -r 300000000 {bus},0:0,#FFFFFFFF");
+        let mut command = command(&words);
+        command.stdout(File::create(log).unwrap()).stderr(Stdio::null());
+        let child = Beside(command.spawn().unwrap_or_else(|error| missing(&words, &error)));
+        let candump = Self { child, bus: bus.to_owned(), log: log.to_owned(), marks: 0 };
+        // The kernel's lists of listeners do not name the process of an entry.
+        until("candump to listen", || {
+            tool(&format!("cansend {bus} {}", mark(0)));
+            candump.tail().contains(&mark(0)).then_some(())
+        });
+        candump
+    }
+
+    /// The end of its log, which may be long.
+    fn tail(&self) -> String {
+        let mut log = File::open(&self.log).unwrap();
+        let len = log.metadata().unwrap().len();
+        log.seek(SeekFrom::Start(len.saturating_sub(16_384))).unwrap();
+        let mut tail = String::new();
+        log.read_to_string(&mut tail).unwrap();
+        tail
+    }
+
+    /// Waits until it has seen all that was on the bus until now. This takes a frame of its own, which is
+    /// foreign to all clients and stays in its log.
+    pub fn catch_up(&mut self) {
+        self.marks += 1;
+        let mark = mark(self.marks);
+        tool(&format!("cansend {} {mark}", self.bus));
+        until("candump to see a frame", || self.tail().contains(&mark).then_some(()));
+    }
+
+    /// What was on the bus from its start until now.
+    pub fn frames(mut self) -> Vec<Frame> {
+        self.catch_up();
+        drop(self.child);
+        let frames = frames_of(&self.log);
+        let [first, last] = [0, self.marks].map(|number| parse_frame(&mark(number)).unwrap());
+        let begin = frames.iter().rposition(|frame| *frame == first).unwrap() + 1;
+        let end = frames.iter().rposition(|frame| *frame == last).unwrap();
+        frames[begin..end].to_vec()
+    }
+}
+
+/// A frame that no other client sends.
+fn mark(number: u32) -> String {
+    format!("1BADCAFE#{number:08X}")
+}
+
+/// The frames of a log; every other line is a mistake, `DROPCOUNT` too.
+pub fn frames_of(log: &Path) -> Vec<Frame> {
+    let text = fs::read_to_string(log).unwrap();
+    let frame = |line: &str| match parse(line) {
+        Ok(Line::Frame(record)) => record.frame,
+        other => panic!("{}: {line}: {other:?}", log.display()),
+    };
+    text.lines().map(frame).collect()
+}
+
+/// Frames by sender and kind, in the order in which each was sent: what two views of a bus have in common.
+pub fn by_identifier(frames: &[Frame]) -> BTreeMap<u32, Vec<Frame>> {
+    let mut all = BTreeMap::<_, Vec<Frame>>::new();
+    for frame in frames {
+        all.entry(frame.raw_id()).or_default().push(*frame);
+    }
+    all
+}
+
+/// What the gateway keeps is what `candump` sees, in the same order by sender; but cells that are being ended may still
+/// send a heartbeat when the gateway no longer listens.
+pub fn same_by_sender(ours: &[Frame], theirs: &[Frame]) {
+    let (ours, theirs) = (by_identifier(ours), by_identifier(theirs));
+    assert_eq!(ours.keys().collect::<Vec<_>>(), theirs.keys().collect::<Vec<_>>());
+    for (id, theirs) in &theirs {
+        let ours = &ours[id];
+        let kind = Id::from_bits(u16::try_from(*id).unwrap()).kind;
+        assert!(theirs.len() == ours.len() || kind == Kind::Network, "frames of {id:03X}");
+        assert!(theirs.starts_with(ours), "{id:03X} comes in another order");
+    }
+}

@@ -1,0 +1,194 @@
+//! Emulated cells in benches of processes: they count as any other cell.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use skinbus_tests::process;
+
+use std::fs;
+
+use model::generate::Format as SkinFormat;
+use process::log::Log;
+use process::{Ended, PRESSED, Place, Running, skin_of};
+use protocol::can::Format;
+use protocol::id::CellId;
+use protocol::message::Message;
+use rustix::process::Signal;
+
+/// The firmware's file.
+fn firmware() -> String {
+    std::env::var("SKINBUS_FIRMWARE").expect("tests/firmware/run names it")
+}
+
+/// A bench whose cells of these node ids are emulated.
+fn bench(place: &Place, seconds: f64, emulate: &str, more: &str) -> Running {
+    place.bench(seconds, &format!("--firmware {} --emulate {emulate} {more}", firmware()))
+}
+
+/// Each of these cells is killed, and started again a while later.
+fn kills(cells: std::ops::RangeInclusive<u8>) -> String {
+    let fault = |at: f64, kind: &str, cell: u8| {
+        format!("\n[[fault]]\nat_s = {at}\nkind = \"{kind}\"\nbus = \"vcan0\"\ncells = [{cell}]\n")
+    };
+    let mut faults = String::new();
+    let (mut restarts, mut at) = (Vec::new(), 1.5);
+    for cell in cells {
+        faults += &fault(at, "kill", cell);
+        restarts.push((at + 4.5, cell));
+        at += 0.4;
+    }
+    for (at, cell) in restarts {
+        faults += &fault(at, "restart", cell);
+    }
+    faults
+}
+
+#[test]
+#[ignore = "needs tests/firmware/run"]
+fn four_emulated_and_eight_process_cells_lose_only_what_was_on_its_way_at_a_kill() {
+    let place = Place::new();
+    place.skin(12);
+    place.scenario(&format!("{PRESSED}{}", kills(9..=12)));
+    fs::create_dir(place.path("flash")).unwrap();
+    let ended = bench(&place, 10.0, "9,10,11,12", "--flash flash").end().well();
+    place.is_left_clean();
+    let summary = place.summary();
+    summary.adds_up();
+    assert_eq!(summary.of_bus("/uplink/restarts"), 4, "{:#}", summary.0);
+    for nothing in ["/uplink/rejected", "/uplink/unknown", "/replies/unknown", "/replies/lost"] {
+        assert_eq!(summary.of_bus(nothing), 0, "{nothing}: {:#}", summary.0);
+    }
+    // What was due while a cell was dead is due from nobody: they are silent for 3.9 s, until they claim again.
+    let broadcasts = summary.number("/loop/broadcasts");
+    for cell in summary.cells() {
+        let (node, due) = (cell["node"].as_u64().unwrap(), cell["due"].as_u64().unwrap());
+        let in_doubt = cell["missing"]["in_doubt"].as_u64().unwrap_or(0);
+        if node <= 8 {
+            assert!(in_doubt == 0 && due <= broadcasts, "{cell:#}");
+        } else {
+            assert!(due < broadcasts - 150 && due > 250, "{node} was dead for a while: {cell:#}");
+            // 600 ms of silence pass before it counts as dead.
+            assert!((1..60).contains(&in_doubt), "{node}, on its way and after the kill: {cell:#}");
+        }
+    }
+    for cell in 9..=12 {
+        let said = format!("cell {cell} on vcan0 restarted");
+        assert!(ended.stderr.contains(&said), "{said:?} in\n{}", ended.stderr);
+        // Nobody commissions them in a run: their flash did it.
+        assert_eq!(fs::read(place.path(&format!("flash/vcan0-{cell}.flash"))).unwrap().len(), 133);
+    }
+    assert!(ended.stderr.contains("cells 9, 10, 11, 12 emulated by "), "{}", ended.stderr);
+}
+
+#[test]
+#[ignore = "needs tests/firmware/run"]
+fn an_emulated_cell_answers_on_fd_and_on_classic_buses() {
+    for format in [SkinFormat::Fd, SkinFormat::Classic] {
+        let place = Place::new();
+        place.write("skin.toml", &skin_of(2, 1, format));
+        place.scenario(PRESSED);
+        bench(&place, 2.0, "2", "").end().well();
+        place.is_left_clean();
+        let summary = place.summary();
+        // An emulator that a busy machine stops for 15 ms between two segments loses their packet.
+        if format == SkinFormat::Fd {
+            summary.adds_up();
+        }
+        assert!(summary.cells()[1]["in_time"].as_u64().unwrap() > 60, "{:#}", summary.0);
+        assert_eq!(
+            summary.of_bus("/uplink/unknown") + summary.of_bus("/uplink/rejected"),
+            0,
+            "{:#}",
+            summary.0
+        );
+        assert!(summary.figure("/accuracy/single/max_nm") < 0.001, "{:#}", summary.0);
+    }
+}
+
+#[test]
+#[ignore = "needs tests/firmware/run"]
+fn an_emulated_cell_sums_with_processes_as_neighbours() {
+    let place = Place::new();
+    process::sums::grid(&place, Format::Fd);
+    place.scenario(PRESSED);
+    bench(&place, 4.0, "6", "").end().well();
+    place.is_left_clean();
+    let log = Log::read(&place.read("run.log"), Format::Fd);
+    let sums = |is: &dyn Fn(CellId, u8) -> bool| {
+        let is = |message: &Message| matches!(message, Message::Sum { from, count, .. } if is(*from, *count));
+        log.messages.iter().filter(|(message, _)| is(message)).count()
+    };
+    assert!(sums(&|from, _| from.get() == 6) > 30, "of the emulated cell, at 20 Hz");
+    // Both roots together have all cells.
+    let largest = (1..=12).rev().find(|&size| sums(&|_, count| count == size) > 0);
+    assert!(largest >= Some(6), "{largest:?}");
+}
+
+#[test]
+#[ignore = "needs tests/firmware/run"]
+fn emulators_end_with_a_gateway_that_is_killed_or_interrupted() {
+    for (signal, code) in [(Signal::KILL, None), (Signal::INT, Some(0))] {
+        let place = Place::new();
+        place.pressed();
+        let bench = bench(&place, 60.0, "8", "");
+        bench.hears_the_loop();
+        bench.signal(signal);
+        assert_eq!(bench.end().code(), code);
+        place.is_left_clean();
+    }
+}
+
+/// The one line of a run that does not begin.
+fn refused(place: &Place, words: &str) -> String {
+    let ended = place.start("gateway", &format!("run skin.toml --bus-kind embedded --quiet {words}")).end();
+    ended.refusal(ended.code().unwrap()).to_owned()
+}
+
+#[test]
+#[ignore = "needs tests/firmware/run"]
+fn what_cannot_be_emulated_is_refused_in_one_line() {
+    let place = Place::new();
+    place.pressed();
+    let elf = firmware();
+    let says = |words: &str, expected: &str| {
+        let line = refused(&place, words);
+        assert!(line.contains(expected), "{expected:?} in {line:?}");
+    };
+    says("--firmware nowhere.elf --emulate 8", "--firmware nowhere.elf: No such file");
+    place.write("text", "no program");
+    says("--firmware text --emulate 8", "no ELF file of a 32-bit ARM microcontroller");
+    says(&format!("--firmware {elf} --emulate 77"), "--emulate 77: the skin has no such cell on vcan0");
+    says(&format!("--firmware {elf} --emulate 8,3,8"), "--emulate 8 is there twice");
+    says(&format!("--firmware {elf}"), "--emulate");
+    says("--emulate 8", "--firmware");
+    says(&format!("--firmware {elf} --emulate 8 --no-spawn"), "--no-spawn");
+    place.is_left_clean();
+}
+
+/// A run whose emulator is this script.
+fn with_emulator(place: &Place, script: Option<&str>) -> Ended {
+    let folder = place.path("programs");
+    let _ = fs::create_dir(&folder);
+    if let Some(script) = script {
+        place.script("programs/qemu-system-arm", script);
+    }
+    let words = format!("run skin.toml --bus-kind embedded --quiet --firmware {} --emulate 8", firmware());
+    let mut command = place.command("gateway", &words);
+    command.env("PATH", &folder);
+    Running::start(command).end()
+}
+
+#[test]
+#[ignore = "needs tests/firmware/run"]
+fn an_emulator_that_is_missing_or_ends_is_named_with_its_last_line() {
+    let place = Place::new();
+    place.pressed();
+    let line = with_emulator(&place, None);
+    let missing =
+        "gateway: qemu-system-arm is not in PATH, and --emulate needs it: apt-get install qemu-system-arm";
+    assert_eq!(line.refusal(2), missing);
+    let ends = "#!/bin/sh\necho 'qemu-system-arm: unsupported machine type' >&2\nexit 1\n";
+    let ended = with_emulator(&place, Some(ends));
+    let said = "gateway: the emulator of cell 8 on vcan0 ended before its cell was commissioned (exit status: 1: \
+                qemu-system-arm: unsupported machine type)";
+    assert_eq!(ended.refusal(1), said);
+    place.is_left_clean();
+}

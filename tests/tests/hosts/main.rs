@@ -1,0 +1,3 @@
+//! A bus over several hosts, in network namespaces: `tests/hosts`.
+
+mod hosts;

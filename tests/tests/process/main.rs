@@ -1,0 +1,37 @@
+//! Benches of real processes on the embedded bus, each in a directory of its own.
+
+mod commands;
+mod embedded;
+mod process_buses;
+mod process_calibrate;
+mod process_captures;
+mod process_chains;
+mod process_command_line;
+mod process_commission;
+mod process_conformance;
+mod process_end;
+mod process_experiment;
+mod process_external;
+mod process_faults;
+mod process_files;
+mod process_flash;
+mod process_foxglove;
+mod process_halts;
+mod process_import;
+mod process_network;
+mod process_parts;
+mod process_readme;
+mod process_record;
+mod process_recordings;
+mod process_refusals;
+mod process_replay;
+mod process_replay_ends;
+mod process_report;
+mod process_run;
+mod process_sensing;
+mod process_slcan;
+mod process_sums;
+mod process_view;
+mod process_view_bench;
+mod process_view_recording;
+mod serve;

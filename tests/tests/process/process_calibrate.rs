@@ -1,0 +1,86 @@
+//! Calibrations of simulated cells over a bus: the robot moves, a recording is kept, and says the same again.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use skinbus_tests::process;
+
+use process::Place;
+use protocol::skin::Skin;
+use serde_json::Value;
+
+const START: [&str; 2] = ["--start", "0 -1.2 1.0 -1.4 -1.57 0"];
+
+/// Exit code, result unless it was refused, and standard error.
+fn calibrate(place: &Place, words: &str) -> (Option<i32>, Option<Value>, String) {
+    let mut command = place.command("gateway", &format!("calibrate skin.toml --json --force {words}"));
+    let output = command.args(START).output().unwrap();
+    let said = String::from_utf8(output.stderr).unwrap();
+    let found = (!output.stdout.is_empty())
+        .then(|| serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{error}: {said}")));
+    (output.status.code(), found, said)
+}
+
+#[test]
+fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
+    let place = Place::new();
+    place.skin(6);
+    let live = "--duration 24s --quiet --bus-kind embedded --record run.mcap -o found.toml --page found.html";
+    let (_, found, said) = calibrate(&place, live);
+    let (code, again, repeated) = calibrate(&place, "--from run.mcap -o again.toml");
+    assert_eq!(found, again, "{said}");
+    let exists = |name: &str| place.path(name).exists();
+    // The same cells under the description of others.
+    let skin = place.read("skin.toml");
+    place.write("skin.toml", &skin.replace("serial = 100001", "serial = 7"));
+    let (refused, nothing, why) = calibrate(&place, "--from run.mcap -o other.toml");
+    assert_eq!((refused, nothing), (Some(2), None), "{why}");
+    assert!(why.contains("was recorded with another skin: serial numbers 100002, recorded 100001"), "{why}");
+    assert!(!exists("other.toml"));
+    place.write("skin.toml", &skin);
+    let Some(found) = found else {
+        // A machine that is late too often: the refusal names the gaps, and nothing is written.
+        assert_eq!(code, Some(1));
+        assert!(
+            said.contains("in the broadcasts") && repeated.contains("in the broadcasts"),
+            "{said}{repeated}"
+        );
+        assert!(!exists("found.toml") && !exists("again.toml") && !exists("found.html"));
+        return;
+    };
+    assert_eq!(place.read("found.toml"), place.read("again.toml"));
+    let skin = Skin::parse("skin.toml", &place.read("skin.toml")).unwrap();
+    let new = Skin::parse("found.toml", &place.read("found.toml")).unwrap();
+    let cells = found["cells"].as_array().unwrap();
+    for ((old, new), result) in skin.cells.iter().zip(&new.cells).zip(cells) {
+        assert_eq!((old.joint, old.node), (new.joint, new.node), "{result}");
+        assert!(result["readings"].as_u64().unwrap() > 500, "{result}");
+        // As far as a machine lets it that is late for some broadcasts.
+        assert!(result["moved_mm"].as_f64().unwrap() < 15.0, "{result}");
+        assert!(result["turned_deg"].as_f64().unwrap() < 3.0, "{result}");
+    }
+    assert!(place.read("found.html").contains("calibrated"));
+    place.is_left_clean();
+}
+
+#[test]
+fn what_cannot_be_calibrated_is_refused_in_one_line() {
+    let place = Place::new();
+    place.skin(2);
+    let refused = |words: &str| {
+        let output = place.command("gateway", &format!("calibrate skin.toml {words}")).output().unwrap();
+        assert_eq!(output.status.code(), Some(2));
+        String::from_utf8(output.stderr).unwrap()
+    };
+    assert_eq!(
+        refused("--start 0.5 --dry-run"),
+        "gateway: the pose has 1 positions; the robot has 6 joints: give one for each\n"
+    );
+    assert_eq!(refused("--duration 5s --dry-run"), "gateway: a motion of 5 s: 20 to 3600 s are allowed\n");
+    place.write("sheet.toml", "noise_g = 3.0\n");
+    assert_eq!(
+        refused("--data-sheet sheet.toml --dry-run"),
+        "gateway: sheet.toml:1:11: noise_g = 3: 0 to 1 are possible\n"
+    );
+    place.write("empty.log", "(1.000000) vcan0 080##1\n");
+    let said = refused("--from empty.log");
+    assert!(said.contains("no cell of the skin sent an acceleration; record a bus with"), "{said}");
+}

@@ -1,0 +1,489 @@
+//! Robots of one's own: a URDF becomes a skin, covered with cells, drawn, recorded, and computed with.
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::cast_possible_truncation,
+    reason = "a test may stop"
+)]
+
+use skinbus_tests::process;
+use skinbus_tests::process::recorded;
+
+use std::collections::BTreeSet;
+use std::fs;
+
+use process::{Ended, Place, example};
+use protocol::skin::Skin;
+use recorded::{Message, Recorded};
+use serde_json::Value;
+
+/// Two joints, a tube, a box, and a plate that is a mesh of a package.
+const ARM: &str = r#"<robot name="arm">
+  <link name="base"><visual><geometry><cylinder radius="0.06" length="0.1"/></geometry></visual></link>
+  <link name="upper"><visual><origin xyz="0 0 0.2"/><geometry><cylinder radius="0.05" length="0.3"/></geometry></visual></link>
+  <link name="fore"><visual><origin xyz="0 0 0.2"/><geometry><box size="0.08 0.08 0.3"/></geometry></visual></link>
+  <link name="plate"><visual><geometry><mesh filename="package://arm_parts/meshes/plate.stl"/></geometry></visual></link>
+  <link name="bare"/>
+  <joint name="shoulder" type="revolute">
+    <parent link="base"/><child link="upper"/><origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>
+    <limit lower="-1" upper="2" velocity="1" effort="9"/>
+  </joint>
+  <joint name="elbow" type="revolute">
+    <parent link="upper"/><child link="fore"/><origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
+    <limit lower="0.5" upper="1.5" velocity="1" effort="9"/>
+  </joint>
+  <joint name="wrist" type="fixed"><parent link="fore"/><child link="plate"/><origin xyz="0 0 0.4"/></joint>
+  <joint name="end" type="fixed"><parent link="plate"/><child link="bare"/></joint>
+</robot>
+"#;
+
+const COVER: &str =
+    "skin import arm.urdf --tip bare --cover upper,fore --pitch 0.04 --package arm_parts=parts";
+
+/// `arm.urdf`, and its mesh in `parts/meshes`: a square of 0.2 m.
+fn arm() -> Place {
+    let place = Place::new();
+    place.write("arm.urdf", ARM);
+    fs::create_dir_all(place.path("parts/meshes")).unwrap();
+    let triangle = |corners: [[f64; 2]; 3]| {
+        let corners = corners.map(|[x, y]| format!("vertex {x} {y} 0\n")).concat();
+        format!("facet normal 0 0 1\nouter loop\n{corners}endloop\nendfacet\n")
+    };
+    let square = [[[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1]], [[-0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]];
+    let facets = square.map(triangle).concat();
+    place.write("parts/meshes/plate.stl", &format!("solid plate\n{facets}endsolid plate\n"));
+    place
+}
+
+fn run(place: &Place, words: &str) -> Ended {
+    place.start("gateway", words).end()
+}
+
+/// A command that is refused with exit code 2 in one line, and writes nothing.
+fn refused(place: &Place, words: &str, expected: &str) {
+    let before = place.files();
+    let ended = run(place, words);
+    let said = ended.refusal(2);
+    assert!(said.contains(expected), "{words}\n{said}\n{expected}");
+    assert_eq!(place.files(), before, "{words}");
+}
+
+fn read(place: &Place, name: &str) -> Skin {
+    Skin::read(&place.path(name)).unwrap()
+}
+
+/// What a page's script reads.
+fn data(page: &str) -> Value {
+    let (_, data) = page.split_once(r#"id="skin">"#).unwrap();
+    serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap()
+}
+
+#[test]
+fn each_example_becomes_a_skin() {
+    let place = Place::new();
+    for (file, tips, joints) in [
+        ("panda.urdf", &["hand"][..], 7),
+        ("ur10.urdf", &["tool0"], 6),
+        ("two-arms.urdf", &["left_palm", "right_palm"], 12),
+        ("lift.urdf", &["tool"], 8),
+    ] {
+        fs::copy(example(file), place.path(file)).unwrap();
+        let tips_words = tips.iter().map(|tip| format!(" --tip {tip}")).collect::<String>();
+        let ended = run(&place, &format!("skin import {file}{tips_words} -o skin.toml --force")).well();
+        assert_eq!(ended.stderr.lines().count(), tips.len(), "a line for each chain: {}", ended.stderr);
+        let said = run(&place, "skin check skin.toml").well().stdout;
+        assert!(said.contains(&format!("{joints} joints")), "{file}: {said}");
+        let skin = read(&place, "skin.toml");
+        assert_eq!((skin.cells.len(), skin.robot.chains.len()), (tips.len(), tips.len()), "{file}");
+        assert_eq!(skin.robot.urdf.as_deref(), Some(file));
+    }
+}
+
+#[test]
+fn links_are_covered_and_the_skin_runs() {
+    let place = arm();
+    let said = run(&place, &format!("{COVER} --nodes-per-bus 60 -o skin.toml")).well();
+    for link in ["upper: ", "fore: "] {
+        let line = said.stderr.lines().find(|line| line.starts_with(link)).unwrap();
+        assert!(line.contains(" cells, ") && line.contains(" % of ") && line.contains(" mm from "), "{line}");
+    }
+    run(&place, "skin check skin.toml").well();
+    let skin = read(&place, "skin.toml");
+    assert!(skin.cells.len() > 100 && skin.buses.len() >= 2, "{} cells", skin.cells.len());
+    for (index, bus) in skin.buses.iter().enumerate() {
+        assert_eq!(bus.name, format!("vcan{index}"));
+        assert!((1..=60).contains(&skin.cells_of(index).count()), "{}", bus.name);
+        assert!(skin.cells_of(index).any(|cell| cell.root), "{} has a root", bus.name);
+        let wired = skin.cells_of(index).filter(|cell| cell.neighbors.iter().any(Option::is_some));
+        assert!(wired.count() > skin.cells_of(index).count() * 9 / 10);
+    }
+    // By the first line, the same again; with another seed, other cells.
+    let again = run(&place, &format!("{COVER} --nodes-per-bus 60 -o again.toml")).well();
+    assert_eq!((place.read("again.toml"), again.stderr), (place.read("skin.toml"), said.stderr));
+    run(&place, &format!("{COVER} --seed 2 -o other.toml")).well();
+    assert_ne!(read(&place, "other.toml").cells, skin.cells);
+
+    let words = "run skin.toml --bus-kind embedded --cells-per-process 60 --duration 1.5 --record run.mcap --record-split 1s";
+    run(&place, words).well();
+    for part in ["run.mcap", "run-1.mcap"] {
+        let recorded = Recorded::read(&place.path(part));
+        assert_eq!(recorded.attachments["robot.urdf"], ARM.as_bytes(), "{part}");
+        let said = |topic: &str| recorded.on(topic).next().unwrap().value.clone();
+        assert_eq!(said("/robot_description")["data"], ARM, "{part}");
+        let frames = ["/tf", "/tf_static"].map(|topic| said(topic)["transforms"].as_array().unwrap().clone());
+        let frames: BTreeSet<_> =
+            frames.iter().flatten().map(|it| it["child_frame_id"].as_str().unwrap()).collect();
+        let patches: Vec<_> = recorded.messages.iter().filter(|it| it.topic.starts_with("/skin/")).collect();
+        let named = |it: &Message| it.value["header"]["frame_id"].as_str().unwrap().to_owned();
+        assert!(!patches.is_empty());
+        for patch in patches {
+            let base = named(patch) == "base" && patch.topic.ends_with("/points");
+            assert!(base || frames.contains(named(patch).as_str()), "{}", named(patch));
+        }
+        assert!(frames.contains("upper") && frames.contains("vcan0/1"), "{frames:?}");
+    }
+    // What is no URDF goes into no recording.
+    place.write("arm.urdf", "root:x:0:0:root:/root:/bin/bash\n");
+    refused(
+        &place,
+        "run skin.toml --bus-kind embedded --record no.mcap",
+        "robot.urdf: arm.urdf: not XML: unknown token at 1:1; correct the skin's path, or take the key out",
+    );
+    fs::remove_file(place.path("arm.urdf")).unwrap();
+    refused(
+        &place,
+        "run skin.toml --bus-kind embedded --record no.mcap",
+        "robot.urdf: arm.urdf: No such file",
+    );
+}
+
+#[test]
+fn a_box_holds_no_cell_and_a_bus_has_one_chain() {
+    let place = arm();
+    let box_words = "--keep-out upper:-1,-1,0.2,1,1,1";
+    run(&place, &format!("{COVER} {box_words} -o kept.toml")).well();
+    run(&place, &format!("{COVER} -o all.toml")).well();
+    let [kept, all] = ["kept.toml", "all.toml"].map(|name| read(&place, name).cells.len());
+    assert!(kept + 20 < all, "{kept} of {all}");
+    assert!(place.read("kept.toml").lines().next().unwrap().contains(box_words));
+
+    fs::copy(example("two-arms.urdf"), place.path("two.urdf")).unwrap();
+    let words = "skin import two.urdf --tip left_palm --tip right_palm --pitch 0.05 -o two.toml \
+                 --cover torso,left_upper_arm,right_upper_arm";
+    run(&place, words).well();
+    let skin = read(&place, "two.toml");
+    let chains: Vec<_> = skin.buses.iter().map(|bus| skin.robot.chains[bus.chain].name.as_str()).collect();
+    assert_eq!(chains, ["left_palm", "right_palm"]);
+    let joints = |bus| skin.cells_of(bus).map(|cell| cell.joint).collect::<BTreeSet<_>>();
+    assert!(joints(0).contains(&2) && !joints(1).contains(&2), "the torso belongs to the first chain");
+}
+
+#[test]
+fn a_skin_is_drawn_on_one_page() {
+    let place = arm();
+    run(&place, &format!("{COVER} -o skin.toml")).well();
+    let ended = run(&place, "skin show skin.toml --package arm_parts=parts -o skin.html").well();
+    assert_eq!(ended.stderr, "");
+    let page = place.read("skin.html");
+    let outside = page.replace("http://www.w3.org/2000/svg", "");
+    assert!(!outside.contains("http:") && !outside.contains("https:"), "it asks for nothing outside");
+    let drawn = data(&page);
+    let names = |value: &Value| (value["bus"].as_u64().unwrap(), value["node"].as_u64().unwrap());
+    let drawn_names: Vec<_> = drawn["cells"].as_array().unwrap().iter().map(names).collect();
+    let skin = read(&place, "skin.toml");
+    let all: Vec<_> = skin.cells.iter().map(|cell| (cell.bus as u64, cell.node.get().into())).collect();
+    assert_eq!(drawn_names, all);
+    assert_eq!(drawn["buses"][0], "vcan0");
+    assert!(drawn["triangles"].as_array().unwrap().len() > 100);
+    // Each cell of the upper arm lies on its tube, which stands upright from 0.15 to 0.45 m.
+    let upper =
+        drawn["cells"].as_array().unwrap().iter().zip(&skin.cells).filter(|(_, cell)| cell.joint == 1);
+    for (drawn, _) in upper {
+        let [x, y, z] = [0, 1, 2].map(|axis| drawn["position"][axis].as_f64().unwrap());
+        assert!(x.hypot(y) < 0.051 && (0.149..0.451).contains(&z), "{x} {y} {z}");
+    }
+
+    // Without the mesh, the rest; without the URDF, lines.
+    let said = run(&place, "skin show skin.toml -o less.html").well().stderr;
+    assert!(said.starts_with("1 link not drawn: arm.urdf: link plate: mesh package://arm_parts/"), "{said}");
+    fs::remove_file(place.path("arm.urdf")).unwrap();
+    let ended = run(&place, "skin show skin.toml").well();
+    assert!(ended.stderr.starts_with("the robot is not drawn: arm.urdf: No such file"), "{}", ended.stderr);
+    let with_urdf = drawn;
+    let drawn = data(&ended.stdout);
+    // Where the chain begins is in the skin too.
+    for (one, other) in with_urdf["cells"].as_array().unwrap().iter().zip(drawn["cells"].as_array().unwrap())
+    {
+        for axis in 0..3 {
+            let [one, other] = [one, other].map(|cell| cell["position"][axis].as_f64().unwrap());
+            assert!((one - other).abs() < 2e-5, "{one} {other}");
+        }
+    }
+    assert_eq!(drawn["triangles"].as_array().unwrap().len(), 0);
+    assert!(!drawn["segments"].as_array().unwrap().is_empty());
+    let ur5 = example("ur5-253.toml").display().to_string();
+    let page = run(&place, &format!("skin show {ur5}")).well().stdout;
+    assert_eq!(data(&page)["cells"].as_array().unwrap().len(), 253);
+    place.write("skin.html", "mine");
+    refused(&place, &format!("skin show {ur5} -o skin.html"), "-o skin.html: ");
+}
+
+#[test]
+fn what_cannot_be_covered_is_said_in_a_line() {
+    let place = arm();
+    let cover = |links: &str, more: &str| format!("skin import arm.urdf --tip bare --cover {links} {more}");
+    let with = "--package arm_parts=parts";
+    for (words, expected) in [
+        (cover("fore", ""), "link plate: mesh package://arm_parts/meshes/plate.stl: "),
+        (cover("fore", ""), "is no file: say where the package is with --package arm_parts=DIR"),
+        (cover("fore", "--package arm_parts=nowhere"), "nowhere/meshes/plate.stl is no file: say where"),
+        (cover("bare", with), "--cover bare: arm.urdf has no visual of this link"),
+        (cover("forearm", with), "--cover forearm: arm.urdf: there is no link \"forearm\"; the nearest are"),
+        (
+            cover("base", with),
+            "--cover base: no chain moves this link: those that a chain moves are upper, fore",
+        ),
+        (cover("fore,fore", with), "--cover fore: this link is named twice"),
+        (cover("fore", "--pitch 2"), "a length from 0.001 to 1 m"),
+        (cover("fore", "--nodes-per-bus 251"), "251 is not in 1..=250"),
+        (cover("fore", "--keep-out fore:0,0,0,1,1"), "six lengths in m"),
+        (cover("fore", "--keep-out fore:1,0,0,0,1,1"), "six lengths in m"),
+        (cover("fore", "--keep-out upper:0,0,0,1,1,1"), "upper is not covered: the covered links are fore"),
+        (cover("fore", "--package arm_parts"), "NAME=DIR"),
+        (cover("fore", "--cells cells.csv"), "cannot be used with"),
+    ] {
+        refused(&place, &words, expected);
+    }
+}
+
+#[test]
+fn what_is_no_chain_of_joints_is_said_in_a_line() {
+    let place = arm();
+    let floating = ARM.replacen("type=\"revolute\"", "type=\"floating\"", 1);
+    let mimic = ARM.replacen("<limit", "<mimic joint=\"elbow\"/><limit", 1);
+    let far = ARM.replace("<origin xyz=\"0 0 0.4\"/><axis", "<origin xyz=\"0 0 2.5\"/><axis");
+    for (text, words, expected) in [
+        (floating.as_str(), "--tip bare", "joint \"shoulder\" is floating"),
+        (&mimic, "--tip bare", "joint \"shoulder\" mimics \"elbow\""),
+        (&far, "--tip bare", " m is possible"),
+        ("", "--tip bare", "the file is empty"),
+        (
+            "<robot xmlns:xacro=\"x\"><xacro:a/></robot>",
+            "--tip bare",
+            "run `xacro FILE.xacro > FILE.urdf` first",
+        ),
+        (ARM, "--tip hand", "there is no link \"hand\"; the nearest are"),
+        (ARM, "--tip bare --tip bare", "--tip bare: this tip is named twice"),
+        (ARM, "--tip base", "no joint moves between"),
+    ] {
+        place.write("arm.urdf", text);
+        refused(&place, &format!("skin import arm.urdf {words}"), expected);
+    }
+    refused(&place, "skin import nowhere.urdf --tip a", "nowhere.urdf: No such file");
+    let head = "link,px,py,pz,nx,ny,nz";
+    for (text, expected) in [
+        (
+            "link,px,py,pz,nx,ny,up\nfore,0,0,0,0,0,1\n".to_owned(),
+            "cells.csv: line 1: the first line must be the header link,px,py,pz,nx,ny,nz, with bus,node if they are \
+             given, and it is \"link,px,py,pz,nx,ny,up\": correct it",
+        ),
+        ("fore,0,0,0,0,0,1\n".to_owned(), "it is \"fore,0,0,0,0,0,1\": write the header above it"),
+        (format!("{head}\nfore,0,0,x,0,0,1\n"), "cells.csv: line 2: pz = \"x\": a finite number is needed"),
+        (format!("{head}\nfore,0,0,0,0,0,1\nfourth,0,0,0,0,0,1\n"), "cells.csv: line 3: "),
+        (format!("{head}\nfore,0,0,0,0,0,0\n"), "line 2: the normal"),
+        (
+            format!("{head}\nfore,0,0\n"),
+            "cells.csv: line 2: 3 values: one is needed for each of the columns link, ",
+        ),
+        (head.to_owned(), "there is no cell in it"),
+        // What only the skin's check knows, by the line of the file.
+        (
+            format!("# mine\n{head}\nfore,0,0,0,0,0,1\n\nfore,3,0,0,0,0,1\n"),
+            "gateway: cells.csv: line 5: position px,py,pz = 3,0,0 of link \"fore\" can come 3.",
+        ),
+        (
+            format!("{head},bus,node\nfore,0,0,0,0,0,1,,300\n"),
+            "gateway: cells.csv: line 2: node = \"300\": 1 to 254 are possible",
+        ),
+        (
+            format!("{head},bus,node\nfore,0,0,0,0,0,1,,\nupper,0,0,0,0,0,1,,1\n"),
+            "gateway: cells.csv: line 3: node 1 of bus \"vcan0\" is that of line 2 already",
+        ),
+        (
+            format!("{head},bus\nfore,0,0,0,0,0,1,my bus\n"),
+            "gateway: cells.csv: line 2: bus \"my bus\": its name has 1 to 15 letters",
+        ),
+    ] {
+        place.write("cells.csv", &text);
+        refused(&place, "skin import arm.urdf --tip bare --cells cells.csv", expected);
+    }
+}
+
+/// A torso with several arms of 12 joints each.
+#[test]
+fn a_robot_has_at_most_32_joints() {
+    let place = Place::new();
+    let mut inner = "<link name=\"torso\"/>".to_owned();
+    for arm in ["a", "b", "c"] {
+        for joint in 1..=12 {
+            let below = if joint == 1 { "torso".to_owned() } else { format!("{arm}{}", joint - 1) };
+            inner += &format!(
+                "<link name=\"{arm}{joint}\"/><joint name=\"j{arm}{joint}\" type=\"revolute\"><parent link=\"{below}\"/>\
+                 <child link=\"{arm}{joint}\"/><origin xyz=\"0 0 0.1\"/><axis xyz=\"0 1 0\"/><limit lower=\"-1\" \
+                 upper=\"1\" velocity=\"1\" effort=\"9\"/></joint>"
+            );
+        }
+    }
+    place.write("arms.urdf", &format!("<robot name=\"arms\">{inner}</robot>"));
+    place.write("cells.csv", "link,px,py,pz,nx,ny,nz\na12,0,0,0,0,0,1\nb12,0,0,0,0,0,1\n");
+    for cells in ["", " --cells cells.csv"] {
+        refused(
+            &place,
+            &format!("skin import arms.urdf --tip a12 --tip b12 --tip c12{cells}"),
+            "gateway: arms.urdf: 36 joints move between the root and the tips; a robot has 1 to 32: give fewer --tip",
+        );
+        run(&place, &format!("skin import arms.urdf --tip a12 --tip b12{cells}")).well();
+    }
+}
+
+#[test]
+fn each_covered_link_has_a_cell() {
+    let place = arm();
+    // A knob that is smaller than a cell, beside a link with room.
+    let knob = ARM.replace(
+        "<link name=\"bare\"/>",
+        "<link name=\"bare\"><visual><origin xyz=\"0 0 0.3\"/><geometry><sphere radius=\"0.003\"/></geometry></visual></link>",
+    );
+    place.write("arm.urdf", &knob);
+    let cover = |links: &str, more: &str| {
+        let mut command = place
+            .command("gateway", "skin import arm.urdf --tip bare --package arm_parts=parts --pitch 0.04");
+        command.args(["--cover", links]).args(more.split_whitespace()).output().unwrap()
+    };
+    let boxes = "--keep-out fore:-1,-1,-1,1,1,1";
+    for (links, more, expected) in [
+        (
+            "upper,bare",
+            "",
+            "gateway: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
+        ),
+        (
+            "bare",
+            "",
+            "gateway: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
+        ),
+        (
+            "upper,fore",
+            boxes,
+            "gateway: --cover fore: the boxes of --keep-out leave nothing of it: make them smaller",
+        ),
+    ] {
+        let output = cover(links, more);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!((output.status.code(), said.lines().count()), (Some(2), 1), "{said}");
+        assert!(said.starts_with(expected) && output.stdout.is_empty(), "{said}");
+    }
+    let [plain, blanks] = ["upper,fore", " upper, fore "].map(|links| cover(links, "").stdout);
+    assert!(!plain.is_empty() && plain == blanks, "blanks around names do not count");
+}
+
+/// 10 N on a cell 0.3 m above the shoulder, and 0.2 m in front of it.
+#[test]
+fn torques_of_a_force_are_computed_in_both_ways() {
+    let place = arm();
+    place.write("cells.csv", "link,px,py,pz,nx,ny,nz\nupper,0,0,0.3,1,0,0\nfore,0.2,0,0.1,0,0,1\n");
+    run(&place, "skin import arm.urdf --tip bare --cells cells.csv -o skin.toml").well();
+    place.write("rows.csv", "cell,force_n,q\nvcan0:1,10,0 0.5\n2,10,0 0.5\n1,10,1.5707963267948966 0.5\n");
+    let said = run(&place, "torque skin.toml --batch rows.csv --json").well().stdout;
+    let rows: Vec<Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let numbers = |row: &Value, key: &str| {
+        row[key].as_array().unwrap().iter().map(|it| it.as_f64().unwrap()).collect::<Vec<_>>()
+    };
+    // A lever r and a force -F n about y: r_z F_x - r_x F_z. The forearm is turned by 0.5 about y at 0.4 m.
+    let (sine, cosine) = 0.5_f64.sin_cos();
+    let (x, z) = (0.2 * cosine + 0.1 * sine, 0.1 * cosine - 0.2 * sine);
+    let elbow = z * -10.0 * sine + x * 10.0 * cosine;
+    let expected = [[-3.0, 0.0], [elbow + 0.4 * -10.0 * sine, elbow], [-3.0, 0.0]];
+    assert_eq!(rows.len(), expected.len());
+    for (row, expected) in rows.iter().zip(expected) {
+        assert_eq!(row["joints"], serde_json::json!(["shoulder", "elbow"]));
+        assert_eq!((&row["units"][0], &row["saturated"]), (&Value::from("Nm"), &Value::from(false)));
+        let keys = ["central", "fixed", "difference"].map(|key| numbers(row, key));
+        for joint in 0..2 {
+            let [central, fixed, difference] = [0, 1, 2].map(|key| keys[key][joint]);
+            assert!((central - expected[joint]).abs() < 1e-9, "{row}");
+            assert!((fixed - central).abs() < 0.01 && (fixed - central - difference).abs() < 1e-12, "{row}");
+        }
+    }
+    let mut single = place.command("gateway", "torque skin.toml --json --cell vcan0:1 --force 10 --joints");
+    single.arg("0 0.5");
+    let out = single.output().unwrap();
+    assert!(out.status.success());
+    let same: Value = serde_json::from_slice(&out.stdout).unwrap();
+    assert_eq!(same, rows[0]);
+
+    for (words, expected) in [
+        ("--cell 9 --force 1 --joints 0,0.5", "--cell 9: the skin has no such cell on vcan0"),
+        ("--cell 1 --force 1 --joints 0", "one is needed for each of the chain's 2 joints, shoulder, elbow"),
+        ("--cell 1 --force 1 --joints 0,x", "position \"x\" of elbow: a number in rad is needed"),
+        ("--cell 1 --force -1 --joints 0,0.5", "force -1 N: a force presses against the outward normal"),
+        ("--cell 1 --force 95.998 --joints 0,0.5", "gateway: --cell 1: force 95.998 N: "),
+        (
+            "--cell vcan0:1 --force 1 --joints 45,0.5",
+            "gateway: --cell vcan0:1: position 45 rad: shoulder takes -6.2832 to 6.2832 rad",
+        ),
+        ("--cell 1 --joints 0,0.5", "--force"),
+        ("--cell 1 --force 1 --joints 0,0.5 --batch rows.csv", "cannot be used with"),
+        ("--batch nowhere.csv", "nowhere.csv: No such file"),
+        (
+            "--batch cells.csv",
+            "cells.csv: line 1: the first line must be the header cell,force_n,q, and it is \"link,",
+        ),
+    ] {
+        refused(&place, &format!("torque skin.toml {words}"), expected);
+    }
+    for (text, expected) in [
+        ("cell,force_n,q\n", "there is no row in it"),
+        (
+            "cell,force_n,q\n7,1,0 0.5\n",
+            "gateway: rows.csv, row 1: cell 7: the skin has no such cell on vcan0",
+        ),
+        (
+            "cell,force_n,q\n1,1,0 0.5\nvcan5:1,1,0 0.5\n",
+            "gateway: rows.csv, row 2: cell vcan5:1: the skin's buses are vcan0",
+        ),
+        ("cell,force_n,q\n1,1,0\n", "gateway: rows.csv, row 1: cell 1: 1 position: one is needed"),
+        (
+            "cell,force_n,q\n1,x,0 0.5\n",
+            "gateway: rows.csv: line 2: force_n = \"x\": a finite number is needed",
+        ),
+        ("1,1,0 0.5\n2,1,0 0.5\n", "and it is \"1,1,0 0.5\": write the header above it"),
+        (
+            "cell,force_n,q\n1,1,0 0.5\nvcan0:2,96,0 0.5\n",
+            "gateway: rows.csv, row 2: cell vcan0:2: force 96 N: a force presses against the outward normal with 0 to \
+             95.997 N, the range of three contact words",
+        ),
+        (
+            "cell,force_n,q\n2,1,0 -6.3\n",
+            "gateway: rows.csv, row 1: cell 2: position -6.3 rad: elbow takes -6.2832 to 6.2832 rad",
+        ),
+    ] {
+        place.write("rows.csv", text);
+        refused(&place, "torque skin.toml --batch rows.csv", expected);
+    }
+
+    // The ends of what is possible.
+    place.write("rows.csv", "# ends\ncell,force_n,q\n1,0,-6.28 0.5\n1,95.9970703125,2 6.28\n");
+    run(&place, "torque skin.toml --batch rows.csv").well();
+    let endless = ARM.replacen("revolute", "continuous", 1).replacen("revolute", "prismatic", 1);
+    place.write("arm.urdf", &endless.replace("\"0.5\" upper=\"1.5\"", "\"0\" upper=\"0.5\""));
+    run(&place, "skin import arm.urdf --tip bare -o skin.toml --force").well();
+    run(&place, "torque skin.toml --cell 1 --force 1 --joints -3.14159,0.5").well();
+    for (joints, expected) in [
+        ("-6.3,0", "position -6.3 rad: shoulder takes -6.2832 to 6.2832 rad"),
+        ("0,0.6", "position 0.6 m: elbow takes 0.0000 to 0.5000 m"),
+    ] {
+        refused(&place, &format!("torque skin.toml --cell 1 --force 1 --joints {joints}"), expected);
+    }
+}

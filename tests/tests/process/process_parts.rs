@@ -1,0 +1,217 @@
+//! Split recordings of real processes: every part replays by itself, bit for bit, with presses across the split and late
+//! frames; all parts together are one recording.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use skinbus_tests::process;
+
+use std::fs;
+use std::time::Duration;
+
+use analysis::report::run::{Options, report};
+use model::generate::{Format, Reply, Target, generate};
+use process::replay::{TOUCHED, says_everything};
+use process::{Place, skin_of, until};
+use rustix::process::Signal;
+use serde_json::Value;
+
+/// Touches across every split of a second, and on both buses.
+fn touched(buses: usize) -> String {
+    let more = |bus: usize| {
+        format!(
+            "\n[[touch]]\nat_s = 0.4\nfor_s = 2.9\nbus = \"vcan{bus}\"\ncells = [1, 3]\nforce_n = 3.0\n\
+             profile = \"step\"\n\n[[touch]]\nat_s = 0.97\nfor_s = 0.06\nbus = \"vcan{bus}\"\ncells = [2]\n\
+             force_n = 3.0\nprofile = \"half-sine\"\n"
+        )
+    };
+    TOUCHED.to_owned() + &(1..buses).map(more).collect::<String>()
+}
+
+/// The parts of `run.mcap`, by their numbers.
+fn parts(place: &Place) -> Vec<String> {
+    let name = |number: u32| if number == 0 { "run.mcap".to_owned() } else { format!("run-{number}.mcap") };
+    (0..).map(name).take_while(|name| place.path(name).exists()).collect()
+}
+
+/// Checks that each part answers by itself as it is recorded, and all together.
+fn all_come_back(place: &Place, min: u64) {
+    place.is_left_clean();
+    let parts = parts(place);
+    assert!(parts.len() >= 4, "{parts:?}");
+    let route = "--expect --spawn --max --quiet --cells-per-process 8";
+    let mut equal = 0;
+    for part in &parts {
+        let (ended, replayed) = place.replayed(part, route);
+        let came_back = replayed.all_came_back(&ended);
+        // In the second part at least something was pressed in the one before.
+        assert!(part != "run-1.mcap" || came_back > min / 10, "{came_back} in {part}: {:#}", replayed.0);
+        equal += came_back;
+    }
+    // In whatever order.
+    let backwards = parts.iter().rev().map(String::as_str).collect::<Vec<_>>().join(" ");
+    let (ended, replayed) = place.replayed(&backwards, route);
+    let together = replayed.all_came_back(&ended);
+    assert!(together >= min && equal >= min, "{equal} one by one, {together} together");
+    let title = format!("run.mcap to {} ({} parts)", parts.last().unwrap(), parts.len());
+    assert_eq!(replayed.text("/file"), title);
+    place.is_left_clean();
+}
+
+#[test]
+fn parts_of_a_run_with_every_message_come_back() {
+    let place = Place::new();
+    let skin = place.skin(8);
+    place.scenario(&touched(1));
+    let bench = place.running_bench(4.2, "--record run.mcap --record-split 1s");
+    says_everything(&place.test_client(), &skin);
+    bench.end().well();
+    all_come_back(&place, 300);
+}
+
+#[test]
+fn parts_of_two_buses_of_classic_frames_come_back() {
+    let place = Place::new();
+    place.write("skin.toml", &skin_of(16, 2, Format::Classic));
+    place.scenario(&touched(2));
+    place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
+    all_come_back(&place, 400);
+}
+
+#[test]
+fn parts_of_cells_that_send_events_come_back() {
+    let place = Place::new();
+    place.write(
+        "skin.toml",
+        &skin_of(12, 1, Format::Fd).replace("format = \"fd\"", "format = \"fd\"\nsensing = \"event\""),
+    );
+    place.scenario(&touched(1));
+    place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
+    all_come_back(&place, 300);
+}
+
+#[test]
+fn parts_of_cells_that_send_continuously_on_a_slow_bus_come_back() {
+    let place = Place::new();
+    let expected = Target { cells: 9, broadcast_hz: 31.25, format: Format::Classic, ..Target::default() };
+    let sensing = "format = \"classic\"\nsensing = \"continuous\"\nsensing_hz = 5.0";
+    place.write("skin.toml", &generate(&expected).unwrap().replace("format = \"classic\"", sensing));
+    place.scenario(&touched(1));
+    place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
+    all_come_back(&place, 150);
+}
+
+#[test]
+fn parts_of_sums_come_back_with_what_rounding_carries() {
+    let place = Place::new();
+    let expected = Target { cells: 10, reply: Reply::Sum, ..Target::default() };
+    place.write("skin.toml", &generate(&expected).unwrap());
+    place.scenario(&touched(1));
+    place.bench(4.2, "--record run.mcap --record-split 1s").end().well();
+    all_come_back(&place, 150);
+}
+
+/// A run of four seconds in parts, with a touch all the time.
+fn recorded(place: &Place) {
+    place.skin(8);
+    place.scenario(&touched(1));
+    place.bench(3.4, "--record run.mcap --record-split 1s").end().well();
+}
+
+#[test]
+fn explain_dump_and_report_take_a_part_and_all_of_them() {
+    let place = Place::new();
+    recorded(&place);
+    let parts = parts(&place).join(" ");
+    // Cell 1 is pressed from the beginning of the run on: more than half of all epochs ago.
+    let ended = place.start("gateway", "explain run-3.mcap --epoch 200 --cell 1").end().well();
+    assert!(ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus of -"), "{ended:#?}");
+    assert!(!ended.stdout.contains("not known"), "{ended:#?}");
+    let whole = place.start("gateway", &format!("explain {parts} --epoch 200 --cell 1")).end().well();
+    let contact = |text: &str| text.lines().find(|line| line.contains("  contact  ")).unwrap().to_owned();
+    assert_eq!(contact(&whole.stdout), contact(&ended.stdout));
+
+    let stats = |files: &str| -> Value {
+        let ended = place.start("gateway", &format!("dump {files} --stats --json")).end().well();
+        serde_json::from_str(&ended.stdout).unwrap()
+    };
+    let lines =
+        |files: &str| place.start("gateway", &format!("dump {files}")).end().well().stdout.lines().count();
+    let one_by_one: usize = parts.split(' ').map(lines).sum();
+    assert_eq!(lines(&parts), one_by_one);
+    let all = stats(&parts);
+    assert_eq!(all["source"], "run.mcap to run-3.mcap (4 parts)");
+    let ended = place.start("gateway", &format!("convert {parts} all.log --plain")).end().well();
+    assert!(ended.stderr.contains(&format!("{one_by_one} frames")), "{ended:#?}");
+    place.start("gateway", &format!("shadow {parts}")).end().well();
+
+    // No packet of the part before counts as lost in this one.
+    let summary = place.summary();
+    let ways = ["dropped", "backlog", "outage", "unknown"];
+    let lost: u64 = ways.iter().map(|route| summary.number(&format!("/buses/0/uplink/{route}"))).sum();
+    for files in [parts.as_str(), "run-2.mcap"] {
+        let files: Vec<_> = files.split(' ').map(|name| place.path(name)).collect();
+        let report = report(&files, &Options::default()).unwrap();
+        let findings = report.page.sections.iter().flat_map(|section| &section.findings);
+        let mut found = findings.filter(|finding| finding.what.starts_with("packets of cells lost"));
+        assert!(found.next().unwrap().ours.value <= lost as f64, "{files:?}");
+    }
+    place.start("gateway", &format!("report {parts}")).end().well();
+    assert!(place.path("run.html").exists());
+}
+
+#[test]
+fn files_that_are_not_the_parts_of_one_recording_are_named() {
+    let place = Place::new();
+    recorded(&place);
+    let refused = |files: &str| place.start("gateway", &format!("dump {files}")).end().refusal(2).to_owned();
+    let said = "gateway: part 1 of the recording is missing between run.mcap and run-2.mcap: name all parts from the \
+                first to the last, or one alone";
+    assert_eq!(refused("run-2.mcap run.mcap run-3.mcap"), said);
+    fs::copy(place.path("run-1.mcap"), place.path("again.mcap")).unwrap();
+    let said = "gateway: run-1.mcap and again.mcap are both part 1 of the recording: name one of them";
+    assert_eq!(refused("run.mcap run-1.mcap again.mcap run-2.mcap"), said);
+    let line = refused("run.mcap run-1.mcap run.log");
+    assert_eq!(line, "gateway: run.mcap is a part of a recording, and run.log is none: name the parts alone");
+    let line = refused("run.mcap nothing.mcap");
+    assert!(line.starts_with("gateway: there is no file nothing.mcap: "), "{line}");
+    fs::rename(place.path("run.mcap"), place.path("run-recovered.mcap")).unwrap();
+    place.bench(0.1, "--record other.mcap").end().well();
+    let line = refused("other.mcap run-1.mcap");
+    assert!(
+        line.starts_with("gateway: other.mcap and run-1.mcap are of different recordings, begun at "),
+        "{line}"
+    );
+    // The file name does not matter; nor do parts that are missing at an end.
+    place.start("gateway", "dump run-2.mcap run-1.mcap run-recovered.mcap").end().well();
+    place.start("gateway", "dump run-3.mcap run-2.mcap").end().well();
+}
+
+#[test]
+fn parts_of_a_killed_run_come_back_recovered_or_as_they_are() {
+    let place = Place::new();
+    place.skin(8);
+    place.scenario(&touched(1));
+    let bench = place.running_bench(60.0, "--record run.mcap --record-split 1s");
+    // A moment ago the file before it was ended.
+    until("a fourth part", || place.path("run-3.mcap.part").exists().then_some(()));
+    std::thread::sleep(Duration::from_millis(300));
+    bench.signal(Signal::KILL);
+    bench.end();
+    until("the cells' end", || place.processes().is_empty().then_some(()));
+    let left = fs::read_dir(place.path(".")).unwrap();
+    let left = left.map(|entry| entry.unwrap().file_name().into_string().unwrap());
+    let left: Vec<_> = left.collect();
+    let last = left.iter().filter(|name| name.ends_with(".part")).max();
+    let last = last.unwrap_or_else(|| panic!("{left:?}"));
+    let route = "--expect --spawn --max --quiet";
+    let whole = parts(&place).join(" ");
+    let (ended, replayed) = place.replayed(&format!("{whole} {last}"), "--expect --spawn --max");
+    let as_it_is = replayed.all_came_back(&ended);
+    assert!(ended.stderr.contains("it has no end"), "{ended:#?}");
+    place.start("gateway", &format!("recover {last} -o z-recovered.mcap")).end().well();
+    let (ended, replayed) = place.replayed(&format!("z-recovered.mcap {whole}"), route);
+    assert_eq!(replayed.all_came_back(&ended), as_it_is);
+    let (ended, replayed) = place.replayed("z-recovered.mcap", route);
+    replayed.all_came_back(&ended);
+    assert!(as_it_is > 100, "{as_it_is}");
+    place.is_left_clean();
+}

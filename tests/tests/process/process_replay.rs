@@ -1,0 +1,388 @@
+//! Runs are recorded, and replayed to cells that were just started, or that have another history: their
+//! replies are those recorded, bit for bit, or the difference is reported.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use skinbus_tests::process;
+
+use std::cell::Cell as Counter;
+use std::fs;
+use std::time::Duration;
+
+use model::generate::{self, Format};
+use process::replay::{FRESH, Replayed, TOUCHED, by_hand, cell, changed, is_torque, without};
+use process::{Place, example, skin_of};
+use protocol::id::Node;
+use protocol::message::{From, Message, NetworkPage, Request, SensorPage, SkinSensors, State};
+use protocol::packet::WORDS;
+use protocol::parameters::Parameter;
+use protocol::skin::Skin;
+use rustix::process::Signal;
+
+#[test]
+fn a_run_comes_back_bit_for_bit_at_its_own_times_in_lockstep_and_as_fast_as_it_can() {
+    let place = Place::new();
+    place.records(8);
+    let mut counts = Vec::new();
+    for route in ["", "--spin 0", "--lockstep --speed 4", "--max", "--max --cells-per-process 8", "--max"] {
+        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
+        place.is_left_clean();
+        let count = if route.contains("--max") || route.contains("--lockstep") {
+            replayed.all_came_back(&ended)
+        } else {
+            replayed.all_came_back_in_time(&ended)
+        };
+        counts.push(count);
+        let timed = !route.contains("--max") && !route.contains("--lockstep");
+        assert_eq!(!replayed.0["late_us"].is_null(), timed);
+        assert_eq!(ended.stdout.contains("lateness"), timed, "{}", ended.stdout);
+        assert_eq!(replayed.number("/refused") + replayed.number("/lost"), 0);
+        assert!(ended.stdout.contains("bit for bit"), "{}", ended.stdout);
+    }
+    let sent = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap()).number("/sent");
+    // More than the torques of one cell in every epoch.
+    assert!(counts[0] > 300 && counts.iter().all(|count| *count == counts[0]), "{counts:?}");
+    let inputs = without(&place.read("run.log"), |message| {
+        !matches!(
+            message,
+            Message::Halt
+                | Message::Joints { .. }
+                | Message::Sync
+                | Message::Resume
+                | Message::Report
+                | Message::Configure { .. }
+                | Message::Stimulus { .. }
+        )
+    });
+    assert_eq!(inputs.lines().count() as u64, sent, "all inputs, and nothing else");
+}
+
+#[test]
+fn a_recording_brings_its_own_skin() {
+    let place = Place::new();
+    place.skin(5);
+    place.scenario(process::PRESSED);
+    place.bench(2.0, "--record run.mcap").end().well();
+    fs::remove_file(place.path("skin.toml")).unwrap();
+    let mut counts = Vec::new();
+    for file in ["run.mcap", "run.log"] {
+        let skin = if file == "run.log" { " --skin again.toml" } else { "" };
+        place.skin(5);
+        fs::rename(place.path("skin.toml"), place.path("again.toml")).unwrap();
+        let (ended, replayed) = place.replayed(file, &format!("--expect --spawn --max{skin}"));
+        counts.push((replayed.all_came_back(&ended), replayed.number("/sent")));
+        place.is_left_clean();
+    }
+    // The log and the recording are of the same run.
+    assert!(counts[0].0 > 300 && counts[0] == counts[1], "{counts:?}");
+}
+
+#[test]
+fn the_second_file_of_a_recording_begins_with_what_was_latched() {
+    let place = Place::new();
+    place.skin(5);
+    place.scenario(process::PRESSED);
+    place.bench(2.5, "--record run.mcap --record-split 1s").end().well();
+    let (ended, first) = place.replayed("run.mcap", &format!("{FRESH} --max"));
+    let first = first.all_came_back(&ended);
+    let (ended, second) = place.replayed("run-1.mcap", &format!("{FRESH} --max"));
+    // It was pressed in the first file, and is in contact in the second.
+    let second = second.all_came_back(&ended);
+    assert!(first > 30 && second > 30, "{first} and {second}");
+    place.is_left_clean();
+}
+
+#[test]
+fn two_buses_of_classic_frames_come_back_too() {
+    let place = Place::new();
+    place.write("skin.toml", &skin_of(9, 2, Format::Classic));
+    place.scenario(process::PRESSED);
+    place.bench(2.0, "").end().well();
+    for route in ["--max", "--lockstep --from 1"] {
+        let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
+        assert!(replayed.all_came_back(&ended) > 100, "{:#}", replayed.0);
+        assert_eq!(replayed.0["buses"].as_array().unwrap().len(), 2);
+        assert!(replayed.number("/buses/1/sent") > 50, "{:#}", replayed.0);
+        place.is_left_clean();
+    }
+}
+
+#[test]
+fn from_the_middle_on_the_torques_are_the_same() {
+    let place = Place::new();
+    place.records(8);
+    let (ended, all) = place.replayed("run.log", &format!("{FRESH} --max"));
+    let all = all.all_came_back(&ended);
+    let mut before = all;
+    // The second one begins while the cells are halted, the last one after cell 4 was configured again.
+    for from in ["1.1", "2.1", "2.6", "3.2"] {
+        let (ended, part) = place.replayed("run.log", &format!("{FRESH} --max --from {from}"));
+        let count = part.all_came_back(&ended);
+        assert!(count > 0 && count < before, "{count} of {before} from {from} on");
+        before = count;
+    }
+    let (ended, thrice) = place.replayed("run.log", &format!("{FRESH} --max --from 2.6 --to 3.1 --loop 3"));
+    let (again, once) = place.replayed("run.log", &format!("{FRESH} --max --from 2.6 --to 3.1"));
+    assert_eq!(thrice.all_came_back(&ended), 3 * once.all_came_back(&again));
+    place.is_left_clean();
+}
+
+#[test]
+fn cells_with_another_history_answer_as_they_did_then() {
+    let place = Place::new();
+    place.records(8);
+    let _bench = by_hand(&place, "1-8");
+    let test_client = place.test_client();
+    for round in 0..2 {
+        // Pressed, halted, and in an epoch that comes soon.
+        let page = SensorPage::Skin(SkinSensors {
+            contact: [protocol::fixed::Q5_10::nearest(3.0); 3],
+            ..SkinSensors::default()
+        });
+        test_client.sends(&Message::Stimulus { to: Node::Everyone, from: From::Next, page });
+        test_client.sends(&Message::Joints {
+            epoch: protocol::packet::Epoch(3),
+            joints: protocol::message::Joints { in_use: 6, ..Default::default() },
+        });
+        test_client.sends(&Message::Halt);
+        // The configuration was changed in the middle of the run, and a restart from there has it again.
+        let part = if round == 0 { "--to 1.2" } else { "--from 2" };
+        let (ended, replayed) = place.replayed("run.log", &format!("--expect --max {part}"));
+        assert!(replayed.all_came_back(&ended) > 50, "{:#}", replayed.0);
+    }
+    // Now cell 4 has another configuration than at the beginning.
+    let ended = place.replay("run.log", "--expect --max --quiet").end();
+    let line = ended.refusal(1);
+    assert!(line.contains("cells have another configuration than in the recording: 4 (recorded "), "{line}");
+}
+
+#[test]
+fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
+    let place = Place::new();
+    place.records(8);
+    let text = place.read("skin.toml");
+    // Cell 3 sits 10 cm elsewhere.
+    let third = text.match_indices("\nposition = [").nth(2).unwrap().0;
+    let moved = text[..third].to_owned()
+        + &text[third..].replacen("position = [", "position = [0.1, 0.0, 0.1] # [", 1);
+    place.write("moved.toml", &moved);
+    let ended = place.replay("run.log", "--expect --spawn --skin moved.toml --quiet").end();
+    let line = ended.refusal(1);
+    let said = "gateway: cells have another configuration than in the recording: 3 (recorded ";
+    assert!(
+        line.starts_with(said) && line.ends_with("on vcan0; name the recording's skin with --skin"),
+        "{line}"
+    );
+
+    place.write("other.toml", &text.replace("force_threshold_n = 0.1", "force_threshold_n = 0.3"));
+    let ended = place.replay("run.log", "--expect --spawn --skin other.toml --quiet").end();
+    let line = ended.refusal(1);
+    assert!(
+        line.starts_with("gateway: the recording is of another skin: all 8 cells have another "),
+        "{line}"
+    );
+    place.is_left_clean();
+
+    let bench = by_hand(&place, "1-6");
+    let ended = place.replay("run.log", "--expect --quiet").end();
+    let said = "gateway: cells of the recording are absent: 7, 8 on vcan0; start them with cell-node, or all with \
+                --spawn";
+    assert_eq!(ended.refusal(1), said);
+    let ended = place.replay("run.log", &format!("{FRESH} --quiet")).end();
+    let said =
+        "gateway: cells are on vcan0 already: 1, 2, 3, 4, 5, 6; leave out --spawn to use them, or stop them";
+    assert_eq!(ended.refusal(1), said);
+    drop(bench);
+}
+
+#[test]
+fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
+    let place = Place::new();
+    place.records(8);
+    let log = place.read("run.log");
+    let wrong = changed(&log, 30, |message| is_torque(message, 2), |words| words[1] += 3);
+    place.write("wrong.log", &wrong);
+    let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --max"));
+    place.is_left_clean();
+    assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[1, 0, 0][..]), "{:#}", replayed.0);
+    assert!(
+        ended.stderr.contains("gateway: replies are not as they were recorded: 1 different"),
+        "{ended:#?}"
+    );
+    let text = replayed.text("/expect/first/text");
+    assert!(ended.stdout.contains(text) && text.contains("cell 2 on vcan0, joints "), "{text}");
+    let lines: Vec<_> = text.lines().map(str::trim).collect();
+    assert!(lines[1].starts_with("recorded  torque 2 epoch ") && lines[1].ends_with(" Nm"), "{text}");
+    assert!(lines[2].starts_with("now       torque 2 epoch "), "{text}");
+    assert_eq!(lines[3], "joint 2: 3 steps less (0.0007 Nm)", "{text}");
+
+    // Within a tolerance it is equal, and counted.
+    for (steps, code, replies) in [("2", 1, [1, 0]), ("3", 0, [0, 1])] {
+        let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --max --tolerance {steps}"));
+        let [equal, different, missing, extra] = replayed.replies();
+        let tolerated = replayed.number("/expect/tolerated");
+        assert_eq!((ended.code(), missing, extra), (Some(code), 0, 0), "{:#}", replayed.0);
+        assert_eq!([different, tolerated], replies, "{:#}", replayed.0);
+        let words = &replayed.0["expect"]["torque_words"];
+        assert_eq!((&words["by_steps"][3], &words["max"]), (&1.into(), &3.into()), "{:#}", replayed.0);
+        assert!(equal > 50 && ended.stdout.contains("torque words 3 off"), "{}", ended.stdout);
+        let said = "1 different, torque words by up to 3 steps (--tolerance 2)";
+        assert_eq!(ended.stderr.contains(said), code == 1, "{ended:#?}");
+    }
+
+    // One that was not recorded, and one that cannot come.
+    let counted = Counter::new(0);
+    let gone = without(&log, |message| {
+        let it = is_torque(message, 2) || is_torque(message, 3);
+        it && counted.replace(counted.get() + 1) == 20
+    });
+    // Nor may the recording have counters that say that it is lacking.
+    let silent = |message: &Message| matches!(message, Message::Network { page: NetworkPage::Heard(_), .. });
+    let beats = Counter::new(0);
+    let heartbeat = |message: &Message| {
+        let it = matches!(message, Message::Network { page: NetworkPage::Heartbeat(beat), .. } if !beat.state.has(State::CLAIMING));
+        it && beats.replace(beats.get() + 1) >= 8
+    };
+    place.write("gone.log", &without(&gone, |message| silent(message) || heartbeat(message)));
+    let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --max"));
+    assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[0, 0, 1][..]), "{:#}", replayed.0);
+    assert_eq!(replayed.text("/expect/first/how"), "extra");
+    // With them it is known that it is the recording's fault.
+    place.write("gone.log", &gone);
+    let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --max"));
+    replayed.all_came_back(&ended);
+    // A busy machine during the recording is another reason, and the two cannot be distinguished.
+    let lacking = ["unrecorded", "untaken"].map(|why| replayed.number(&format!("/expect/lacking/{why}")));
+    assert!(lacking.iter().sum::<u64>() >= 1, "{:#}", replayed.0);
+}
+
+/// Whether a message is a sum of a cell, of one cell at least.
+fn is_sum(message: &Message, cell: u8) -> bool {
+    matches!(message, Message::Sum { from, count, .. } if from.get() == cell && *count > 0)
+}
+
+#[test]
+fn sums_without_their_children_come_back_in_any_tree() {
+    let place = Place::new();
+    let expected = generate::Target { cells: 12, reply: generate::Reply::Sum, ..generate::Target::default() };
+    place.write("skin.toml", &generate::generate(&expected).unwrap());
+    place.scenario(TOUCHED);
+    place.bench(4.0, "--record run.mcap").end().well();
+    place.is_left_clean();
+    for file in ["run.mcap", "run.log"] {
+        let (ended, replayed) = place.replayed(file, &format!("{FRESH} --lockstep"));
+        replayed.all_came_back(&ended);
+        place.is_left_clean();
+        let lacking = |why| replayed.number(&format!("/expect/lacking/{why}"));
+        assert_eq!(lacking("tree_unknown"), 0, "{:#}", replayed.0);
+        // On a busy machine cells look for other parents; mostly they do not.
+        let omitted = lacking("parent_changing") + lacking("sums_not_taken");
+        let sums = replayed.number("/expect/sums");
+        assert!(sums > 300 && sums > 2 * omitted, "{:#}", replayed.0);
+    }
+
+    // The root, which is not in contact, adds something to what it forwards.
+    let skin = Skin::read(&place.path("skin.toml")).unwrap();
+    let root = skin.cells.iter().find(|cell| cell.root).unwrap().node;
+    let wrong = (100..110).fold(place.read("run.log"), |log, nth| {
+        changed(&log, nth, |message| is_sum(message, root.get()), |words| words[1] += 5)
+    });
+    place.write("wrong.log", &wrong);
+    let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --lockstep"));
+    let [_, different, missing, extra] = replayed.replies();
+    assert_eq!((ended.code(), missing, extra), (Some(1), 0, 0), "{:#}", replayed.0);
+    // A cell that changes its parent is left out, and so is a resent sum with more cells in it.
+    assert!((1..=10).contains(&different), "{:#}", replayed.0);
+    let text = replayed.text("/expect/first/text");
+    assert!(text.starts_with(&format!("the first difference: cell {root} on vcan0, joints ")), "{text}");
+    let lines: Vec<_> = text.lines().map(str::trim).collect();
+    assert!(lines[1].starts_with(&format!("recorded  sum {root} epoch ")), "{text}");
+    assert!(lines[1].contains("; less its child"), "{text}");
+    assert_eq!(lines[3], "joint 2: 5 steps less (0.0195 Nm)", "{text}");
+    place.is_left_clean();
+}
+
+#[test]
+fn a_killed_cell_is_named_and_its_replies_are_missing() {
+    let place = Place::new();
+    place.records(8);
+    let replay = place.replay("run.log", &format!("{FRESH} --lockstep"));
+    place.test_client().waits_for_epoch(30);
+    process::signal(replay.cell(1), Signal::KILL);
+    let ended = replay.end();
+    place.is_left_clean();
+    assert_eq!(ended.code(), Some(1), "{ended:#?}");
+    assert!(ended.stderr.contains("cell 1 on vcan0 does not answer within "), "{ended:#?}");
+    assert!(ended.stderr.contains("the process of cell 1 on vcan0 ended (signal: 9"), "{ended:#?}");
+    let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
+    assert_eq!(replayed.0["lockstep"]["silent_cells"], serde_json::json!(["1 on vcan0"]));
+    let [_, different, missing, extra] = replayed.replies();
+    assert!(different == 0 && missing > 50 && extra == 0, "{:#}", replayed.0);
+}
+
+#[test]
+fn a_foreign_capture_goes_to_another_bus_as_it_is() {
+    let place = Place::new();
+    let log = "(10.000000) can7 123#DEADBEEF\n(10.001000) can7 1F334455#R4\n# a comment\n\
+               (10.002000) can8 00C##3AABB\n(10.002000) can7 20000004#0001000000000000\n(10.003000) can7 7FF#\n";
+    place.write("foreign.log", log);
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    let dump = place.start("gateway", "dump vcan0 --bus-kind embedded --max 4");
+    dump.hears("vcan0 is embedded");
+    let (ended, replayed) = place.replayed("foreign.log", "--map can7=vcan0 --map can8=vcan0");
+    ended.well();
+    let ended = dump.end().well();
+    let seen: Vec<_> = ended.stdout.lines().map(|line| line.split([' ', '\t']).nth(2).unwrap()).collect();
+    assert_eq!(seen, ["123#DEADBEEF", "1F334455#R4", "00C##7AABB", "7FF#"]);
+    assert_eq!(replayed.number("/sent"), 4);
+    assert_eq!(replayed.0["skipped"], serde_json::json!({"error frame": 1, "note": 1}));
+}
+
+#[test]
+fn a_cell_that_measures_obeys_for_the_replay_with_test_mode() {
+    let place = Place::new();
+    place.records(8);
+    let _bench = by_hand(&place, "1-8");
+    let test_client = place.test_client();
+    let mode = |tag, request| Message::Configure { to: Node::Cell(cell(3)), tag, request };
+    let number = Parameter::Mode.number();
+    let answers = |tag: u8, expected: i16| {
+        move |message: &Message| {
+            matches!(message, Message::Configured { tag: of, answer: protocol::message::Answer::Value { words, .. }, .. }
+                if *of == tag && words[0] == expected)
+        }
+    };
+    test_client.waits_for("a cell that has settled", |message| {
+        matches!(message, Message::Network { from, page: NetworkPage::Heartbeat(beat), .. }
+            if *from == Node::Cell(cell(3)) && !beat.state.has(State::CLAIMING))
+    });
+    test_client.sends(&mode(1, Request::Write { number, words: [0; WORDS] }));
+    test_client.waits_for("a cell that measures", answers(1, 0));
+    let ended = place.replay("run.log", "--expect --to 1 --quiet").end();
+    let said = "gateway: cells measure and do not obey stimuli, as they did in the recording: 3; --test-mode lets them \
+                obey while the replay lasts";
+    assert_eq!(ended.refusal(1), said);
+    let (ended, replayed) = place.replayed("run.log", "--expect --max --to 1 --test-mode");
+    assert!(replayed.all_came_back(&ended) > 50);
+    test_client.sends(&mode(2, Request::Read { number }));
+    test_client.waits_for("a cell that measures again", answers(2, 0));
+}
+
+/// The whole skin, while it is stroked: a few seconds of it, twice.
+#[test]
+fn two_hundred_and_fifty_three_fresh_cells_answer_as_the_others_did_twice() {
+    let place = Place::new();
+    fs::copy(example("ur5-253.toml"), place.path("skin.toml")).unwrap();
+    fs::copy(example("demo.toml"), place.path("scenario.toml")).unwrap();
+    place.bench(4.0, "").end().well();
+    place.is_left_clean();
+    let mut counts = Vec::new();
+    for route in ["--lockstep", "--max"] {
+        let replay = place.replay("run.log", &format!("{FRESH} {route}"));
+        let ended = replay.end_after(Duration::from_secs(120));
+        let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
+        counts.push(replayed.all_came_back(&ended));
+        place.is_left_clean();
+    }
+    assert!(counts[0] > 1_000 && counts[0] == counts[1], "{counts:?}");
+}

@@ -1,0 +1,271 @@
+//! `gateway view`: a page's WebSocket beside a real bench, and clients that mean no good.
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use skinbus_tests::process;
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::TcpStream;
+
+use process::page::{Page, QUIET, address, ask, watched};
+use process::{Place, TIMEOUT, until};
+use serde_json::Value;
+use tungstenite::{Error, Message};
+
+#[test]
+fn a_press_is_a_torque_and_a_release_takes_it_away() {
+    let place = Place::new();
+    let (run, address) = watched(&place, 12, "--candump run.log");
+    let mut page = Page::new(&address);
+    assert_eq!(page.scene["cells"].as_array().unwrap().len(), 12);
+    assert_eq!(
+        (&page.scene["may_press"], &page.scene["joints"][1]["torque_unit"]),
+        (&true.into(), &"Nm".into())
+    );
+    let rest = page.sees("all cells quiet", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    assert!(rest.cells.iter().all(|cell| cell.1 == 0 && cell.2 == 0));
+    page.say(r#"{"do":"choose","bus":0,"node":5}"#);
+    page.press(5, 6.0);
+    let pressed = page.sees("the torque of the cell", |it| it.joints.iter().any(|joint| joint[1] != 0.0));
+    assert_eq!((pressed.cells[4].1, pressed.cells[4].2), (16, 6_000), "pressed by a page, 6 N");
+    let both = page.sees("the central computation", |it| {
+        it.joints.iter().any(|joint| joint[1] != 0.0)
+            && it.joints.iter().all(|joint| (joint[1] - joint[2]).abs() < 0.01)
+    });
+    let said = page.hears("the cell in detail", |said| said["detail"]["torque"].is_object());
+    let detail = &said["detail"];
+    assert_eq!(
+        (&detail["node"], &detail["status"], &detail["force_n"]),
+        (&5.into(), &"active".into(), &6.0.into())
+    );
+    for (ours, central) in detail["torque"]["distributed"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .zip(detail["torque"]["central"].as_array().unwrap())
+    {
+        assert!((ours.as_f64().unwrap() - central.as_f64().unwrap()).abs() < 2e-3, "{detail}");
+    }
+    let start = rest.joints[1][0];
+    page.sees("the arm gives way", |it| (it.joints[1][0] - start).abs() > 0.01);
+    assert!(both.time >= rest.time);
+    page.say(r#"{"do":"release"}"#);
+    page.sees("no torque", |it| {
+        it.joints.iter().all(|joint| joint[1] == 0.0) && it.cells[4].0 == 1 && it.cells[4].1 == 0
+    });
+
+    // A page that goes takes its touch with it.
+    let mut other = Page::new(&address);
+    other.press(7, 3.0);
+    page.sees("a touch of the other page", |it| it.cells[6].2 == 3_000);
+    drop(other);
+    page.sees("that it is gone", |it| it.cells[6].2 == 0);
+    page.say(r#"{"do":"halt"}"#);
+    page.hears("the halt", |said| said["halted"] == true);
+    page.say(r#"{"do":"resume"}"#);
+    page.hears("the resume", |said| said["halted"] == false);
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    place.is_left_clean();
+    assert!(TcpStream::connect(&address).is_err(), "the page ends with its run");
+    // What the page pressed is on the bus as stimuli.
+    let log = place.read("run.log");
+    assert!(log.contains(" 705#") && log.contains(" 707#"), "stimuli of cells 5 and 7");
+}
+
+#[test]
+fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
+    let place = Place::new();
+    let (run, address) = watched(&place, 4, "");
+    let port = address.rsplit(':').next().unwrap();
+    let status = |headers: &[(&'static str, &str)]| match ask(&address, headers) {
+        Ok((_, status)) => status,
+        Err(Error::Http(response)) => response.status().as_u16(),
+        Err(error) => panic!("{error}"),
+    };
+    assert_eq!(status(&[]), 101, "a program of this machine's user");
+    assert_eq!(status(&[("Origin", "http://evil.example")]), 403);
+    assert_eq!(status(&[("Origin", "null")]), 403);
+    assert_eq!(status(&[("Host", &format!("evil.example:{port}"))]), 403);
+    let http = |request: String| {
+        let mut stream = TcpStream::connect(&address).unwrap();
+        stream.set_read_timeout(Some(TIMEOUT)).unwrap();
+        stream.write_all(request.as_bytes()).unwrap();
+        let mut answer = String::new();
+        match stream.read_to_string(&mut answer) {
+            Ok(_) => {}
+            Err(error) if error.kind() == ErrorKind::ConnectionReset => {}
+            Err(error) => panic!("{error}"),
+        }
+        answer
+    };
+    let get = |path: &str| http(format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n\r\n"));
+    let page = get("/");
+    assert!(
+        page.starts_with("HTTP/1.1 200 OK") && page.contains("Content-Security-Policy: default-src 'none'")
+    );
+    assert!(get("/app.js").contains("text/javascript") && get("/../Cargo.toml").starts_with("HTTP/1.1 404"));
+    assert_eq!(
+        http(format!("GET / HTTP/1.1\r\nHost: {address}\r\nX: {}\r\n\r\n", "x".repeat(20_000))),
+        "",
+        "a long head"
+    );
+
+    // One page reads nothing, one sends what it likes; a third one goes on.
+    let stalled = Page::new(&address);
+    let mut flood = Page::new(&address);
+    let flooding = std::thread::spawn(move || {
+        for number in 0..100_000_u32 {
+            let text = match number % 8 {
+                0 => "{\"do\":\"press\",\"bus\":9,\"node\":1,\"force_n\":1}".to_owned(),
+                1 => format!("{{\"do\":\"choose\",\"bus\":0,\"node\":{}}}", number % 256),
+                2 => "x".repeat(200),
+                3 => "{\"do\":\"press\",\"bus\":0,\"node\":2,\"force_n\":1e308}".to_owned(),
+                4 => "{\"do\":\"bench\",\"on\":\"process\",\"action\":\"kill\",\"bus\":9,\"node\":1}"
+                    .to_owned(),
+                5 => "{\"do\":\"bench\",\"on\":\"link\",\"down\":true,\"bus\":0,\"nodes\":[1,1]}".to_owned(),
+                6 => {
+                    "{\"do\":\"bench\",\"on\":\"bus\",\"down\":false,\"bus\":18446744073709551615}".to_owned()
+                }
+                _ => "{\"do\":\"release\"}".to_owned(),
+            };
+            if flood.socket.send(Message::text(text)).is_err() {
+                break;
+            }
+        }
+    });
+    let mut page = Page::new(&address);
+    let mut seen = 0;
+    page.sees("snapshots during the flood", |_| {
+        seen += 1;
+        seen > 60
+    });
+    flooding.join().unwrap();
+    let mut too_long = Page::new(&address);
+    let _ = too_long.socket.send(Message::text(" ".repeat(2_000)));
+    until("the end of a page that says too much", || {
+        loop {
+            match too_long.socket.read() {
+                Ok(_) => {}
+                Err(Error::Io(error)) if error.kind() == ErrorKind::WouldBlock => return None,
+                Err(_) => return Some(()),
+            }
+        }
+    });
+    page.press(1, 2.0);
+    page.sees("a press as before", |it| {
+        it.cells[0].2 == 2_000 && it.joints.iter().any(|joint| joint[1] != 0.0)
+    });
+    drop(stalled);
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    let summary = place.summary();
+    assert!(summary.total("/buses/0/received") > 0);
+    place.is_left_clean();
+}
+
+#[test]
+fn pages_that_may_only_look_press_nothing_and_others_need_a_token() {
+    let place = Place::new();
+    place.skin(4);
+    place.scenario(QUIET);
+    let run = place.running_bench(30.0, "");
+    let view = place.start("gateway", "view skin.toml --bus-kind embedded --read-only");
+    let mut page = Page::new(&address(&view));
+    assert_eq!(page.scene["may_press"], false);
+    page.press(2, 5.0);
+    page.say(r#"{"do":"halt"}"#);
+    page.act("kill", 3);
+    let mut seen = 0;
+    let last = page.sees("snapshots", |_| {
+        seen += 1;
+        seen > 30
+    });
+    assert!(last.cells.iter().all(|cell| cell.2 == 0 && cell.1 == 0));
+    let said = page.hears("words", |_| true);
+    assert!(said["bench"].is_null(), "it belongs to no run: {said}");
+    assert_eq!(run.cells().len(), 4);
+    view.signal(rustix::process::Signal::INT);
+    view.end().well();
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    for (words, expected) in [
+        ("--listen 0.0.0.0:0", "--listen 0.0.0.0:0: others than this machine may come there: give a --token"),
+        ("--listen 0.0.0.0:0 --token short", "a token has at least 16 letters or digits"),
+        ("--listen nowhere", "--listen"),
+        ("", "vcan0"),
+    ] {
+        let ended = place.start("gateway", &format!("view skin.toml --bus-kind embedded {words}")).end();
+        let said = ended.refusal(2);
+        assert!(said.contains(expected), "{words}: {said}");
+    }
+}
+
+#[test]
+fn one_bus_of_a_skin_is_shown_alone() {
+    let place = Place::new();
+    place.start("gateway", "skin generate --cells 10 --buses 2 -o skin.toml").end().well();
+    place.scenario(QUIET);
+    let run = place.running_bench(30.0, "");
+    let view = place.start("gateway", "view vcan1 --skin skin.toml --bus-kind embedded");
+    let mut page = Page::new(&address(&view));
+    assert_eq!(page.scene["buses"].as_array().unwrap().len(), 1);
+    assert_eq!(page.scene["buses"][0]["name"], "vcan1");
+    let cells = page.scene["cells"].as_array().unwrap().len();
+    assert!((1..10).contains(&cells), "{cells}");
+    page.sees("its cells quiet", |it| it.cells.len() == cells && it.cells.iter().all(|cell| cell.0 == 1));
+    view.signal(rustix::process::Signal::INT);
+    view.end().well();
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    for (words, expected) in [
+        (
+            "view vcan1",
+            "there is no file vcan1: name a skin, whose buses are listened to, a recording, or a bus",
+        ),
+        ("view vcan7 --skin skin.toml", "bus vcan7 is not in skin.toml, which has vcan0, vcan1"),
+        ("view vcan1 --skin skin.toml --at 3", "--at is of a recording, and buses are listened to"),
+    ] {
+        let ended = place.start("gateway", &format!("{words} --bus-kind embedded")).end();
+        assert!(ended.refusal(2).contains(expected), "{words}: {}", ended.refusal(2));
+    }
+}
+
+#[test]
+fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
+    let place = Place::new();
+    std::fs::copy(
+        concat!(env!("CARGO_MANIFEST_DIR"), "/../gateway/examples/lift.urdf"),
+        place.path("lift.urdf"),
+    )
+    .unwrap();
+    place.start("gateway", "skin import lift.urdf --tip arm7 -o skin.toml").end().well();
+    let view = place.start("gateway", "view skin.toml --wait --bus-kind embedded");
+    view.hears("view: http://");
+    let address = address(&view);
+    let scene = Page::new(&address).scene;
+    let shells = scene["shells"].as_array().unwrap();
+    let number = |shell: &Value, key: &str| usize::try_from(shell[key].as_u64().unwrap()).unwrap();
+    let rows: Vec<_> = shells.iter().map(|shell| number(shell, "row")).collect();
+    assert!(rows[0] == 0 && rows.len() > 5 && rows.is_sorted(), "{rows:?}");
+
+    let mut stream = TcpStream::connect(&address).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
+    write!(stream, "GET /surface HTTP/1.1\r\nHost: {address}\r\n\r\n").unwrap();
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).unwrap();
+    let body = answer.windows(4).position(|end| end == b"\r\n\r\n").unwrap() + 4;
+    let floats: Vec<_> =
+        answer[body..].chunks(4).map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap())).collect();
+    let corners: Vec<_> = floats.chunks(6).collect();
+    assert_eq!(corners.len(), shells.iter().map(|shell| number(shell, "count")).sum::<usize>());
+    // The base, a box, is as large as the URDF says.
+    let base = &corners[number(&shells[0], "first")..][..number(&shells[0], "count")];
+    let size = [0, 1, 2].map(|axis| {
+        let of = |pick: fn(f32, f32) -> f32| base.iter().map(|corner| corner[axis]).reduce(pick).unwrap();
+        of(f32::max) - of(f32::min)
+    });
+    assert!(size.iter().zip([0.5, 0.4, 0.3]).all(|(one, other)| (one - other).abs() < 1e-5), "{size:?}");
+    assert_eq!(base.len(), 36, "two triangles for each of six faces");
+    view.signal(rustix::process::Signal::INT);
+    view.end();
+}

@@ -1,0 +1,9 @@
+//! Benches beside other people's tools: `tests/tools/run`.
+
+mod tools_captures;
+mod tools_chains;
+mod tools_dbc;
+mod tools_power_loss;
+mod tools_recording;
+mod tools_slcan;
+mod tools_view;

@@ -1,0 +1,227 @@
+//! The page of `gateway run --view` in a real browser: a click presses a cell, and the arm gives way.
+//!
+//! `tests/tools/install` makes the browser ready; `tests/tools/run` does that, and then runs this.
+#![allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::print_stdout,
+    clippy::wildcard_enum_match_arm,
+    reason = "a test may stop, and its figures are what it is about"
+)]
+
+use skinbus_tests::process;
+use skinbus_tests::process::browser;
+
+use browser::Browser;
+use process::Place;
+use process::log::Log;
+use process::page::{address, watched};
+use protocol::can::Format;
+use protocol::message::{Message, SensorPage};
+
+/// The text of an element.
+fn text(browser: &mut Browser, id: &str) -> String {
+    browser.value(&format!("document.getElementById('{id}').textContent")).as_str().unwrap().to_owned()
+}
+
+/// Rules of accessibility, and what looks for faults of a page.
+const AXE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../target/axe/node_modules/axe-core/axe.min.js");
+
+/// The serious and critical findings of axe-core, which is in the page.
+fn findings(browser: &mut Browser) -> Vec<String> {
+    browser.value(
+        "window.found = null; axe.run().then((it) => { window.found = [it.passes.length, it.violations.filter((it) =>
+         ['serious', 'critical'].includes(it.impact)).map((it) => `${it.id}: ${it.nodes[0].html}`)]; }); 0",
+    );
+    let found = browser.until("window.found");
+    assert!(found[0].as_u64().unwrap() > 20, "rules were looked at");
+    serde_json::from_value(found[1].clone()).unwrap()
+}
+
+/// There are no faults of accessibility at two widths, light and dark.
+fn is_accessible(browser: &mut Browser) {
+    let axe = std::fs::read_to_string(AXE).expect("tests/tools/install makes axe-core ready");
+    browser.value(&format!("{axe};0"));
+    for (width, scheme) in [(1400, "light"), (1400, "dark"), (390, "light"), (390, "dark")] {
+        browser.resize(width, 844);
+        browser.scheme(scheme);
+        browser.until(&format!("document.documentElement.scrollWidth <= {width}"));
+        assert_eq!(findings(browser), Vec::<String>::new(), "{width} px, {scheme}");
+    }
+}
+
+/// The page asked for nothing elsewhere, and has nothing to complain about.
+fn is_content(browser: &Browser, url: &str) {
+    let host = url.split('#').next().unwrap().trim_end_matches('/');
+    let outside: Vec<_> = browser
+        .requests()
+        .into_iter()
+        .filter(|it| !it.starts_with(host) && !it.starts_with("data:"))
+        .collect();
+    assert_eq!(outside, Vec::<&str>::new(), "the page asks for nothing outside");
+    assert_eq!(browser.complaints(), Vec::<&serde_json::Value>::new());
+}
+
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
+    let place = Place::new();
+    let (run, address) = watched(&place, 24, "--candump run.log");
+    let url = format!("http://{address}/");
+    let mut browser = Browser::new(1400, 900);
+    browser.scheme("light");
+    browser.open(&url);
+    browser.until("window.skinbus && window.skinbus.frames > 3");
+    browser.until("document.getElementById('facts').textContent.includes('Cells24')");
+
+    // Here the processor draws: it says so, and draws sharp what stands still.
+    assert_eq!(browser.value("document.getElementById('software').hidden"), false);
+    browser.until(
+        "(() => { const c = document.getElementById('picture'); return c.width === 2 * c.clientWidth; })()",
+    );
+
+    // A cell that is seen from its front.
+    let found = browser.until(
+        "(() => { for (let i = 0; i < 24; i++) { const at = window.skinbus.where(i); if (at) return [i, ...at]; } return null; })()",
+    );
+    let number = |value: &serde_json::Value| value.as_f64().unwrap();
+    let stage = browser.value("(() => { const b = document.getElementById('picture').getBoundingClientRect(); return [b.x, b.y]; })()");
+    let at = [number(&stage[0]) + number(&found[1]), number(&stage[1]) + number(&found[2])];
+    let before = browser.value("window.skinbus.joints()");
+    browser.mouse("mousePressed", at);
+    browser.until("document.getElementById('facts').textContent.includes('In contact1')");
+    browser.until("document.getElementById('cell').textContent.includes('Torque of epoch')");
+    assert!(text(&mut browser, "cell").contains("active"));
+    let moved = format!("window.skinbus.joints().some((q, i) => Math.abs(q - {before}[i]) > 0.01)");
+    browser.until(&moved);
+    browser.mouse("mouseReleased", at);
+    browser.until("document.getElementById('facts').textContent.includes('In contact0')");
+
+    // The same with the keyboard, on the next cell.
+    browser.key("keyDown", "n");
+    browser.key("keyDown", " ");
+    browser.until("document.getElementById('facts').textContent.includes('In contact1')");
+    browser.key("keyUp", " ");
+    browser.until("document.getElementById('facts').textContent.includes('In contact0')");
+
+    // The process of that cell.
+    let kill = "[...document.querySelectorAll('button')].find((it) => it.textContent === 'Kill')";
+    browser.until(&format!("{kill} && !{kill}.disabled"));
+    browser.value(&format!("{kill}.click()"));
+    browser.until("document.getElementById('answer').textContent.startsWith('kill cell ')");
+    browser.until(&format!(
+        "{kill}.disabled && document.getElementById('facts').textContent.includes('Silent1')"
+    ));
+
+    is_accessible(&mut browser);
+    // It finds what is there.
+    browser.value("document.getElementById('halt').textContent = ''");
+    assert_eq!(findings(&mut browser).len(), 1);
+    is_content(&browser, &url);
+    drop(browser);
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+
+    // On the bus the first torque follows the first stimulus within three epochs.
+    let log = Log::read(&place.read("run.log"), Format::Fd);
+    let node = u8::try_from(found[0].as_u64().unwrap()).unwrap() + 1;
+    let (mut pressed, mut epochs, mut answered) = (false, 0, false);
+    for (message, _) in &log.messages {
+        match message {
+            Message::Stimulus { page: SensorPage::Skin(_), .. } => pressed = true,
+            Message::Joints { .. } if pressed && !answered => epochs += 1,
+            Message::Torque { from, torque, .. } if from.get() == node && !torque.is_zero() => {
+                answered = true
+            }
+            _ => {}
+        }
+    }
+    println!("the torque came {epochs} epochs after the stimulus");
+    assert!(answered && epochs <= 3, "{epochs} epochs");
+    place.is_left_clean();
+}
+
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn a_recording_is_gone_through_in_a_browser() {
+    let place = Place::new();
+    let from = concat!(env!("CARGO_MANIFEST_DIR"), "/recordings/fd.mcap");
+    std::fs::copy(from, place.path("fd.mcap")).unwrap();
+    let view = place.start("gateway", "view fd.mcap");
+    let url = format!("http://{}/#at=0.9", address(&view));
+    let mut browser = Browser::new(1400, 900);
+    browser.open(&url);
+    let at = "(() => { const said = document.querySelector('#time output').textContent; return said.startsWith('0:') ? Number(said.slice(2, 8)) : NaN; })()";
+    let click = |name: &str| {
+        format!("[...document.querySelectorAll('#time button')].find((it) => it.title === '{name}').click()")
+    };
+    browser.until(&format!("window.skinbus && window.skinbus.frames > 1 && {at} === 0.9"));
+    assert_eq!(browser.value("getComputedStyle(document.getElementById('commands')).display"), "none");
+
+    // An epoch forth and back.
+    browser.value(&click("The next epoch"));
+    browser.until(&format!("{at} > 0.9 && {at} < 0.92"));
+    browser.value(&click("The epoch before"));
+    browser.until(&format!("{at} < 0.91"));
+    // It plays to its end, and a touch is gone back to.
+    browser.value(&click("Play"));
+    browser.until(&format!("{at} > 1.2"));
+    browser.until(&format!("{at} > 2.1"));
+    browser.value(&click("The event before"));
+    browser.until(&format!("{at} < 2"));
+    // Its torque comes within an epoch or two.
+    browser.until(&format!(
+        "!document.getElementById('facts').textContent.includes('In contact0') || ({}, false)",
+        click("The next epoch")
+    ));
+    // The slider.
+    browser.value("(() => { const it = document.querySelector('#time input'); it.value = 0; it.oninput(); it.onchange(); })()");
+    browser.until(&format!("{at} === 0"));
+
+    // A cell's frames, and why its torque is what it is.
+    browser.value("location.hash = '#at=1'");
+    browser.until(&format!("{at} === 1"));
+    browser.value(
+        "(() => { const it = document.getElementById('search'); it.value = 'vcan0:1'; it.onchange(); })()",
+    );
+    browser.until("document.querySelector('#frames button')");
+    browser.value("document.querySelector('#frames button').click()");
+    browser.until("document.getElementById('why').textContent.includes('nearest')");
+    is_accessible(&mut browser);
+    is_content(&browser, &url);
+    drop(browser);
+    view.signal(rustix::process::Signal::INT);
+    view.end().well();
+}
+
+/// Prints how often the page draws an arm that moves, beside the 253 processes of its cells.
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn a_page_in_software_draws_an_arm_that_moves() {
+    let place = Place::new();
+    place.skin(253);
+    place.scenario(
+        "version = 1\nduration_s = 120.0\n\n[motion]\nkind = \"sine\"\nstart_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n\
+         amplitude_rad = [0.5, 0.3, 0.4, 0.3, 0.2, 0.2]\nperiod_s = 10.0\n",
+    );
+    let run = place.start("gateway", "run skin.toml --bus-kind embedded --scenario scenario.toml --view");
+    let url = format!("http://{}/", address(&run));
+    let mut browser = Browser::new(1400, 900);
+    browser.open(&url);
+    browser.until("window.skinbus && window.skinbus.frames > 10");
+    let count = |browser: &mut Browser| {
+        let counts = browser.value("[window.skinbus.frames, window.skinbus.snapshots]");
+        [0, 1].map(|at| counts[at].as_f64().unwrap())
+    };
+    let (from, began) = (count(&mut browser), std::time::Instant::now());
+    std::thread::sleep(std::time::Duration::from_secs(8));
+    let (to, passed) = (count(&mut browser), began.elapsed().as_secs_f64());
+    let [frames, snapshots] = [0, 1].map(|at| (to[at] - from[at]) / passed);
+    println!("{frames:.1} frames/s of {snapshots:.1} snapshots/s");
+    assert!(frames > 0.0 && snapshots > 0.0);
+    drop(browser);
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    place.is_left_clean();
+}

@@ -1,0 +1,96 @@
+//! A bench of processes on a real kernel's vcan, beside `candump`.
+
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use skinbus_tests::process;
+
+use model::generate::{Target, generate};
+use process::Place;
+use process::log::{Log, same_torques};
+use process::vcan::{Candump, frames_of, same_by_sender};
+use protocol::can::Format;
+
+/// The joints stand still, so that torques depend on nothing but the epoch, also when a slow machine skips
+/// ticks.
+const SCENARIO: &str = r#"version = 1
+duration_s = 6.0
+
+[motion]
+kind = "hold"
+start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]
+
+[[touch]]
+at_s = 0.0
+for_s = 6.0
+all = true
+force_n = 1.5
+profile = "half-sine"
+"#;
+
+/// Twelve cells at a rate that an emulated machine keeps up.
+fn prepare(place: &Place) {
+    let expected = Target { cells: 12, broadcast_hz: 20.0, ..Target::default() };
+    place.write("skin.toml", &generate(&expected).unwrap());
+    place.scenario(SCENARIO);
+}
+
+#[test]
+#[ignore = "needs vcan"]
+fn candump_sees_exactly_what_the_gateway_counts_in_the_same_order_by_sender() {
+    let place = Place::on_vcan();
+    prepare(&place);
+    let candump = Candump::start("vcan0", &place.path("candump.log"));
+    place.bench(6.0, "").end().well();
+    let (ours, theirs) = (frames_of(&place.path("run.log")), candump.frames());
+    let summary = place.summary();
+    assert_eq!(summary.0["buses"][0]["kind"], "socketcan");
+    summary.adds_up();
+    assert_eq!(summary.of_bus("/dropped_by_bus"), 0);
+    assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
+    let counted = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
+    assert_eq!(ours.len() as u64, counted, "the log has what is counted");
+    assert!(summary.of_bus("/replies/due") > 600, "{:#}", summary.0);
+
+    same_by_sender(&ours, &theirs);
+}
+
+#[test]
+#[ignore = "needs vcan"]
+fn what_candump_logged_is_the_same_run_when_we_decode_it() {
+    let place = Place::on_vcan();
+    prepare(&place);
+    let candump = Candump::start("vcan0", &place.path("candump.log"));
+    place.bench(3.0, "").end().well();
+    let frames = candump.frames();
+    let dumped = |file: &str| {
+        let dump =
+            place.start("gateway", &format!("dump {file} --kind torque,stimulus,command")).end().well();
+        let mut lines: Vec<_> = dump.stdout.lines().map(without_time).map(str::to_owned).collect();
+        lines.sort();
+        lines
+    };
+    let (ours, theirs) = (dumped("run.log"), dumped("candump.log"));
+    assert!(ours.len() > 12 * 40 && ours == theirs, "{} and {} lines", ours.len(), theirs.len());
+    let [ours, theirs] = [Log::read(&place.read("run.log"), Format::Fd), Log::of(frames, Format::Fd)];
+    let (shared, all) = same_torques(&ours, &theirs);
+    assert!(shared == all && ours.torques().len() == theirs.torques().len(), "{shared} of {all}");
+}
+
+/// A line of `gateway dump` from the interface's name on.
+fn without_time(line: &str) -> &str {
+    line.find("vcan0").map_or(line, |at| &line[at..])
+}
+
+#[test]
+#[ignore = "needs vcan"]
+fn torques_are_the_same_bit_for_bit_on_vcan_and_on_the_embedded_bus() {
+    let [on_vcan, on_embedded] = [Place::on_vcan(), Place::new()].map(|place| {
+        prepare(&place);
+        place.bench(6.0, "").end().well();
+        place.summary().adds_up();
+        Log::read(&place.read("run.log"), Format::Fd)
+    });
+    // A machine that is away for a while makes a cell skip an epoch: what is there is compared, and has to be most.
+    let (shared, all) = same_torques(&on_vcan, &on_embedded);
+    assert!(all > 500 && shared * 10 > all * 9, "{shared} of {all} causes are in both runs");
+}

@@ -1,0 +1,234 @@
+//! Loss that is made on purpose, by receive buffers that are far too small, and counted exactly.
+//!
+//! The same rule on a real kernel's vcan and on the embedded bus; the embedded bus needs nothing.
+
+#![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
+
+use skinbus_tests::process;
+use skinbus_tests::process::recorded;
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use process::vcan::{Candump, backlog_drops, frames_of, own_network, small_skin, tool};
+use process::{PRESSED, Place, TIMEOUT, is_stopped, until};
+use protocol::bus::{Bus, BusKind, Choice, Filter, Inbox, Options};
+use protocol::can::{EXTENDED, Frame};
+use protocol::candump::{Line, parse};
+use recorded::Recorded;
+use rustix::process::Signal;
+
+/// About 16 frames, of which the kernel makes 32 and more.
+const SMALL: usize = 16 * 1024;
+/// Frames of a round; the buffer has room for a hundredth of them.
+const FRAMES: u32 = 5_000;
+/// What the receiver wants; it is sent beside what it does not want.
+const EXPECTED: u32 = 0x200;
+const UNWANTED: u32 = 0x300;
+
+/// One receiver that sleeps and one sender.
+struct Pair {
+    kind: BusKind,
+    sender: Bus,
+    sleeper: Bus,
+    inbox: Inbox,
+    /// Frames that passed the sleeper's filter, so far.
+    sent: u32,
+    /// Frames that it got.
+    heard: u32,
+}
+
+impl Pair {
+    fn open(kind: BusKind, place: &Place, filters: &[Filter]) -> Self {
+        let options = |filters: &[Filter], receive_buffer| Options {
+            filters: filters.to_vec(),
+            receive_buffer,
+            directory: Some(place.buses()),
+            send_timeout: TIMEOUT,
+            ..Options::default()
+        };
+        let open = |options: &Options| Bus::open("vcan0", Choice::Only(kind), options).unwrap();
+        let (sender, sleeper) = (open(&options(&[], 0)), open(&options(filters, SMALL)));
+        assert!((SMALL..=2 * SMALL).contains(&sleeper.receive_buffer()), "{}", sleeper.receive_buffer());
+        Self { kind, sender, sleeper, inbox: Inbox::new(), sent: 0, heard: 0 }
+    }
+
+    /// The next frame that the sleeper wants: its number, in frames of either format and several lengths.
+    fn next(&mut self) -> Frame {
+        let number = self.sent.to_le_bytes();
+        self.sent += 1;
+        match self.sent % 3 {
+            0 => Frame::classic(EXPECTED, &number),
+            1 => Frame::fd(EXPECTED, 1, &number),
+            _ => Frame::fd(EXPECTED, 0, &[&number[..], &[0xA5; 60]].concat()),
+        }
+        .unwrap()
+    }
+
+    /// Sends while the receiver sleeps: two of three frames are for it.
+    fn overflow(&mut self) {
+        let mut burst = Vec::new();
+        for number in 0..FRAMES {
+            burst.push(match number % 3 {
+                0 => Frame::fd(UNWANTED, 1, &[0; 16]).unwrap(),
+                _ => self.next(),
+            });
+            if burst.len() == 50 {
+                self.sender.send(&burst).unwrap();
+                burst.clear();
+            }
+        }
+        self.sender.send(&burst).unwrap();
+    }
+
+    /// Reads what is there. The oldest are kept and the newest are dropped; and who reads a frame knows how
+    /// many are missing before it.
+    fn read(&mut self) {
+        while self.sleeper.wait(Some(Duration::from_millis(20))).unwrap() {
+            self.sleeper.receive(&mut self.inbox).unwrap();
+            let dropped = self.inbox.dropped();
+            let mut last = None;
+            for received in self.inbox.frames() {
+                assert_eq!(received.frame.id(), EXPECTED);
+                let number = u32::from_le_bytes(*received.frame.data().first_chunk().unwrap());
+                assert!(number >= self.heard && number - self.heard <= dropped, "{number} is out of order");
+                self.heard += 1;
+                last = Some(number);
+            }
+            // The embedded bus may have reported drops after the last one as well.
+            let known = self.heard + dropped;
+            match (last, self.kind) {
+                (Some(last), BusKind::SocketCan) => assert_eq!(last + 1, known),
+                (Some(last), BusKind::Embedded) => assert!(last < known, "{last}, and {known} are known"),
+                (None, _) => {}
+            }
+        }
+    }
+
+    /// Lets frames follow until one comes: it brings the whole count.
+    fn settle(&mut self) {
+        self.read();
+        until("a frame that is not dropped", || {
+            let heard = self.heard;
+            let last = self.next();
+            self.sender.send(&[last]).unwrap();
+            self.read();
+            // Those that wait on the way, on the embedded bus, come in between.
+            (self.heard > heard && self.heard + self.inbox.dropped() == self.sent).then_some(())
+        });
+    }
+}
+
+/// What was sent and not received is what the bus reports as dropped, to the last frame.
+fn what_is_lost_is_counted(kind: BusKind, place: &Place) {
+    let exact = Filter { id: EXPECTED, mask: Filter::EXACT_MASK };
+    // What several filters match comes once and is dropped once; what none matches is no loss.
+    let several = [exact, Filter { id: EXPECTED, mask: 0x700 }, Filter { id: EXTENDED, mask: EXTENDED }];
+    for filters in [&[exact][..], &several, &[Filter { id: UNWANTED, mask: 0x7FF }.inverted()]] {
+        let backlog = || if kind == BusKind::SocketCan { backlog_drops() } else { 0 };
+        let before = backlog();
+        let mut pair = Pair::open(kind, place, filters);
+        let mut dropped = 0;
+        for round in 0..3 {
+            let (sent, heard) = (pair.sent, pair.heard);
+            pair.overflow();
+            pair.settle();
+            let (sent, heard) = (pair.sent - sent, pair.heard - heard);
+            let lost = pair.inbox.dropped() - dropped;
+            assert_eq!(sent - heard, lost, "round {round}, {filters:?}");
+            assert!(heard > 10 && lost > FRAMES / 3, "round {round}: {heard} heard, {lost} lost");
+            dropped = pair.inbox.dropped();
+        }
+        // Nothing was lost on the way to the socket, which no socket could know.
+        assert_eq!(backlog(), before);
+
+        // And when it reads in time again, nothing is missing.
+        for _ in 0..10 {
+            let frames: Vec<_> = (0..10).map(|_| pair.next()).collect();
+            pair.sender.send(&frames).unwrap();
+            pair.read();
+        }
+        assert_eq!((pair.inbox.dropped(), pair.heard + dropped), (dropped, pair.sent));
+    }
+}
+
+#[test]
+#[ignore = "needs vcan"]
+fn what_is_lost_is_counted_on_vcan() {
+    own_network();
+    what_is_lost_is_counted(BusKind::SocketCan, &Place::new());
+}
+
+#[test]
+fn what_is_lost_is_counted_on_the_embedded_bus() {
+    let place = Place::new();
+    let server = place.start("vcan-setup", "serve vcan0");
+    server.prints("serving vcan0 at ");
+    what_is_lost_is_counted(BusKind::Embedded, &place);
+}
+
+/// Frames by identifier.
+fn counts(frames: &[Frame]) -> BTreeMap<u32, usize> {
+    let mut counts = BTreeMap::new();
+    for frame in frames {
+        *counts.entry(frame.raw_id()).or_default() += 1;
+    }
+    counts
+}
+
+#[test]
+#[ignore = "needs vcan"]
+fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
+    const FOREIGN: u32 = 600;
+    let place = Place::on_vcan();
+    place.write("skin.toml", &small_skin(8));
+    place.scenario(PRESSED);
+    let candump = Candump::start("vcan0", &place.path("candump.log"));
+    let backlog = backlog_drops();
+    let bench = place.running_bench(4.0, &format!("--record run.mcap --receive-buffer {SMALL}"));
+    place.test_client().waits_for_epoch(10);
+    bench.signal(Signal::STOP);
+    until("a gateway that is stopped", || is_stopped(bench.pid()).then_some(()));
+    // For more than a second; cells keep sending meanwhile.
+    tool(&format!("cangen vcan0 -g 2 -n {FOREIGN} -e -I 1234567 -L 8 -D i"));
+    bench.signal(Signal::CONT);
+    let ended = bench.end().well();
+    // The log itself records what is missing in it.
+    let log = place.read("run.log");
+    let (missing, lines): (Vec<_>, Vec<_>) = log.lines().partition(|line| line.starts_with("DROPCOUNT: "));
+    place.write("frames.log", &(lines.join("\n") + "\n"));
+    let (ours, mut theirs) = (frames_of(&place.path("frames.log")), candump.frames());
+    // What cells sent after the gateway stopped listening is not a loss.
+    let last = ours.last().unwrap();
+    theirs.truncate(1 + theirs.iter().rposition(|frame| frame == last).unwrap());
+
+    let summary = place.summary();
+    summary.adds_up();
+    assert_eq!(summary.of_bus("/receive_buffer"), 2 * SMALL as u64);
+    let dropped = summary.of_bus("/dropped_by_bus");
+    assert_eq!((theirs.len() - ours.len()) as u64, dropped, "{}", ended.stderr);
+    let said = |line: &str| match parse(line) {
+        Ok(Line::Dropped { frames }) => frames,
+        other => panic!("{line}: {other:?}"),
+    };
+    assert_eq!(missing.iter().map(|line| said(line)).sum::<u64>(), dropped, "{missing:?}");
+    assert!(missing.iter().all(|line| line.contains("on 'vcan0' socket")), "{missing:?}");
+    // And so does the recording, word for word.
+    let recorded = Recorded::read(&place.path("run.mcap"));
+    let notes: Vec<_> = recorded.on("/can/notes").map(|note| &note.value).collect();
+    assert_eq!(notes.iter().map(|note| note["text"].as_str().unwrap()).collect::<Vec<_>>(), missing);
+    assert_eq!(notes.iter().map(|note| note["frames"].as_u64().unwrap()).sum::<u64>(), dropped);
+    assert_eq!(recorded.lines("/can/vcan0"), lines);
+    let (ours, theirs) = (counts(&ours), counts(&theirs));
+    assert!(ours.iter().all(|(id, count)| theirs[id] >= *count), "{ours:?} {theirs:?}");
+    let foreign = FOREIGN as usize - ours[&(0x0123_4567 | EXTENDED)];
+    assert!(foreign > 400 && (foreign as u64) < dropped, "{foreign} of {dropped} were foreign");
+    // Of the rest, those of cells are missed in their accounts, and nothing else is.
+    let by_cells = |counts: &BTreeMap<u32, usize>| -> usize {
+        counts.iter().filter(|(id, _)| (0x200..0x500).contains(*id)).map(|(_, count)| count).sum()
+    };
+    let unanswered = (by_cells(&theirs) - by_cells(&ours)) as u64;
+    assert!(unanswered > 8, "{unanswered} missed of the cells");
+    assert_eq!((summary.of_bus("/uplink/dropped"), summary.of_bus("/uplink/surplus")), (unanswered, 0));
+    assert_eq!((summary.number("/recording/lost"), backlog_drops()), (0, backlog));
+}
