@@ -22,5 +22,6 @@ pub use served::Served;
 pub use server::{ServeError, Server, Totals};
 
 #[cfg(test)]
+#[allow(unreachable_pub, reason = "the tests on a real kernel have the same table")]
 #[path = "../../tests/src/can_raw.rs"]
 mod cases;

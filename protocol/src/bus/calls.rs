@@ -1,4 +1,5 @@
-//! The system calls that have no safe wrapper: many datagrams at once, and how a process is scheduled.
+//! The system calls that have no safe wrapper: many datagrams at once, the process at the other end, and how a process
+//! is scheduled.
 //! Decides nothing.
 
 use std::io;
@@ -12,6 +13,18 @@ pub(super) fn set_batch() -> bool {
     let parameters = libc::sched_param { sched_priority: 0 };
     // SAFETY: the pointer is to a live, initialised struct, which the call only reads.
     unsafe { libc::sched_setscheduler(0, libc::SCHED_BATCH, &raw const parameters) == 0 }
+}
+
+/// `SO_PEERCRED`: the process that connected a socket; none if it is in another pid namespace, where its id is 0.
+pub(super) fn peer_process(fd: BorrowedFd<'_>) -> Option<u32> {
+    let mut peer = libc::ucred { pid: 0, uid: 0, gid: 0 };
+    let mut len = libc::socklen_t::try_from(size_of_val(&peer)).ok()?;
+    let pointer = (&raw mut peer).cast();
+    // SAFETY: the pointers are to live variables, and `len` is the size of `peer`, of which every value is valid.
+    let result = unsafe {
+        libc::getsockopt(fd.as_raw_fd(), libc::SOL_SOCKET, libc::SO_PEERCRED, pointer, &raw mut len)
+    };
+    if result == 0 { u32::try_from(peer.pid).ok().filter(|pid| *pid > 0) } else { None }
 }
 
 /// `recvmmsg`: how many slots were filled. It waits for the first datagram, as long as the socket's

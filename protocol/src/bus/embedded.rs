@@ -3,7 +3,9 @@
 //! docs/reference/embedded-bus.md describes each byte. A frame is a datagram of 16 or 72 bytes, exactly the kernel's
 //! struct; no control datagram has either length.
 
-use super::Filter;
+use std::os::fd::AsFd;
+
+use super::{Filter, calls};
 
 pub(super) use client::Embedded;
 pub use client::seqpacket;
@@ -25,6 +27,12 @@ pub const HELLO_MAX: usize = HELLO_HEAD + 8 * Filter::MAX;
 const MAGIC: &[u8; 7] = b"skinbus";
 const HELLO_HEAD: usize = 23;
 const ANSWER_LEN: usize = 17;
+
+/// Returns the id of the process that connected a socket; none if it is in another pid namespace.
+#[must_use]
+pub fn peer_process(socket: impl AsFd) -> Option<u32> {
+    calls::peer_process(socket.as_fd())
+}
 
 /// A client's request when it connects.
 #[derive(Clone, Debug, Eq, PartialEq)]

@@ -4,7 +4,7 @@ use std::os::fd::OwnedFd;
 
 use protocol::bus::Filter;
 use protocol::bus::batch::{BATCH, Outgoing, is_shortage};
-use protocol::bus::embedded::encode_dropped;
+use protocol::bus::embedded::{encode_dropped, peer_process};
 use protocol::can::FD_BYTES;
 use rustix::event::epoll::{self, EventData, EventFlags};
 use rustix::io::Errno;
@@ -40,8 +40,12 @@ pub(super) enum Sent {
 
 #[derive(Debug)]
 pub(super) struct Client {
-    id: ClientId,
+    pub(super) id: ClientId,
     pub(super) socket: OwnedFd,
+    /// The process at the other end, if it is in this pid namespace.
+    pub(super) process: Option<u32>,
+    /// The other client of that process, if there are two.
+    pub(super) sibling: Option<ClientId>,
     queue: Queue,
     /// Its hello; nothing is routed before.
     pub(super) greeted: bool,
@@ -57,10 +61,12 @@ pub(super) struct Client {
 }
 
 impl Client {
-    pub(super) const fn new(id: ClientId, socket: OwnedFd) -> Self {
+    pub(super) fn new(id: ClientId, socket: OwnedFd) -> Self {
         let queue = Queue::new(QUEUE);
         Self {
             id,
+            process: peer_process(&socket),
+            sibling: None,
             socket,
             queue,
             greeted: false,
@@ -84,6 +90,14 @@ impl Client {
             let _ = self.send(post);
         }
         !self.blocked && !std::mem::replace(&mut self.dirty, true)
+    }
+
+    /// Sends what waits for it before its process gets a newer frame by another socket. Errors are found again at the end
+    /// of the round.
+    pub(super) fn send_early(&mut self, post: &mut Post) {
+        if self.dirty && !self.blocked {
+            let _ = self.send(post);
+        }
     }
 
     /// Sends what waits for it, unless there is no room.

@@ -368,6 +368,11 @@ impl Server {
         let Self { router, clients, dirty, post, .. } = self;
         post.totals.frames += 1;
         router.route(from, parcel.raw_id(), parcel.format(), |to, own| {
+            // The kernel's time stamps, set when a frame is sent, then order the frames of both sockets of a process.
+            let sibling = client(clients, to.0).and_then(|client| client.sibling);
+            if let Some(sibling) = sibling.and_then(|sibling| client(clients, sibling.0)) {
+                sibling.send_early(post);
+            }
             let Some(client) = clients.get_mut(to.0).and_then(Option::as_mut) else { return };
             if client.take(parcel.marked(own), post) {
                 dirty.push_back(to);
@@ -417,8 +422,9 @@ impl Server {
     fn forget(&mut self, id: ClientId) {
         self.silence(id);
         self.paused.retain(|token| *token != id.0 as u64);
-        if let Some(slot) = self.clients.get_mut(id.0) {
-            *slot = None;
+        let client = self.clients.get_mut(id.0).and_then(Option::take);
+        if let Some(sibling) = client.and_then(|client| client.sibling).and_then(|id| self.client(id)) {
+            sibling.sibling = None;
         }
     }
 }

@@ -79,10 +79,16 @@ impl Server {
             hang_up(&socket);
             return;
         }
-        let client = Some(Client::new(ClientId(index), socket));
+        let mut client = Client::new(ClientId(index), socket);
+        let is_alone = |other: &&mut Client| other.process == client.process && other.sibling.is_none();
+        if client.process.is_some()
+            && let Some(other) = self.clients.iter_mut().flatten().find(is_alone)
+        {
+            (other.sibling, client.sibling) = (Some(client.id), Some(other.id));
+        }
         match self.clients.get_mut(index) {
-            Some(slot) => *slot = client,
-            None => self.clients.push(client),
+            Some(slot) => *slot = Some(client),
+            None => self.clients.push(Some(client)),
         }
     }
 

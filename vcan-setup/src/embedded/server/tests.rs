@@ -1,8 +1,8 @@
 use std::collections::VecDeque;
 use std::os::unix::net::UnixStream;
 
-use protocol::bus::{Bus, Choice, Inbox, Options};
-use protocol::can::Frame;
+use protocol::bus::{Bus, Choice, Filter, Inbox, Options};
+use protocol::can::{Frame, STANDARD_MASK};
 use tempfile::TempDir;
 
 use super::*;
@@ -47,7 +47,12 @@ impl Bench {
     }
 
     fn open(&self) -> Bus {
+        self.open_with(vec![Filter::ALL])
+    }
+
+    fn open_with(&self, filters: Vec<Filter>) -> Bus {
         let options = Options {
+            filters,
             directory: Some(self.directory.path().join("skinbus")),
             send_timeout: Duration::from_secs(20),
             receive_buffer: 4 << 20,
@@ -64,13 +69,18 @@ impl Bench {
 
 /// Waits for so many frames: their identifiers.
 fn receives(bus: &Bus, count: usize) -> Vec<u32> {
-    let (mut inbox, mut ids) = (Inbox::new(), Vec::new());
-    while ids.len() < count {
+    arrivals(bus, count).into_iter().map(|(_, id)| id).collect()
+}
+
+/// Waits for so many frames: their time stamps and identifiers.
+fn arrivals(bus: &Bus, count: usize) -> Vec<(u64, u32)> {
+    let (mut inbox, mut all) = (Inbox::new(), Vec::new());
+    while all.len() < count {
         bus.wait(None).unwrap();
         bus.receive(&mut inbox).unwrap();
-        ids.extend(inbox.frames().map(|received| received.frame.id()));
+        all.extend(inbox.frames().map(|received| (received.at_nanos, received.frame.id())));
     }
-    ids
+    all
 }
 
 #[test]
@@ -89,6 +99,21 @@ fn errors_of_a_reception_that_pass_cost_a_client_no_frame() {
     let totals = bench.end();
     assert_eq!((totals.frames, totals.delivered, totals.abandoned), (500, 500, 0));
     assert_eq!((totals.failed, totals.failure, totals.garbage), (0, None, 0));
+}
+
+#[test]
+fn time_stamps_of_a_process_with_two_sockets_are_in_the_order_of_the_bus() {
+    let bench = Bench::new(&[], None);
+    let open = |id| bench.open_with(vec![Filter { id, mask: STANDARD_MASK }]);
+    // The first two of a process are a pair, and the next two.
+    let [sender, _idle, first, second] = [bench.open(), open(3), open(1), open(2)];
+    // One round of the server: every socket is written to once when it ends, or more often.
+    let expected = [1, 2, 1, 2, 2, 1];
+    sender.send(&expected.map(|id| Frame::classic(id, &[]).unwrap())).unwrap();
+    let mut came: Vec<_> = [first, second].iter().flat_map(|bus| arrivals(bus, 3)).collect();
+    came.sort_unstable();
+    assert_eq!(came.iter().map(|(_, id)| *id).collect::<Vec<_>>(), expected);
+    bench.end();
 }
 
 #[test]
