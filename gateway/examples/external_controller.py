@@ -90,7 +90,7 @@ def main():
             waiting = True
             time.sleep(0.2)
         except (BlockingIOError, TimeoutError):
-            continue  # the gateway's queue is full, or it is still starting; the next state will come
+            time.sleep(0.01)  # the gateway's queue is full, or it is still starting; the next state will come
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ Never "fix" a line of a log by copying what the Rust code prints.
 
 Every frame is preceded by a comment line with its meaning: a word, then key=value fields. Numbers are
 in the units of the document (quarter turns, Nm, N, g, degrees Celsius, m), as exact decimals.
-`protocol/tests/golden.rs` builds a message from the comment alone and compares both directions.
+`protocol/src/tests/golden.rs` builds a message from the comment alone and compares both directions.
 
     fd.log          every kind, page and parameter: bytes <-> meaning, both ways
     lenient.log     frames that are read although nobody should write them so: bytes -> meaning

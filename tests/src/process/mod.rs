@@ -31,9 +31,11 @@ pub mod test_client;
 pub mod vcan;
 pub mod whole;
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::sync::Mutex;
+use std::time::{Duration, Instant, SystemTime};
 
 use model::generate::{Format, Target, generate};
 use rustix::process::{Pid, Signal, kill_process};
@@ -79,23 +81,48 @@ pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// A program of this build, which `cargo test` of this package alone does not make; or one from the folder that
+/// Finds a program under test, `gateway`, `cell-node` or `vcan-setup`: beside this test program, or in the folder that
 /// `SKINBUS_PROGRAMS` names.
+///
+/// # Panics
+///
+/// If it is missing, or older than a source that it was built from; the message names the command that builds it.
 pub fn program(name: &str) -> PathBuf {
-    if let Some(folder) = std::env::var_os("SKINBUS_PROGRAMS") {
-        let path = Path::new(&folder).join(name);
-        assert!(path.is_file(), "{} is missing: build it, or unset SKINBUS_PROGRAMS", path.display());
+    static CHECKED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+    let named = std::env::var_os("SKINBUS_PROGRAMS").map(PathBuf::from);
+    let own = std::env::current_exe().unwrap();
+    let beside = own.parent().and_then(Path::parent).expect("tests lie in target/PROFILE/deps");
+    let folder = named.as_deref().unwrap_or(beside);
+    let path = folder.join(name);
+    if CHECKED.lock().is_ok_and(|checked| checked.contains(&path)) {
         return path;
     }
-    let own = std::env::current_exe().unwrap();
-    let folder = own.parent().and_then(Path::parent).expect("tests lie in target/PROFILE/deps");
-    let path = folder.join(name);
     let build = match folder.file_name().and_then(|name| name.to_str()) {
         Some("debug") | None => "cargo build --workspace".to_owned(),
         Some(profile) => format!("cargo build --workspace --profile {profile}"),
     };
-    assert!(path.is_file(), "{} is missing: `{build}` makes it", path.display());
+    let built = fs::metadata(&path).and_then(|metadata| metadata.modified());
+    let built = built.unwrap_or_else(|error| panic!("{}: {error}; `{build}` makes it", path.display()));
+    if let Some(newer) = sources(&path).into_iter().find(|source| is_newer(source, built)) {
+        panic!("{} is older than {}; `{build}` makes it again", path.display(), newer.display());
+    }
+    if let Ok(mut checked) = CHECKED.lock() {
+        checked.insert(path.clone());
+    }
     path
+}
+
+/// The files that cargo says a program was built from.
+fn sources(program: &Path) -> Vec<PathBuf> {
+    let rule = fs::read_to_string(program.with_extension("d")).unwrap_or_default();
+    let (_, sources) = rule.trim_end().split_once(": ").unwrap_or_default();
+    // A blank within a name is escaped.
+    let names = sources.replace("\\ ", "\0");
+    names.split(' ').filter(|name| !name.is_empty()).map(|name| name.replace('\0', " ").into()).collect()
+}
+
+fn is_newer(source: &Path, than: SystemTime) -> bool {
+    fs::metadata(source).and_then(|metadata| metadata.modified()).is_ok_and(|changed| changed > than)
 }
 
 /// An example of the gateway's.

@@ -244,7 +244,9 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     };
     place.write("gone.log", &without(&gone, |message| silent(message) || heartbeat(message)));
     let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --max"));
-    assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[0, 0, 1][..]), "{:#}", replayed.0);
+    let [_, different, missing, extra] = replayed.replies();
+    // Without counters a reply that a busy machine kept from the recording is extra, too.
+    assert!(ended.code() == Some(1) && (different, missing) == (0, 0) && extra >= 1, "{:#}", replayed.0);
     assert_eq!(replayed.text("/expect/first/how"), "extra");
     // With them it is known that it is the recording's fault.
     place.write("gone.log", &gone);

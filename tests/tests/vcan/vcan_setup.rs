@@ -81,18 +81,6 @@ fn assert_ours(link: &Value, kind: &str) {
     assert!(flag(link, "UP"), "{link}");
 }
 
-/// Removes what a test has made, however it ends.
-struct Made(&'static [&'static str]);
-
-impl Drop for Made {
-    fn drop(&mut self) {
-        for name in self.0 {
-            // It may be gone already.
-            let _ = Command::new("ip").args(["link", "del", name]).output();
-        }
-    }
-}
-
 fn open(name: &str) -> Bus {
     Bus::open(name, Choice::Only(BusKind::SocketCan), &Options::default()).unwrap()
 }
@@ -111,7 +99,6 @@ fn passes(from: &Bus, to: &Bus) {
 #[ignore = "needs vcan"]
 fn a_vcan_is_made_once_carries_fd_frames_and_is_removed() {
     own_network();
-    let _made = Made(&["vcan20", "vcan21"]);
     let before = links("").len();
     let planned = done("up --dry-run vcan20 vcan21");
     assert!(planned.starts_with("would make vcan20, a vcan with MTU 72, and bring it up\n"), "{planned}");
@@ -137,7 +124,6 @@ fn a_vcan_is_made_once_carries_fd_frames_and_is_removed() {
 #[ignore = "needs vcan"]
 fn the_commands_of_a_plan_do_the_same() {
     own_network();
-    let _made = Made(&["vcan20"]);
     done("up vcan20");
     let of = |mut link: Value| {
         // What went through it, and which number it got.
@@ -159,7 +145,6 @@ fn the_commands_of_a_plan_do_the_same() {
 #[ignore = "needs vcan"]
 fn what_is_ours_and_was_spoilt_is_repaired() {
     own_network();
-    let _made = Made(&["vcan20"]);
     done("up vcan20");
     let index = link("vcan20").unwrap()["ifindex"].clone();
     ip("link set vcan20 down");
@@ -178,7 +163,6 @@ fn what_is_ours_and_was_spoilt_is_repaired() {
 #[ignore = "needs vcan"]
 fn what_is_not_ours_is_never_touched() {
     own_network();
-    let _made = Made(&["vcan20", "vcan21"]);
     ip("link add vcan20 type vcan");
     ip("link set vcan20 mtu 16");
     ip("link set vcan20 up");
@@ -222,7 +206,6 @@ fn what_is_not_ours_is_never_touched() {
 #[ignore = "needs vcan"]
 fn a_skins_buses_are_made_and_removed_and_what_others_made_stays() {
     own_network();
-    let _made = Made(&["vcan20"]);
     let folder = TempDir::new().unwrap();
     let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     let text = std::fs::read_to_string(root.join("gateway/examples/ur5-253.toml")).unwrap();
@@ -254,7 +237,6 @@ fn a_skins_buses_are_made_and_removed_and_what_others_made_stays() {
 fn who_makes_interfaces_at_the_same_time_as_others_makes_them() {
     own_network();
     const NAMES: [&str; 8] = ["vcan20", "vcan21", "vcan22", "vcan23", "vcan24", "vcan25", "vcan26", "vcan27"];
-    let _made = Made(&NAMES);
     for _ in 0..4 {
         // Each takes the first number that is free, and only the first of them can have it.
         let said = std::thread::scope(|scope| {
@@ -301,7 +283,6 @@ impl Drop for Namespace {
 #[ignore = "needs vcan"]
 fn a_pair_leads_into_another_namespace() {
     own_network();
-    let _made = Made(&["vcan20"]);
     let blue = Namespace::new("blue");
     let up = "up vcan20 --peer vcan0 --namespace blue";
     done(&format!("{up} --dry-run"));
@@ -347,7 +328,6 @@ fn a_pair_leads_into_another_namespace() {
 #[ignore = "needs vcan"]
 fn a_pair_within_one_namespace_and_into_that_of_a_process() {
     own_network();
-    let _made = Made(&["vcan20", "vcan22"]);
     done("up vcan20 --peer vcan21");
     assert_ours(&link("vcan20").unwrap(), "vxcan");
     assert_ours(&link("vcan21").unwrap(), "vxcan");
@@ -374,7 +354,6 @@ fn a_pair_within_one_namespace_and_into_that_of_a_process() {
 #[ignore = "needs vcan"]
 fn what_was_made_is_taken_back_when_a_later_step_fails() {
     own_network();
-    let _made = Made(&["vcan20", "vcan21", "vcan22"]);
     // An altname is taken, and only the kernel reports it.
     ip("link add vcan20 type vcan");
     ip("link set vcan20 mtu 16");
@@ -392,7 +371,6 @@ fn what_was_made_is_taken_back_when_a_later_step_fails() {
 #[ignore = "needs vcan"]
 fn who_is_not_root_is_told_so_and_may_look() {
     own_network();
-    let _made = Made(&["vcan20"]);
     let said = run_as(65_534, "up vcan20");
     let program = program("vcan-setup").display().to_string();
     let expected =
@@ -418,7 +396,6 @@ fn who_is_not_root_is_told_so_and_may_look() {
 #[ignore = "needs vcan"]
 fn status_agrees_with_ip() {
     own_network();
-    let _made = Made(&["vcan20", "vcan21"]);
     done("up vcan20");
     ip("link add vcan21 type vcan");
     let (from, to) = (open("vcan20"), open("vcan20"));
@@ -470,7 +447,6 @@ fn doctor(arguments: &str) -> (i32, Vec<String>) {
 #[ignore = "needs vcan"]
 fn the_doctor_finds_what_is_wrong_and_its_hints_repair_it() {
     own_network();
-    let _made = Made(&["vcan20"]);
     let program = program("vcan-setup").display().to_string();
     let repair = |fault: &str| {
         let command = fault.split(" | ").nth(1).unwrap();

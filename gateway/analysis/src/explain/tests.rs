@@ -1,4 +1,4 @@
-//! One cell by hand, and what is found of which joints. Whole benches are explained in `tests/tests/bench_explain.rs`.
+//! One cell by hand, and what is found of which joints. Whole benches are explained in `tests/tests/virtual/bench_explain.rs`.
 
 use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
