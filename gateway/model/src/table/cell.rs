@@ -15,6 +15,7 @@ use super::root_totals::RootSums;
 use super::sensed::Sensed;
 use super::sent::Sent;
 use super::status::Status;
+use super::stuck::Stuck;
 use super::switched::{SWITCHES, Switch, Switched};
 use crate::tracker::{Contact, Pages, Tracked, Update, Uplink, Word};
 
@@ -69,6 +70,7 @@ pub struct Cell {
     halt: Halt,
     sent: Sent,
     pub(super) outstanding: Outstanding,
+    pub(super) stuck: Stuck,
     /// The number of the last broadcast that it answered.
     pub(super) answered: Option<u64>,
     held: Held,
@@ -101,6 +103,7 @@ impl Cell {
             halt: Halt::default(),
             sent: Sent::default(),
             outstanding: Outstanding::default(),
+            stuck: Stuck::default(),
             answered: None,
             held: Held::default(),
             sums: summed.then(|| RootSums::new(described.root)),
@@ -125,6 +128,18 @@ impl Cell {
         self.outstanding.errors
     }
 
+    /// The kinds of words (`torque`, `skin`, `acceleration`) that stayed equal while what it should have sent changed, each
+    /// with the most in a row.
+    pub fn stuck(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        self.stuck.longest()
+    }
+
+    /// Whether it sends such words now.
+    #[must_use]
+    pub fn is_stuck(&self) -> bool {
+        self.stuck.is_now()
+    }
+
     /// Whether it measures, so that stimuli do not touch it; none before its first heartbeat.
     #[must_use]
     pub fn measures(&self) -> Option<bool> {
@@ -140,7 +155,7 @@ impl Cell {
     /// Begins new accounts: what has come so far does not count.
     pub(super) fn begin_accounts(&mut self) {
         self.tracked.account = Default::default();
-        (self.replies, self.sensed) = Default::default();
+        (self.replies, self.sensed, self.stuck) = Default::default();
         self.outstanding.begin_accounts();
         self.sent.begin();
     }
@@ -216,6 +231,9 @@ impl Cell {
     pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, is_newest: bool, events: &Events) {
         self.sensed.hear(at, page, events);
         self.switched.subtracts |= matches!(page, SensorPage::Baseline(_));
+        if self.sensors().is_some() {
+            self.contact.latched().for_each(|(right, _)| self.stuck.take_page(page, &right));
+        }
         if is_newest {
             self.contact.learn(*page, ());
         }
