@@ -202,7 +202,7 @@ fn a_bad_line_is_named_and_kept_and_with_strict_it_is_the_end() {
     assert_eq!(
         folder.says("convert run.log run.mcap", 0),
         "run.log:2: column 4: digits of a second\n\
-         run.log: 1 begin like a frame and are none: not read\n\
+         run.log: 1 begins like a frame and is none: not read\n\
          run.log -> run.mcap: 2 frames, 1 notes\n"
     );
     folder.says("convert run.mcap back.log", 0);
