@@ -405,13 +405,10 @@ impl Bus {
 
     fn io_error(&self, doing: &'static str, source: io::Error) -> BusError {
         let name = self.name.clone();
-        match Errno::from_io_error(&source).and_then(|errno| self.carrier().cause(errno)) {
-            Some(cause) => match cause(name) {
-                BusError::Closed(_) => self.closed(),
-                other => other,
-            },
-            None => BusError::Io { name, doing, source },
-        }
+        let cause = Errno::from_io_error(&source).and_then(|errno| self.carrier().cause(errno));
+        let Some(cause) = cause else { return BusError::Io { name, doing, source } };
+        let error = cause(name);
+        if matches!(error, BusError::Closed(_)) { self.closed() } else { error }
     }
 }
 

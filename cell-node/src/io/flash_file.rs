@@ -153,7 +153,6 @@ fn holder(file: &File) -> Option<String> {
 }
 
 #[cfg(test)]
-#[expect(clippy::unwrap_used, reason = "a test may stop")]
 mod tests {
     use super::*;
     use protocol::id::CellId;

@@ -86,8 +86,8 @@ pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
     if unit.is_empty() { format!("{value}{half}") } else { format!("{value}{half}\u{a0}{unit}") }
 }
 
-/// So many digits behind the point that the second significant one is the last; `None` of a number that is zero, not finite,
-/// or has so many that a power of ten writes it.
+/// Counts the digits behind the point up to the second significant one; `None` for a number that is zero, not finite, or
+/// written with a power of ten.
 fn second_digit(value: f64) -> Option<usize> {
     let text = format!("{value:.1e}");
     let power: i32 = text.split_once('e')?.1.parse().ok()?;

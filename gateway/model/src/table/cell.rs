@@ -134,7 +134,7 @@ impl Cell {
         self.stuck.longest()
     }
 
-    /// Whether it sends such words now.
+    /// Returns whether it sends such words now.
     #[must_use]
     pub fn is_stuck(&self) -> bool {
         self.stuck.is_now()

@@ -22,7 +22,7 @@ const CHANGES: u32 = 4;
 /// The least change in one of the words, in steps.
 const STEPS: u16 = 16;
 
-/// What a cell may be stuck with, as [`Stuck::longest`] names it.
+/// Kinds of words that may be stuck, as [`Stuck::longest`] names them.
 const NAMES: [&str; 3] = ["torque", "skin", "acceleration"];
 
 /// The words of a cell's torques and sensors.
@@ -35,9 +35,9 @@ pub(super) struct Stuck {
 #[derive(Clone, Copy, Debug, Default)]
 struct Words {
     sent: Option<[i16; MAX_JOINTS]>,
-    /// How many in a row were equal to `sent`.
+    /// Words in a row that were equal to `sent`.
     equal: u64,
-    /// What it should have sent when that changed last.
+    /// Words that it should have sent, as they changed last.
     right: [i16; MAX_JOINTS],
     changes: u32,
     /// The most equal words in a row that were too many.
@@ -84,7 +84,7 @@ impl Stuck {
         words.take(bits(sent), bits(right));
     }
 
-    /// Whether it sends the same words for too long now.
+    /// Returns whether it sends the same words for too long now.
     pub(super) fn is_now(&self) -> bool {
         self.kinds.iter().any(Words::is_stuck)
     }

@@ -94,7 +94,7 @@ pub(in crate::bus) fn closed(name: &str, directory: Option<&Path>) -> BusError {
     if is_served { BusError::HungUp(name.to_owned()) } else { BusError::Closed(name.to_owned()) }
 }
 
-/// Whether a server keeps a new connection: one that is just ending resets it.
+/// Returns whether a server keeps a new connection: one that is just ending resets it.
 fn is_kept(socket: &OwnedFd) -> bool {
     let wait = Timespec::try_from(RESET).unwrap_or_default();
     let mut polled = [PollFd::new(socket, PollFlags::IN)];

@@ -20,7 +20,7 @@ use thiserror::Error;
 
 use crate::container::Damage;
 
-/// Whether messages of an encoding and a type are frames of another program.
+/// Returns whether messages of an encoding and a type are frames of another program.
 pub(crate) fn is_foreign_frame(encoding: &str, schema: &str) -> bool {
     foreign::Foreign::of(encoding, schema).is_some()
 }
