@@ -15,7 +15,6 @@ use super::root_totals::RootSums;
 use super::sensed::Sensed;
 use super::sent::Sent;
 use super::status::Status;
-use super::stuck::Stuck;
 use super::switched::{SWITCHES, Switch, Switched};
 use crate::tracker::{Contact, Pages, Tracked, Update, Uplink, Word};
 
@@ -70,7 +69,6 @@ pub struct Cell {
     halt: Halt,
     sent: Sent,
     pub(super) outstanding: Outstanding,
-    pub(super) stuck: Stuck,
     /// The number of the last broadcast that it answered.
     pub(super) answered: Option<u64>,
     held: Held,
@@ -103,7 +101,6 @@ impl Cell {
             halt: Halt::default(),
             sent: Sent::default(),
             outstanding: Outstanding::default(),
-            stuck: Stuck::default(),
             answered: None,
             held: Held::default(),
             sums: summed.then(|| RootSums::new(described.root)),
@@ -131,13 +128,13 @@ impl Cell {
     /// The kinds of words (`torque`, `skin`, `acceleration`) that stayed equal while what it should have sent changed, each
     /// with the most in a row.
     pub fn stuck(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        self.stuck.longest()
+        self.outstanding.stuck.longest()
     }
 
     /// Returns whether it sends such words now.
     #[must_use]
     pub fn is_stuck(&self) -> bool {
-        self.stuck.is_now()
+        self.outstanding.stuck.is_now()
     }
 
     /// Whether it measures, so that stimuli do not touch it; none before its first heartbeat.
@@ -155,7 +152,7 @@ impl Cell {
     /// Begins new accounts: what has come so far does not count.
     pub(super) fn begin_accounts(&mut self) {
         self.tracked.account = Default::default();
-        (self.replies, self.sensed, self.stuck) = Default::default();
+        (self.replies, self.sensed) = Default::default();
         self.outstanding.begin_accounts();
         self.sent.begin();
     }
@@ -232,7 +229,7 @@ impl Cell {
         self.sensed.hear(at, page, events);
         self.switched.subtracts |= matches!(page, SensorPage::Baseline(_));
         if self.sensors().is_some() {
-            self.contact.latched().for_each(|(right, _)| self.stuck.take_page(page, &right));
+            self.contact.latched().for_each(|(right, _)| self.outstanding.stuck.take_page(page, &right));
         }
         if is_newest {
             self.contact.learn(*page, ());
