@@ -174,7 +174,7 @@ fn start(
     // A cell without wires is never assigned a node id.
     let is_nameless = arguments.fresh && wires.is_some();
     let mut identity = Identity { cell: (!is_nameless).then_some(cell), serial: described.serial };
-    let file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
+    let mut file = FlashFile::new(arguments.flash.as_deref(), &arguments.bus, identity);
     let flash = match file.load().with_context(|| file.name())? {
         Ok(Kept { parameters: None, .. }) if !arguments.fresh => {
             let parameters = skin.parameters(described);

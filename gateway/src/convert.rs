@@ -390,25 +390,34 @@ fn bar(size: Option<u64>) -> ProgressBar {
 /// Notes on a conversion, a line each.
 fn remarks(reader: &Reader, done: &Converted, style: &Style, text: bool) -> Vec<String> {
     let mut lines = reader.remarks();
-    let direction = if style.plain {
-        "frames are written without their direction"
-    } else {
-        "frames are written without their direction, which not every tool reads; --direction writes it"
-    };
-    let Shortened { digits, direction: directions, raw_dlc, name } = done.shortened;
-    for (count, what) in [
-        (done.unreadable, "begin like a frame and are none: not read"),
-        (done.unreadable_messages, "messages are none of their type: not read"),
-        (done.can_xl, "are CAN XL frames: not read"),
-        (done.dropped, "frames are missing: the recorder lost them"),
-        (digits, "frames are written without the digits of their times below 1 us"),
-        (directions, direction),
-        (raw_dlc, "frames are written without their raw DLC"),
-        (name, "frames have a bus that is written under another name: blanks and controls are _ in a log"),
-        (done.omitted, "notes are left out"),
+    let how = if style.plain { "" } else { ", which not every tool reads; --direction writes it" };
+    let Shortened { digits, direction, raw_dlc, name } = done.shortened;
+    let written = ["frame is written", "frames are written"];
+    for (count, [one, more], what) in [
+        (
+            done.unreadable,
+            ["begins like a frame and is none", "begin like a frame and are none"],
+            ": not read",
+        ),
+        (
+            done.unreadable_messages,
+            ["message is not of its type", "messages are none of their type"],
+            ": not read",
+        ),
+        (done.can_xl, ["is a CAN XL frame", "are CAN XL frames"], ": not read"),
+        (done.dropped, ["frame is missing", "frames are missing"], ": lost by the recorder"),
+        (digits, written, " without digits of time below 1 us"),
+        (direction, written, &format!(" without direction{how}")),
+        (raw_dlc, written, " without raw DLC"),
+        (
+            name,
+            ["frame has a bus", "frames have a bus"],
+            " that is written under another name: blanks and controls are _ in a log",
+        ),
+        (done.omitted, ["note is left out", "notes are left out"], ""),
     ] {
         if count > 0 {
-            lines.push(format!("{count} {what}"));
+            lines.push(format!("{count} {}{what}", if count == 1 { one } else { more }));
         }
     }
     match others(reader) {

@@ -42,7 +42,7 @@ const DEMO_LOG: &str = "skinbus-demo.log";
 /// Options of both commands.
 #[derive(Args, Debug)]
 struct Common {
-    /// End after this time, 10 or 10s or 2min; else after the scenario's duration
+    /// End after this time, 10 or 10s or 2min; else after the scenario's duration, or 10 s
     #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
     duration: Option<f64>,
     /// Write the figures of the end as JSON, also when the run fails; docs/reference/summary.md explains its keys

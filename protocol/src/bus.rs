@@ -106,6 +106,8 @@ pub struct Bus {
     receive_buffer: usize,
     fd: bool,
     send_timeout: Duration,
+    /// Where an embedded bus lives, as in [`Options`].
+    directory: Option<PathBuf>,
     /// A send failed because the interface is down, and the next receive will report it: the kernel reports to a
     /// socket once.
     down: AtomicBool,
@@ -138,6 +140,7 @@ impl Bus {
             receive_buffer,
             fd,
             send_timeout,
+            directory: options.directory.clone(),
             down: AtomicBool::new(false),
             failed: AtomicBool::new(false),
             receive_timeout: AtomicU32::new(0),
@@ -216,8 +219,8 @@ impl Bus {
     /// has come.
     ///
     /// # Errors
-    /// [`BusError::Down`] and [`BusError::Gone`] for an interface, [`BusError::Closed`] for an embedded bus
-    /// whose server ended; frames that came before are received first.
+    /// [`BusError::Down`] and [`BusError::Gone`] for an interface, [`BusError::Closed`] or [`BusError::HungUp`] for an
+    /// embedded bus; frames that came before are received first.
     pub fn receive(&self, inbox: &mut Inbox) -> Result<usize, BusError> {
         self.take(inbox, |batch, socket| batch.receive(socket))
     }
@@ -276,7 +279,7 @@ impl Bus {
         self.failed.store(inbox.failure.is_some(), Ordering::Relaxed);
         let over = inbox.take(self.carrier());
         match inbox.frames().len() {
-            0 if over => Err(BusError::Closed(self.name.clone())),
+            0 if over => Err(self.closed()),
             count => Ok(count),
         }
     }
@@ -391,16 +394,21 @@ impl Bus {
         wait_on(&mut [PollFd::new(&self.socket, what)], timeout)
     }
 
+    /// The error for the end of the connection to an embedded bus.
+    fn closed(&self) -> BusError {
+        embedded::closed(&self.name, self.directory.as_deref())
+    }
+
     fn error(&self, doing: &'static str, errno: Errno) -> BusError {
         self.io_error(doing, errno.into())
     }
 
     fn io_error(&self, doing: &'static str, source: io::Error) -> BusError {
         let name = self.name.clone();
-        match Errno::from_io_error(&source).and_then(|errno| self.carrier().cause(errno)) {
-            Some(cause) => cause(name),
-            None => BusError::Io { name, doing, source },
-        }
+        let cause = Errno::from_io_error(&source).and_then(|errno| self.carrier().cause(errno));
+        let Some(cause) = cause else { return BusError::Io { name, doing, source } };
+        let error = cause(name);
+        if matches!(error, BusError::Closed(_)) { self.closed() } else { error }
     }
 }
 

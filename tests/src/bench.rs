@@ -356,6 +356,7 @@ impl Bench {
     fn sends(&mut self, cell_slot: usize, packets: &[Packet]) {
         let Some(there) = self.cell_slots.get_mut(cell_slot) else { return };
         let (life, at) = (there.lives, self.agenda.now + there.thinks);
+        let packets: Vec<_> = packets.iter().map(|packet| there.sent(*packet)).collect();
         let timeout =
             there.node().filter(|_| there.runs()).map(|node| node.poll_timeout().max(self.agenda.now));
         if let Some(timeout) = timeout
@@ -364,7 +365,7 @@ impl Bench {
             there.wake = Some(timeout);
             self.agenda.enter(timeout, Event::Wake(cell_slot));
         }
-        self.packets(Party::CellSlot(cell_slot), life, at, packets);
+        self.packets(Party::CellSlot(cell_slot), life, at, &packets);
     }
 
     fn say(&mut self, messages: &[Message]) {

@@ -4,7 +4,8 @@ use cell_node::flash::Flash;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
 use protocol::can::{Format, Frame};
-use protocol::packet::Packet;
+use protocol::id::Kind;
+use protocol::packet::{Packet, Words};
 use protocol::time::{Micros, Span};
 
 use crate::life::Life;
@@ -26,6 +27,9 @@ pub struct CellSlot {
     pub thinks: Span,
     /// How often it was switched on: packets of an earlier life are not this one's.
     pub lives: u32,
+    /// Each of its torques has the words of the first one, as long as this is set.
+    pub is_stuck: bool,
+    first: Option<Words>,
     format: Format,
     /// While it hangs, frames gather in its socket.
     life: Life<Waiting>,
@@ -40,7 +44,18 @@ impl CellSlot {
     #[must_use]
     pub const fn new(identity: Identity, flash: Flash, format: Format) -> Self {
         let thinks = Span(30);
-        Self { identity, flash, thinks, lives: 0, format, life: Life::Off, gave_up: None, wake: None }
+        Self {
+            identity,
+            flash,
+            thinks,
+            lives: 0,
+            is_stuck: false,
+            first: None,
+            format,
+            life: Life::Off,
+            gave_up: None,
+            wake: None,
+        }
     }
 
     /// The cell, unless it is off or gave up.
@@ -59,6 +74,14 @@ impl CellSlot {
     #[must_use]
     pub const fn runs(&self) -> bool {
         self.life.runs()
+    }
+
+    /// A packet as it sends it.
+    pub(crate) fn sent(&mut self, packet: Packet) -> Packet {
+        if !self.is_stuck || packet.id.kind != Kind::Torque {
+            return packet;
+        }
+        Packet { words: *self.first.get_or_insert(packet.words), ..packet }
     }
 
     /// Switches it on; a simulated cell obeys stimuli from the start.

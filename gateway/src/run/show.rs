@@ -219,6 +219,10 @@ fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
     if !unclear.is_empty() {
         rows.row("cells of unknown contact", words(unclear), "stimuli from before this run, or a baseline");
     }
+    for cell in all().filter(|cell| !cell.stuck.is_empty()) {
+        let kinds = cell.stuck.iter().map(|(kind, count)| format!("{count} times one {kind}"));
+        rows.row(format!("stuck: cell {}", cell.node), list(kinds), "while it should have sent others");
+    }
     let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > OFF_NM);
     let rank =
         |cell: &CellSummary| (is_off(cell), cell.missing.values().sum::<u64>(), cell.late, cell.restarts);

@@ -78,7 +78,7 @@ fn a_log_becomes_a_recording_and_a_log_again() {
     assert_eq!(folder.text("back.log"), LOG);
     assert_eq!(folder.all().len(), 3, "and nothing beside them");
     let nine = folder.says("convert run.mcap nine.txt --digits 9 --plain", 0);
-    assert_eq!(nine, "run.mcap: 1 notes are left out\nrun.mcap -> nine.txt: 2 frames, 0 notes\n");
+    assert_eq!(nine, "run.mcap: 1 note is left out\nrun.mcap -> nine.txt: 2 frames, 0 notes\n");
     assert_eq!(folder.text("nine.txt"), "(1.000001000) can0 123#11\n(2.000000000) can0 22C##5AABB\n");
 }
 
@@ -123,7 +123,7 @@ fn padded_seconds_and_can_xl_come_back_and_indented_lines_are_read() {
     let folder = Folder::new(&[("run.log", log.as_bytes()), ("in.log", indented.as_bytes())]);
     folder.says("convert run.log run.mcap", 0);
     let said = folder.says("convert run.mcap back.log", 0);
-    assert!(said.contains("1 are CAN XL frames"), "{said}");
+    assert!(said.contains("1 is a CAN XL frame"), "{said}");
     assert_eq!(folder.text("back.log"), log);
     let said = folder.says("convert in.log in.mcap", 0);
     assert!(said.ends_with("in.log -> in.mcap: 3 frames, 2 notes\n"), "{said}");
@@ -202,7 +202,7 @@ fn a_bad_line_is_named_and_kept_and_with_strict_it_is_the_end() {
     assert_eq!(
         folder.says("convert run.log run.mcap", 0),
         "run.log:2: column 4: digits of a second\n\
-         run.log: 1 begin like a frame and are none: not read\n\
+         run.log: 1 begins like a frame and is none: not read\n\
          run.log -> run.mcap: 2 frames, 1 notes\n"
     );
     folder.says("convert run.mcap back.log", 0);

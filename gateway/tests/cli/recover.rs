@@ -159,6 +159,27 @@ fn types_and_topics_of_a_recording_by_others_are_known_from_its_summary() {
 }
 
 #[test]
+fn frames_of_other_programs_count_as_frames() {
+    for (schema, encoding, frames) in [
+        ("can_msgs/msg/Frame", "cdr", 3),
+        ("ros2_socketcan_msgs/msg/FdFrame", "cdr", 3),
+        ("can_msgs/Frame", "ros1", 3),
+        ("a/B", "cdr", 0),
+    ] {
+        let mut writer = WriteOptions::new().create(Cursor::new(Vec::new())).unwrap();
+        let schema = writer.add_schema(schema, "ros2msg", b"uint8 a").unwrap();
+        let topic = writer.add_channel(schema, "/from_can_bus", encoding, &BTreeMap::new()).unwrap();
+        for sequence in 0..3 {
+            let header = MessageHeader { channel_id: topic, sequence, log_time: 7, publish_time: 7 };
+            writer.write_to_known_channel(&header, &[1; 40]).unwrap();
+        }
+        writer.finish().unwrap();
+        let (said, _) = recovered(&writer.into_inner().into_inner()).unwrap();
+        assert_eq!((said.messages, said.frames), (3, frames), "{encoding}");
+    }
+}
+
+#[test]
 fn types_and_topics_are_described_outside_of_chunks_again_and_again() {
     let mut writer = FileWriter::new(Vec::new()).unwrap();
     let mut joints = writer.channel::<JointState<'_>>("/arm/joint_states", &[]).unwrap();

@@ -38,6 +38,7 @@ mod flag {
     pub(super) const MEASURES: u8 = 4;
     pub(super) const HALTED: u8 = 8;
     pub(super) const PRESSED: u8 = 16;
+    pub(super) const STUCK: u8 = 32;
 }
 
 impl Live {
@@ -170,7 +171,7 @@ impl Live {
     /// | 8 for each cell | status u8, flags u8, force mN u16, proximity 2^-15 u16, temperature 0.01 °C i16 |
     ///
     /// All are little-endian. The torques are those of the last epoch that is over. Status: 0 never heard, 1 quiet, 2 active, 3 stale, 4 dead. Flags: 1 without
-    /// parameters, 2 with others than the skin's, 4 measures, 8 halted, 16 pressed by a page.
+    /// parameters, 2 with others than the skin's, 4 measures, 8 halted, 16 pressed by a page, 32 stuck.
     pub fn snapshot(&mut self, now: Micros, pressed: &Pressed) -> Vec<u8> {
         self.number = self.number.wrapping_add(1);
         let joints = self.skin.robot.joints.len();

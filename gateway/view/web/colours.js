@@ -33,6 +33,7 @@ export const SHAPES = [
   { shape: 3, is: (cell) => (cell.flags & 1) !== 0, name: "no parameters", mark: "hole" },
   { shape: 4, is: (cell) => (cell.flags & 2) !== 0, name: "other parameters", mark: "half" },
   { shape: 5, is: (cell) => cell.status === 3, name: "stale: no answer", mark: "bar" },
+  { shape: 7, is: (cell) => (cell.flags & 32) !== 0, name: "stuck: one value", mark: "disc" },
   { shape: 6, is: (cell) => (cell.flags & 8) !== 0, name: "halted", mark: "square" },
   { shape: 0, is: () => true, name: "in order", mark: "" },
 ];

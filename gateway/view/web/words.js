@@ -176,6 +176,7 @@ export function shapes(css) {
     if (mark === "cross") { pen.beginPath(); for (const s of [1, -1]) { pen.moveTo(-r * 0.5, -s * r * 0.5); pen.lineTo(r * 0.5, s * r * 0.5); } pen.stroke(); }
     if (mark === "ring") { hexagon(0.7); erase(); }
     if (mark === "hole") { pen.beginPath(); pen.arc(0, 0, r * 0.4, 0, 7); erase(); }
+    if (mark === "disc") { pen.beginPath(); pen.arc(0, 0, r * 0.34, 0, 7); pen.fill(); }
     if (mark === "half") { pen.fillRect(0, -r * 0.7, r * 0.6, r * 1.4); }
     if (mark === "bar") { pen.fillRect(-r * 0.66, -r * 0.16, r * 1.32, r * 0.32); }
     if (mark === "square") { pen.fillRect(-r * 0.34, -r * 0.34, r * 0.68, r * 0.68); }

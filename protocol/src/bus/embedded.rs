@@ -7,8 +7,8 @@ use std::os::fd::AsFd;
 
 use super::{Filter, calls};
 
-pub(super) use client::Embedded;
 pub use client::seqpacket;
+pub(super) use client::{Embedded, closed};
 pub use directory::{
     DirectoryError, MARK, address, make_directory, mark, open_directory, remove_directory, socket_name,
     usual_directory,

@@ -113,6 +113,11 @@ pub enum BusError {
     /// The server of the embedded bus has ended. The bus has to be opened again.
     #[error("the embedded bus {0} was closed: its server ended")]
     Closed(String),
+    /// The server of the embedded bus has closed this connection, and goes on. The bus has to be opened again.
+    #[error(
+        "the embedded bus {0} was closed: its server hung up on this program alone and serves others still; attach again"
+    )]
+    HungUp(String),
     /// The queue stayed full.
     #[error("{name} took no frame for {} ms: its queue is full; send less, or ask whether anybody is on the bus", waited.as_millis())]
     Full {
@@ -165,6 +170,7 @@ impl BusError {
                 | Self::Down(_)
                 | Self::Gone(_)
                 | Self::Closed(_)
+                | Self::HungUp(_)
                 | Self::Io { .. }
         )
     }
@@ -172,7 +178,7 @@ impl BusError {
     /// Whether the bus has ended and has to be opened again.
     #[must_use]
     pub const fn is_closed(&self) -> bool {
-        matches!(self, Self::Closed(_) | Self::Gone(_))
+        matches!(self, Self::Closed(_) | Self::HungUp(_) | Self::Gone(_))
     }
 }
 

@@ -52,6 +52,7 @@ fn pair() -> (Bus, std::os::fd::OwnedFd) {
         receive_buffer: 0,
         fd: true,
         send_timeout: Duration::from_millis(100),
+        directory: Some("/nowhere".into()),
         down: AtomicBool::new(false),
         failed: AtomicBool::new(false),
         receive_timeout: AtomicU32::new(0),

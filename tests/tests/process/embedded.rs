@@ -396,6 +396,23 @@ fn a_bus_that_ends_is_read_to_its_end_and_then_closed() {
 }
 
 #[test]
+fn a_client_that_alone_is_hung_up_on_is_not_told_that_the_server_ended() {
+    let bench = Bench::new();
+    let (bus, other) = (bench.open(&[Filter::ALL]), bench.open(&[Filter::ALL]));
+    // The server hangs up on a client that will never send again.
+    rustix::net::shutdown(&bus, rustix::net::Shutdown::Write).unwrap();
+    assert!(bus.wait(Some(LONG)).unwrap());
+    let error = bus.receive(&mut Inbox::new()).unwrap_err();
+    let said = "the embedded bus vcan0 was closed: its server hung up on this program alone and serves others still; attach \
+                again";
+    assert_eq!((error.to_string().as_str(), error.is_closed(), error.may_open_later()), (said, true, true));
+    let sender = bench.open(&[]);
+    sender.send(&[frame(1, 1)]).unwrap();
+    assert!(other.wait(Some(LONG)).unwrap(), "the others go on");
+    bench.end();
+}
+
+#[test]
 fn a_server_that_lets_nobody_in_is_given_up_on() {
     let parent = TempDir::new().unwrap();
     // Bound and never run, as a process that is stopped: no client is accepted.

@@ -162,3 +162,30 @@ fn a_directory_that_is_not_there_is_named() {
     assert_eq!(place.files(), ["scenario.toml", "skin.toml"]);
     place.is_left_clean();
 }
+
+#[test]
+fn two_programs_do_not_use_one_cells_file_at_a_time() {
+    let place = written();
+    let other = Place::new();
+    other.pressed();
+    let running = place.running_bench(60.0, "--flash flash");
+    let flash = place.path("flash").display().to_string();
+    // Another bench, whose bus has the same name, in a directory of its own.
+    let before = images(&place);
+    let ended = other.bench(0.5, &format!("--quiet --cells-per-process 8 --flash {flash}")).end();
+    assert_eq!(ended.code(), Some(1), "{ended:#?}");
+    let who = running.cell(1).as_raw_nonzero();
+    assert!(ended.stderr.contains(&format!("flash of cell 1 ({flash}/vcan0-1.flash)")), "{ended:#?}");
+    assert!(ended.stderr.contains(&format!("process {who} (cell-node) uses it")), "{ended:#?}");
+    // A cell alone says so too; one of which nobody has the file starts.
+    let words = |node| {
+        format!("--bus vcan0 --bus-kind embedded --node {node} --skin skin.toml --flash {flash} --fresh")
+    };
+    let refused = other.start("cell-node", &words(2)).end();
+    assert!(refused.refusal(2).contains("(cell-node) uses it: end that one first"), "{refused:#?}");
+    assert_eq!(images(&place), before);
+    running.signal(Signal::TERM);
+    running.end();
+    place.is_left_clean();
+    other.bench(0.5, &format!("--flash {flash}")).end().well();
+}

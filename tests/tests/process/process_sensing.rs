@@ -3,14 +3,20 @@
 
 use skinbus_tests::process;
 
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
 use process::log::Log;
 use process::{PRESSED, Place, Running, skin};
-use protocol::can::Format;
+use protocol::bus::{Bus, Inbox};
+use protocol::can::{Format, Frame};
 use protocol::fixed::{Q, Q5_10};
-use protocol::id::{CellId, Node};
+use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Answer, From, Message, NetworkPage, SensorPage, SkinSensors, State};
+use protocol::packet::Packet;
 use protocol::touch::contact;
 use rustix::process::Signal;
+use serde_json::json;
 
 const CELLS: u8 = 8;
 
@@ -241,4 +247,61 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     assert_eq!(summary.of_bus("/replies/unexpected"), 0, "{:#}", summary.0);
     assert!(summary.figure("/accuracy/single/max_nm") < 1e-3, "{:#}", summary.0);
     drop((cells, server, test_client));
+}
+
+/// Passes frames on until it is stopped, as `change` makes them.
+fn pass_on(from: &Bus, to: &Bus, stop: &AtomicBool, mut change: impl FnMut(&Frame) -> Frame) {
+    let mut inbox = Inbox::new();
+    while !stop.load(Ordering::Relaxed) {
+        from.wait(Some(Duration::from_millis(20))).unwrap();
+        from.receive(&mut inbox).unwrap();
+        let frames: Vec<_> = inbox.frames().map(|received| change(&received.frame)).collect();
+        to.send(&frames).unwrap();
+    }
+}
+
+#[test]
+fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_the_report() {
+    // The cell is on a bus of its own, and what it sends comes to the others changed.
+    let [place, behind] = [Place::new(), Place::new()];
+    let moving = PRESSED
+        .replace("hold", "sine")
+        .replace("start_rad", "period_s = 2.0\namplitude = [0.4, 0.4, 0.4, 0.0, 0.0, 0.0]\nstart");
+    for place in [&place, &behind] {
+        place.skin(8);
+        place.scenario(&moving);
+    }
+    let servers = [&place, &behind].map(|place| place.start("vcan-setup", "serve vcan0"));
+    let (bench, far) = (place.test_client().bus, behind.test_client().bus);
+    let cells = [("1-4", &place), ("6-8", &place), ("5-5", &behind)].map(|(nodes, on)| {
+        let words = format!("--bus vcan0 --bus-kind embedded --nodes {nodes} --skin skin.toml");
+        on.start("cell-node", &words)
+    });
+    let stop = AtomicBool::new(false);
+    std::thread::scope(|scope| {
+        scope.spawn(|| pass_on(&bench, &far, &stop, |frame| *frame));
+        scope.spawn(|| {
+            let mut first = None;
+            pass_on(&far, &bench, &stop, |frame| match Packet::from_fd(frame) {
+                Ok(mut packet) if packet.id.kind == Kind::Torque && !packet.words.is_zero() => {
+                    packet.words = *first.get_or_insert(packet.words);
+                    packet.frames(Format::Fd).next().unwrap()
+                }
+                _ => *frame,
+            });
+        });
+        place.test_client().waits_for_settled_cells(8);
+        let ended = place.bench(6.0, "--no-spawn --record run.mcap").end().well();
+        stop.store(true, Ordering::Relaxed);
+        assert!(ended.stdout.contains("stuck: cell 5"), "{}", ended.stdout);
+    });
+    drop((cells, servers));
+    let summary = place.summary();
+    let stuck = summary.0["cells"].as_array().unwrap().iter().filter(|cell| cell["stuck"] != json!({}));
+    let stuck: Vec<_> =
+        stuck.map(|cell| (&cell["node"], cell["stuck"]["torque"].as_u64() > Some(31))).collect();
+    assert_eq!(stuck, [(&json!(5), true)], "{:#}", summary.0["cells"]);
+    place.start("gateway", "report run.mcap -o run.html").end().well();
+    let page = place.read("run.html");
+    assert!(page.contains("stuck cells, which should have sent other words (vcan0 5: "), "not in the report");
 }

@@ -398,6 +398,30 @@ fn clients_for_which_there_is_no_file_are_turned_away_and_the_others_go_on() {
     assert_eq!(ended(server, &parent).code(), Some(0));
 }
 
+/// The processor's time that a process has used, in ticks of 10 ms.
+fn processor_ticks(pid: u32) -> u64 {
+    let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
+    let (_, after_name) = stat.rsplit_once(')').unwrap();
+    after_name.split_whitespace().skip(11).take(2).map(|ticks| ticks.parse::<u64>().unwrap()).sum()
+}
+
+#[test]
+fn a_server_that_has_no_files_left_rests_and_ends_by_a_signal() {
+    let parent = TempDir::new().unwrap();
+    let directory = parent.path().join("skinbus");
+    let server = serve_with_files(&directory, "-n 64");
+    let options = Options { directory: Some(directory), filters: vec![], ..Options::default() };
+    let open = || Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options);
+    let clients: Vec<_> = std::iter::repeat_with(open).map_while(Result::ok).collect();
+    let before = processor_ticks(server.id());
+    std::thread::sleep(Duration::from_millis(300));
+    let used = processor_ticks(server.id()) - before;
+    assert!(used < 10, "{used} of 30 ticks, while nothing happens");
+    signal(&server, Signal::TERM);
+    assert_eq!(ended(server, &parent).code(), Some(0));
+    drop(clients);
+}
+
 #[test]
 fn a_server_lets_in_as_many_clients_as_the_system_allows() {
     let parent = TempDir::new().unwrap();

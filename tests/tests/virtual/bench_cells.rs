@@ -8,9 +8,10 @@ use cell_node::node::{CLAIM, HEARTBEAT, PENDING};
 use model::table::{Event, Notice, Replies, Status};
 use model::tracker::DEAD_AFTER;
 use protocol::can::Format;
-use protocol::id::Kind;
-use protocol::message::{Message, State};
-use protocol::parameters::MAX_JOINTS;
+use protocol::id::{Kind, Node};
+use protocol::message::{Message, Request, State};
+use protocol::packet::words;
+use protocol::parameters::{MAX_JOINTS, Parameter};
 use protocol::time::{Micros, Span};
 use skinbus_tests::accounts;
 use skinbus_tests::bench::{Act, Bench};
@@ -373,4 +374,52 @@ fn a_damaged_flash_is_reported_and_nothing_is_due() {
     assert!(heartbeat.state.has(State::FLASH_DAMAGED) && !heartbeat.state.has(State::CONFIGURED));
     finish(&mut bench);
     assert_eq!((replies(&bench, 0), bench.torques(0).len()), (Replies::default(), 0));
+}
+
+fn stuck(bench: &Bench) -> Vec<(usize, &'static str)> {
+    let cells = bench.gateway.table.cells().iter().enumerate();
+    cells.flat_map(|(place, cell)| cell.stuck().map(move |(kind, _)| (place, kind))).collect()
+}
+
+#[test]
+fn a_cell_whose_torque_never_changes_is_stuck_once_the_arm_or_the_touch_has_moved() {
+    for moved_by in ["the arm", "touches"] {
+        let mut bench = bench(7);
+        bench.cell_slots[CELL].is_stuck = true;
+        if moved_by == "the arm" {
+            (0..4).for_each(|place| bench.press(place, 3.0));
+            bench.run_epochs(300);
+        } else {
+            for newtons in [3.0, 1.0, 2.0, 4.0, 1.5, 3.0] {
+                (0..4).for_each(|place| bench.press(place, newtons));
+                bench.run_epochs(20);
+            }
+        }
+        assert_eq!(stuck(&bench), [(CELL, "torque")], "{moved_by}");
+        assert!(bench.gateway.table.cells()[CELL].is_stuck());
+        bench.cell_slots[CELL].is_stuck = false;
+        bench.run_epochs(2);
+        assert!(!bench.gateway.table.cells()[CELL].is_stuck(), "it answers rightly again");
+        finish(&mut bench);
+    }
+}
+
+#[test]
+fn a_right_cell_is_not_stuck_whether_pressed_or_not_measuring_or_halted() {
+    let mut bench = bench(8);
+    bench.run_epochs(100);
+    assert_eq!(stuck(&bench), [], "nothing touches the skin");
+    for newtons in [3.0, 0.4, 2.0, 0.0, 1.0, 6.0] {
+        bench.press(CELL, newtons);
+        bench.run_epochs(40);
+    }
+    bench.act(Act::Kill(0));
+    bench.run_epochs(40);
+    bench.act(Act::Say(Message::Halt));
+    bench.run_epochs(100);
+    let (node, number) = (Node::Everyone, Parameter::Mode.number());
+    let request = Request::Write { number, words: words([0]) };
+    bench.act(Act::Say(Message::Configure { to: node, tag: 0, request }));
+    bench.run_epochs(100);
+    assert_eq!(stuck(&bench), []);
 }

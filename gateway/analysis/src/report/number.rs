@@ -66,17 +66,48 @@ pub fn quantity(value: f64, unit: &str) -> String {
     interval(value, None, unit)
 }
 
-/// The same with half the width of its 95 % interval.
+/// The same with half the width of its 95 % interval, which has two digits; the number ends at the place of the second.
 pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
     let size = value.abs().max(half.unwrap_or(0.0));
     if !value.is_finite() || unit.is_empty() && half.is_none() {
-        return number(value);
+        return fraction(value);
     }
     let Fitted { factor, unit } =
         fitted(size, unit).unwrap_or_else(|| Fitted { factor: 1.0, unit: unit.to_owned() });
-    let (value, half) = (number(value * factor), half.map(|half| number(half * factor)));
-    let half = half.map_or_else(String::new, |half| format!(" ± {half}"));
+    let value = value * factor;
+    let of_half = half.map(|half| half * factor).and_then(|half| Some((half, second_digit(half)?)));
+    let (value, half) = match of_half {
+        Some((half, digits)) => (trimmed(value, digits), format!(" ± {}", trimmed(half, digits))),
+        None => {
+            let half = half.map_or_else(String::new, |half| format!(" ± {}", number(half * factor)));
+            (number(value), half)
+        }
+    };
     if unit.is_empty() { format!("{value}{half}") } else { format!("{value}{half}\u{a0}{unit}") }
+}
+
+/// Counts the digits behind the point up to the second significant one; `None` for a number that is zero, not finite, or
+/// written with a power of ten.
+fn second_digit(value: f64) -> Option<usize> {
+    let text = format!("{value:.1e}");
+    let power: i32 = text.split_once('e')?.1.parse().ok()?;
+    let is_plain = value.is_finite() && value != 0.0 && (-4..6).contains(&power);
+    is_plain.then(|| usize::try_from(1 - power).unwrap_or(0))
+}
+
+/// A number with at most so many digits behind the point.
+fn trimmed(value: f64, digits: usize) -> String {
+    let text = format!("{:.digits$}", value + 0.0);
+    if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
+}
+
+/// A number without a unit, of which the part that it lacks to 1 is not rounded away down to a millionth: 0.9995.
+fn fraction(value: f64) -> String {
+    let digits = (4..=6).find(|digits| 1.0 - value >= 10_f64.powi(-digits));
+    match digits.and_then(|digits| usize::try_from(digits).ok()) {
+        Some(digits) if value > 0.999 && value < 1.0 => trimmed(value, digits),
+        _ => number(value),
+    }
 }
 
 /// A number without a unit: whole ones below a million as they are, else at most three significant digits; very
@@ -105,8 +136,7 @@ pub fn number(value: f64) -> String {
     }
     let digits = [(100.0, 0), (10.0, 1), (1.0, 2), (0.1, 3), (0.01, 4), (0.001, 5)];
     let digits = digits.iter().find(|(from, _)| size >= *from).map_or(6, |(_, digits)| *digits);
-    let text = format!("{value:.digits$}");
-    if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
+    trimmed(value, digits)
 }
 
 #[cfg(test)]
@@ -152,6 +182,30 @@ mod tests {
         }
         assert_eq!(interval(0.25, Some(0.5), "Nm"), "250 ± 500\u{a0}mNm");
         assert_eq!(interval(0.25, Some(0.5), ""), "0.25 ± 0.5");
+    }
+
+    #[test]
+    fn an_interval_has_two_digits_and_its_number_ends_there() {
+        for (value, half, text) in [
+            (3.88, 0.0347, "3.88 ± 0.035 ns"),
+            (3.941_26, 0.004_52, "3.9413 ± 0.0045 ns"),
+            (31.904, 0.99, "31.9 ± 0.99 ns"),
+            (998.0, 0.996, "998 ± 1 ns"),
+            (123.456, 34.7, "123 ± 35 ns"),
+            (5.0, 123.4, "5 ± 123 ns"),
+            (3.88, 0.0, "3.88 ± 0 ns"),
+            (3.88, 1e-9, "3.88 ± 1e-9 ns"),
+            (3.88, f64::INFINITY, "3.88 ± – ns"),
+        ] {
+            assert_eq!(interval(value, Some(half), "ns").replace('\u{a0}', " "), text, "{value} {half}");
+        }
+    }
+
+    #[test]
+    fn nearly_all_is_not_written_as_all() {
+        let written = [1.0, 0.9995, 0.939, 0.999_96, 0.999_999_4, 1.0 - 1e-9, 0.998_9, 1.000_4, f64::NAN];
+        let texts = ["1", "0.9995", "0.939", "0.99996", "1", "1", "0.999", "1", "–"];
+        assert_eq!(written.map(|value| quantity(value, "")), texts);
     }
 
     proptest! {

@@ -331,6 +331,7 @@ const fn is_absent(error: &BusError) -> bool {
             | BusError::Gone { .. }
             | BusError::NotServed { .. }
             | BusError::Closed { .. }
+            | BusError::HungUp { .. }
     )
 }
 

@@ -96,6 +96,8 @@ pub struct CellSummary {
     pub contact_unknown: u64,
     /// Its torques against the central ones, in the joints that move it.
     pub error: Errors,
+    /// Equal words in a row, the most of each kind, while it should have sent others; kinds without any are left out.
+    pub stuck: BTreeMap<&'static str, u64>,
     /// How often it restarted.
     pub restarts: u32,
 }
@@ -117,6 +119,7 @@ impl CellSummary {
             missing: replies.missing().into_iter().filter(|(_, count)| *count > 0).collect(),
             contact_unknown: replies.contact_unknown,
             error: known.map(Cell::errors).unwrap_or_default(),
+            stuck: known.into_iter().flat_map(Cell::stuck).collect(),
             restarts: known.map_or(0, |cell| cell.uplink().restarts),
         }
     }

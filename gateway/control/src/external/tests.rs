@@ -380,3 +380,26 @@ fn a_controller_that_answered_is_absent_only_if_it_is_silent_at_the_end() {
     gateway.step(&input(2));
     assert_eq!(gateway.absence(None), None);
 }
+
+#[test]
+fn descriptors_that_a_program_passes_along_are_closed() {
+    use rustix::net::{SendAncillaryBuffer, SendAncillaryMessage, SendFlags, sendmsg};
+    use std::io::{IoSlice, Read};
+    use std::mem::MaybeUninit;
+    use std::os::fd::AsFd;
+
+    let (folder, _path, mut gateway) = gateway();
+    let program = program(&folder, "program.sock");
+    let (mut read, write) = std::io::pipe().unwrap();
+    for _ in 0..10 {
+        let passed = [write.as_fd(); 3];
+        let mut space = [MaybeUninit::uninit(); 128];
+        let mut control = SendAncillaryBuffer::new(&mut space);
+        assert!(control.push(SendAncillaryMessage::ScmRights(&passed)));
+        sendmsg(&program, &[IoSlice::new(HELLO)], &mut control, SendFlags::empty()).unwrap();
+        gateway.step(&input(1));
+    }
+    drop(write);
+    rustix::io::ioctl_fionbio(&read, true).unwrap();
+    assert_eq!(read.read(&mut [0]).unwrap(), 0);
+}

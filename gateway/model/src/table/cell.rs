@@ -125,6 +125,18 @@ impl Cell {
         self.outstanding.errors
     }
 
+    /// The kinds of words (`torque`, `skin`, `acceleration`) that stayed equal while what it should have sent changed, each
+    /// with the most in a row.
+    pub fn stuck(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        self.outstanding.stuck.longest()
+    }
+
+    /// Returns whether it sends such words now.
+    #[must_use]
+    pub fn is_stuck(&self) -> bool {
+        self.outstanding.stuck.is_now()
+    }
+
     /// Whether it measures, so that stimuli do not touch it; none before its first heartbeat.
     #[must_use]
     pub fn measures(&self) -> Option<bool> {
@@ -216,6 +228,9 @@ impl Cell {
     pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, is_newest: bool, events: &Events) {
         self.sensed.hear(at, page, events);
         self.switched.subtracts |= matches!(page, SensorPage::Baseline(_));
+        if self.sensors().is_some() {
+            self.contact.latched().for_each(|(right, _)| self.outstanding.stuck.take_page(page, &right));
+        }
         if is_newest {
             self.contact.learn(*page, ());
         }

@@ -197,6 +197,9 @@ impl Table {
         if let (Requested::Due, Some(expected)) = (asked, cell.outstanding.expected(number)) {
             let error =
                 self.accuracy.compare(cell.joint, format, torque, &expected, &mut cell.outstanding.errors);
+            cell.outstanding
+                .stuck
+                .take_torque(torque.padded(), expected.quantised.map(|torque| format.nearest(torque)));
             if lag == 0 {
                 for (sum, error) in broadcast.error.iter_mut().zip(error) {
                     *sum += error;

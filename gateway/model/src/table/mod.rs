@@ -22,6 +22,7 @@ mod root_totals;
 mod sensed;
 mod sent;
 mod status;
+mod stuck;
 mod switched;
 
 use std::collections::VecDeque;
@@ -360,8 +361,7 @@ impl Table {
         }
     }
 
-    /// Whether somebody on this bus uses an identifier, as the skin describes the bus: what is no packet under another
-    /// one is foreign.
+    /// Whether the skin describes a sender with this identifier on this bus.
     fn is_used(&self, id: Id) -> bool {
         let is_cell = |cell: CellId| self.place(cell).is_some();
         match (id.kind, Node::from_byte(id.node)) {

@@ -4,6 +4,7 @@ use derive_more::{Add, Sum};
 use protocol::parameters::MAX_JOINTS;
 
 use super::accuracy::Errors;
+use super::stuck::Stuck;
 use crate::tracker::LATEST;
 
 /// Replies of one cell: due = in time + late + missing.
@@ -74,6 +75,8 @@ pub(super) struct Outstanding {
     expected: [Option<Expected>; LATEST + 1],
     /// How far its answers were from that.
     pub(super) errors: Errors,
+    /// Its words beside those that it should have sent.
+    pub(super) stuck: Stuck,
 }
 
 impl Outstanding {

@@ -185,7 +185,7 @@ fn a_name_that_was_changed_is_what_is_said() {
         (code, out.as_str()),
         (Some(0), "(1700000000.000000000) _/robot_one/can 123#0102030405060708\n")
     );
-    assert!(said.contains("1 frames have a bus that is written under another name"), "{said}");
+    assert!(said.contains("1 frame has a bus that is written under another name"), "{said}");
     assert!(!said.contains("direction"), "{said}");
 }
 

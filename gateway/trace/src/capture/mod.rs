@@ -25,6 +25,7 @@ mod times;
 pub use error::CaptureError;
 pub use extras::{Extras, Latched, SKIN, Topic};
 pub use mcap::ORIGIN;
+pub(crate) use mcap::is_foreign_frame;
 pub use parts::{Part, PartsError};
 pub use places::{Place, Places};
 pub use reader::{Format, Reader};

@@ -18,7 +18,7 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
         (
             any(&|line| line == "BS_:" || line == "NS_ :" || line == "NS_:" || line.starts_with("BO_ "))
                 || begins_with("VERSION \""),
-            ("a DBC file", "it describes signals and holds no frames: name a capture"),
+            ("a DBC file", "it describes signals and holds no frames"),
         ),
         (any(&|line| line.starts_with("base hex") || line.starts_with("base dec")), ASC),
         (any(&|line| line.starts_with("Begin Triggerblock") || line == "// version 7.0.0"), ASC),

@@ -204,6 +204,7 @@ impl LiveBus {
                 (view.heard && view.other, flag::OTHER_CONFIGURATION),
                 (view.measures, flag::MEASURES),
                 (view.halted, flag::HALTED),
+                (cell.is_stuck(), flag::STUCK),
             ];
             let flags = flags.iter().filter(|(is, _)| *is).fold(0, |all, (_, bit)| all | bit);
             let sensors = sensors.unwrap_or_default();

@@ -85,6 +85,7 @@ test("a cell's shape says the worst about it, and each shape is another", () => 
   assert.equal(of(1, 2 | 8), "other parameters");
   assert.equal(of(3, 8), "stale: no answer");
   assert.equal(of(1, 8 | 16), "halted");
+  assert.equal(of(2, 16 | 32), "stuck: one value");
   assert.equal(new Set(SHAPES.map((it) => it.shape)).size, SHAPES.length);
 });
 

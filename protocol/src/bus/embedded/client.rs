@@ -2,6 +2,7 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
+use std::path::Path;
 use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -17,6 +18,8 @@ use crate::bus::{Bus, BusError, Filter, Options};
 
 /// How long a client waits for a server: it answers at once unless it is stopped.
 const TIMEOUT: Duration = Duration::from_secs(2);
+/// Time in which a server that ends resets connections.
+const RESET: Duration = Duration::from_millis(50);
 /// Room for what the server has not read yet: some 700 FD frames, a whole skin's answers in one go.
 const SEND_BUFFER: usize = 1 << 18;
 
@@ -27,11 +30,11 @@ impl Carrier for Embedded {
     fn open(&self, name: &str, options: &Options) -> Result<(CanFdSocket, usize), BusError> {
         let failed = |errno: Errno| BusError::refused(name, "connect to", errno);
         let gone = |errno| match errno {
-            Errno::PIPE | Errno::CONNRESET => BusError::Closed(name.to_owned()),
+            Errno::PIPE | Errno::CONNRESET => closed(name, options.directory.as_deref()),
             errno => failed(errno),
         };
         let no_answer = || BusError::NoAnswer { name: name.to_owned(), waited: TIMEOUT };
-        let socket = CanFdSocket::from(connect(name, options)?);
+        let socket = CanFdSocket::from(connect(name, options.directory.as_deref())?);
         socket.set_recv_timestamp(true).map_err(|source| BusError::refused(name, "set up", source))?;
         let hello = Hello {
             filters: options.filters.clone(),
@@ -58,7 +61,7 @@ impl Carrier for Embedded {
             Some(Answer::Refused { version }) => {
                 Err(BusError::Refused { name: name.to_owned(), ours: VERSION, theirs: version })
             }
-            None => Err(BusError::Closed(name.to_owned())),
+            None => Err(closed(name, options.directory.as_deref())),
         }
     }
 
@@ -85,9 +88,23 @@ impl Carrier for Embedded {
     }
 }
 
+/// The error for a connection that is over: its server has ended, or serves others and has hung up on this client.
+pub(in crate::bus) fn closed(name: &str, directory: Option<&Path>) -> BusError {
+    let is_served = connect(name, directory).is_ok_and(|socket| is_kept(&socket));
+    if is_served { BusError::HungUp(name.to_owned()) } else { BusError::Closed(name.to_owned()) }
+}
+
+/// Returns whether a server keeps a new connection: one that is just ending resets it.
+fn is_kept(socket: &OwnedFd) -> bool {
+    let wait = Timespec::try_from(RESET).unwrap_or_default();
+    let mut polled = [PollFd::new(socket, PollFlags::IN)];
+    let is_quiet = rustix::io::retry_on_intr(|| poll(&mut polled, Some(&wait))) == Ok(0);
+    is_quiet || rustix::net::recv(socket, &mut [0; 64], RecvFlags::DONTWAIT).is_ok()
+}
+
 /// A socket that a server has taken, or that waits among those that it will take; it gives up sending in time.
-fn connect(name: &str, options: &Options) -> Result<OwnedFd, BusError> {
-    let directory = options.directory.clone().unwrap_or_else(usual_directory);
+fn connect(name: &str, directory: Option<&Path>) -> Result<OwnedFd, BusError> {
+    let directory = directory.map_or_else(usual_directory, Path::to_owned);
     let failed = |errno: Errno| BusError::refused(name, "connect to", errno);
     let not_served = || BusError::NotServed { name: name.to_owned(), directory: directory.clone() };
     open_directory(&directory)

@@ -12,7 +12,7 @@ use super::moments::Loss;
 use crate::paper;
 use crate::report::figure::{Axis, Figure, Finding, Mark, Page, Section, Series, Shape, number, quantity};
 use crate::report::thin::Thinned;
-use model::table::{Accuracy, Uplink};
+use model::table::{Accuracy, Cell, Uplink};
 
 /// The paper's cells, control loop and broadcasts.
 const PAPER_CELLS: f64 = 253.0;
@@ -20,6 +20,9 @@ const PAPER_CONTROL_HZ: f64 = 500.0;
 const PAPER_BROADCAST_HZ: f64 = 62.5;
 /// The paper's law of the central computation (Eq. 29 and 30), in µs: of each active cell, of each cell, of none.
 const PAPER_CENTRAL_US: [f64; 3] = [0.798, 0.827, 10.7];
+
+/// Stuck cells that are named.
+const NAMED: usize = 10;
 
 /// What a page is made of.
 struct Draft<'a> {
@@ -149,10 +152,29 @@ impl Draft<'_> {
         let uplink: Uplink = self.run.bus_figures.iter().map(|bus_figures| bus_figures.table.uplink()).sum();
         let lost = none("packets of cells lost, by their own count".to_owned(), uplink.lost);
         findings.push(lost.look(self.worst_loss(|loss| loss.packets)));
+        findings.extend(self.stuck());
         Section::new("summary", "In numbers").findings(findings).text(
             "Beside the paper's numbers (Efficient Distributed Torque Computation for Large Scale Robot Skin). Within \
              5 % of the paper's, a number is the same. A command shows the recording where the number is worst.",
         )
+    }
+
+    /// Cells that sent the same words while they should have sent others; `None` without any.
+    fn stuck(&self) -> Option<Finding> {
+        let cells = self.run.bus_figures.iter().flat_map(|bus_figures| {
+            let name = |cell: &Cell| {
+                let kinds: Vec<_> =
+                    cell.stuck().map(|(kind, count)| format!("{count} times one {kind}")).collect();
+                (!kinds.is_empty())
+                    .then(|| format!("{} {}: {}", bus_figures.name, cell.node, kinds.join(", ")))
+            };
+            bus_figures.table.cells().iter().filter_map(name)
+        });
+        let cells: Vec<_> = cells.collect();
+        let more = if cells.len() > NAMED { ", and others" } else { "" };
+        let named: Vec<_> = cells.iter().take(NAMED).map(String::as_str).collect();
+        let what = format!("stuck cells, which should have sent other words ({}{more})", named.join("; "));
+        (!cells.is_empty()).then(|| none(what, cells.len() as u64))
     }
 
     /// The command for the loss with most of what a count names.

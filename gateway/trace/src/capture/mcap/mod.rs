@@ -20,6 +20,11 @@ use thiserror::Error;
 
 use crate::container::Damage;
 
+/// Returns whether messages of an encoding and a type are frames of another program.
+pub(crate) fn is_foreign_frame(encoding: &str, schema: &str) -> bool {
+    foreign::Foreign::of(encoding, schema).is_some()
+}
+
 /// Why nothing more comes.
 #[derive(Debug, Error)]
 pub(super) enum Fault {

@@ -7,13 +7,10 @@
 use std::collections::BTreeMap;
 use std::io::{self, Write};
 
-use mcap::records::op;
-use protocol::candump::Record as Frame;
-
+use crate::capture::is_foreign_frame;
 use crate::container::{Damage, Names, Record, parse};
-use crate::recording::TOPIC_OF_BUS;
-use crate::recording::file::FileWriter;
-use crate::ros2::Message;
+use crate::recording::file::{FileWriter, is_frames};
+use mcap::records::op;
 
 /// How far a statement is to be trusted.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -85,7 +82,7 @@ impl Described {
                 && id != 0
             {
                 writer.schema_as(id, (name, encoding), data)?;
-                types.insert(id, name == Frame::TYPE);
+                types.insert(id, name.to_owned());
             }
         }
         let mut topics = BTreeMap::new();
@@ -93,10 +90,11 @@ impl Described {
             let Ok(Record::Channel { id, schema, topic, encoding, facts }) = parse(op::CHANNEL, body) else {
                 continue;
             };
-            let of_frames = types.get(&schema).copied();
-            if schema == 0 || of_frames.is_some() {
+            let of = types.get(&schema).map(String::as_str);
+            if schema == 0 || of.is_some() {
                 writer.channel_as((id, schema), (topic, encoding), &facts.into())?;
-                topics.insert(id, of_frames == Some(true) && topic.starts_with(TOPIC_OF_BUS));
+                let is_frames = of.is_some_and(|of| is_frames(topic, of) || is_foreign_frame(encoding, of));
+                topics.insert(id, is_frames);
             }
         }
         Ok(topics)

@@ -1,0 +1,172 @@
+//! Cells that send the same words for ever while they should send others.
+//!
+//! ```text
+//!   torque that was due, and the central one ──────────┐
+//!                                                      ├─> Words ─> equal words in a row
+//!   sensors page, and what stimuli set it to ──────────┘
+//! ```
+//!
+//! Equal words are right where nothing changes: a force may be constant, an arm may stand, and a small torque is rounded to
+//! zero. So they count only against words that are known: of a cell whose contact is known, which neither measures nor
+//! subtracts a zero. These must have changed several times, each time by far more than a cell's rounding, so that neither
+//! a lost stimulus nor an epoch's delay explains it. Nothing is known of cells in sums, nor of what a cell measures.
+
+use protocol::message::SensorPage;
+use protocol::packet::padded;
+use protocol::parameters::MAX_JOINTS;
+
+/// Equal words in a row from which on a cell is stuck.
+const EQUAL: u64 = 32;
+/// Changes of the right words meanwhile.
+const CHANGES: u32 = 4;
+/// The least change in one of the words, in steps.
+const STEPS: u16 = 16;
+
+/// Kinds of words that may be stuck, as [`Stuck::longest`] names them.
+const NAMES: [&str; 3] = ["torque", "skin", "acceleration"];
+
+/// The words of a cell's torques and sensors.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Stuck {
+    kinds: [Words; NAMES.len()],
+}
+
+/// The words of one kind.
+#[derive(Clone, Copy, Debug, Default)]
+struct Words {
+    sent: Option<[i16; MAX_JOINTS]>,
+    /// Words in a row that were equal to `sent`.
+    equal: u64,
+    /// Words that it should have sent, as they changed last.
+    right: [i16; MAX_JOINTS],
+    changes: u32,
+    /// The most equal words in a row that were too many.
+    longest: u64,
+}
+
+impl Words {
+    fn take(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
+        if self.sent.replace(sent) != Some(sent) {
+            (self.equal, self.right, self.changes) = (1, right, 0);
+            return;
+        }
+        self.equal += 1;
+        let mut both = self.right.iter().zip(&right);
+        if both.any(|(before, now)| before.abs_diff(*now) >= STEPS) {
+            self.right = right;
+            self.changes += 1;
+        }
+        if self.is_stuck() {
+            self.longest = self.longest.max(self.equal);
+        }
+    }
+
+    const fn is_stuck(&self) -> bool {
+        self.equal >= EQUAL && self.changes >= CHANGES
+    }
+}
+
+impl Stuck {
+    /// Takes a torque that was due, beside the central one.
+    pub(super) fn take_torque(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
+        let [torque, ..] = &mut self.kinds;
+        torque.take(sent, right);
+    }
+
+    /// Takes a sensors page of the cell, beside the one that stimuli set; pages of different kinds tell nothing.
+    pub(super) fn take_page(&mut self, sent: &SensorPage, right: &SensorPage) {
+        let [_, skin, acceleration] = &mut self.kinds;
+        let words = match (sent, right) {
+            (SensorPage::Skin(_), SensorPage::Skin(_)) => skin,
+            (SensorPage::Acceleration(_), SensorPage::Acceleration(_)) => acceleration,
+            (..) => return,
+        };
+        words.take(bits(sent), bits(right));
+    }
+
+    /// Returns whether it sends the same words for too long now.
+    pub(super) fn is_now(&self) -> bool {
+        self.kinds.iter().any(Words::is_stuck)
+    }
+
+    /// The kinds of words that stayed equal for too long, each with the most in a row.
+    pub(super) fn longest(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        NAMES.into_iter().zip(self.kinds.map(|words| words.longest)).filter(|(_, longest)| *longest > 0)
+    }
+}
+
+/// The words of a page.
+fn bits(page: &SensorPage) -> [i16; MAX_JOINTS] {
+    match page {
+        SensorPage::Skin(skin) => {
+            let [a, b, c] = skin.contact.map(|word| word.to_bits());
+            let [warmth, inside] = skin.temperature.map(|word| word.to_bits());
+            padded(&[a, b, c, skin.proximity.to_bits(), warmth, inside])
+        }
+        SensorPage::Acceleration(xyz) => padded(&xyz.map(|word| word.to_bits())),
+        SensorPage::Baseline(_) => [0; MAX_JOINTS],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::fixed::Q3_12;
+    use protocol::message::SkinSensors;
+
+    const FEW: i16 = 15;
+    const MANY: i16 = 16;
+
+    /// The most equal words in a row that were too many, of what was sent and what was right.
+    fn longest(words: impl Iterator<Item = (i16, i16)>) -> u64 {
+        let mut all = Words::default();
+        words.for_each(|(sent, right)| all.take(padded(&[0, sent]), padded(&[0, right])));
+        all.longest
+    }
+
+    #[test]
+    fn equal_words_are_too_many_when_the_right_ones_changed_four_times() {
+        let moving = |count: i16| longest((0..count).map(|n| (200, n * MANY)));
+        assert_eq!([5, 31, 32, 40].map(moving), [0, 0, 32, 40]);
+        let changes = |count: i16| longest((0..100).map(|n| (0, (n / 8).min(count) * MANY)));
+        assert_eq!([0, 1, 3, 4].map(changes), [0, 0, 0, 100]);
+        assert_eq!(longest((0..100).map(|n| (7, n % 2 * MANY))), 100, "there and back");
+    }
+
+    #[test]
+    fn a_right_cell_is_not_stuck() {
+        assert_eq!(longest((0..500).map(|n| (n, n))), 0, "it follows a motion");
+        assert_eq!(longest((0..500).map(|n| (n / 3, n))), 0, "coarsely");
+        assert_eq!(longest((0..500).map(|_| (512, 510))), 0, "constant force, arm at rest");
+        assert_eq!(longest((0..500).map(|n| (0, n % 2 * FEW))), 0, "zero, by rounding");
+        assert_eq!(longest((0..500).map(|n| (512, if n < 250 { 512 } else { 2_048 }))), 0, "a lost stimulus");
+        assert_eq!(longest((0..500).map(|n| (n / 20 * 320, n * MANY))), 0, "late by a third of a second");
+    }
+
+    #[test]
+    fn words_that_change_again_end_it_and_it_is_remembered() {
+        let mut stuck = Stuck::default();
+        (0..40).for_each(|n| stuck.take_torque(padded(&[9]), padded(&[n * MANY])));
+        assert!(stuck.is_now());
+        stuck.take_torque(padded(&[10]), padded(&[10]));
+        assert!(!stuck.is_now());
+        assert_eq!(stuck.longest().collect::<Vec<_>>(), [("torque", 40)]);
+    }
+
+    #[test]
+    fn pages_are_compared_with_pages_of_their_kind() {
+        let acceleration =
+            |bits| SensorPage::Acceleration([Q3_12::ZERO, Q3_12::ZERO, Q3_12::from_bits(bits)]);
+        let skin = |bits| {
+            let temperature = [protocol::fixed::Q9_6::from_bits(bits); 2];
+            SensorPage::Skin(SkinSensors { temperature, ..SkinSensors::default() })
+        };
+        let mut stuck = Stuck::default();
+        for n in 0..40 {
+            stuck.take_page(&skin(0), &acceleration(n * MANY));
+            stuck.take_page(&acceleration(n), &acceleration(n));
+            stuck.take_page(&skin(64), &skin(n * MANY));
+        }
+        assert_eq!(stuck.longest().collect::<Vec<_>>(), [("skin", 40)]);
+    }
+}
