@@ -1,0 +1,147 @@
+//! A page that stays: it gets the newest of everything, and sends commands.
+
+use std::io::{self, Cursor, ErrorKind, Read, Write};
+use std::net::{Shutdown, TcpStream};
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use tungstenite::protocol::WebSocketConfig;
+use tungstenite::{Error, Message, WebSocket, accept_with_config};
+
+use super::Shared;
+use crate::command::{self, Command};
+use crate::locked;
+
+/// The time for a page to take in a piece of what it is sent.
+const TIMEOUT: Duration = Duration::from_secs(5);
+/// How long a page's message is waited for, before the next snapshot is looked for.
+const LOOK: Duration = Duration::from_millis(15);
+/// Messages that are read at once.
+const AT_ONCE: usize = 64;
+
+/// A stream of which the beginning has been read.
+#[derive(Debug)]
+pub(super) struct Begun {
+    head: Cursor<Vec<u8>>,
+    stream: TcpStream,
+}
+
+impl Begun {
+    pub(super) const fn new(head: Vec<u8>, stream: TcpStream) -> Self {
+        Self { head: Cursor::new(head), stream }
+    }
+
+    pub(super) fn into_stream(self) -> TcpStream {
+        self.stream
+    }
+}
+
+impl Read for Begun {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        match self.head.read(buffer)? {
+            0 => self.stream.read(buffer),
+            read => Ok(read),
+        }
+    }
+}
+
+impl Write for Begun {
+    fn write(&mut self, buffer: &[u8]) -> io::Result<usize> {
+        self.stream.write(buffer)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.stream.flush()
+    }
+}
+
+/// Serves a page until it goes, or takes too long.
+pub(super) fn serve(begun: Begun, page: u64, shared: &Shared) {
+    let _ = live(begun, page, shared);
+}
+
+fn live(begun: Begun, page: u64, shared: &Shared) -> io::Result<()> {
+    let stream = &begun.stream;
+    stream.set_nonblocking(false)?;
+    stream.set_nodelay(true)?;
+    stream.set_read_timeout(Some(TIMEOUT))?;
+    stream.set_write_timeout(Some(TIMEOUT))?;
+    let config = WebSocketConfig::default()
+        .max_message_size(Some(command::LONGEST))
+        .max_frame_size(Some(command::LONGEST))
+        .write_buffer_size(0)
+        .max_write_buffer_size(64 << 20);
+    let Ok(mut socket) = accept_with_config(begun, Some(config)) else {
+        shared.refused.fetch_add(1, Ordering::Relaxed);
+        return Ok(());
+    };
+    shared.clients.fetch_add(1, Ordering::Relaxed);
+    let ended = talk(&mut socket, page, shared);
+    locked(&shared.chosen).remove(&page);
+    locked(&shared.gone).push(page);
+    if ended.is_ok() {
+        let _ = socket.close(None);
+        let _ = socket.flush();
+    }
+    let _ = socket.get_ref().stream.shutdown(Shutdown::Both);
+    Ok(())
+}
+
+fn talk(socket: &mut WebSocket<Begun>, page: u64, shared: &Shared) -> Result<(), Error> {
+    socket.send(Message::text(shared.scene.as_str()))?;
+    socket.get_ref().stream.set_read_timeout(Some(LOOK))?;
+    let (mut sent, mut said_number, mut jumps) = (0, 0, 0);
+    while !shared.stop.load(Ordering::Relaxed) {
+        let (history, snapshot, said) = {
+            let newest = locked(&shared.newest);
+            let history = (newest.jumps != jumps).then(|| newest.history.clone());
+            let snapshot = (newest.number != sent).then(|| newest.snapshot.clone());
+            let own = newest.own.get(&page).unwrap_or(&newest.said);
+            let said = (newest.said_number != said_number).then(|| own.clone());
+            (sent, said_number, jumps) = (newest.number, newest.said_number, newest.jumps);
+            (history, snapshot, said)
+        };
+        for bytes in [history, snapshot].into_iter().flatten() {
+            socket.send(Message::Binary(bytes))?;
+        }
+        if let Some(said) = said {
+            socket.send(Message::Text(said))?;
+        }
+        for _ in 0..AT_ONCE {
+            match socket.read() {
+                Ok(Message::Text(text)) => take(text.as_str(), page, shared),
+                Ok(Message::Close(_)) => return Ok(()),
+                Ok(Message::Binary(_)) => _ = shared.ignored.fetch_add(1, Ordering::Relaxed),
+                Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_)) => {}
+                // A program that was stopped goes on with an interrupted call.
+                Err(Error::Io(error))
+                    if matches!(
+                        error.kind(),
+                        ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted
+                    ) =>
+                {
+                    break;
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+    Ok(())
+}
+
+/// A page's message.
+fn take(text: &str, page: u64, shared: &Shared) {
+    let ignore = || _ = shared.ignored.fetch_add(1, Ordering::Relaxed);
+    match Command::parse(text) {
+        None => ignore(),
+        Some(command) if command.acts() && !shared.access.may_act => ignore(),
+        Some(command) if command.plays() && !shared.access.may_play => ignore(),
+        Some(Command::Choose(chosen)) => _ = locked(&shared.chosen).insert(page, chosen),
+        Some(Command::Unchoose) => _ = locked(&shared.chosen).remove(&page),
+        Some(command) => {
+            if shared.commands.try_send((page, command)).is_err() {
+                ignore();
+            }
+        }
+    }
+}
