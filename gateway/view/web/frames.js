@@ -99,17 +99,14 @@ function explain(why) {
     ])));
   }
   parts.push(...why.missing.map((line) => element("p", line, "faint")));
-  explained(parts);
-}
-
-// Shows an explanation, and goes to it once.
-function explained(parts) {
   show($("why"), parts);
-  if (sought !== null) $("why").scrollIntoView({ block: "nearest" });
+  if (sought === why.number) $("why").scrollIntoView({ block: "nearest" });
   sought = null;
 }
 
 function giveUp() {
-  explained([element("p", "No answer: this frame is older than the 3 s that are kept. Choose a newer one.", "faint")]);
+  const words = "No answer: frames are kept for 3 s, and this one may be older. Choose a newer one.";
+  $("why").replaceChildren(element("p", words, "faint"));
+  $("why").scrollIntoView({ block: "nearest" });
   hold(false);
 }
