@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread;
 
@@ -116,7 +116,11 @@ impl Server {
             ignored: AtomicU64::new(0),
         });
         let server = Self { shared: Arc::clone(&shared), commands };
-        thread::Builder::new().name("view door".to_owned()).spawn(move || door::serve(&listener, &shared))?;
+        let (pages, begun) = channel();
+        let of_pages = Arc::clone(&shared);
+        let named = |name: &str| thread::Builder::new().name(name.to_owned());
+        named("view pages").spawn(move || door::open(begun, &of_pages))?;
+        named("view door").spawn(move || door::serve(&listener, &shared, &pages))?;
         Ok(server)
     }
 

@@ -7,7 +7,7 @@ use serde_json::Value;
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Error, Message, WebSocket, client};
 
-use super::{Place, Running, TIMEOUT, until};
+use super::{Place, Running, TIMEOUT, skin, until};
 
 /// Nothing happens by itself; the arm gives way.
 pub(crate) const QUIET: &str = "version = 1\nduration_s = 60.0\n\n[motion]\nkind = \"kinesthetic\"\n\
@@ -81,9 +81,14 @@ pub(crate) fn ask(
 
 impl Page {
     pub(crate) fn new(address: &Address) -> Self {
-        let (mut socket, _) = ask(address, &[("Origin", &format!("http://{}", address.host))]).unwrap();
-        let scene = serde_json::from_str(socket.read().unwrap().to_text().unwrap()).unwrap();
-        Self { socket, scene }
+        Self::attempt(address).unwrap()
+    }
+
+    /// A page, unless it is refused.
+    pub(crate) fn attempt(address: &Address) -> Result<Self, Error> {
+        let (mut socket, _) = ask(address, &[("Origin", &format!("http://{}", address.host))])?;
+        let scene = serde_json::from_str(socket.read()?.to_text()?).unwrap();
+        Ok(Self { socket, scene })
     }
 
     pub(crate) fn say(&mut self, command: &str) {
@@ -164,7 +169,8 @@ impl Snapshot {
 
 /// A run that is watched, and where its page is.
 pub(crate) fn watched(place: &Place, cells: usize, more: &str) -> (Running, Address) {
-    place.skin(cells);
+    // A busy machine halts no robot.
+    place.write("skin.toml", &(skin(cells) + "\n[safety]\nbad_cycles = 10000\n"));
     watched_skin(place, more)
 }
 

@@ -8,11 +8,12 @@ use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, Sender};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
-use rustix::process::{Resource, getrlimit};
+use rustix::process::{Resource, getrlimit, setpriority_process};
 
 use super::answer::{Answer, Turned, answer};
 use super::page::{self, Begun};
@@ -33,6 +34,8 @@ const ACCEPTED_AT_ONCE: usize = 32;
 const POLL_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
 /// The time without accepting after that has failed.
 const REST: Duration = Duration::from_millis(50);
+/// The priority of the door's thread: a storm of connections takes no time that the bench needs.
+const NICE: i32 = 10;
 /// Bytes that are read at once.
 const PIECE: usize = 4 * 1024;
 
@@ -56,11 +59,13 @@ enum Next {
     Left,
 }
 
-/// Serves until the server stops.
-pub(super) fn serve(listener: &TcpListener, shared: &Arc<Shared>) {
+/// Serves until the server stops, and hands on those that become pages.
+pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begun>) {
+    // On Linux this is the thread's own; without it the door works as well.
+    let _ = setpriority_process(None, NICE);
     let room = room();
     let mut visitors = Vec::<Visitor>::new();
-    let (mut pages, mut resting) = (0, None::<Instant>);
+    let mut resting = None::<Instant>;
     while !shared.stop.load(Ordering::Relaxed) {
         resting = resting.filter(|end| Instant::now() < *end);
         let ready = wait(listener, resting.is_none(), &visitors);
@@ -75,7 +80,7 @@ pub(super) fn serve(listener: &TcpListener, shared: &Arc<Shared>) {
                     visitor.turn_away(Turned::Late);
                 }
             } else if *is_ready {
-                enter(visitor.advance(shared), &mut visitors, &mut pages, shared);
+                enter(visitor.advance(shared), &mut visitors, pages);
             } else {
                 visitors.push(visitor);
             }
@@ -89,9 +94,8 @@ pub(super) fn serve(listener: &TcpListener, shared: &Arc<Shared>) {
                     if stream.set_nonblocking(true).is_err() {
                         continue;
                     }
-                    let until = Instant::now() + HEAD_TIME;
-                    let visitor = Visitor { stream, head: Vec::new(), answer: None, until };
-                    enter(visitor.advance(shared), &mut visitors, &mut pages, shared);
+                    let visitor = Visitor::new(stream);
+                    enter(visitor.advance(shared), &mut visitors, pages);
                     if visitors.len() > room {
                         turn_oldest_away(&mut visitors, shared);
                     }
@@ -133,37 +137,33 @@ fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool
 }
 
 /// Takes a visitor where it goes next.
-fn enter(next: Next, visitors: &mut Vec<Visitor>, pages: &mut u64, shared: &Arc<Shared>) {
+fn enter(next: Next, visitors: &mut Vec<Visitor>, pages: &Sender<Begun>) {
     match next {
         Next::Stays(visitor) => visitors.push(visitor),
         Next::Left => {}
-        Next::Page(begun) => {
-            *pages += 1;
-            open(begun, *pages, shared);
-        }
+        // The other end ends with this one.
+        Next::Page(begun) => _ = pages.send(begun),
     }
 }
 
-/// Starts a page's thread, if there is a place.
-fn open(begun: Begun, page: u64, shared: &Arc<Shared>) {
-    let turn_away = |begun: Begun| {
-        shared.refused.fetch_add(1, Ordering::Relaxed);
-        let until = Instant::now();
-        Visitor { stream: begun.into_stream(), head: Vec::new(), answer: None, until }
-            .turn_away(Turned::Full);
-    };
-    if shared.pages.fetch_add(1, Ordering::Relaxed) >= PAGES {
-        shared.pages.fetch_sub(1, Ordering::Relaxed);
-        return turn_away(begun);
-    }
-    let of_thread = Arc::clone(shared);
-    let started = thread::Builder::new().name(format!("view page {page}")).spawn(move || {
-        page::serve(begun, page, &of_thread);
-        of_thread.pages.fetch_sub(1, Ordering::Relaxed);
-    });
-    if started.is_err() {
-        shared.pages.fetch_sub(1, Ordering::Relaxed);
-        shared.refused.fetch_add(1, Ordering::Relaxed);
+/// Starts a thread for each page, if there is a place; these threads have the ordinary priority of this one.
+pub(super) fn open(pages: Receiver<Begun>, shared: &Arc<Shared>) {
+    for (page, begun) in (1..).zip(pages) {
+        if shared.pages.fetch_add(1, Ordering::Relaxed) >= PAGES {
+            shared.pages.fetch_sub(1, Ordering::Relaxed);
+            shared.refused.fetch_add(1, Ordering::Relaxed);
+            Visitor::new(begun.into_stream()).turn_away(Turned::Full);
+            continue;
+        }
+        let of_thread = Arc::clone(shared);
+        let started = thread::Builder::new().name(format!("view page {page}")).spawn(move || {
+            page::serve(begun, page, &of_thread);
+            of_thread.pages.fetch_sub(1, Ordering::Relaxed);
+        });
+        if started.is_err() {
+            shared.pages.fetch_sub(1, Ordering::Relaxed);
+            shared.refused.fetch_add(1, Ordering::Relaxed);
+        }
     }
 }
 
@@ -182,6 +182,10 @@ fn turn_oldest_away(visitors: &mut Vec<Visitor>, shared: &Shared) {
 }
 
 impl Visitor {
+    fn new(stream: TcpStream) -> Self {
+        Self { stream, head: Vec::new(), answer: None, until: Instant::now() + HEAD_TIME }
+    }
+
     /// Reads what has come, and writes what there is room for.
     fn advance(mut self, shared: &Shared) -> Next {
         while self.answer.is_none() {
