@@ -1,9 +1,9 @@
 //! `gateway view`: a page's WebSocket beside a real bench, and clients that mean no good.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
+#[path = "process/intruders.rs"]
+mod intruders;
 mod process;
-#[path = "process/strangers.rs"]
-mod strangers;
 
 use std::fs::Permissions;
 use std::io::{ErrorKind, Read, Write};

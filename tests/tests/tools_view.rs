@@ -180,7 +180,7 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
     let button = "document.querySelectorAll('#frames button')[1]";
     for _ in 0..5 {
         browser.value("document.getElementById('side').scrollTop = 0");
-        browser.until(&format!("{button}"));
+        browser.until(button);
         browser.value("document.getElementById('frames').scrollIntoView({ block: 'end' })");
         let pressed = loop {
             let near = place_of(&mut browser, button);
@@ -213,7 +213,7 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
     browser.value("document.getElementById('halt').click()");
     browser.until(
         "document.getElementById('halted').textContent === \
-         'The robot is halted: somebody sent a halt frame. Press Resume to let it go on.'",
+         'The robot is halted: somebody sent a halt frame. Press Resume to continue.'",
     );
     let colour = "getComputedStyle(document.getElementById('resume')).backgroundColor";
     assert_eq!(browser.value(colour), "rgb(98, 181, 242)", "the next step is marked");

@@ -198,7 +198,7 @@ pub fn url(listen: SocketAddr, token: Option<&Token>) -> String {
     let ip = match listen.ip() {
         IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
         IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
-        ip => ip,
+        ip @ (IpAddr::V4(_) | IpAddr::V6(_)) => ip,
     };
     let query = token.map_or_else(String::new, |token| format!("?token={}", token.as_str()));
     format!("http://{}/{query}", SocketAddr::new(ip, listen.port()))

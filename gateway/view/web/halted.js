@@ -5,5 +5,5 @@ export function haltedWords(said, mayPress) {
   if (!said.halted && !run?.halted) return "";
   const why = run?.halted ? `The robot is halted: ${run.halted}.` : "The robot is halted by a Halt on the bus.";
   if (!mayPress) return why;
-  return run?.buses.some(({ down }) => down) ? `${why} Take the bus up, then press Resume.` : `${why} Press Resume to let it go on.`;
+  return run?.buses.some(({ down }) => down) ? `${why} Take the bus up, then press Resume.` : `${why} Press Resume to continue.`;
 }

@@ -42,7 +42,7 @@ pub struct Scenario {
     pub modes: Vec<ModeChange>,
     /// The touches, in the file's order.
     pub touches: Vec<Touch>,
-    /// The time after which the touches begin anew, and again after each such time.
+    /// The period after which the touches repeat.
     pub touches_repeat: Option<Span>,
     /// The faults, in the order of time.
     pub faults: Vec<Fault>,

@@ -335,7 +335,7 @@ fn touches_come_and_go_by_their_profile() {
 }
 
 #[test]
-fn touches_that_repeat_begin_anew() {
+fn touches_repeat_after_their_period() {
     let scenario = Scenario { touches_repeat: Some(Span(12_000_000)), ..good() };
     let mut touches = Touches::new(&scenario, &three());
     for epoch in [0, 125, 150, 188, 219] {

@@ -35,7 +35,7 @@ pub struct Touches {
     /// From one epoch to the next, in µs.
     period_us: f64,
     touches: Vec<Touch>,
-    /// The time after which they begin anew.
+    /// The period after which they repeat.
     repeat: Option<Span>,
     /// The touches' forces in N before and now: scratch of [`Touches::changes`].
     levels: Vec<[Option<f64>; 2]>,

@@ -56,7 +56,7 @@ enum Next {
     /// It is a page.
     Page(Begun),
     /// It has its answer, or has gone.
-    Left,
+    Done,
 }
 
 /// Serves until the server stops, and hands on those that become pages.
@@ -140,7 +140,7 @@ fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool
 fn enter(next: Next, visitors: &mut Vec<Visitor>, pages: &Sender<Begun>) {
     match next {
         Next::Stays(visitor) => visitors.push(visitor),
-        Next::Left => {}
+        Next::Done => {}
         // The other end ends with this one.
         Next::Page(begun) => _ = pages.send(begun),
     }
@@ -193,19 +193,19 @@ impl Visitor {
             // The end of a head is not before the last bytes of what was there.
             let seen = self.head.len().saturating_sub(3);
             match self.stream.read(&mut piece) {
-                Ok(0) => return Next::Left,
+                Ok(0) => return Next::Done,
                 Ok(read) => self.head.extend(piece.iter().take(read)),
                 Err(error) if error.kind() == ErrorKind::Interrupted => continue,
                 Err(error) if error.kind() == ErrorKind::WouldBlock => return Next::Stays(self),
-                Err(_) => return Next::Left,
+                Err(_) => return Next::Done,
             }
-            let is_whole =
-                self.head.get(seen..).is_some_and(|new| new.windows(4).any(|end| end == b"\r\n\r\n"));
+            let new = self.head.get(seen..).unwrap_or_default();
+            let end = new.windows(4).position(|end| end == b"\r\n\r\n").map(|at| seen + at + 4);
             if self.head.len() > LONGEST {
                 shared.refused.fetch_add(1, Ordering::Relaxed);
                 self.answer = Some((Answer::of(Turned::Long), 0));
-            } else if is_whole {
-                match answer(&self.head, shared) {
+            } else if let Some(head) = end.and_then(|end| self.head.get(..end)) {
+                match answer(head, shared) {
                     Some(answer) => self.answer = Some((answer, 0)),
                     None => return Next::Page(Begun::new(self.head, self.stream)),
                 }
@@ -219,10 +219,10 @@ impl Visitor {
             let rest = answer.bytes.get(*sent..).unwrap_or_default();
             if rest.is_empty() {
                 self.close();
-                return Next::Left;
+                return Next::Done;
             }
             match self.stream.write(rest) {
-                Ok(0) => return Next::Left,
+                Ok(0) => return Next::Done,
                 Ok(written) => {
                     *sent += written;
                     if answer.is_known {
@@ -231,7 +231,7 @@ impl Visitor {
                 }
                 Err(error) if error.kind() == ErrorKind::Interrupted => {}
                 Err(error) if error.kind() == ErrorKind::WouldBlock => return Next::Stays(self),
-                Err(_) => return Next::Left,
+                Err(_) => return Next::Done,
             }
         }
         Next::Stays(self)

@@ -9,7 +9,7 @@ use super::*;
 
 const TOKEN: &str = "abcdef0123456789";
 /// The time that anything may take that should happen at once.
-const PATIENCE: Duration = Duration::from_secs(40);
+const TIMEOUT: Duration = Duration::from_secs(40);
 
 fn served(token: Option<&str>) -> Server {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
@@ -20,7 +20,7 @@ fn served(token: Option<&str>) -> Server {
 
 fn connect(server: &Server) -> TcpStream {
     let stream = TcpStream::connect(server.address()).unwrap();
-    stream.set_read_timeout(Some(PATIENCE)).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
     stream
 }
 
@@ -87,6 +87,19 @@ fn without_the_token_only_the_code_of_the_page_is_served() {
 }
 
 #[test]
+fn bytes_behind_a_head_do_not_change_its_answer() {
+    let server = served(Some(TOKEN));
+    let mut stream = connect(&server);
+    let head = format!("GET /live HTTP/1.1\r\nHost: {}\r\nUpgrade: websocket\r\n\r\n", server.address());
+    // A message of a page, masked with zeros, is no UTF-8.
+    stream
+        .write_all(&[head.as_bytes(), &[0x81, 0x80 | 13, 0, 0, 0, 0], br#"{"do":"halt"}"#].concat())
+        .unwrap();
+    assert_eq!(status(&rest(stream)), "403");
+    assert_eq!(server.commands().count(), 0);
+}
+
+#[test]
 fn a_page_without_a_token_is_served_to_anybody() {
     let server = served(None);
     assert_eq!([status(&get(&server, "/")), status(&get(&server, "/surface"))], ["200", "200"]);
@@ -99,7 +112,7 @@ fn a_head_has_one_deadline_however_it_drips() {
     let (mut slow, mut silent, empty) = (connect(&server), connect(&server), connect(&server));
     write!(silent, "GET / HTTP/1.1\r\n").unwrap();
     write!(slow, "GET / HTTP/1.1\r\nX: ").unwrap();
-    let give_up = Instant::now() + PATIENCE;
+    let give_up = Instant::now() + TIMEOUT;
     while slow.write_all(b"a").is_ok() {
         assert!(Instant::now() < give_up, "a head that drips is waited for");
         thread::sleep(Duration::from_millis(200));
@@ -142,7 +155,7 @@ fn a_page_too_many_is_refused_in_words() {
     let answer = get(&server, &format!("/live{query}"));
     assert!(answer.contains("503: 16 pages are open, and there may be no more"), "{answer}");
     drop(pages);
-    let give_up = Instant::now() + PATIENCE;
+    let give_up = Instant::now() + TIMEOUT;
     while page(&server, &query).is_err() {
         assert!(Instant::now() < give_up, "places become free");
         thread::sleep(Duration::from_millis(20));

@@ -232,9 +232,9 @@ test("a halt is told with its reason and the next step", () => {
   const bench = (halted, down = false) => ({ halted, buses: [{ down }] });
   assert.equal(haltedWords({ halted: false, bench: bench(null) }, true), "");
   const said = (bench, mayPress = true) => haltedWords({ halted: true, bench }, mayPress);
-  assert.equal(said(bench("too many bad cycles")), "The robot is halted: too many bad cycles. Press Resume to let it go on.");
+  assert.equal(said(bench("too many bad cycles")), "The robot is halted: too many bad cycles. Press Resume to continue.");
   assert.equal(said(bench("no torque", true)), "The robot is halted: no torque. Take the bus up, then press Resume.");
-  assert.equal(said(null), "The robot is halted by a Halt on the bus. Press Resume to let it go on.");
+  assert.equal(said(null), "The robot is halted by a Halt on the bus. Press Resume to continue.");
   assert.equal(said(null, false), "The robot is halted by a Halt on the bus.");
   // A run with its bus down knows of the halt before any frame tells it.
   assert.match(haltedWords({ halted: false, bench: bench("no bus", true) }, true), /^The robot is halted: no bus/);

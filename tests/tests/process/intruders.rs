@@ -1,7 +1,7 @@
 //! The page of a run among users of the machine that mean no good: of another user id, without the token.
 //!
-//! By default one run of some seconds is attacked. A campaign compares runs with and without strangers, in turn:
-//! `SKINBUS_STRANGERS=5x12 cargo test -p skinbus-tests --test process_view strangers -- --nocapture` takes five pairs of 12 s each.
+//! By default one run of some seconds is attacked. A campaign compares runs with and without intruders, in turn:
+//! `SKINBUS_INTRUDERS=5x12 cargo test -p skinbus-tests --test process_view intruders -- --nocapture` takes five pairs of 12 s each.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
@@ -19,7 +19,7 @@ use crate::process::{PRESSED, Place, Running, Summary, program, skin};
 const KINDS: [&str; 6] = ["no token", "old token", "slow heads", "silence", "storm", "foreign host"];
 /// A user that has nothing.
 const NOBODY: u32 = 65_534;
-/// The exit code of a stranger whose commands were let in.
+/// The exit code of an intruder whose commands were let in.
 const LET_IN: i32 = 9;
 /// Everything that a page may do to a run.
 const COMMANDS: [&str; 7] = [
@@ -33,13 +33,13 @@ const COMMANDS: [&str; 7] = [
 ];
 
 /// A process that attacks a page until it is dropped.
-struct Stranger(Child);
+struct Intruder(Child);
 
-impl Stranger {
+impl Intruder {
     fn start(kind: &str, host: &str) -> Self {
         let mut command = Command::new(std::env::current_exe().unwrap());
-        command.args(["strangers::stranger", "--exact", "--ignored"]);
-        command.env("SKINBUS_STRANGER", kind).env("SKINBUS_STRANGER_OF", host).current_dir("/");
+        command.args(["intruders::intruder", "--exact", "--ignored"]);
+        command.env("SKINBUS_INTRUDER", kind).env("SKINBUS_INTRUDER_OF", host).current_dir("/");
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         let is_root = getuid().is_root();
         if is_root {
@@ -61,18 +61,18 @@ impl Stranger {
     }
 }
 
-impl Drop for Stranger {
+impl Drop for Intruder {
     fn drop(&mut self) {
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
 }
 
-/// The program of a stranger.
+/// The program of an intruder.
 #[test]
 #[ignore = "another test starts it as a process"]
-fn stranger() {
-    let (Ok(kind), Ok(host)) = (std::env::var("SKINBUS_STRANGER"), std::env::var("SKINBUS_STRANGER_OF"))
+fn intruder() {
+    let (Ok(kind), Ok(host)) = (std::env::var("SKINBUS_INTRUDER"), std::env::var("SKINBUS_INTRUDER_OF"))
     else {
         return;
     };
@@ -106,6 +106,7 @@ fn intrude(address: &str, host: &str, query: &str) {
          Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
     )
     .into_bytes();
+    let head = bytes.len();
     for command in COMMANDS {
         let length = u8::try_from(command.len()).unwrap();
         assert!(length < 126);
@@ -113,10 +114,15 @@ fn intrude(address: &str, host: &str, query: &str) {
         bytes.extend([0x81, 0x80 | length, 0, 0, 0, 0]);
         bytes.extend(command.as_bytes());
     }
-    let _ = stream.write_all(&bytes);
+    // At once, or one after the other.
+    let is_whole = query.is_empty();
+    let _ = stream.write_all(if is_whole { &bytes } else { &bytes[..head] });
     let mut answer = [0; 12];
     if stream.read_exact(&mut answer).is_ok() && answer.starts_with(b"HTTP/1.1 101") {
         std::process::exit(LET_IN);
+    }
+    if !is_whole {
+        let _ = stream.write_all(&bytes[head..]);
     }
 }
 
@@ -130,8 +136,8 @@ fn hold(address: &str, held: &mut Vec<TcpStream>, count: usize, begin: &[u8], mo
     }
     for _ in 0..count / 20 {
         let mut stream = held.remove(0);
-        let is_closed = matches!(stream.read(&mut [0; 256]), Ok(_));
-        if !is_closed && (more.is_empty() || stream.write(more).is_ok()) {
+        let is_open = stream.read(&mut [0; 256]).is_err_and(|error| error.kind() == ErrorKind::WouldBlock);
+        if is_open && (more.is_empty() || stream.write(more).is_ok()) {
             held.push(stream);
         }
     }
@@ -147,16 +153,16 @@ struct Outcome {
 }
 
 /// A run of so many seconds; pages are opened with the token as long as it lasts.
-fn run(seconds: u64, with_strangers: bool) -> Outcome {
+fn run(seconds: u64, with_intruders: bool) -> Outcome {
     let place = Place::new();
-    // Strangers that take the processors' time halt no robot.
+    // Intruders that take the processors' time halt no robot.
     place.write("skin.toml", &(skin(12) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(&PRESSED.replace("60.0", "3600.0"));
     let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --view --duration 3600 --summary run.json --quiet";
     let run = place.start("gateway", words);
     let address = address(&run);
-    let strangers = KINDS.iter().filter(|_| with_strangers).map(|kind| Stranger::start(kind, &address.host));
-    let mut strangers: Vec<_> = strangers.collect();
+    let intruders = KINDS.iter().filter(|_| with_intruders).map(|kind| Intruder::start(kind, &address.host));
+    let mut intruders: Vec<_> = intruders.collect();
     let mut outcome = [0, 0];
     let mut longest = Duration::ZERO;
     let (mut began, mut first) = (Instant::now(), true);
@@ -175,10 +181,10 @@ fn run(seconds: u64, with_strangers: bool) -> Outcome {
             (first, began) = (false, Instant::now());
         }
     }
-    for (stranger, kind) in strangers.iter_mut().zip(KINDS) {
-        assert!(stranger.is_kept_out(), "{kind}");
+    for (intruder, kind) in intruders.iter_mut().zip(KINDS) {
+        assert!(intruder.is_kept_out(), "{kind}");
     }
-    drop(strangers);
+    drop(intruders);
     run.signal(rustix::process::Signal::INT);
     let ended = run.end();
     assert_eq!(ended.code(), Some(0), "{ended:#?}");
@@ -205,8 +211,8 @@ fn open(address: &Address, [opened, tries]: &mut [usize; 2]) -> Page {
 }
 
 #[test]
-fn strangers_keep_nobody_out_and_are_not_obeyed() {
-    let campaign = std::env::var("SKINBUS_STRANGERS").ok();
+fn intruders_keep_nobody_out_and_are_not_obeyed() {
+    let campaign = std::env::var("SKINBUS_INTRUDERS").ok();
     let Some((pairs, seconds)) = campaign.as_deref().map(|it| it.split_once('x').expect("PAIRSxSECONDS"))
     else {
         run(3, true);
