@@ -18,7 +18,7 @@ use protocol::usage::{Failure, print};
 use super::arguments::{BusKinds, Programs, Word, nanos, one_of};
 use super::output::{self, Force, apart, note};
 use super::print::{Rows, count, json, list, or, quantiles};
-use super::view::Page;
+use super::view::{Page, PageOptions};
 
 /// Bytes for frames that wait: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
@@ -107,6 +107,8 @@ struct Shown {
     /// docs/how-to/view.md
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true, conflicts_with = "map")]
     view: Option<Option<SocketAddr>>,
+    #[command(flatten)]
+    page: PageOptions,
 }
 
 /// Which frames of the capture, and where they go.
@@ -164,7 +166,9 @@ impl Replay {
         apart([("--summary", self.summary.as_deref())], read)?;
         // Before the replay, so that a file that cannot be written is reported first.
         let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
-        let page = |listen| Page::of_replay(&self.files, self.skin.as_deref(), &options.kinds, listen);
+        let page = |listen| {
+            Page::of_replay(&self.files, self.skin.as_deref(), &options.kinds, listen, &self.shown.page)
+        };
         // Its pipes stay open until the end.
         let mut page = self.shown.view.map(page).transpose()?;
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);

@@ -27,7 +27,7 @@ use super::buses;
 use super::output::{self, Force, apart, note};
 use super::print::json;
 use super::robot_file::{RobotOfSkin, urdf_of};
-use super::view::Page;
+use super::view::{Page, PageOptions};
 
 /// The skin and the scenario of the demonstration.
 const SKIN: &str = include_str!("../examples/ur5-253.toml");
@@ -57,6 +57,8 @@ struct Common {
     /// machine; docs/how-to/view.md. Without --duration the run then ends with Ctrl-C
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true)]
     view: Option<Option<SocketAddr>>,
+    #[command(flatten)]
+    page: PageOptions,
     #[command(flatten)]
     recording: Recording,
 }
@@ -195,8 +197,10 @@ impl Demo {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let (_file, skin_file) = in_memory(SKIN.as_bytes()).map_err(Failure::run)?;
         let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
-        let scenario =
+        let mut scenario =
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
+        // Whoever opens the page late sees the arm move, too.
+        scenario.touches_repeat = self.common.view.map(|_| scenario.duration);
         let mut options = self.common.options(skin_file, skin, scenario);
         options.kinds = Kinds::all(self.bus_kind);
         let kind = self.bus_kind.resolve();
@@ -208,7 +212,7 @@ impl Demo {
         let place = place.map(|path| format!("SKINBUS_DIR={} ", quoted_os(path.as_os_str())));
         let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
         options.announced.push(format!("its frames in words: {place}gateway dump vcan0 --bus-kind {kind}"));
-        let Common { recording, summary, view, .. } = self.common;
+        let Common { recording, summary, view, page, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
@@ -218,7 +222,7 @@ impl Demo {
         };
         let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), robot };
         options.record = recording.options(candump, files);
-        let page = view.map(|listen| Page::of(&options, listen)).transpose()?;
+        let page = view.map(|listen| Page::of(&options, listen, &page)).transpose()?;
         bench(&options, summary.as_deref(), recording.force, &[], page)
     }
 }
@@ -253,7 +257,7 @@ impl Run {
             note(format_args!("remark: {remark}"));
         }
         let mut options = self.common.options(skin_file, skin, scenario);
-        let Common { recording, summary, view, .. } = self.common;
+        let Common { recording, summary, view, page, .. } = self.common;
         options.kinds = self.kinds.of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
         let files = Files { skin: skin_text, scenario: scenario_text, robot };
@@ -262,7 +266,7 @@ impl Run {
         options.flash = self.flash;
         options.emulated = emulated(self.firmware, &self.emulate, &options.skin)?;
         options.receive_buffer = self.receive_buffer as usize;
-        let page = view.map(|listen| Page::of(&options, listen)).transpose()?;
+        let page = view.map(|listen| Page::of(&options, listen, &page)).transpose()?;
         bench(&options, summary.as_deref(), recording.force, &read, page)
     }
 }

@@ -1,13 +1,17 @@
 //! `gateway view`, and the option `--view` of runs.
 
+mod address;
+mod token;
+
 use std::collections::BTreeMap;
 use std::ffi::{OsStr, OsString};
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
-use std::os::fd::AsFd;
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus, Stdio};
+use std::process::{Child, Command, ExitStatus};
 
 use bench::remote::Lines;
 use bench::run;
@@ -18,17 +22,18 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 use robots::Isometry3;
 use trace::capture::{CaptureError, Format, Reader};
-use view::Shell;
 use view::play::{self, play};
 use view::player::PlayError;
 use view::serve::{Options, ServeError, serve};
-use view::server::Access;
+use view::server::{Access, url};
+use view::{Shell, Token};
 
 use super::arguments::{BusKinds, bus_names, bus_of, nanos};
 use super::input::{no_frame, read_skin, remark_another, skin_for, skin_of, stopped};
 use super::output::note;
 use super::surface::{Placed, Surface};
 use super::visuals::Packages;
+use address::AddressFile;
 
 /// The most triangles of a robot that a page draws; more are simplified.
 const TRIANGLES: usize = 20_000;
@@ -42,8 +47,9 @@ const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 /// proximity or temperature, their state by their shape, each joint's torque beside the central computation. A click presses
 /// a cell with a stimulus, if it is in test mode. Of a recording the same page plays, scrubs, steps by epoch, and goes to
 /// the next touch, loss, silent cell or halt. The page needs no network but this server, which only answers this machine,
-/// unless --listen names another address; then each request needs the --token. If the skin has robot.urdf, the robot is
-/// drawn by its meshes, as far as they are found. It ends with Ctrl-C.
+/// unless --listen names another address. A page that can press and halt, or that others can reach, has a random token in its
+/// address, without which the server tells and does nothing. If the skin has robot.urdf, the robot is drawn by its meshes,
+/// as far as they are found. It ends with Ctrl-C.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   gateway demo --view
@@ -51,7 +57,7 @@ const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
   gateway view can1 --skin humanoid.toml
   gateway view run.mcap run-*.mcap --at 12.5
   gateway view run.log --skin skin.toml
-  gateway view skin.toml --listen 0.0.0.0:8100 --token $(openssl rand -hex 16) --read-only")]
+  gateway view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
 pub(crate) struct View {
     /// A skin's description, whose buses are listened to; or some of its buses, with --skin; or a candump log or MCAP
     /// recording, or all parts of a split one in any order
@@ -66,16 +72,25 @@ pub(crate) struct View {
     /// The address of the page; port 0 is any that is free
     #[arg(long, value_name = "ADDRESS:PORT", default_value_t = LISTEN)]
     listen: SocketAddr,
-    /// What every request has to carry as ?token=; at least 16 letters or digits
-    #[arg(long, value_name = "TOKEN", value_parser = token)]
-    token: Option<String>,
+    /// The token in the page's address, at least 16 letters or digits; every user of this machine can read it on the command
+    /// line, so --token-file is better
+    #[arg(long, value_name = "TOKEN", value_parser = Token::parse, conflicts_with = "token_file")]
+    token: Option<Token>,
+    /// Take the token in the page's address from this file; else from the variable SKINBUS_TOKEN, else it is random
+    #[arg(long, value_name = "FILE")]
+    token_file: Option<PathBuf>,
+    /// Write the page's address to this file as well, for scripts: only you can read it, and it goes with the page; - is
+    /// standard output
+    #[arg(long, value_name = "FILE")]
+    address_file: Option<PathBuf>,
     /// Let pages look, but not press, halt or resume
     #[arg(long)]
     read_only: bool,
     /// Wait for buses that are not there yet
     #[arg(long)]
     wait: bool,
-    /// Belong to the run that has started it: take its state from standard input, write commands to standard output, end with it
+    /// Belong to the run that has started it: serve who comes to the listener at standard input, exchange commands and states
+    /// over the socket at standard output, end with it
     #[arg(long, hide = true)]
     of_run: bool,
     /// Listen to the buses of a recording's skin, to which it is replayed
@@ -87,35 +102,58 @@ pub(crate) struct View {
     kinds: BusKinds,
 }
 
-fn token(text: &str) -> Result<String, String> {
-    let is_plain = text.bytes().all(|byte| byte.is_ascii_alphanumeric());
-    if text.len() < 16 || !is_plain {
-        return Err("a token has at least 16 letters or digits".to_owned());
-    }
-    Ok(text.to_owned())
+/// The options of a run's page, and of a replay's.
+#[derive(Args, Debug)]
+pub(crate) struct PageOptions {
+    /// Write the page's address to this file as well, for scripts: only you can read it, and it goes with the page; - is
+    /// standard output
+    #[arg(long, value_name = "FILE", requires = "view")]
+    address_file: Option<PathBuf>,
+    /// Take the token in the page's address from this file; else from the variable SKINBUS_TOKEN, else it is random
+    #[arg(long, value_name = "FILE", requires = "view")]
+    token_file: Option<PathBuf>,
+}
+
+/// A page that is about to be served.
+struct Served {
+    listener: TcpListener,
+    access: Access,
+    /// Its address, unless the run says that.
+    url: Option<String>,
 }
 
 impl View {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        if !self.listen.ip().is_loopback() && self.token.is_none() {
-            return Err(Failure::usage(format!(
-                "--listen {}: others than this machine may come there: give a --token, or listen on 127.0.0.1",
-                self.listen
-            )));
-        }
         let is_recording = !self.replayed && self.is_recording()?;
-        let access = Access {
-            listen: self.listen,
-            may_act: !self.read_only && !is_recording,
-            may_play: is_recording,
-            token: self.token.clone(),
+        let may_act = !self.read_only && !is_recording;
+        let (listener, token) = if self.of_run {
+            (listener_of_run().map_err(|error| failed(&error))?, token::chosen(None)?)
+        } else {
+            let listen = self.listen;
+            let token = match &self.token {
+                Some(token) => {
+                    let instead = "--token-file FILE, or the variable SKINBUS_TOKEN, keeps it to you";
+                    note(format_args!(
+                        "--token: every user of this machine can read it while this runs; {instead}"
+                    ));
+                    Some(token.clone())
+                }
+                None => token::chosen(self.token_file.as_deref())?,
+            };
+            let bound = TcpListener::bind(listen);
+            let listener = bound.map_err(|error| Failure::usage(format!("--listen {listen}: {error}")))?;
+            (listener, token::needed(token, may_act, listen)?)
         };
-        let says = |url: &str| note(format_args!("view: {url}"));
-        if is_recording { self.recorded(access, says) } else { self.live(access, says) }
+        let address = listener.local_addr().map_err(|error| failed(&error))?;
+        let url = (!self.of_run).then(|| url(address, token.as_ref()));
+        let of_file = self.address_file.as_deref().zip(url.as_deref());
+        let _file = of_file.map(|(path, url)| AddressFile::write(path, url)).transpose()?;
+        let served = Served { listener, access: Access { may_act, may_play: is_recording, token }, url };
+        if is_recording { self.recorded(served) } else { self.live(served) }
     }
 
     /// The skin of buses.
-    fn live(self, access: Access, says: impl FnOnce(&str)) -> Result<(), Failure> {
+    fn live(self, served: Served) -> Result<(), Failure> {
         let (skin, surface) = match self.sources.as_slice() {
             _ if self.replayed => self.recorded_skin()?,
             [one, ..] if !one.exists() => self.on_buses()?,
@@ -132,8 +170,10 @@ impl View {
         let kinds = self.kinds.of(bus_names(&skin))?;
         let stop = stopped()?;
         let bench = self.of_run.then(run_of_this).transpose().map_err(|error| failed(&error))?;
-        let options = Options { skin, surface, kinds, directory: None, access, patient: self.wait, bench };
-        serve(options, &stop, says).map_err(Failure::usage)?;
+        let Served { listener, access, url } = served;
+        let options =
+            Options { skin, surface, kinds, directory: None, listener, access, patient: self.wait, bench };
+        serve(options, &stop, || say(url)).map_err(Failure::usage)?;
         Ok(())
     }
 
@@ -157,18 +197,19 @@ impl View {
     }
 
     /// A recording.
-    fn recorded(self, access: Access, says: impl FnOnce(&str)) -> Result<(), Failure> {
+    fn recorded(self, served: Served) -> Result<(), Failure> {
         let (skin, surface) = self.recorded_skin()?;
         #[expect(clippy::cast_precision_loss, reason = "to the µs")]
         let at_s = self.at.map(|nanos| nanos as f64 / 1e9);
         let stop = stopped()?;
         let warns = |what: &str| note(format_args!("{what}"));
-        let options = play::Options { paths: self.sources, skin, surface, access, at_s };
-        play(options, &stop, says, warns).map_err(|error| match error {
+        let Served { listener, access, url } = served;
+        let options = play::Options { paths: self.sources, skin, surface, listener, access, at_s };
+        play(options, &stop, || say(url), warns).map_err(|error| match error {
             ServeError::Play(PlayError::Damaged(_) | PlayError::Capture(CaptureError::Damaged { .. })) => {
                 Failure::run(error)
             }
-            ServeError::Bus(_) | ServeError::Play(_) | ServeError::Thread(_) | ServeError::Listen { .. } => {
+            ServeError::Bus(_) | ServeError::Play(_) | ServeError::Thread(_) | ServeError::Server(_) => {
                 Failure::usage(error)
             }
         })?;
@@ -230,9 +271,20 @@ fn simplified(surface: &Surface) -> Vec<Shell> {
     shells.map(|((chain, row), all)| Shell { chain, row, triangles: point(all) }).collect()
 }
 
-/// The run that has started this program, at its standard input and output.
+/// Prints where the page is.
+fn say(url: Option<String>) {
+    url.iter().for_each(|url| note(format_args!("view: {url}")));
+}
+
+/// Returns the run that has started this program, at the other end of the socket that is its standard output.
 fn run_of_this() -> io::Result<Lines> {
-    Lines::new(io::stdin().as_fd().try_clone_to_owned()?, io::stdout().as_fd().try_clone_to_owned()?)
+    let socket = || io::stdout().as_fd().try_clone_to_owned();
+    Lines::new(socket()?, socket()?)
+}
+
+/// Returns the listener that is this program's standard input.
+fn listener_of_run() -> io::Result<TcpListener> {
+    Ok(io::stdin().as_fd().try_clone_to_owned()?.into())
 }
 
 fn failed(error: &io::Error) -> Failure {
@@ -241,13 +293,34 @@ fn failed(error: &io::Error) -> Failure {
 
 /// The page of a run, in a process of its own; it ends with this value.
 #[derive(Debug)]
-pub(crate) struct Page(Child);
+pub(crate) struct Page {
+    process: Child,
+    _address_file: Option<AddressFile>,
+}
+
+/// What a page shows, and whether it can act on it.
+struct Shown<'a> {
+    words: Vec<&'a OsStr>,
+    skin: &'a Skin,
+    kinds: &'a Kinds,
+    directory: Option<&'a Path>,
+    may_act: bool,
+}
 
 impl Page {
     /// Serves the page of a run, whose buses open later; and where it sends what pages want of the run.
-    pub(crate) fn of(run: &run::Options, listen: Option<SocketAddr>) -> Result<(Self, Lines), Failure> {
+    pub(crate) fn of(
+        run: &run::Options,
+        listen: Option<SocketAddr>,
+        options: &PageOptions,
+    ) -> Result<(Self, Lines), Failure> {
         let run::Options { skin_file, skin, kinds, directory, .. } = run;
-        Self::start([skin_file.as_os_str()], skin, kinds, directory.as_deref(), listen)
+        let words = vec![skin_file.as_os_str()];
+        Self::start(
+            Shown { words, skin, kinds, directory: directory.as_deref(), may_act: true },
+            listen,
+            options,
+        )
     }
 
     /// Serves the page of a replay, which cannot be commanded.
@@ -256,59 +329,65 @@ impl Page {
         skin: Option<&Path>,
         kinds: &Kinds,
         listen: Option<SocketAddr>,
+        options: &PageOptions,
     ) -> Result<(Self, Lines), Failure> {
         let known = skin_for(files, skin)?;
         let given = skin.into_iter().flat_map(|path| [OsStr::new("--skin"), path.as_os_str()]);
         let words = ["--replayed", "--read-only"].map(OsStr::new).into_iter().chain(given);
-        Self::start(words.chain(files.iter().map(|file| file.as_os_str())), &known, kinds, None, listen)
+        let words = words.chain(files.iter().map(|file| file.as_os_str())).collect();
+        Self::start(Shown { words, skin: &known, kinds, directory: None, may_act: false }, listen, options)
     }
 
-    fn start<'a>(
-        words: impl IntoIterator<Item = &'a OsStr>,
-        skin: &Skin,
-        kinds: &Kinds,
-        directory: Option<&Path>,
+    fn start(
+        shown: Shown<'_>,
         listen: Option<SocketAddr>,
+        options: &PageOptions,
     ) -> Result<(Self, Lines), Failure> {
         let program = std::env::current_exe().map_err(|error| failed(&error))?;
         let mut command = Command::new(program);
-        command.args(["view", "--wait", "--of-run"]).args(words);
-        for bus in &skin.buses {
-            let kind = kinds.of(&bus.name).resolve();
+        command.args(["view", "--wait", "--of-run"]).args(shown.words);
+        for bus in &shown.skin.buses {
+            let kind = shown.kinds.of(&bus.name).resolve();
             command.arg("--bus-kind").arg(OsString::from(format!("{}={kind}", bus.name)));
         }
-        if let Some(listen) = listen {
-            // Its own refusal would come when the run has begun.
-            TcpListener::bind(listen).map_err(|error| {
-                Failure::usage(format!(
-                    "--view={listen}: {error}; name another port, or --view alone for a free one"
-                ))
-            })?;
-            command.arg("--listen").arg(listen.to_string());
-        }
-        if let Some(directory) = directory {
+        if let Some(directory) = shown.directory {
             command.env("SKINBUS_DIR", directory);
         }
-        // Its signals are its own: the run ends it, also on Ctrl-C.
-        command.process_group(0);
-        let child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn();
-        let mut page = child.map(Self).map_err(|error| failed(&error))?;
-        let (Some(commands), Some(state)) = (page.0.stdout.take(), page.0.stdin.take()) else {
-            return Err(Failure::run("--view: no pipes"));
+        let listen = listen.unwrap_or(LISTEN);
+        let token = token::needed(token::chosen(options.token_file.as_deref())?, shown.may_act, listen)?;
+        // In its environment only this user can read it, on its command line everybody.
+        match &token {
+            Some(token) => command.env(token::VARIABLE, token.as_str()),
+            None => command.env_remove(token::VARIABLE),
         };
-        let lines = Lines::new(commands, state).map_err(|error| failed(&error))?;
-        Ok((page, lines))
+        let listener = TcpListener::bind(listen).map_err(|error| {
+            Failure::usage(format!(
+                "--view={listen}: {error}; name another port, or --view alone for a free one"
+            ))
+        })?;
+        let address = listener.local_addr().map_err(|error| failed(&error))?;
+        let url = url(address, token.as_ref());
+        let address_file = options.address_file.as_deref();
+        let address_file = address_file.map(|path| AddressFile::write(path, &url)).transpose()?.flatten();
+        let (here, there) = UnixStream::pair().map_err(|error| failed(&error))?;
+        let lines =
+            here.try_clone().and_then(|input| Lines::new(input, here)).map_err(|error| failed(&error))?;
+        // Its signals are its own: the run ends it, also on Ctrl-C.
+        command.process_group(0).stdin(OwnedFd::from(listener)).stdout(OwnedFd::from(there));
+        let process = command.spawn().map_err(|error| failed(&error))?;
+        say(Some(url));
+        Ok((Self { process, _address_file: address_file }, lines))
     }
 
     /// How its process has ended, if it has.
     pub(crate) fn ended(&mut self) -> Option<ExitStatus> {
-        self.0.try_wait().ok().flatten()
+        self.process.try_wait().ok().flatten()
     }
 }
 
 impl Drop for Page {
     fn drop(&mut self) {
-        let _ = self.0.kill();
-        let _ = self.0.wait();
+        let _ = self.process.kill();
+        let _ = self.process.wait();
     }
 }

@@ -63,6 +63,9 @@ pub struct State {
     pub buses: Vec<BusState>,
     /// How late ticks began.
     pub lateness: Lateness,
+    /// The reason of a halt that lasts.
+    #[serde(default)]
+    pub halted: Option<String>,
     /// The last answers to commands, oldest first.
     pub answers: Vec<Answer>,
 }

@@ -26,6 +26,7 @@ pub mod serve;
 pub mod server;
 pub mod surface;
 pub mod tape;
+pub mod token;
 mod web;
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -33,6 +34,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 pub use live::Live;
 pub use scene::Scene;
 pub use surface::Shell;
+pub use token::Token;
 
 /// What a mutex holds, also after a thread that held it has panicked.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

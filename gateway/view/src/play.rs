@@ -1,6 +1,7 @@
 //! The shell of a recording: its player, a thread for its index, and the server.
 
 use std::collections::BTreeMap;
+use std::net::TcpListener;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
@@ -36,33 +37,33 @@ pub struct Options {
     pub skin: Skin,
     /// The robot's surface, where it is known.
     pub surface: Vec<Shell>,
+    /// What its pages come to.
+    pub listener: TcpListener,
     /// Who may use it.
     pub access: Access,
     /// Where to stay at first, in s since the first frame; else it plays from there.
     pub at_s: Option<f64>,
 }
 
-/// Plays a recording until `stop`. `says` is told the page's address once it is served, `warns` once what is wrong with the
-/// recording, when that is known.
+/// Plays a recording until `stop`. Calls `is_served` once the page is, and `warns` with what is wrong with the recording, when that
+/// is known.
 ///
 /// # Errors
-/// When the address cannot be listened on, or the recording cannot be read or is damaged: the page shows what is before
+/// When the system refuses a thread, or the recording cannot be read or is damaged: the page shows what is before
 /// that.
 pub fn play(
     options: Options,
     stop: &AtomicBool,
-    says: impl FnOnce(&str),
+    is_served: impl FnOnce(),
     warns: impl Fn(&str) + Sync,
 ) -> Result<Counts, ServeError> {
-    let Options { paths, skin, surface, access, at_s } = options;
-    let listen = access.listen;
+    let Options { paths, skin, surface, listener, access, at_s } = options;
     let mut player = Player::open(&paths, skin.clone())?;
     let reader = Reader::open_all(&paths).map_err(PlayError::from)?;
     let (shells, corners) = pack(&surface);
     let scene = serde_json::to_string(&Scene { shells, ..Scene::of(&skin, false) }).unwrap_or_default();
-    let server =
-        Server::start(access, scene, corners).map_err(|source| ServeError::Listen { listen, source })?;
-    says(&server.url());
+    let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
+    is_served();
     let (index, origin) = (player.index(), player.origin());
     let name = reader.name().to_owned();
     thread::scope(|scope| {

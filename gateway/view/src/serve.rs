@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::iter;
+use std::net::TcpListener;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
@@ -52,6 +53,8 @@ pub struct Options {
     pub kinds: Kinds,
     /// Where embedded buses are, if not where they usually are.
     pub directory: Option<PathBuf>,
+    /// What its pages come to.
+    pub listener: TcpListener,
     /// Who may use it.
     pub access: Access,
     /// Whether a bus that is not there at the start is waited for.
@@ -72,14 +75,9 @@ pub enum ServeError {
     /// The system has no thread for a bus or for the recording.
     #[error("cannot start a thread: {0}")]
     Thread(std::io::Error),
-    /// The address cannot be listened on.
-    #[error("--listen {listen}: {source}")]
-    Listen {
-        /// The address.
-        listen: std::net::SocketAddr,
-        /// Why.
-        source: std::io::Error,
-    },
+    /// The system has no thread for the server.
+    #[error("cannot serve the page: {0}")]
+    Server(std::io::Error),
 }
 
 /// One bus as its thread and the main one share it.
@@ -92,13 +90,13 @@ struct Shared {
     read_to: AtomicU64,
 }
 
-/// Shows a skin until `stop`. `says` is told the page's address once it is served.
+/// Shows a skin until `stop`. Calls `is_served` once the page is.
 ///
 /// # Errors
-/// When the address cannot be listened on, or a bus cannot be opened at the start and is not waited for.
-pub fn serve(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Result<Counts, ServeError> {
-    let Options { skin, surface, kinds, directory, access, patient, bench } = options;
-    let (listen, may_act) = (access.listen, access.may_act);
+/// When a bus cannot be opened at the start and is not waited for, or the system refuses a thread.
+pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> Result<Counts, ServeError> {
+    let Options { skin, surface, kinds, directory, listener, access, patient, bench } = options;
+    let may_act = access.may_act;
     let opened = |name: &str, format: Format| {
         let options = bus::Options {
             own_frames: true,
@@ -121,9 +119,8 @@ pub fn serve(options: Options, stop: &AtomicBool, says: impl FnOnce(&str)) -> Re
     let (shells, corners) = pack(&surface);
     let scene = Scene { shells, ..Scene::of(&skin, may_act) };
     let scene = serde_json::to_string(&scene).unwrap_or_default();
-    let server =
-        Server::start(access, scene, corners).map_err(|source| ServeError::Listen { listen, source })?;
-    says(&server.url());
+    let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
+    is_served();
     let live = Mutex::new(Live::new(skin));
     thread::scope(|scope| {
         for (index, shared) in buses.iter().enumerate() {

@@ -1,41 +1,42 @@
 //! The server of the page: HTTP for its files, and a WebSocket for what changes.
 //!
-//! Each client has a thread, and gets the newest snapshot whenever it can take one; a slow or stalled client holds up only its own. It is
-//! refused unless it asks for this host, and comes from a page of this server.
+//! Requests come through a [`door`], which opens to those that ask for this host, come from a page of this server, and carry the token
+//! where there is one. Behind it each page has a thread, and gets the newest snapshot whenever it can take one; a slow or stalled page
+//! holds up only its own.
 
-mod client;
+mod answer;
+mod door;
+mod page;
 mod request;
 
 use std::collections::BTreeMap;
 use std::io;
-use std::net::{SocketAddr, TcpListener};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpListener};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, SyncSender, channel, sync_channel};
 use std::sync::{Arc, Mutex};
 use std::thread;
-use std::time::Duration;
 
 use tungstenite::{Bytes, Utf8Bytes};
 
 use crate::command::{Chosen, Command};
 use crate::locked;
+use crate::token::Token;
 
-/// Clients at the same time.
-const CLIENTS: usize = 16;
+/// The most pages at the same time.
+const PAGES: usize = 16;
 /// Commands that wait; more are counted and dropped.
 const COMMANDS: usize = 256;
 
-/// Who may use the page, and for what.
+/// The powers of the page, and the token that they need.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Access {
-    /// Where the server listens.
-    pub listen: SocketAddr,
-    /// Whether pages may press cells, halt and resume, and command the bench.
+    /// Pages may press cells, halt and resume, and command the bench.
     pub may_act: bool,
-    /// Whether there is a recording that pages may play.
+    /// There is a recording that pages may play.
     pub may_play: bool,
-    /// What every request has to carry, where others than this machine may come.
-    pub token: Option<String>,
+    /// What every request has to carry that asks for more than the page's code.
+    pub token: Option<Token>,
 }
 
 /// What the server has counted.
@@ -43,7 +44,7 @@ pub struct Access {
 pub struct Counts {
     /// Pages that were connected.
     pub clients: u64,
-    /// Requests that were refused: another host or origin, no token, too many clients, no such file.
+    /// Requests that were refused: another host or origin, no token, too slow or too many, no such file.
     pub refused: u64,
     /// Messages of pages that were no command, or not allowed, or for which there was no room.
     pub ignored: u64,
@@ -67,8 +68,8 @@ struct Newest {
 #[derive(Debug)]
 struct Shared {
     access: Access,
-    /// The port that it listens on.
-    port: u16,
+    /// Where it listens.
+    address: SocketAddr,
     scene: String,
     /// What is served as /surface.
     surface: Vec<u8>,
@@ -88,21 +89,20 @@ struct Shared {
 pub struct Server {
     shared: Arc<Shared>,
     commands: Receiver<(u64, Command)>,
-    address: SocketAddr,
 }
 
 impl Server {
-    /// Listens, and serves from now on. `scene` is the first message to every page, `surface` is what it gets as `/surface`.
+    /// Serves from now on whoever comes to `listener`. `scene` is the first message to every page, `surface` is what it gets as `/surface`.
     ///
     /// # Errors
-    /// When the address cannot be listened on.
-    pub fn start(access: Access, scene: String, surface: Vec<u8>) -> io::Result<Self> {
-        let listener = TcpListener::bind(access.listen)?;
+    /// When that is no listener, or there is no thread for it.
+    pub fn start(listener: TcpListener, access: Access, scene: String, surface: Vec<u8>) -> io::Result<Self> {
+        listener.set_nonblocking(true)?;
         let address = listener.local_addr()?;
         let (sender, commands) = sync_channel(COMMANDS);
         let shared = Arc::new(Shared {
             access,
-            port: address.port(),
+            address,
             scene,
             surface,
             newest: Mutex::default(),
@@ -115,23 +115,19 @@ impl Server {
             refused: AtomicU64::new(0),
             ignored: AtomicU64::new(0),
         });
-        let server = Self { shared: Arc::clone(&shared), commands, address };
-        thread::Builder::new().name("view accept".to_owned()).spawn(move || accept(&listener, &shared))?;
+        let server = Self { shared: Arc::clone(&shared), commands };
+        let (pages, begun) = channel();
+        let of_pages = Arc::clone(&shared);
+        let named = |name: &str| thread::Builder::new().name(name.to_owned());
+        named("view pages").spawn(move || door::open(begun, &of_pages))?;
+        named("view door").spawn(move || door::serve(&listener, &shared, &pages))?;
         Ok(server)
     }
 
-    /// Where it listens.
+    /// Returns where it listens.
     #[must_use]
-    pub const fn address(&self) -> SocketAddr {
-        self.address
-    }
-
-    /// The page's address in a browser on this machine.
-    #[must_use]
-    pub fn url(&self) -> String {
-        let token = self.shared.access.token.as_ref();
-        let token = token.map_or_else(String::new, |token| format!("?token={token}"));
-        format!("http://{}/{token}", self.address)
+    pub fn address(&self) -> SocketAddr {
+        self.shared.address
     }
 
     /// What is to be known before the next snapshot.
@@ -193,33 +189,20 @@ impl Server {
 impl Drop for Server {
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Relaxed);
-        // Wakes the thread that accepts.
-        let _ = std::net::TcpStream::connect_timeout(&self.address, Duration::from_millis(200));
     }
 }
 
-fn accept(listener: &TcpListener, shared: &Arc<Shared>) {
-    for (page, stream) in (0..).zip(listener.incoming()) {
-        if shared.stop.load(Ordering::Relaxed) {
-            return;
-        }
-        let Ok(stream) = stream else {
-            // Out of files: the clients that are there go on.
-            thread::sleep(Duration::from_millis(50));
-            continue;
-        };
-        if shared.pages.fetch_add(1, Ordering::Relaxed) >= CLIENTS {
-            shared.pages.fetch_sub(1, Ordering::Relaxed);
-            shared.refused.fetch_add(1, Ordering::Relaxed);
-            continue;
-        }
-        let of_thread = Arc::clone(shared);
-        let started = thread::Builder::new().name(format!("view page {page}")).spawn(move || {
-            client::serve(stream, page, &of_thread);
-            of_thread.pages.fetch_sub(1, Ordering::Relaxed);
-        });
-        if started.is_err() {
-            shared.pages.fetch_sub(1, Ordering::Relaxed);
-        }
-    }
+/// Returns the page's address for a browser on the machine that listens there.
+#[must_use]
+pub fn url(listen: SocketAddr, token: Option<&Token>) -> String {
+    let ip = match listen.ip() {
+        IpAddr::V4(ip) if ip.is_unspecified() => Ipv4Addr::LOCALHOST.into(),
+        IpAddr::V6(ip) if ip.is_unspecified() => Ipv6Addr::LOCALHOST.into(),
+        ip @ (IpAddr::V4(_) | IpAddr::V6(_)) => ip,
+    };
+    let query = token.map_or_else(String::new, |token| format!("?token={}", token.as_str()));
+    format!("http://{}/{query}", SocketAddr::new(ip, listen.port()))
 }
+
+#[cfg(test)]
+mod tests;

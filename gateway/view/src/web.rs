@@ -21,17 +21,23 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
         "/touch.js" => (SCRIPT, include_bytes!("../web/touch.js")),
         "/dom.js" => (SCRIPT, include_bytes!("../web/dom.js")),
         "/time.js" => (SCRIPT, include_bytes!("../web/time.js")),
+        "/halted.js" => (SCRIPT, include_bytes!("../web/halted.js")),
         "/frames.js" => (SCRIPT, include_bytes!("../web/frames.js")),
         "/link.js" => (SCRIPT, include_bytes!("../web/link.js")),
         _ => return None,
     })
 }
 
+/// Checks that a file is a script or a style: the same for everybody, with nothing about the bench.
+pub(crate) fn is_code(path: &str) -> bool {
+    path != "/" && file(path).is_some()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const FILES: [&str; 19] = [
+    const FILES: [&str; 20] = [
         "/",
         "/style.css",
         "/app.js",
@@ -50,6 +56,7 @@ mod tests {
         "/dom.js",
         "/time.js",
         "/frames.js",
+        "/halted.js",
         "/link.js",
     ];
 

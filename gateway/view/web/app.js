@@ -141,9 +141,9 @@ const link = new Link({
     time.say(it.playback);
     redraw();
   },
-  closed() {
+  closed(refusal) {
     pressed = -1;
-    words.link("not connected: the bench has ended, or is not reachable", true);
+    words.link(`not connected: ${refusal || "the bench has ended, or is not reachable"}`, true);
   },
 });
 

@@ -1,16 +1,30 @@
 // The newest frames of the chosen cell in words, and why the torque in one of them is what it is.
 
-import { element } from "./dom.js";
+import { element, show } from "./dom.js";
 import { number } from "./plots.js";
 
 const VERDICTS = { nearest: "nearest", saturated: "saturated", rounded: "16-bit J", unexplained: "no J near", open: "not known" };
 
 const $ = (id) => document.getElementById(id);
+// The server keeps frames for 3 s. A list under the pointer is renewed sooner, and only after this time.
+const STILL_MS = 2000;
+// The time for an answer about a frame.
+const ANSWER_MS = 1500;
 // The list stands still while somebody reads it or chooses from it.
-let held = false, shown = "", asked = null;
+let held = false, asked = null, sought = null, renewed = 0;
+// A button has to be under the pointer until it is released, and rows move when new ones come.
+let isPressed = false;
+$("frames").onpointerdown = () => { isPressed = true; };
+for (const end of ["pointerup", "pointercancel"]) window.addEventListener(end, () => { isPressed = false; });
+
+function standsStill() {
+  const box = $("frames");
+  if (!box.firstChild) return false;
+  return held || isPressed || box.matches(":hover") && performance.now() < renewed + STILL_MS;
+}
 
 export function forget() {
-  [held, shown, asked] = [false, "", null];
+  [held, asked, sought] = [false, null, null];
   $("frames").replaceChildren();
   $("why").replaceChildren();
   hold(false);
@@ -23,27 +37,41 @@ export function hold(still) {
 
 export function frames(all, why, ask) {
   $("frames-part").hidden = false;
-  const state = JSON.stringify(all);
-  if (!held && state !== shown) {
-    shown = state;
-    const focused = document.activeElement?.dataset?.frame;
-    $("frames").replaceChildren(...all.map((frame) => {
-      const item = element("li"), words = element("span", frame.said);
-      item.append(element("span", frame.at_s.toFixed(4), "faint"), words);
-      item.title = frame.frame;
-      if (frame.is_torque) {
-        const button = element("button", "Why");
-        button.type = "button";
-        button.dataset.frame = frame.number;
-        button.setAttribute("aria-label", `Why is the torque at ${frame.at_s.toFixed(4)} s what it is`);
-        button.onclick = () => { asked = frame.number; hold(true); ask(frame.number); };
-        item.append(button);
-      }
-      return item;
-    }));
-    if (focused) $("frames").querySelector(`[data-frame="${focused}"]`)?.focus();
-  }
+  if (!standsStill()) update(all, ask);
   if (why && why.number === asked) explain(why);
+}
+
+// Keeps the rows of frames that are still among the newest, so that the focus and a pressed key stay with their button.
+function update(all, ask) {
+  const box = $("frames"), rows = new Map([...box.children].map((row) => [row.dataset.frame, row]));
+  const keys = all.map((frame) => JSON.stringify(frame));
+  for (const [key, row] of rows) if (!keys.includes(key)) row.remove();
+  let next = box.firstChild;
+  all.forEach((frame, at) => {
+    const row = rows.get(keys[at]);
+    if (row && row === next) next = next.nextSibling;
+    else box.insertBefore(row ?? rowOf(frame, keys[at], ask), next);
+  });
+  renewed = performance.now();
+}
+
+function rowOf(frame, key, ask) {
+  const row = element("li");
+  row.dataset.frame = key;
+  row.title = frame.frame;
+  row.append(element("span", frame.at_s.toFixed(4), "faint"), element("span", frame.said));
+  if (!frame.is_torque) return row;
+  const button = element("button", "Why");
+  button.type = "button";
+  button.setAttribute("aria-label", `Why is the torque at ${frame.at_s.toFixed(4)} s what it is`);
+  button.onclick = () => {
+    asked = sought = frame.number;
+    hold(true);
+    ask(frame.number);
+    setTimeout(() => { if (sought === frame.number) giveUp(); }, ANSWER_MS);
+  };
+  row.append(button);
+  return row;
 }
 
 function table(head, rows) {
@@ -71,5 +99,14 @@ function explain(why) {
     ])));
   }
   parts.push(...why.missing.map((line) => element("p", line, "faint")));
-  $("why").replaceChildren(...parts);
+  show($("why"), parts);
+  if (sought === why.number) $("why").scrollIntoView({ block: "nearest" });
+  sought = null;
+}
+
+function giveUp() {
+  const words = "No answer: frames are kept for 3 s, and this one may be older. Choose a newer one.";
+  $("why").replaceChildren(element("p", words, "faint"));
+  $("why").scrollIntoView({ block: "nearest" });
+  hold(false);
 }

@@ -54,12 +54,22 @@ export class Link {
       this.on.scene(message);
     };
     // It may come back: a run that was started again listens at the same address.
-    socket.onclose = () => {
-      this.on.closed();
+    socket.onclose = async () => {
+      this.on.closed(scene ? "" : await this.refusal());
       setTimeout(() => this.open(), this.wait);
       this.wait = Math.min(4000, this.wait * 2);
     };
     this.socket = socket;
+  }
+
+  // The server's words if it refuses this page: with an old token, or as one too many.
+  async refusal() {
+    try {
+      const answer = await fetch(`/live${location.search}`);
+      return answer.status === 426 ? "" : (await answer.text()).trim();
+    } catch {
+      return "";
+    }
   }
 
   send(command) {

@@ -3,6 +3,7 @@
 import { BUSES, SHAPES, busColour } from "./colours.js";
 import { element, show } from "./dom.js";
 import { forget, frames } from "./frames.js";
+import { haltedWords } from "./halted.js";
 import { number } from "./plots.js";
 
 // More buses than these have a row each in one table.
@@ -60,6 +61,10 @@ export function say(scene, said, ask) {
     ["Epochs complete", due ? `${complete} of ${due}` : "–", complete < due ? "bad" : ""],
     ...(said.halted ? [["Robot", "halted", "bad"]] : []),
   ]);
+  const halted = haltedWords(said, scene.may_press);
+  document.body.classList.toggle("halted", halted !== "");
+  if ($("halted").textContent !== halted) $("halted").textContent = halted;
+  $("halted").hidden = !halted;
   show($("buses"), said.buses.length > FEW_BUSES ? [many(said.buses)] : said.buses.flatMap((bus) => [
     element("h3", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad"),
     table([

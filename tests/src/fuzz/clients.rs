@@ -2,7 +2,7 @@
 
 use std::cell::RefCell;
 use std::io::{Read as _, Write as _};
-use std::net::{Ipv4Addr, Shutdown, TcpStream};
+use std::net::{Ipv4Addr, Shutdown, TcpListener, TcpStream};
 use std::os::unix::net::UnixDatagram;
 use std::time::Duration;
 
@@ -25,9 +25,9 @@ fn upgrade(port: u16) -> String {
 pub(super) fn page(data: &[u8]) {
     thread_local! {
         static SERVER: Server = {
-            let listen = (Ipv4Addr::LOCALHOST, 0).into();
-            let access = Access { listen, may_act: true, may_play: true, token: None };
-            Server::start(access, "{}".to_owned(), vec![1, 2, 3]).unwrap()
+            let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).unwrap();
+            let access = Access { may_act: true, may_play: true, token: None };
+            Server::start(listener, access, "{}".to_owned(), vec![1, 2, 3]).unwrap()
         };
     }
     SERVER.with(|server| {

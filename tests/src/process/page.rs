@@ -1,13 +1,13 @@
 //! The page of a run, without the browser: its WebSocket.
 
 use std::net::TcpStream;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use serde_json::Value;
 use tungstenite::client::IntoClientRequest;
 use tungstenite::{Error, Message, WebSocket, client};
 
-use super::{Place, Running, TIMEOUT};
+use super::{Place, Running, TIMEOUT, skin, until};
 
 /// Nothing happens by itself; the arm gives way.
 pub const QUIET: &str = "version = 1\nduration_s = 60.0\n\n[motion]\nkind = \"kinesthetic\"\n\
@@ -28,19 +28,47 @@ pub struct Snapshot {
     pub cells: Vec<(u8, u8, u16)>,
 }
 
-/// Where the server of a run or a view says that it is: `127.0.0.1:8100`.
-pub fn address(served: &Running) -> String {
+/// Where a page is.
+#[derive(Clone, Debug)]
+pub struct Address {
+    /// `127.0.0.1:8100`.
+    pub host: String,
+    /// `?token=...`, or nothing.
+    pub query: String,
+}
+
+impl Address {
+    /// Reads `http://127.0.0.1:8100/?token=...`.
+    pub fn parse(url: &str) -> Self {
+        let (host, query) = url.strip_prefix("http://").unwrap().split_once('/').unwrap();
+        Self { host: host.to_owned(), query: query.to_owned() }
+    }
+
+    /// What a browser opens.
+    pub fn url(&self) -> String {
+        format!("http://{}/{}", self.host, self.query)
+    }
+}
+
+/// Where the server of a run or a view says that it is.
+pub fn address(served: &Running) -> Address {
     served.hears("view: http://");
-    let said = served.stderr();
-    let (_, rest) = said.split_once("view: http://").unwrap();
-    rest.split('/').next().unwrap().to_owned()
+    let said = || {
+        let said = served.stderr();
+        let (line, _) = said.split_once("view: ")?.1.split_once('\n')?;
+        Some(line.trim_end().to_owned())
+    };
+    Address::parse(&until("the whole address", said))
 }
 
 /// Asks to be a page, with these headers more or other ones.
-pub fn ask(address: &str, headers: &[(&'static str, &str)]) -> Result<(WebSocket<TcpStream>, u16), Error> {
-    let stream = TcpStream::connect(address).unwrap();
-    stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
-    let mut request = format!("ws://{address}/live").into_client_request()?;
+pub fn ask(
+    Address { host, query }: &Address,
+    headers: &[(&'static str, &str)],
+) -> Result<(WebSocket<TcpStream>, u16), Error> {
+    let stream = TcpStream::connect(host).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
+    let mut request = format!("ws://{host}/live{query}").into_client_request()?;
     for (name, value) in headers {
         request.headers_mut().insert(*name, value.parse().unwrap());
     }
@@ -52,10 +80,15 @@ pub fn ask(address: &str, headers: &[(&'static str, &str)]) -> Result<(WebSocket
 }
 
 impl Page {
-    pub fn new(address: &str) -> Self {
-        let (mut socket, _) = ask(address, &[("Origin", &format!("http://{address}"))]).unwrap();
-        let scene = serde_json::from_str(socket.read().unwrap().to_text().unwrap()).unwrap();
-        Self { socket, scene }
+    pub fn new(address: &Address) -> Self {
+        Self::attempt(address).unwrap()
+    }
+
+    /// A page, unless it is refused.
+    pub fn attempt(address: &Address) -> Result<Self, Error> {
+        let (mut socket, _) = ask(address, &[("Origin", &format!("http://{}", address.host))])?;
+        let scene = serde_json::from_str(socket.read()?.to_text()?).unwrap();
+        Ok(Self { socket, scene })
     }
 
     pub fn say(&mut self, command: &str) {
@@ -135,13 +168,14 @@ impl Snapshot {
 }
 
 /// A run that is watched, and where its page is.
-pub fn watched(place: &Place, cells: usize, more: &str) -> (Running, String) {
-    place.skin(cells);
+pub fn watched(place: &Place, cells: usize, more: &str) -> (Running, Address) {
+    // A busy machine halts no robot.
+    place.write("skin.toml", &(skin(cells) + "\n[safety]\nbad_cycles = 10000\n"));
     watched_skin(place, more)
 }
 
 /// The same of `skin.toml`.
-pub fn watched_skin(place: &Place, more: &str) -> (Running, String) {
+pub fn watched_skin(place: &Place, more: &str) -> (Running, Address) {
     place.scenario(QUIET);
     let words = format!(
         "run skin.toml --bus-kind {} --scenario scenario.toml --view --summary run.json {more}",

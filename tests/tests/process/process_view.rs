@@ -1,13 +1,17 @@
 //! `gateway view`: a page's WebSocket beside a real bench, and clients that mean no good.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
+mod intruders;
+
 use skinbus_tests::process;
 
+use std::fs::Permissions;
 use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
+use std::os::unix::fs::PermissionsExt;
 
-use process::page::{Page, QUIET, address, ask, watched};
-use process::{Place, TIMEOUT, until};
+use process::page::{Address, Page, QUIET, address, ask, watched};
+use process::{Place, Running, TIMEOUT, skin, until};
 use serde_json::Value;
 use tungstenite::{Error, Message};
 
@@ -31,7 +35,9 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
         it.joints.iter().any(|joint| joint[1] != 0.0)
             && it.joints.iter().all(|joint| (joint[1] - joint[2]).abs() < 0.01)
     });
-    let said = page.hears("the cell in detail", |said| said["detail"]["torque"].is_object());
+    let said = page.hears("the cell in detail", |said| {
+        said["detail"]["torque"].is_object() && said["detail"]["status"] == "active"
+    });
     let detail = &said["detail"];
     assert_eq!(
         (&detail["node"], &detail["status"], &detail["force_n"]),
@@ -66,7 +72,7 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
     run.signal(rustix::process::Signal::INT);
     run.end();
     place.is_left_clean();
-    assert!(TcpStream::connect(&address).is_err(), "the page ends with its run");
+    assert!(TcpStream::connect(&address.host).is_err(), "the page ends with its run");
     // What the page pressed is on the bus as stimuli.
     let log = place.read("run.log");
     assert!(log.contains(" 705#") && log.contains(" 707#"), "stimuli of cells 5 and 7");
@@ -76,18 +82,19 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
 fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
     let place = Place::new();
     let (run, address) = watched(&place, 4, "");
-    let port = address.rsplit(':').next().unwrap();
+    let Address { host, query } = &address;
+    let port = host.rsplit(':').next().unwrap();
     let status = |headers: &[(&'static str, &str)]| match ask(&address, headers) {
         Ok((_, status)) => status,
         Err(Error::Http(response)) => response.status().as_u16(),
         Err(error) => panic!("{error}"),
     };
-    assert_eq!(status(&[]), 101, "a program of this machine's user");
+    assert_eq!(status(&[]), 101, "a program that has the token");
     assert_eq!(status(&[("Origin", "http://evil.example")]), 403);
     assert_eq!(status(&[("Origin", "null")]), 403);
     assert_eq!(status(&[("Host", &format!("evil.example:{port}"))]), 403);
     let http = |request: String| {
-        let mut stream = TcpStream::connect(&address).unwrap();
+        let mut stream = TcpStream::connect(&address.host).unwrap();
         stream.set_read_timeout(Some(TIMEOUT)).unwrap();
         stream.write_all(request.as_bytes()).unwrap();
         let mut answer = String::new();
@@ -98,17 +105,14 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
         }
         answer
     };
-    let get = |path: &str| http(format!("GET {path} HTTP/1.1\r\nHost: {address}\r\n\r\n"));
+    let get = |path: &str| http(format!("GET {path}{query} HTTP/1.1\r\nHost: {host}\r\n\r\n"));
     let page = get("/");
     assert!(
         page.starts_with("HTTP/1.1 200 OK") && page.contains("Content-Security-Policy: default-src 'none'")
     );
     assert!(get("/app.js").contains("text/javascript") && get("/../Cargo.toml").starts_with("HTTP/1.1 404"));
-    assert_eq!(
-        http(format!("GET / HTTP/1.1\r\nHost: {address}\r\nX: {}\r\n\r\n", "x".repeat(20_000))),
-        "",
-        "a long head"
-    );
+    let long = http(format!("GET / HTTP/1.1\r\nHost: {host}\r\nX: {}\r\n\r\n", "x".repeat(20_000)));
+    assert!(long.starts_with("HTTP/1.1 431"), "{long}");
 
     // One page reads nothing, one sends what it likes; a third one goes on.
     let stalled = Page::new(&address);
@@ -164,9 +168,10 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
 }
 
 #[test]
-fn pages_that_may_only_look_press_nothing_and_others_need_a_token() {
+fn pages_that_may_only_look_press_nothing() {
     let place = Place::new();
-    place.skin(4);
+    // A busy machine halts no robot.
+    place.write("skin.toml", &(skin(4) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(QUIET);
     let run = place.running_bench(30.0, "");
     let view = place.start("gateway", "view skin.toml --bus-kind embedded --read-only");
@@ -189,8 +194,10 @@ fn pages_that_may_only_look_press_nothing_and_others_need_a_token() {
     run.signal(rustix::process::Signal::INT);
     run.end();
     for (words, expected) in [
-        ("--listen 0.0.0.0:0", "--listen 0.0.0.0:0: others than this machine may come there: give a --token"),
-        ("--listen 0.0.0.0:0 --token short", "a token has at least 16 letters or digits"),
+        ("--listen 0.0.0.0:0 --token short", "a token has 16 to 256 letters or digits"),
+        ("--token-file skin.toml", "--token-file skin.toml: a token has 16 to 256 letters or digits"),
+        ("--token-file no-such-file", "--token-file no-such-file: No such file or directory"),
+        ("--address-file skin.toml", "--address-file skin.toml: it exists, and is no page's address: name"),
         ("--listen nowhere", "--listen"),
         ("", "vcan0"),
     ] {
@@ -248,9 +255,10 @@ fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
     let rows: Vec<_> = shells.iter().map(|shell| number(shell, "row")).collect();
     assert!(rows[0] == 0 && rows.len() > 5 && rows.is_sorted(), "{rows:?}");
 
-    let mut stream = TcpStream::connect(&address).unwrap();
+    let mut stream = TcpStream::connect(&address.host).unwrap();
     stream.set_read_timeout(Some(TIMEOUT)).unwrap();
-    write!(stream, "GET /surface HTTP/1.1\r\nHost: {address}\r\n\r\n").unwrap();
+    let Address { host, query } = &address;
+    write!(stream, "GET /surface{query} HTTP/1.1\r\nHost: {host}\r\n\r\n").unwrap();
     let mut answer = Vec::new();
     stream.read_to_end(&mut answer).unwrap();
     let body = answer.windows(4).position(|end| end == b"\r\n\r\n").unwrap() + 4;
@@ -268,4 +276,84 @@ fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
     assert_eq!(base.len(), 36, "two triangles for each of six faces");
     view.signal(rustix::process::Signal::INT);
     view.end();
+}
+
+#[test]
+fn a_page_that_acts_tells_and_does_nothing_without_its_token() {
+    let place = Place::new();
+    let (run, address) = watched(&place, 4, "--address-file address");
+    let Address { host, query } = address.clone();
+    assert_eq!(query.len(), "?token=".len() + 32, "{query}");
+    assert_eq!(place.read("address"), format!("{}\n", address.url()));
+    assert_eq!(place.path("address").metadata().unwrap().permissions().mode() & 0o777, 0o600);
+    // It is on no command line, which every user of the machine may read.
+    let token = query.strip_prefix("?token=").unwrap();
+    assert!(place.processes().iter().all(|(_, line)| !line.contains(token)));
+    let origin = format!("http://{host}");
+    for wrong in ["", "?token=", "?token=00000000000000000000000000000000"] {
+        let without = Address { host: host.clone(), query: wrong.to_owned() };
+        match ask(&without, &[("Origin", &origin)]) {
+            Err(Error::Http(answer)) => {
+                let body = String::from_utf8(answer.body().clone().unwrap_or_default()).unwrap();
+                assert_eq!(answer.status().as_u16(), 403);
+                assert!(body.is_empty() || body.contains("open the whole address"), "{body}");
+            }
+            other => panic!("{:?}", other.map(|(_, status)| status)),
+        }
+    }
+    let mut page = Page::new(&address);
+    page.sees("all cells", |it| it.cells.iter().all(|cell| cell.0 == 1));
+    run.signal(rustix::process::Signal::INT);
+    run.end();
+    assert!(!place.path("address").exists(), "it goes with the page");
+    place.is_left_clean();
+}
+
+#[test]
+fn a_token_is_taken_from_a_file_the_environment_or_the_command_line() {
+    const SECRET: &str = "0123456789abcdefXYZ";
+    let place = Place::new();
+    place.skin(2);
+    place.write("token", &format!("{SECRET}\n"));
+    std::fs::set_permissions(place.path("token"), Permissions::from_mode(0o600)).unwrap();
+    let view = "view skin.toml --wait --bus-kind embedded";
+    let run = "run skin.toml --bus-kind embedded --duration 60 --view";
+    let warning = "--token: every user of this machine can read it";
+    for (words, variable, is_warned) in [
+        (format!("{view} --token-file token"), "", false),
+        (view.to_owned(), SECRET, false),
+        (format!("{view} --token {SECRET}"), "", true),
+        (format!("{view} --read-only --token-file token"), "", false),
+        (format!("{run} --token-file token"), "", false),
+        (run.to_owned(), SECRET, false),
+    ] {
+        let mut command = place.command("gateway", &words);
+        command.env("SKINBUS_TOKEN", variable);
+        let served = Running::start(command);
+        let address = address(&served);
+        assert_eq!(address.query, format!("?token={SECRET}"), "{words}");
+        Page::new(&address);
+        assert_eq!(served.stderr().contains(warning), is_warned, "{words}: {}", served.stderr());
+        let without = Address { query: String::new(), ..address };
+        assert!(matches!(ask(&without, &[]), Err(Error::Http(_))), "{words}");
+        served.signal(rustix::process::Signal::INT);
+        served.end();
+    }
+    // What can only look needs none on this machine, and one elsewhere.
+    for (words, has_token) in [("--read-only", false), ("--read-only --listen 0.0.0.0:0", true)] {
+        let served = place.start("gateway", &format!("{view} {words}"));
+        let address = address(&served);
+        assert_eq!(!address.query.is_empty(), has_token, "{words}: {}", address.url());
+        Page::new(&address);
+        served.signal(rustix::process::Signal::INT);
+        served.end().well();
+    }
+    let mut command = place.command("gateway", &format!("{run} --candump run.log"));
+    command.env("SKINBUS_TOKEN", "short");
+    let refused = Running::start(command).end();
+    assert_eq!(
+        refused.refusal(2),
+        "gateway: SKINBUS_TOKEN: a token has 16 to 256 letters or digits, and nothing else"
+    );
+    assert!(!place.path("run.log").exists(), "nothing was done");
 }

@@ -9,7 +9,7 @@ use process::{Place, Running, is_stopped, signal, skin, until};
 use protocol::can::Format;
 use recorded::Recorded;
 use rustix::process::{Pid, Signal};
-use serde_json::json;
+use serde_json::{Value, json};
 
 /// Ends a run that is watched, and checks what it left; its exit code.
 fn end(place: &Place, run: Running) -> Option<i32> {
@@ -130,6 +130,9 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
         said["buses"][0]["up"] == false && said["bench"]["buses"][0]["down"] == true
     });
     run.hears("the robot is halted: ");
+    let why = |said: &Value| said["bench"]["halted"].as_str().map(str::to_owned);
+    let said = page.hears("why it is halted", |said| why(said).is_some());
+    assert!(run.stderr().contains(&format!("the robot is halted: {};", why(&said).unwrap())), "{said}");
     assert!(!served(), "it is not served again by itself");
     page.command(r#""on":"bus","down":true,"bus":0"#);
     assert!(!page.answer("it is not up by a command"));
@@ -141,6 +144,7 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
         said["buses"][0]["up"] == true && said["bench"]["buses"][0]["down"] == false
     });
     page.say(r#"{"do":"resume"}"#);
+    page.hears("that it goes on", |said| why(said).is_none());
     page.sees("all cells again", |it| it.cells.iter().all(|cell| cell.0 == 1));
     page.press(2, 3.0);
     page.sees("a torque", |it| it.joints.iter().any(|joint| joint[1] != 0.0));

@@ -285,6 +285,7 @@ impl Bench<'_> {
             links_down: links_down.collect(),
             buses: buses.collect(),
             lateness: measured.lateness,
+            halted: measured.halts.why().map(str::to_owned),
             answers: remote.answers.clone(),
         }
     }

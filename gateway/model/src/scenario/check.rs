@@ -28,7 +28,7 @@ pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     let touches = touches(&raw.touch, end, &names)?;
     let faults = faults::faults(&raw.fault, end, &names)?;
     let sensors = sensors::sensors(&raw.sensors, end)?;
-    Ok(Scenario { duration, seed, motion, modes, touches, faults, sensors })
+    Ok(Scenario { duration, seed, motion, modes, touches, touches_repeat: None, faults, sensors })
 }
 
 /// The scenario's duration in s.

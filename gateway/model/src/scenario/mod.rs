@@ -42,6 +42,8 @@ pub struct Scenario {
     pub modes: Vec<ModeChange>,
     /// The touches, in the file's order.
     pub touches: Vec<Touch>,
+    /// The period after which the touches repeat.
+    pub touches_repeat: Option<Span>,
     /// The faults, in the order of time.
     pub faults: Vec<Fault>,
     /// How the sensors differ from perfect ones.
@@ -364,6 +366,7 @@ impl Scenario {
             motion,
             modes: Vec::new(),
             touches: Vec::new(),
+            touches_repeat: None,
             faults: Vec::new(),
             sensors: Sensors::PERFECT,
         }

@@ -335,6 +335,17 @@ fn touches_come_and_go_by_their_profile() {
 }
 
 #[test]
+fn touches_repeat_after_their_period() {
+    let scenario = Scenario { touches_repeat: Some(Span(12_000_000)), ..good() };
+    let mut touches = Touches::new(&scenario, &three());
+    for epoch in [0, 125, 150, 188, 219] {
+        // 12 s are 750 epochs.
+        assert_eq!(force(&touches, 0, epoch), force(&touches, 0, epoch + 750_000), "{epoch}");
+    }
+    assert_eq!(touches.stimuli_for(750 + 126).count(), 2);
+}
+
+#[test]
 fn forces_of_overlapping_touches_add_up() {
     let text = GOOD.replacen("cells = [2]", "cells = [1]", 1);
     let touches = Touches::new(&Scenario::parse("s.toml", &text, &three()).unwrap(), &three());

@@ -35,6 +35,8 @@ pub struct Touches {
     /// From one epoch to the next, in µs.
     period_us: f64,
     touches: Vec<Touch>,
+    /// The period after which they repeat.
+    repeat: Option<Span>,
     /// The touches' forces in N before and now: scratch of [`Touches::changes`].
     levels: Vec<[Option<f64>; 2]>,
     cells: Vec<Touched>,
@@ -100,6 +102,7 @@ impl Touches {
             period_us: 1e6 / skin.timing.broadcast_hz(),
             levels: vec![[None; 2]; scenario.touches.len()],
             touches: scenario.touches.clone(),
+            repeat: scenario.touches_repeat,
             changed: Vec::with_capacity(cells.len()),
             there: Vec::with_capacity(cells.len()),
             before: Vec::with_capacity(cells.len()),
@@ -165,7 +168,7 @@ impl Touches {
     fn there(&self, touched: &Touched, time: Micros) -> True {
         let mut there = True::default();
         for touch in touched.touches.iter().filter_map(|&index| self.touches.get(index)) {
-            let Some(level) = touch.level(time) else { continue };
+            let Some(level) = self.level(touch, time) else { continue };
             there.force_n += level;
             there.sensors.proximity = there.sensors.proximity.max(touch.proximity);
             if let Some(temperature) = touch.temperature {
@@ -183,8 +186,9 @@ impl Touches {
 
     fn perfect_changes(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
         let times = [before.map(|before| self.time_of(before)), Some(self.time_of(epoch))];
+        let phases = times.map(|time| time.map(|time| self.phase(time)));
         for (levels, touch) in self.levels.iter_mut().zip(&self.touches) {
-            *levels = times.map(|time| time.and_then(|time| touch.level(time)));
+            *levels = phases.map(|phase| phase.and_then(|phase| touch.level(phase)));
         }
         let this = &*self;
         this.cells.iter().filter_map(move |touched| {
@@ -236,6 +240,19 @@ impl Touches {
         Micros((epoch as f64 * self.period_us).round() as u64)
     }
 
+    /// Returns the time since the touches began last.
+    fn phase(&self, time: Micros) -> Micros {
+        match self.repeat {
+            Some(Span(repeat @ 1..)) => Micros(time.0 % repeat),
+            Some(Span(0)) | None => time,
+        }
+    }
+
+    /// Returns the force of a touch at a time.
+    fn level(&self, touch: &Touch, time: Micros) -> Option<f64> {
+        touch.level(self.phase(time))
+    }
+
     /// Before and now, from the scratch; `None` when no touch of this cell changed.
     fn words_of_levels(&self, touched: &Touched) -> Option<[SkinSensors; 2]> {
         let levels = || touched.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
@@ -257,8 +274,10 @@ impl Touches {
             SensorFault::Drift { n_per_s } if wrong.holds_at(time) => n_per_s * seconds(time.since(wrong.at)),
             SensorFault::Drift { .. } | SensorFault::Stuck => 0.0,
         });
-        let levels =
-            touched.touches.iter().filter_map(|&index| Some((index, self.touches.get(index)?.level(time))));
+        let levels = touched
+            .touches
+            .iter()
+            .filter_map(|&index| Some((index, self.level(self.touches.get(index)?, time))));
         self.words(levels, drift.sum())
     }
 

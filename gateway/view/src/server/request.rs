@@ -1,13 +1,15 @@
-//! The head of an HTTP request, and whether it may be served.
+//! The head of an HTTP request, and the conditions under which it is served.
 
 use std::net::{IpAddr, SocketAddr};
 
-use super::Access;
+use crate::token::Token;
 
 /// The longest head, in bytes.
 pub(super) const LONGEST: usize = 8 * 1024;
+/// The port of an address that names none.
+const HTTP: u16 = 80;
 
-/// What of a request counts.
+/// The parts of a request that count.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub(super) struct Request {
     pub(super) path: String,
@@ -42,36 +44,61 @@ impl Request {
         Some(request)
     }
 
-    /// Whether it is for this server, from a page of this server, with the token if there is one.
-    pub(super) fn is_allowed(&self, access: &Access, port: u16) -> bool {
-        let Some(host) = &self.host else { return false };
-        let is_host = is_ours(host, access.listen.ip(), port);
-        let origin = self.origin.as_ref().and_then(|origin| origin.strip_prefix("http://"));
-        // Browsers name the origin of every WebSocket; other programs are as this machine's user.
-        let is_origin = self.origin.is_none() || origin == Some(host);
-        is_host && is_origin && self.has_token(access.token.as_deref())
+    /// Checks that it asks for this server by an address of its own, and comes from no page of another site.
+    pub(super) fn is_for(&self, address: SocketAddr) -> bool {
+        let Some(host) = self.host.as_deref().and_then(Authority::parse) else { return false };
+        // Browsers name the origin of every WebSocket, other programs may leave it away.
+        let is_origin = self.origin.as_ref().is_none_or(|origin| {
+            origin.strip_prefix("http://").and_then(Authority::parse).is_some_and(|origin| origin == host)
+        });
+        host.is_of(address) && is_origin
     }
 
-    fn has_token(&self, token: Option<&str>) -> bool {
+    /// Checks that it carries the token, if there is one.
+    pub(super) fn has(&self, token: Option<&Token>) -> bool {
         let Some(token) = token else { return true };
         let given = self.query.split('&').find_map(|part| part.strip_prefix("token="));
-        // As long for a wrong one as for the right one.
-        given.is_some_and(|given| {
-            let pairs = given.bytes().zip(token.bytes());
-            given.len() == token.len() && pairs.fold(0, |off, (one, other)| off | (one ^ other)) == 0
-        })
+        given.is_some_and(|given| token.is(given))
     }
 }
 
-/// Whether a host is what the server listens on. A name of somebody else's, which leads here, is none: so a page of
-/// another site cannot read this one.
-fn is_ours(host: &str, listen: IpAddr, port: u16) -> bool {
-    if host == format!("localhost:{port}") && listen.is_loopback() {
-        return true;
+/// The host and the port of an address.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+struct Authority<'a> {
+    host: &'a str,
+    port: u16,
+}
+
+impl<'a> Authority<'a> {
+    /// Reads `HOST` or `HOST:PORT`; an address of IPv6 is in brackets.
+    fn parse(text: &'a str) -> Option<Self> {
+        let end = text.rfind(']').map_or(0, |bracket| bracket + 1);
+        let colon = text.get(end..)?.find(':').map(|at| end + at);
+        let (host, port) = colon.and_then(|at| text.split_at_checked(at)).unwrap_or((text, ""));
+        let port = match port.strip_prefix(':') {
+            Some(digits) if digits.bytes().all(|byte| byte.is_ascii_digit()) && !digits.is_empty() => {
+                digits.parse().ok()?
+            }
+            None | Some("") => HTTP,
+            Some(_) => return None,
+        };
+        Some(Self { host, port })
     }
-    match host.parse::<SocketAddr>() {
-        Ok(address) if address.port() == port => address.ip() == listen || listen.is_unspecified(),
-        Ok(_) | Err(_) => false,
+
+    /// Compares it with the address that the server listens on. Names that other sites have made lead here too, so a name
+    /// other than localhost is refused: a page of such a site cannot read this one.
+    fn is_of(self, listen: SocketAddr) -> bool {
+        let is_anywhere = listen.ip().is_unspecified();
+        let inner = self.host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));
+        let ip = match inner {
+            Some(inner) => inner.parse().map(IpAddr::V6).ok(),
+            None => self.host.parse().map(IpAddr::V4).ok(),
+        };
+        let is_host = match ip {
+            Some(ip) => ip == listen.ip() || is_anywhere,
+            None => self.host == "localhost" && (listen.ip().is_loopback() || is_anywhere),
+        };
+        is_host && self.port == listen.port()
     }
 }
 
@@ -80,52 +107,86 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn access(listen: &str, token: Option<&str>) -> Access {
-        Access {
-            listen: listen.parse().unwrap(),
-            may_act: true,
-            may_play: false,
-            token: token.map(str::to_owned),
-        }
-    }
-
-    fn is_allowed(head: &str, access: &Access) -> bool {
-        Request::parse(head).is_some_and(|request| request.is_allowed(access, 8100))
+    fn is_for(head: &str, address: &str) -> bool {
+        Request::parse(head).is_some_and(|request| request.is_for(address.parse().unwrap()))
     }
 
     #[test]
     fn only_this_host_and_its_own_pages_are_served() {
-        let local = access("127.0.0.1:8100", None);
         for (head, expected) in [
             ("GET / HTTP/1.1\r\nHost: 127.0.0.1:8100\r\n\r\n", true),
             ("GET / HTTP/1.1\r\nhost: LOCALHOST:8100\r\n\r\n", true),
             ("GET / HTTP/1.1\r\n\r\n", false),
+            ("GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", false),
             ("GET / HTTP/1.1\r\nHost: evil.example:8100\r\n\r\n", false),
             ("GET / HTTP/1.1\r\nHost: 127.0.0.1:9\r\n\r\n", false),
+            ("GET / HTTP/1.1\r\nHost: 127.0.0.1:+8100\r\n\r\n", false),
+            ("GET / HTTP/1.1\r\nHost: [127.0.0.1]:8100\r\n\r\n", false),
             ("GET / HTTP/1.1\r\nHost: 127.0.0.1:8100\r\nHost: evil.example\r\n\r\n", false),
             ("GET /live HTTP/1.1\r\nHost: localhost:8100\r\nOrigin: http://localhost:8100\r\n\r\n", true),
+            ("GET /live HTTP/1.1\r\nHost: localhost:8100\r\nOrigin: http://localhost\r\n\r\n", false),
             ("GET /live HTTP/1.1\r\nHost: localhost:8100\r\nOrigin: http://evil.example\r\n\r\n", false),
             ("GET /live HTTP/1.1\r\nHost: localhost:8100\r\nOrigin: null\r\n\r\n", false),
             ("POST / HTTP/1.1\r\nHost: 127.0.0.1:8100\r\n\r\n", false),
         ] {
-            assert_eq!(is_allowed(head, &local), expected, "{head}");
+            assert_eq!(is_for(head, "127.0.0.1:8100"), expected, "{head}");
         }
     }
 
     #[test]
-    fn elsewhere_a_token_is_needed() {
-        let open = access("0.0.0.0:8100", Some("abc123"));
-        let head = |query: &str| format!("GET /{query} HTTP/1.1\r\nHost: 192.168.1.5:8100\r\n\r\n");
-        assert!(is_allowed(&head("?token=abc123"), &open));
-        for wrong in ["", "?token=", "?token=abc124", "?token=abc1234", "?other=abc123"] {
-            assert!(!is_allowed(&head(wrong), &open), "{wrong}");
+    fn a_host_without_a_port_means_port_80() {
+        for (host, address, expected) in [
+            ("127.0.0.1", "127.0.0.1:80", true),
+            ("127.0.0.1:", "127.0.0.1:80", true),
+            ("127.0.0.1:80", "127.0.0.1:80", true),
+            ("127.0.0.1:8100", "127.0.0.1:80", false),
+            ("localhost", "127.0.0.1:80", true),
+            ("localhost", "[::1]:80", true),
+            ("localhost", "192.168.1.5:80", false),
+            ("localhost", "0.0.0.0:80", true),
+            ("[::1]", "[::1]:80", true),
+            ("[::1]:80", "[::1]:80", true),
+            ("[::1]:8100", "[::1]:8100", true),
+            ("[::1]", "[::1]:8100", false),
+            ("::1", "[::1]:80", false),
+            ("[::2]", "[::1]:80", false),
+            ("[fe80::5]", "[::]:80", true),
+            ("192.168.1.5", "0.0.0.0:80", true),
+            ("evil.example", "0.0.0.0:80", false),
+        ] {
+            assert_eq!(
+                is_for(&format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n"), address),
+                expected,
+                "{host}"
+            );
+            let own = format!("GET / HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n\r\n");
+            assert_eq!(is_for(&own, address), expected, "{host}");
         }
+        let named = "GET / HTTP/1.1\r\nHost: 127.0.0.1:80\r\nOrigin: http://127.0.0.1\r\n\r\n";
+        assert!(is_for(named, "127.0.0.1:80"), "one origin, written in two ways");
+    }
+
+    #[test]
+    fn a_token_is_in_the_query() {
+        let token = Token::parse("abcdef0123456789").unwrap();
+        let has = |query: &str| {
+            let request = Request::parse(&format!("GET /{query} HTTP/1.1\r\n\r\n")).unwrap();
+            request.has(Some(&token))
+        };
+        assert!(has("?token=abcdef0123456789") && has("?more&token=abcdef0123456789"));
+        for wrong in
+            ["", "?token=", "?token=abcdef0123456780", "?token=abcdef01234567890", "?other=abcdef0123456789"]
+        {
+            assert!(!has(wrong), "{wrong}");
+        }
+        assert!(Request::default().has(None));
     }
 
     proptest! {
         #[test]
-        fn any_head_is_read_without_a_panic(head: String) {
+        fn any_head_is_read_without_a_panic(head: String, host: String) {
             let _ = Request::parse(&head);
+            is_for(&format!("GET / HTTP/1.1\r\nHost: {host}\r\n\r\n"), "127.0.0.1:80");
         }
     }
 }

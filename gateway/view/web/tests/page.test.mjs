@@ -5,6 +5,7 @@ import { test } from "node:test";
 import { about, allowed, isDown, processOf } from "../bench.js";
 import { Camera } from "../camera.js";
 import { BUSES, SHAPES, SHOWS, busColour, colourOf, ramp, shapeOf } from "../colours.js";
+import { haltedWords } from "../halted.js";
 import { cellOf, decode, decodeHistory } from "../link.js";
 import { cross, dot, look, perspective, point, project, row, times, unit } from "../math.js";
 import { Pace, SOFTWARE_HZ } from "../pace.js";
@@ -226,4 +227,16 @@ test("buses have colours of their own, and cells at rest none", () => {
   assert.deepEqual(busColour(BUSES.length), BUSES[0]);
   assert.equal(colourOf(SHOWS.force, { force: 0 }, { bus: 1 }), null);
   assert.deepEqual(colourOf(SHOWS.force, { force: 10000 }, { bus: 1 }), ramp(1));
+});
+
+test("a halt is told with its reason and the next step", () => {
+  const bench = (halted, down = false) => ({ halted, buses: [{ down }] });
+  assert.equal(haltedWords({ halted: false, bench: bench(null) }, true), "");
+  const said = (bench, mayPress = true) => haltedWords({ halted: true, bench }, mayPress);
+  assert.equal(said(bench("too many bad cycles")), "The robot is halted: too many bad cycles. Press Resume to continue.");
+  assert.equal(said(bench("no torque", true)), "The robot is halted: no torque. Take the bus up, then press Resume.");
+  assert.equal(said(null), "The robot is halted by a Halt on the bus. Press Resume to continue.");
+  assert.equal(said(null, false), "The robot is halted by a Halt on the bus.");
+  // A run with its bus down knows of the halt before any frame tells it.
+  assert.match(haltedWords({ halted: false, bench: bench("no bus", true) }, true), /^The robot is halted: no bus/);
 });

@@ -1,4 +1,4 @@
-//! One client: a file, or a page that stays.
+//! A page that stays: it gets the newest of everything, and sends commands.
 
 use std::io::{self, Cursor, ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -9,27 +9,31 @@ use tungstenite::protocol::WebSocketConfig;
 use tungstenite::{Error, Message, WebSocket, accept_with_config};
 
 use super::Shared;
-use super::request::{LONGEST, Request};
 use crate::command::{self, Command};
 use crate::locked;
-use crate::web;
 
-/// How long a client may take for its request, and to take in what it is sent.
+/// The time for a page to take in a piece of what it is sent.
 const TIMEOUT: Duration = Duration::from_secs(5);
 /// How long a page's message is waited for, before the next snapshot is looked for.
 const LOOK: Duration = Duration::from_millis(15);
 /// Messages that are read at once.
 const AT_ONCE: usize = 64;
 
-/// Nothing from elsewhere, and no other page around it.
-const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
-                      base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
-
 /// A stream of which the beginning has been read.
 #[derive(Debug)]
-struct Begun {
+pub(super) struct Begun {
     head: Cursor<Vec<u8>>,
     stream: TcpStream,
+}
+
+impl Begun {
+    pub(super) const fn new(head: Vec<u8>, stream: TcpStream) -> Self {
+        Self { head: Cursor::new(head), stream }
+    }
+
+    pub(super) fn into_stream(self) -> TcpStream {
+        self.stream
+    }
 }
 
 impl Read for Begun {
@@ -51,76 +55,17 @@ impl Write for Begun {
     }
 }
 
-/// Serves a client until it goes.
-pub(super) fn serve(stream: TcpStream, page: u64, shared: &Shared) {
-    let end = stream.try_clone();
-    if handle(stream, page, shared).is_err() {
-        // It is gone, or took too long.
-    }
-    if let Ok(end) = end {
-        let _ = end.shutdown(Shutdown::Both);
-    }
+/// Serves a page until it goes, or takes too long.
+pub(super) fn serve(begun: Begun, page: u64, shared: &Shared) {
+    let _ = live(begun, page, shared);
 }
 
-fn handle(mut stream: TcpStream, page: u64, shared: &Shared) -> io::Result<()> {
+fn live(begun: Begun, page: u64, shared: &Shared) -> io::Result<()> {
+    let stream = &begun.stream;
+    stream.set_nonblocking(false)?;
     stream.set_nodelay(true)?;
     stream.set_read_timeout(Some(TIMEOUT))?;
     stream.set_write_timeout(Some(TIMEOUT))?;
-    let head = head(&mut stream)?;
-    let request = str::from_utf8(&head).ok().and_then(Request::parse);
-    let allowed = request.filter(|request| request.is_allowed(&shared.access, shared.port));
-    let Some(request) = allowed else {
-        shared.refused.fetch_add(1, Ordering::Relaxed);
-        return answer(
-            &mut stream,
-            "403 Forbidden",
-            "text/plain; charset=utf-8",
-            b"403: not for this host, origin or token\n",
-        );
-    };
-    if request.is_upgrade && request.path == "/live" {
-        return live(Begun { head: Cursor::new(head), stream }, page, shared);
-    }
-    if request.path == "/surface" {
-        return answer(&mut stream, "200 OK", "application/octet-stream", &shared.surface);
-    }
-    match web::file(&request.path) {
-        Some((kind, bytes)) => answer(&mut stream, "200 OK", kind, bytes),
-        None => {
-            shared.refused.fetch_add(1, Ordering::Relaxed);
-            answer(&mut stream, "404 Not Found", "text/plain; charset=utf-8", b"404: no such file\n")
-        }
-    }
-}
-
-/// The bytes up to the end of a request's head.
-fn head(stream: &mut TcpStream) -> io::Result<Vec<u8>> {
-    let mut head = Vec::new();
-    let mut piece = [0; 1024];
-    while !head.windows(4).any(|end| end == b"\r\n\r\n") {
-        let read = stream.read(&mut piece)?;
-        if read == 0 || head.len() + read > LONGEST {
-            return Err(ErrorKind::InvalidData.into());
-        }
-        head.extend(piece.iter().take(read));
-    }
-    Ok(head)
-}
-
-fn answer(stream: &mut TcpStream, status: &str, kind: &str, bytes: &[u8]) -> io::Result<()> {
-    let head = format!(
-        "HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {}\r\nConnection: close\r\nCache-Control: no-store\r\n\
-         Content-Security-Policy: {POLICY}\r\nX-Content-Type-Options: nosniff\r\nReferrer-Policy: no-referrer\r\n\
-         Cross-Origin-Resource-Policy: same-origin\r\n\r\n",
-        bytes.len()
-    );
-    stream.write_all(head.as_bytes())?;
-    stream.write_all(bytes)?;
-    stream.flush()
-}
-
-/// A page that stays: it gets the newest, and may send commands.
-fn live(begun: Begun, page: u64, shared: &Shared) -> io::Result<()> {
     let config = WebSocketConfig::default()
         .max_message_size(Some(command::LONGEST))
         .max_frame_size(Some(command::LONGEST))
@@ -138,6 +83,7 @@ fn live(begun: Begun, page: u64, shared: &Shared) -> io::Result<()> {
         let _ = socket.close(None);
         let _ = socket.flush();
     }
+    let _ = socket.get_ref().stream.shutdown(Shutdown::Both);
     Ok(())
 }
 

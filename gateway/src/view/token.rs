@@ -1,0 +1,67 @@
+//! The token of a page: a file's, the environment's, the command line's, or a random one.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::net::SocketAddr;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+
+use protocol::usage::Failure;
+use view::Token;
+
+use crate::output::note;
+
+/// The environment's token; a run hands its page's over in it, since only its user can read it there.
+pub(super) const VARIABLE: &str = "SKINBUS_TOKEN";
+/// The most bytes that are read of a token's file.
+const LONGEST_FILE: u64 = 4096;
+
+/// Returns the token that the user has chosen: of a file, else of the environment.
+pub(super) fn chosen(file: Option<&Path>) -> Result<Option<Token>, Failure> {
+    match file {
+        Some(path) => read(path).map(Some),
+        None => of_environment(),
+    }
+}
+
+/// Returns the token that a page has to have: one that acts, or that others than this machine can reach, is never without.
+pub(super) fn needed(
+    chosen: Option<Token>,
+    acts: bool,
+    listen: SocketAddr,
+) -> Result<Option<Token>, Failure> {
+    match chosen {
+        Some(token) => Ok(Some(token)),
+        None if acts || !listen.ip().is_loopback() => {
+            let failed =
+                |error| Failure::run(format!("no random token for the page: {error}; give a --token-file"));
+            Token::random().map(Some).map_err(failed)
+        }
+        None => Ok(None),
+    }
+}
+
+fn of_environment() -> Result<Option<Token>, Failure> {
+    let Some(text) = std::env::var_os(VARIABLE).filter(|text| !text.is_empty()) else { return Ok(None) };
+    let token = Token::parse(&text.to_string_lossy());
+    token.map(Some).map_err(|error| Failure::usage(format!("{VARIABLE}: {error}")))
+}
+
+fn read(path: &Path) -> Result<Token, Failure> {
+    let name = path.display();
+    let text = || -> io::Result<(String, File)> {
+        let file = File::open(path)?;
+        let mut text = String::new();
+        (&file).take(LONGEST_FILE).read_to_string(&mut text)?;
+        Ok((text, file))
+    };
+    let (text, file) = text().map_err(|error| Failure::usage(format!("--token-file {name}: {error}")))?;
+    let token = Token::parse(text.trim());
+    let token = token.map_err(|error| Failure::usage(format!("--token-file {name}: {error}")))?;
+    let others =
+        file.metadata().ok().filter(|about| about.is_file() && about.permissions().mode() & 0o077 != 0);
+    if others.is_some() {
+        note(format_args!("--token-file {name}: other users may read it; `chmod 600` keeps it to you"));
+    }
+    Ok(token)
+}

@@ -1,0 +1,258 @@
+//! The door: one thread that reads the requests of all clients, answers them, and hands on those that become pages.
+//!
+//! A client has [`HEAD_TIME`] for its whole head. If more clients wait than there is room for, the one that has waited longest
+//! is turned away. Whoever has the token sends its head at once and is through the door by then, so that clients without one,
+//! however many, cannot keep it out; pages have places of their own.
+
+use std::io::{ErrorKind, Read, Write};
+use std::net::{Shutdown, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, Sender};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::process::{Resource, getrlimit, setpriority_process};
+
+use super::answer::{Answer, Turned, answer};
+use super::page::{self, Begun};
+use super::request::LONGEST;
+use super::{PAGES, Shared};
+
+/// The time for a whole head, and for an answer to be taken.
+const HEAD_TIME: Duration = Duration::from_secs(5);
+/// The time for an answer to somebody who has the token, from one piece to the next.
+const PIECE_TIME: Duration = Duration::from_secs(5);
+/// The most clients that are neither answered nor pages.
+const VISITORS: usize = 256;
+/// Open files that are kept free for buses and pages.
+const OTHER_FILES: u64 = 64;
+/// The most connections that are accepted before the others have their turn.
+const ACCEPTED_AT_ONCE: usize = 32;
+/// The time between two looks at whether the server ends.
+const POLL_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
+/// The time without accepting after that has failed.
+const REST: Duration = Duration::from_millis(50);
+/// The priority of the door's thread: a storm of connections takes no time that the bench needs.
+const NICE: i32 = 10;
+/// Bytes that are read at once.
+const PIECE: usize = 4 * 1024;
+
+/// A client on its way to an answer.
+#[derive(Debug)]
+struct Visitor {
+    stream: TcpStream,
+    head: Vec<u8>,
+    /// What is left of its answer, once that is known.
+    answer: Option<(Answer, usize)>,
+    until: Instant,
+}
+
+/// What becomes of a visitor.
+enum Next {
+    /// It has to wait.
+    Stays(Visitor),
+    /// It is a page.
+    Page(Begun),
+    /// It has its answer, or has gone.
+    Done,
+}
+
+/// Serves until the server stops, and hands on those that become pages.
+pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begun>) {
+    // On Linux this is the thread's own; without it the door works as well.
+    let _ = setpriority_process(None, NICE);
+    let room = room();
+    let mut visitors = Vec::<Visitor>::new();
+    let mut resting = None::<Instant>;
+    while !shared.stop.load(Ordering::Relaxed) {
+        resting = resting.filter(|end| Instant::now() < *end);
+        let ready = wait(listener, resting.is_none(), &visitors);
+        let [listener_is_ready, rest @ ..] = ready.as_slice() else { continue };
+        let now = Instant::now();
+        // Clients whose data has come are served before room is made for new ones.
+        for (visitor, is_ready) in std::mem::take(&mut visitors).into_iter().zip(rest) {
+            if now >= visitor.until {
+                shared.refused.fetch_add(1, Ordering::Relaxed);
+                // Browsers connect ahead of a request, and would show it these words.
+                if !visitor.head.is_empty() {
+                    visitor.turn_away(Turned::Late);
+                }
+            } else if *is_ready {
+                enter(visitor.advance(shared), &mut visitors, pages);
+            } else {
+                visitors.push(visitor);
+            }
+        }
+        if !listener_is_ready || resting.is_some() {
+            continue;
+        }
+        for _ in 0..ACCEPTED_AT_ONCE {
+            match listener.accept() {
+                Ok((stream, _)) => {
+                    if stream.set_nonblocking(true).is_err() {
+                        continue;
+                    }
+                    let visitor = Visitor::new(stream);
+                    enter(visitor.advance(shared), &mut visitors, pages);
+                    if visitors.len() > room {
+                        turn_oldest_away(&mut visitors, shared);
+                    }
+                }
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(error)
+                    if matches!(error.kind(), ErrorKind::Interrupted | ErrorKind::ConnectionAborted) => {}
+                Err(_) => {
+                    // Out of files: that lasts until some are closed, so one place is made free.
+                    turn_oldest_away(&mut visitors, shared);
+                    resting = Some(Instant::now() + REST);
+                    break;
+                }
+            }
+        }
+    }
+}
+
+/// Returns how many visitors may wait: no more than leaves files for buses and pages.
+fn room() -> usize {
+    let files = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
+    usize::try_from(files.saturating_sub(OTHER_FILES) / 2).unwrap_or(VISITORS).clamp(4, VISITORS)
+}
+
+/// Waits for the listener and the visitors, and returns which of them are ready.
+fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool> {
+    // A listener that cannot be accepted from stays ready: it is left out meanwhile.
+    let listened = if accepts { PollFlags::IN } else { PollFlags::empty() };
+    let mut files = vec![PollFd::new(listener, listened)];
+    files.extend(visitors.iter().map(|visitor| {
+        let flags = if visitor.answer.is_some() { PollFlags::OUT } else { PollFlags::IN };
+        PollFd::new(&visitor.stream, flags)
+    }));
+    let timeout = if accepts { POLL_INTERVAL } else { Timespec { tv_sec: 0, tv_nsec: 10_000_000 } };
+    if poll(&mut files, Some(&timeout)).is_err() {
+        return Vec::new();
+    }
+    files.iter().map(|file| !file.revents().is_empty()).collect()
+}
+
+/// Takes a visitor where it goes next.
+fn enter(next: Next, visitors: &mut Vec<Visitor>, pages: &Sender<Begun>) {
+    match next {
+        Next::Stays(visitor) => visitors.push(visitor),
+        Next::Done => {}
+        // The other end ends with this one.
+        Next::Page(begun) => _ = pages.send(begun),
+    }
+}
+
+/// Starts a thread for each page, if there is a place; these threads have the ordinary priority of this one.
+pub(super) fn open(pages: Receiver<Begun>, shared: &Arc<Shared>) {
+    for (page, begun) in (1..).zip(pages) {
+        if shared.pages.fetch_add(1, Ordering::Relaxed) >= PAGES {
+            shared.pages.fetch_sub(1, Ordering::Relaxed);
+            shared.refused.fetch_add(1, Ordering::Relaxed);
+            Visitor::new(begun.into_stream()).turn_away(Turned::Full);
+            continue;
+        }
+        let of_thread = Arc::clone(shared);
+        let started = thread::Builder::new().name(format!("view page {page}")).spawn(move || {
+            page::serve(begun, page, &of_thread);
+            of_thread.pages.fetch_sub(1, Ordering::Relaxed);
+        });
+        if started.is_err() {
+            shared.pages.fetch_sub(1, Ordering::Relaxed);
+            shared.refused.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+/// Turns the visitor away that has waited longest, if possible one that has not shown the token.
+fn turn_oldest_away(visitors: &mut Vec<Visitor>, shared: &Shared) {
+    let is_known = |visitor: &Visitor| visitor.answer.as_ref().is_some_and(|(answer, _)| answer.is_known);
+    let at = visitors.iter().position(|visitor| !is_known(visitor)).unwrap_or(0);
+    if visitors.is_empty() {
+        return;
+    }
+    let oldest = visitors.remove(at);
+    shared.refused.fetch_add(1, Ordering::Relaxed);
+    if oldest.answer.is_none() {
+        oldest.turn_away(Turned::Crowded);
+    }
+}
+
+impl Visitor {
+    fn new(stream: TcpStream) -> Self {
+        Self { stream, head: Vec::new(), answer: None, until: Instant::now() + HEAD_TIME }
+    }
+
+    /// Reads what has come, and writes what there is room for.
+    fn advance(mut self, shared: &Shared) -> Next {
+        while self.answer.is_none() {
+            let mut piece = [0; PIECE];
+            // The end of a head is not before the last bytes of what was there.
+            let seen = self.head.len().saturating_sub(3);
+            match self.stream.read(&mut piece) {
+                Ok(0) => return Next::Done,
+                Ok(read) => self.head.extend(piece.iter().take(read)),
+                Err(error) if error.kind() == ErrorKind::Interrupted => continue,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return Next::Stays(self),
+                Err(_) => return Next::Done,
+            }
+            let new = self.head.get(seen..).unwrap_or_default();
+            let end = new.windows(4).position(|end| end == b"\r\n\r\n").map(|at| seen + at + 4);
+            if self.head.len() > LONGEST {
+                shared.refused.fetch_add(1, Ordering::Relaxed);
+                self.answer = Some((Answer::of(Turned::Long), 0));
+            } else if let Some(head) = end.and_then(|end| self.head.get(..end)) {
+                match answer(head, shared) {
+                    Some(answer) => self.answer = Some((answer, 0)),
+                    None => return Next::Page(Begun::new(self.head, self.stream)),
+                }
+            }
+        }
+        self.write()
+    }
+
+    fn write(mut self) -> Next {
+        while let Some((answer, sent)) = &mut self.answer {
+            let rest = answer.bytes.get(*sent..).unwrap_or_default();
+            if rest.is_empty() {
+                self.close();
+                return Next::Done;
+            }
+            match self.stream.write(rest) {
+                Ok(0) => return Next::Done,
+                Ok(written) => {
+                    *sent += written;
+                    if answer.is_known {
+                        self.until = Instant::now() + PIECE_TIME;
+                    }
+                }
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return Next::Stays(self),
+                Err(_) => return Next::Done,
+            }
+        }
+        Next::Stays(self)
+    }
+
+    /// Says why it is not served, as far as that goes without waiting.
+    fn turn_away(mut self, why: Turned) {
+        if self.answer.is_none() {
+            let _ = self.stream.write(&Answer::of(why).bytes);
+        }
+        self.close();
+    }
+
+    /// Closes the connection. Unread bytes would reset it, and the client might not read its answer.
+    fn close(mut self) {
+        let _ = self.stream.shutdown(Shutdown::Write);
+        let mut piece = [0; PIECE];
+        for _ in 0..8 {
+            if !matches!(self.stream.read(&mut piece), Ok(1..)) {
+                break;
+            }
+        }
+    }
+}

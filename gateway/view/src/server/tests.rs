@@ -1,0 +1,190 @@
+use std::io::{ErrorKind, Read, Write};
+use std::net::TcpStream;
+use std::time::{Duration, Instant};
+
+use tungstenite::client::IntoClientRequest;
+use tungstenite::{WebSocket, client};
+
+use super::*;
+
+const TOKEN: &str = "abcdef0123456789";
+/// The time that anything may take that should happen at once.
+const TIMEOUT: Duration = Duration::from_secs(40);
+
+fn served(token: Option<&str>) -> Server {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let token = token.map(|token| Token::parse(token).unwrap());
+    let access = Access { may_act: true, may_play: false, token };
+    Server::start(listener, access, "{}".to_owned(), vec![1, 2, 3]).unwrap()
+}
+
+fn connect(server: &Server) -> TcpStream {
+    let stream = TcpStream::connect(server.address()).unwrap();
+    stream.set_read_timeout(Some(TIMEOUT)).unwrap();
+    stream
+}
+
+/// Everything that comes until the server closes.
+fn rest(mut stream: TcpStream) -> String {
+    let mut answer = String::new();
+    match stream.read_to_string(&mut answer) {
+        Err(error) if error.kind() != ErrorKind::ConnectionReset => panic!("{error}"),
+        Ok(_) | Err(_) => answer,
+    }
+}
+
+fn get(server: &Server, target: &str) -> String {
+    let mut stream = connect(server);
+    write!(stream, "GET {target} HTTP/1.1\r\nHost: {}\r\n\r\n", server.address()).unwrap();
+    rest(stream)
+}
+
+fn status(answer: &str) -> &str {
+    answer.split(' ').nth(1).unwrap_or("none")
+}
+
+fn page(server: &Server, query: &str) -> Result<WebSocket<TcpStream>, u16> {
+    let request = format!("ws://{}/live{query}", server.address()).into_client_request().unwrap();
+    match client(request, connect(server)) {
+        Ok((socket, _)) => Ok(socket),
+        Err(tungstenite::HandshakeError::Failure(tungstenite::Error::Http(answer))) => {
+            Err(answer.status().as_u16())
+        }
+        Err(error) => panic!("{error}"),
+    }
+}
+
+#[test]
+fn without_the_token_only_the_code_of_the_page_is_served() {
+    let server = served(Some(TOKEN));
+    for query in
+        ["", "?token=", "?token=abcdef0123456780", "?token=0123456789abcdef", "?other=abcdef0123456789"]
+    {
+        for path in ["/", "/surface", "/live", "/no-such-file"] {
+            let answer = get(&server, &format!("{path}{query}"));
+            assert_eq!(status(&answer), "403", "{path}{query}: {answer}");
+            assert!(
+                answer.contains("\r\n\r\n403: without the page's token, or with an old one: open"),
+                "{answer}"
+            );
+        }
+        assert_eq!(page(&server, query).err(), Some(403), "{query}");
+    }
+    assert_eq!(server.counts().clients, 0);
+    // The page's links to its code carry no token.
+    for path in ["/app.js", "/style.css"] {
+        assert_eq!(status(&get(&server, path)), "200", "{path}");
+    }
+    for path in ["/", "/surface"] {
+        let answer = get(&server, &format!("{path}?token={TOKEN}"));
+        assert_eq!(status(&answer), "200");
+        assert!(
+            answer.contains("Referrer-Policy: no-referrer") && answer.contains("Cache-Control: no-store")
+        );
+        assert!(!answer.contains(TOKEN), "it is in the address only");
+    }
+    page(&server, &format!("?token={TOKEN}")).unwrap();
+}
+
+#[test]
+fn bytes_behind_a_head_do_not_change_its_answer() {
+    let server = served(Some(TOKEN));
+    let mut stream = connect(&server);
+    let head = format!("GET /live HTTP/1.1\r\nHost: {}\r\nUpgrade: websocket\r\n\r\n", server.address());
+    // A message of a page, masked with zeros, is no UTF-8.
+    stream
+        .write_all(&[head.as_bytes(), &[0x81, 0x80 | 13, 0, 0, 0, 0], br#"{"do":"halt"}"#].concat())
+        .unwrap();
+    assert_eq!(status(&rest(stream)), "403");
+    assert_eq!(server.commands().count(), 0);
+}
+
+#[test]
+fn a_page_without_a_token_is_served_to_anybody() {
+    let server = served(None);
+    assert_eq!([status(&get(&server, "/")), status(&get(&server, "/surface"))], ["200", "200"]);
+    page(&server, "").unwrap();
+}
+
+#[test]
+fn a_head_has_one_deadline_however_it_drips() {
+    let server = served(Some(TOKEN));
+    let (mut slow, mut silent, empty) = (connect(&server), connect(&server), connect(&server));
+    write!(silent, "GET / HTTP/1.1\r\n").unwrap();
+    write!(slow, "GET / HTTP/1.1\r\nX: ").unwrap();
+    let give_up = Instant::now() + TIMEOUT;
+    while slow.write_all(b"a").is_ok() {
+        assert!(Instant::now() < give_up, "a head that drips is waited for");
+        thread::sleep(Duration::from_millis(200));
+    }
+    assert!(server.counts().refused >= 1);
+
+    let answer = rest(silent);
+    assert!(answer.ends_with("408: the request took longer than 5 s\n"), "{answer}");
+    assert_eq!(rest(empty), "", "who has said nothing is told nothing");
+}
+
+#[test]
+fn clients_that_send_no_request_keep_nobody_out_who_has_the_token() {
+    let server = served(Some(TOKEN));
+    let beginning = |_| {
+        let mut stream = connect(&server);
+        // It may have been turned away already.
+        let _ = write!(stream, "GET /?token=wrong HTTP/1.1\r\nX: ");
+        stream
+    };
+    let slow: Vec<_> = (0..400).map(beginning).collect();
+    assert_eq!(status(&get(&server, &format!("/?token={TOKEN}"))), "200");
+    let mut page = page(&server, &format!("?token={TOKEN}")).unwrap();
+    assert_eq!(page.read().unwrap().to_text().unwrap(), "{}");
+    let first = slow.into_iter().next().unwrap();
+    let answer = rest(first);
+    assert!(
+        answer.ends_with("503: too many clients wait that have sent no request: try again\n"),
+        "{answer}"
+    );
+}
+
+#[test]
+fn a_page_too_many_is_refused_in_words() {
+    let server = served(Some(TOKEN));
+    let query = format!("?token={TOKEN}");
+    assert_eq!(status(&get(&server, &format!("/live{query}"))), "426");
+    let pages: Vec<_> = (0..PAGES).map(|_| page(&server, &query).unwrap()).collect();
+    assert_eq!(page(&server, &query).err(), Some(503));
+    let answer = get(&server, &format!("/live{query}"));
+    assert!(answer.contains("503: 16 pages are open, and there may be no more"), "{answer}");
+    drop(pages);
+    let give_up = Instant::now() + TIMEOUT;
+    while page(&server, &query).is_err() {
+        assert!(Instant::now() < give_up, "places become free");
+        thread::sleep(Duration::from_millis(20));
+    }
+}
+
+#[test]
+fn what_is_no_request_is_answered_in_words() {
+    let server = served(None);
+    let answer_to = |text: &str| {
+        let mut stream = connect(&server);
+        let _ = stream.write_all(text.as_bytes());
+        rest(stream)
+    };
+    assert_eq!(status(&answer_to("POST / HTTP/1.1\r\n\r\n")), "400");
+    assert_eq!(status(&answer_to("GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n")), "403");
+    assert_eq!(status(&answer_to(&format!("GET / HTTP/1.1\r\nX: {}\r\n\r\n", "x".repeat(20_000)))), "431");
+    assert_eq!(status(&get(&server, "/../Cargo.toml")), "404");
+}
+
+#[test]
+fn an_address_is_one_that_a_browser_opens() {
+    let token = Token::parse(TOKEN).unwrap();
+    for (listen, expected) in [
+        ("127.0.0.1:8100", "http://127.0.0.1:8100/?token=abcdef0123456789"),
+        ("0.0.0.0:8100", "http://127.0.0.1:8100/?token=abcdef0123456789"),
+        ("[::]:80", "http://[::1]:80/?token=abcdef0123456789"),
+    ] {
+        assert_eq!(url(listen.parse().unwrap(), Some(&token)), expected);
+    }
+    assert_eq!(url("127.0.0.1:80".parse().unwrap(), None), "http://127.0.0.1:80/");
+}

@@ -1,0 +1,86 @@
+//! The secret in a page's address, without which its server answers nothing about the bench.
+
+use std::fmt;
+use std::hint::black_box;
+use std::io;
+
+/// The fewest characters of a token: 16 letters and digits are 95 bits.
+const SHORTEST: usize = 16;
+/// The most characters of a token: it is a part of a request's first line.
+const LONGEST: usize = 256;
+
+/// A secret that every request has to carry.
+#[derive(Clone, Eq, PartialEq)]
+pub struct Token(String);
+
+/// The error for a text that cannot be a token. It does not repeat the text.
+#[derive(Clone, Copy, Debug, Eq, PartialEq, thiserror::Error)]
+#[error("a token has 16 to 256 letters or digits, and nothing else")]
+pub struct TokenError;
+
+impl Token {
+    /// Checks a token that somebody has chosen.
+    ///
+    /// # Errors
+    /// When it is too short or too long, or has other characters than letters and digits.
+    pub fn parse(text: &str) -> Result<Self, TokenError> {
+        let is_plain = text.bytes().all(|byte| byte.is_ascii_alphanumeric());
+        let fits = (SHORTEST..=LONGEST).contains(&text.len());
+        if fits && is_plain { Ok(Self(text.to_owned())) } else { Err(TokenError) }
+    }
+
+    /// Draws a token of 128 bits from the kernel.
+    ///
+    /// # Errors
+    /// When the kernel has no random bytes to give.
+    pub fn random() -> io::Result<Self> {
+        let mut bytes = [0; 16];
+        getrandom::fill(&mut bytes).map_err(io::Error::other)?;
+        Ok(Self(format!("{:032x}", u128::from_ne_bytes(bytes))))
+    }
+
+    /// Returns its text.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+
+    /// Compares it with what a request carries, in a time that does not depend on where they differ.
+    #[must_use]
+    pub fn is(&self, given: &str) -> bool {
+        let pairs = given.bytes().zip(self.0.bytes());
+        let differences = pairs.fold(0, |differences, (one, other)| black_box(differences | (one ^ other)));
+        given.len() == self.0.len() && differences == 0
+    }
+}
+
+impl fmt::Debug for Token {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str("Token(..)")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_token_is_long_plain_and_not_printed_by_accident() {
+        let token = Token::parse("abcdef0123456789").unwrap();
+        assert!(token.is("abcdef0123456789"));
+        for wrong in ["", "abcdef012345678", "abcdef0123456788", "abcdef01234567890", "ABCDEF0123456789"] {
+            assert!(!token.is(wrong), "{wrong}");
+        }
+        assert_eq!(format!("{token:?}"), "Token(..)");
+        for wrong in ["", "short", "abcdef 0123456789", "abcdef0123456789\n", &"a".repeat(257)] {
+            assert_eq!(Token::parse(wrong), Err(TokenError), "{wrong:?}");
+        }
+    }
+
+    #[test]
+    fn random_tokens_differ_and_may_be_given() {
+        let [one, other] = [(), ()].map(|()| Token::random().unwrap());
+        assert_ne!(one, other);
+        assert_eq!((one.as_str().len(), Token::parse(one.as_str())), (32, Ok(one.clone())));
+    }
+}
