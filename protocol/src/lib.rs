@@ -30,3 +30,5 @@ pub mod touch;
 pub mod usage;
 pub mod wire;
 pub mod wire_time;
+#[cfg(feature = "host")]
+pub mod xml;
