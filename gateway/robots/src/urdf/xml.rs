@@ -50,7 +50,8 @@ fn error(file: &str, Fault { line, what }: Fault) -> RobotError {
     RobotError::new(file, line, Problem::Xml(what))
 }
 
-/// What is wrong, and what to do.
+/// Describes an error of the parser, and what to do.
+#[expect(clippy::wildcard_enum_match_arm, reason = "the parser's own words do for all others")]
 fn words(reason: &Error) -> String {
     let plain = |what: &str| what.to_owned();
     match reason {
