@@ -3,7 +3,8 @@
 use std::fmt::Display;
 use std::path::{Component, Path, PathBuf};
 
-use protocol::document;
+use protocol::document::LONGEST;
+use protocol::input;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use robots::Urdf;
@@ -31,8 +32,7 @@ impl RobotOfSkin {
         let Some(path) = file else { return Ok(Self { robot: of_rows(), urdf: None }) };
         let hint = "correct the skin's path, or take the key out";
         let wrong = |error: &dyn Display| Failure::usage(format!("robot.urdf: {error}; {hint}"));
-        let text = document::text(path).map_err(|error| wrong(&error))?;
-        let urdf = Urdf::parse(&path.display().to_string(), &text).map_err(|error| wrong(&error))?;
+        let (urdf, text) = read_urdf(path).map_err(|error| wrong(&error))?;
         let robot = Robot::of_urdf(skin, urdf, text.clone());
         let robot = robot.or_else(|error| {
             note(format_args!("robot.urdf: {error}; the robot is shown by the skin's rows"));
@@ -40,6 +40,18 @@ impl RobotOfSkin {
         });
         Ok(Self { robot: robot.ok(), urdf: Some(text) })
     }
+}
+
+/// Reads a URDF, in the encoding that it declares; its text too.
+///
+/// # Errors
+/// One line: the file cannot be read, or is no URDF.
+pub(crate) fn read_urdf(path: &Path) -> Result<(Urdf, String), String> {
+    let file = path.display().to_string();
+    let bytes = input::bytes(path, LONGEST).map_err(|error| format!("{file}: {error}"))?;
+    let text = robots::text(&file, &bytes).map_err(|error| error.to_string())?.into_owned();
+    let urdf = Urdf::parse(&file, &text).map_err(|error| error.to_string())?;
+    Ok((urdf, text))
 }
 
 /// Where the URDF of a skin's file is.

@@ -3,13 +3,12 @@
 use std::path::Path;
 
 use cover::Part;
-use protocol::document;
 use protocol::skin::{Chain, ChainRow, Skin};
 use robots::{Isometry3, LinkFrame, Row, Urdf};
 
 use super::output::note;
 use super::print::count;
-use super::robot_file::urdf_of;
+use super::robot_file::{read_urdf, urdf_of};
 use super::visuals::{Packages, Visuals};
 
 /// A part of a link.
@@ -36,7 +35,7 @@ impl Surface {
     /// That of the skin in a file; none if it names no URDF. What cannot be drawn is noted.
     pub(crate) fn read(file: &Path, skin: &Skin, packages: &Packages) -> Option<Self> {
         let path = urdf_of(file, skin.robot.urdf.as_deref()?);
-        let surface = text(&path).and_then(|urdf| Self::of(urdf, &path, skin, packages));
+        let surface = read_urdf(&path).and_then(|(urdf, _)| Self::of(urdf, &path, skin, packages));
         surface.map_err(|error| note(format_args!("the robot is not drawn: {error}"))).ok()
     }
 
@@ -63,12 +62,6 @@ impl Surface {
         }
         Ok(Self { urdf, chains, parts })
     }
-}
-
-fn text(path: &Path) -> Result<Urdf, String> {
-    let file = path.display().to_string();
-    let text = document::text(path).map_err(|error| error.to_string())?;
-    Urdf::parse(&file, &text).map_err(|error| error.to_string())
 }
 
 /// The URDF's chain with the same rows as a skin's.

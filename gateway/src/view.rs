@@ -231,7 +231,15 @@ impl View {
                 remark_another(&self.sources, path, &skin);
                 Ok((skin, shells))
             }
-            None => Ok((skin_of(&self.sources)?, Vec::new())),
+            None => {
+                let skin = skin_of(&self.sources)?;
+                if skin.robot.urdf.is_some() {
+                    note(
+                        "the recording does not have the robot's meshes: with the --skin beside its URDF they are shown",
+                    );
+                }
+                Ok((skin, Vec::new()))
+            }
         }
     }
 

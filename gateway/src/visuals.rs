@@ -75,23 +75,27 @@ impl<'a> Visuals<'a> {
     fn find(&self, uri: &str) -> Result<PathBuf, String> {
         let of_package = uri.strip_prefix("package://").or_else(|| uri.strip_prefix("model://"));
         let Some((name, rest)) = of_package.map(|path| path.split_once('/').unwrap_or((path, ""))) else {
-            let path = self.folder.join(uri.strip_prefix("file://").unwrap_or(uri));
-            let tried = path.display();
-            return if path.is_file() {
-                Ok(path)
-            } else {
-                Err(format!("mesh {uri}: {tried} is no file: correct the path"))
-            };
+            let local = path_of_uri(uri);
+            let tried = spellings(local, local != uri).map(|path| self.folder.join(path));
+            let tried: Vec<_> = tried.collect();
+            let shown = tried.first().map_or_else(String::new, |path| path.display().to_string());
+            let found = tried.into_iter().find(|path| path.is_file());
+            return found.ok_or_else(|| format!("mesh {uri}: {shown} is no file: correct the path"));
         };
+        let rests: Vec<_> = spellings(rest, true).collect();
         let given = self.packages.package.iter().find(|(known, _)| known == name);
         let tried: Vec<_> = match given {
-            Some((_, folder)) => vec![folder.join(rest)],
+            Some((_, folder)) => rests.iter().map(|rest| folder.join(rest)).collect(),
             None => self
                 .folder
                 .ancestors()
                 .flat_map(|above| {
                     let is_it = above.file_name().is_some_and(|it| it == name);
-                    [is_it.then(|| above.join(rest)), Some(above.join(name).join(rest))].into_iter().flatten()
+                    let folders = [is_it.then(|| above.to_owned()), Some(above.join(name))];
+                    folders
+                        .into_iter()
+                        .flatten()
+                        .flat_map(|folder| rests.iter().map(move |rest| folder.join(rest)))
                 })
                 .collect(),
         };
@@ -106,6 +110,60 @@ impl<'a> Visuals<'a> {
             .find(named)
             .or_else(|| tried.first())
             .map_or_else(String::new, |path| path.display().to_string());
-        Err(format!("mesh {uri}: {shown} is no file: say where the package is with --package {name}=DIR"))
+        let hint = match given {
+            Some((_, folder)) if folder.is_dir() => {
+                format!("{} is not the package, or lacks this file", folder.display())
+            }
+            Some((_, folder)) => format!("{} is no folder: correct --package {name}=", folder.display()),
+            None => format!("say where the package is with --package {name}=DIR"),
+        };
+        Err(format!("mesh {uri}: {shown} is no file: {hint}"))
+    }
+}
+
+/// The path of a `file:` URI; anything else is a path.
+fn path_of_uri(uri: &str) -> &str {
+    let Some(rest) = uri.strip_prefix("file:") else { return uri };
+    let local = rest.strip_prefix("//localhost").filter(|path| path.starts_with('/'));
+    local.or_else(|| rest.strip_prefix("//")).unwrap_or(rest)
+}
+
+/// A path as it is written; of a URI also with its escapes, as in `%20`, decoded.
+fn spellings(path: &str, is_uri: bool) -> impl Iterator<Item = String> {
+    let decoded = is_uri.then(|| decoded(path)).flatten().filter(|decoded| decoded != path);
+    core::iter::once(path.to_owned()).chain(decoded)
+}
+
+fn decoded(path: &str) -> Option<String> {
+    let mut parts = path.split('%');
+    let mut bytes = parts.next().unwrap_or_default().as_bytes().to_vec();
+    for part in parts {
+        bytes.push(u8::from_str_radix(part.get(..2)?, 16).ok()?);
+        bytes.extend(part.get(2..)?.bytes());
+    }
+    String::from_utf8(bytes).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn uris_name_files() {
+        for (uri, path) in [
+            ("file:///a/b.stl", "/a/b.stl"),
+            ("file://localhost/a/b.stl", "/a/b.stl"),
+            ("file:/a/b.stl", "/a/b.stl"),
+            ("file://a/b.stl", "a/b.stl"),
+            ("a/b.stl", "a/b.stl"),
+        ] {
+            assert_eq!(path_of_uri(uri), path);
+        }
+        let of_uri = |path| spellings(path, true).collect::<Vec<_>>();
+        assert_eq!(of_uri("a%20b%C3%BC.stl"), ["a%20b%C3%BC.stl", "a b\u{fc}.stl"]);
+        for plain in ["ab", "a%2", "a%zz", "a%ff"] {
+            assert_eq!(of_uri(plain), [plain]);
+        }
+        assert_eq!(spellings("a%20b", false).collect::<Vec<_>>(), ["a%20b"]);
     }
 }

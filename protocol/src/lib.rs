@@ -30,6 +30,8 @@ pub mod touch;
 pub mod usage;
 pub mod wire;
 pub mod wire_time;
+#[cfg(feature = "host")]
+pub mod xml;
 
 #[cfg(test)]
 mod tests;

@@ -185,7 +185,9 @@ pub enum CoverError {
     #[error("{0} nodes per bus: it is 1 to {MAX_NODES}; correct it")]
     Nodes(usize),
     /// There are too many links.
-    #[error("{0} links, at most {MAX_LINKS}: leave out those that are far from the skin")]
+    #[error(
+        "{0} links, at most {MAX_LINKS}: take those far from the skin as not there, with --leave-out LINK,.."
+    )]
     Links(usize),
     /// A box is of no link, or inside out.
     #[error("keep-out box {index}: {reason}; correct it")]

@@ -33,15 +33,28 @@ pub enum Problem {
     /// There is nothing in the file.
     #[error("the file is empty; a URDF has a robot element with links and joints")]
     Empty,
-    /// It is not XML.
-    #[error("not XML: {0}")]
+    /// It does not begin as XML does.
+    #[error("not XML: a URDF begins with <?xml or <robot, and this does not; name the robot's URDF")]
+    NotXml,
+    /// It is not XML that can be read: what there is, and what to do.
+    #[error("{0}")]
     Xml(String),
     /// It is a template of a URDF.
-    #[error("a xacro file, from which a URDF is made: run `xacro FILE.xacro > FILE.urdf` first")]
-    Xacro,
+    #[error(
+        "{what} is left: this is a xacro file, a template of a URDF. Make one with `xacrodoc {file} -o NEW.urdf` (pip install xacrodoc), and name that"
+    )]
+    Xacro {
+        /// The element or expression.
+        what: String,
+        /// The file.
+        file: String,
+    },
     /// It is XML of another kind.
-    #[error("the outermost element is {0:?}; a URDF has `robot`: convert the file to URDF first")]
+    #[error("the outermost element is {0}; a URDF has `robot`: name the robot's URDF")]
     NotARobot(String),
+    /// It says which of a robot's joints belong together.
+    #[error("an SRDF file, of MoveIt, which has no links: name the robot's URDF")]
+    Srdf,
     /// There are no links.
     #[error("the robot has no links; a URDF has at least one")]
     NoLinks,
@@ -63,7 +76,7 @@ pub enum Problem {
         /// What it says.
         value: String,
         /// What is allowed.
-        allowed: &'static str,
+        allowed: String,
     },
     /// A name is there twice.
     #[error("two {what}s are named {name:?}; each needs a name of its own: rename one")]
@@ -198,6 +211,14 @@ pub enum Problem {
         /// The one that it follows.
         of: String,
     },
+    /// A joint says nothing of its limits.
+    #[error(
+        "joint {joint:?} has no limits: add <limit lower=\"..\" upper=\"..\"/>, or make the joint continuous or fixed"
+    )]
+    NoLimit {
+        /// The joint.
+        joint: String,
+    },
     /// A joint cannot move within its limits.
     #[error(
         "joint {joint:?} has the limits {lower} to {upper}; the lower must be below the upper, both finite: correct them, or make the joint fixed"
@@ -212,7 +233,7 @@ pub enum Problem {
     },
     /// A length does not fit a cell's words.
     #[error(
-        "row {row}, to {to}: {what} = {value:.3} m; [-{MAX_LENGTH_M}, {MAX_LENGTH_M}) m is possible: choose a tip nearer to the root"
+        "row {row}, to {to}: {what} = {value:.3} m; [-{MAX_LENGTH_M}, {MAX_LENGTH_M}) m is possible: {hint}"
     )]
     Length {
         /// The row, from 1.
@@ -223,6 +244,8 @@ pub enum Problem {
         what: &'static str,
         /// In m.
         value: f64,
+        /// What to do.
+        hint: &'static str,
     },
     /// The chain is longer than a cell can compute.
     #[error(

@@ -24,6 +24,7 @@
 //! | `urdf` | the file: links, joints, shapes, and its own kinematics |
 //! | `describe` | the text of a skin for chains and cells |
 //! | `links` | each link on its parent, for the positions of joints |
+//! | `taken` | names that have to be unique where they are written |
 //! | `written` | the text of a URDF for the chains of a skin |
 //! | `chain` | the joints between two links, with rows and the frame of each link |
 //! | `rows` | rows, and how one axis leads to the next |
@@ -35,6 +36,7 @@ mod links;
 mod nearest;
 mod residual;
 mod rows;
+mod taken;
 mod urdf;
 mod written;
 
@@ -46,7 +48,8 @@ pub use nalgebra::Isometry3;
 pub use protocol::parameters::RowKind;
 pub use protocol::skin::JointKind;
 pub use rows::{Row, frames, pose_of};
-pub use urdf::{Geometry, Shape, Urdf};
+pub use taken::{Taken, chain_words};
+pub use urdf::{Geometry, Shape, Urdf, text};
 pub use written::{Written, word, written};
 
 #[cfg(test)]

@@ -11,6 +11,7 @@ use protocol::parameters::RowKind;
 use protocol::skin::{JointKind, Skin};
 
 use crate::rows::{Row, pose_of};
+use crate::taken::chain_words;
 
 /// The link that all chains are on.
 const BASE: &str = "base";
@@ -76,11 +77,10 @@ struct Joint {
 #[must_use]
 pub fn written(skin: &Skin) -> Written {
     let robot = &skin.robot;
-    let several = robot.chains.len() > 1;
     let mut joints: Vec<Joint> = Vec::new();
     let mut links = Vec::new();
-    for chain in &robot.chains {
-        let prefix = if several { format!("{}_", word(&chain.name)) } else { String::new() };
+    for (chain, word) in robot.chains.iter().zip(chain_words(skin)) {
+        let prefix = if word.is_empty() { word } else { word + "_" };
         let (mut parent, mut origin) = (BASE.to_owned(), Origin::of_base(&chain.base));
         let (mut of_chain, mut moving) = (Vec::new(), chain.joints.iter());
         for (index, row) in chain.rows.iter().enumerate() {
@@ -134,6 +134,9 @@ fn joint(
     if before.iter().any(|it| it.moved == moved) {
         let _ = writeln!(inner, "    <mimic joint=\"{}\"/>", escaped(&name));
         name = format!("{name}_of_{link}");
+        while robot.joints.iter().any(|it| it.name == name) {
+            name.push('_');
+        }
     }
     let kind = match joint.kind {
         JointKind::Revolute => "revolute",

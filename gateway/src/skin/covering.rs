@@ -20,6 +20,9 @@ pub(super) struct Covering {
     /// From one cell's middle to the next one's in m, 0.001 to 1
     #[arg(long, value_name = "M", requires = "cover", default_value_t = 0.028, value_parser = pitch, allow_negative_numbers = true)]
     pitch: f64,
+    /// Take these links as not there: their visuals are not read, and cells may lie where they are
+    #[arg(long, value_name = "LINK,..", requires = "cover", value_delimiter = ',', value_parser = link)]
+    leave_out: Vec<String>,
     /// A box in a covered link's frame that holds no cell, in m; may be given several times
     #[arg(long, value_name = "LINK:MINX,MINY,MINZ,MAXX,MAXY,MAXZ", requires = "cover", value_parser = keep_out)]
     keep_out: Vec<KeptOut>,
@@ -83,9 +86,19 @@ impl Covering {
     pub(super) fn cells(&self, urdf: &Urdf, file: &Path, chains: &[Chain]) -> Result<Covered, Failure> {
         let owners = self.owners(urdf, chains)?;
         let visuals = Visuals::new(urdf, file, &self.packages);
-        let links = urdf.links().map(|name| {
+        let there = urdf.links().filter(|name| !self.leave_out.iter().any(|out| out == name));
+        let links = there.map(|name| {
             let pose = urdf.pose(name, &|joint| urdf.rest(joint)).map_err(|error| error.to_string())?;
-            Ok(Link { name: name.to_owned(), parts: visuals.parts(name)?, pose })
+            let parts = visuals.parts(name).map_err(|error| {
+                let is_covered = self.cover.iter().any(|covered| covered == name);
+                let hint = if is_covered {
+                    String::new()
+                } else {
+                    format!("; or take it as not there with --leave-out {name}")
+                };
+                error + &hint
+            })?;
+            Ok(Link { name: name.to_owned(), parts, pose })
         });
         let links: Vec<_> = links.collect::<Result<_, String>>().map_err(Failure::usage)?;
         if let Some(bare) = self
@@ -154,11 +167,18 @@ impl Covering {
             if self.cover.iter().take(index).any(|before| before == name) {
                 return Err(wrong("this link is named twice".to_owned()));
             }
-            urdf.visuals(name).map_err(|error| wrong(error.to_string()))?;
+            urdf.pose(name, &|_| 0.0).map_err(|error| wrong(error.to_string()))?;
             let owner = chains.iter().position(|chain| chain.link(name).is_ok());
             owners.push(owner.ok_or_else(|| {
                 wrong(format!("no chain moves this link: those that a chain moves are {}", moved()))
             })?);
+        }
+        for name in &self.leave_out {
+            let wrong = |why: String| Failure::usage(format!("--leave-out {name}: {why}"));
+            urdf.pose(name, &|_| 0.0).map_err(|error| wrong(error.to_string()))?;
+            if self.cover.contains(name) {
+                return Err(wrong("--cover names this link".to_owned()));
+            }
         }
         if let Some(lost) = self.keep_out.iter().find(|lost| !self.cover.contains(&lost.link)) {
             let links = list(&self.cover);
@@ -186,11 +206,14 @@ impl Covering {
 
     /// The options as they were given.
     pub(super) fn words(&self) -> String {
-        let Self { cover, pitch, keep_out, seed, nodes_per_bus, packages: _ } = self;
+        let Self { cover, pitch, leave_out, keep_out, seed, nodes_per_bus, packages: _ } = self;
         if cover.is_empty() {
             return String::new();
         }
         let mut words = format!(" --cover {} --pitch {pitch}", cover.join(","));
+        if !leave_out.is_empty() {
+            words += &format!(" --leave-out {}", leave_out.join(","));
+        }
         for it in keep_out {
             words += &format!(" --keep-out {}", it.text);
         }

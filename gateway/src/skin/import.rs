@@ -6,12 +6,12 @@ use clap::Args;
 use protocol::document;
 use protocol::id::CellId;
 use protocol::usage::{Failure, print};
-use robots::{CellOnLink, Chain, Import as Described, ImportError, Urdf};
+use robots::{CellOnLink, Chain, Import as Described, ImportError, JointKind};
 
 use super::super::columns::{Columns, Table};
 use super::super::output::{Force, apart, note};
 use super::super::print::{count, list};
-use super::super::robot_file::path_from;
+use super::super::robot_file::{path_from, read_urdf};
 use super::covering::{self, Covered, Covering};
 
 /// Describe a skin on a robot of one's own, from its URDF
@@ -34,7 +34,7 @@ Examples:
   gateway run panda.toml --duration 10"
 )]
 pub(super) struct Import {
-    /// The robot's description; of a xacro file, what `xacro FILE` prints
+    /// The robot's description; of a xacro file, what `xacrodoc FILE -o ROBOT.urdf` writes
     #[arg(value_name = "ROBOT.urdf")]
     urdf: PathBuf,
     /// The last link of a chain; several chains by several of them
@@ -64,7 +64,11 @@ impl Import {
         let read = [Some(self.urdf.as_path()), self.cells.as_deref()].into_iter().flatten();
         apart([("-o", self.output.as_deref())], read)?;
         let file = self.urdf.display().to_string();
-        let urdf = Urdf::parse(&file, &text(&self.urdf)?).map_err(Failure::usage)?;
+        if self.urdf == Path::new("-") && !self.urdf.exists() {
+            let why = "the description is a file; of a pipe, name /dev/stdin";
+            return Err(Failure::usage(format!("{file}: {why}")));
+        }
+        let (urdf, _) = read_urdf(&self.urdf).map_err(Failure::usage)?;
         let chain = |tip: &String| urdf.chain(self.root.as_deref(), tip).map_err(Failure::usage);
         let chains = self.tip.iter().map(chain).collect::<Result<Vec<_>, _>>()?;
         if let Some(twice) =
@@ -97,6 +101,9 @@ impl Import {
         }
         for chain in &chains {
             note(reported(chain));
+            for joint in wide(chain) {
+                note(joint);
+            }
         }
         for figures in &figures {
             note(covering::reported(figures));
@@ -130,6 +137,22 @@ fn reported(chain: &Chain) -> String {
         "{} to {}: {joints} ({names}) in {rows}; rows and URDF differ by {:.1e} m or rad at most",
         chain.root, chain.tip, chain.residual
     )
+}
+
+/// More than this in rad, either way, is rather an angle in degrees.
+const WIDE_RAD: f64 = 8.0 * core::f64::consts::PI;
+
+/// Joints that turn so far that their limits are rather in degrees, in a line each.
+fn wide(chain: &Chain) -> impl Iterator<Item = String> {
+    let turning = chain.joints.iter().filter(|joint| joint.kind == JointKind::Revolute);
+    let wide = turning.filter(|joint| joint.limits.iter().any(|limit| limit.abs() > WIDE_RAD));
+    wide.map(|joint| {
+        let [lower, upper] = joint.limits;
+        format!(
+            "joint {}: limits of {lower} to {upper} rad, more than four turns each way: if these are degrees, correct them",
+            joint.name
+        )
+    })
 }
 
 fn text(path: &Path) -> Result<String, Failure> {

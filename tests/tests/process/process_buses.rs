@@ -318,10 +318,16 @@ impl PlayedServer {
         Self { listener, decoder: Decoder::new(None), packets: 0 }
     }
 
-    /// Lets a client in.
+    /// Lets a client in; one that only looks whether somebody listens sends no hello.
     fn admits(&self) -> OwnedFd {
-        let client = rustix::net::accept(&self.listener).unwrap();
-        rustix::net::recv(&client, &mut [0; HELLO_MAX], RecvFlags::empty()).unwrap();
+        let client = loop {
+            let client = rustix::net::accept(&self.listener).unwrap();
+            if rustix::net::recv(&client, &mut [0; HELLO_MAX], RecvFlags::empty())
+                .is_ok_and(|(len, _)| len > 0)
+            {
+                break client;
+            }
+        };
         let answer = Answer::Welcome { granted: 1 << 20 }.encode();
         rustix::net::send(&client, &answer, SendFlags::NOSIGNAL).unwrap();
         client

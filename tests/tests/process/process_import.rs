@@ -7,6 +7,8 @@
     reason = "a test may stop"
 )]
 
+mod odd_robots;
+
 use skinbus_tests::process;
 use skinbus_tests::process::recorded;
 
@@ -148,7 +150,7 @@ fn links_are_covered_and_the_skin_runs() {
     refused(
         &place,
         "run skin.toml --bus-kind embedded --record no.mcap",
-        "robot.urdf: arm.urdf: not XML: unknown token at 1:1; correct the skin's path, or take the key out",
+        "robot.urdf: arm.urdf:1: not XML: a URDF begins with <?xml or <robot, and this does not; name the robot's URDF; correct the skin's path, or take the key out",
     );
     fs::remove_file(place.path("arm.urdf")).unwrap();
     refused(
@@ -237,7 +239,14 @@ fn what_cannot_be_covered_is_said_in_a_line() {
     for (words, expected) in [
         (cover("fore", ""), "link plate: mesh package://arm_parts/meshes/plate.stl: "),
         (cover("fore", ""), "is no file: say where the package is with --package arm_parts=DIR"),
-        (cover("fore", "--package arm_parts=nowhere"), "nowhere/meshes/plate.stl is no file: say where"),
+        (cover("fore", "--package arm_parts=nowhere"), "nowhere is no folder: correct --package arm_parts="),
+        (cover("fore", ""), "; or take it as not there with --leave-out plate"),
+        (cover("fore", "--package arm_parts=."), ". is not the package, or lacks this file"),
+        (cover("fore", "--leave-out fore"), "--leave-out fore: --cover names this link"),
+        (
+            cover("fore", "--leave-out plat"),
+            "--leave-out plat: arm.urdf: there is no link \"plat\"; the nearest are",
+        ),
         (cover("bare", with), "--cover bare: arm.urdf has no visual of this link"),
         (cover("forearm", with), "--cover forearm: arm.urdf: there is no link \"forearm\"; the nearest are"),
         (
@@ -271,7 +280,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
         (
             "<robot xmlns:xacro=\"x\"><xacro:a/></robot>",
             "--tip bare",
-            "run `xacro FILE.xacro > FILE.urdf` first",
+            "`xacrodoc arm.urdf -o NEW.urdf` (pip install xacrodoc)",
         ),
         (ARM, "--tip hand", "there is no link \"hand\"; the nearest are"),
         (ARM, "--tip bare --tip bare", "--tip bare: this tip is named twice"),
@@ -280,6 +289,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
         place.write("arm.urdf", text);
         refused(&place, &format!("skin import arm.urdf {words}"), expected);
     }
+    refused(&place, "skin import - --tip a", "-: the description is a file; of a pipe, name /dev/stdin");
     refused(&place, "skin import nowhere.urdf --tip a", "nowhere.urdf: No such file");
     let head = "link,px,py,pz,nx,ny,nz";
     for (text, expected) in [

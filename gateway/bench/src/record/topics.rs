@@ -12,11 +12,11 @@ use control::cycle::Halt;
 use control::cycle::turn::Timed;
 use model::table::Status;
 use trace::capture::Note;
+use trace::recording::NOTES;
 use trace::recording::file::Channel;
 use trace::recording::layout::{Layout, Patch};
 use trace::recording::series::Writer;
 use trace::recording::window::Window;
-use trace::recording::{NOTES, TOPIC_OF_BUS, TOPIC_OF_STATE};
 use trace::ros2::robot::{Text, Transforms};
 use trace::ros2::skin::{ContactState, LoopTiming, PatchState, Torques};
 use trace::ros2::standard::{Diagnosis, Diagnostics, JointState, Point, PointCloud};
@@ -29,6 +29,12 @@ const LATCHED: (&str, &str) = (
      liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n  \
      avoid_ros_namespace_conventions: false\n",
 );
+const TIMING: &str = "/gateway/timing";
+const DIAGNOSTICS: &str = "/diagnostics";
+const TF: &str = "/tf";
+const TF_STATIC: &str = "/tf_static";
+const DESCRIPTION: &str = "/robot_description";
+
 /// Messages of [`Topics::robot`].
 pub const OF_ROBOT: u64 = 2;
 
@@ -56,31 +62,34 @@ impl Topics {
     /// When the file cannot be written.
     pub fn new(writer: &mut Writer, layout: &Layout) -> io::Result<Self> {
         let digits = [("time_digits", "9")];
-        let mut of_buses = |before: &str| -> io::Result<Vec<Channel>> {
-            let topics = layout.buses.iter().map(|bus| format!("{before}{bus}"));
-            topics.map(|topic| writer.channel::<Record<'_>>(&topic, &digits)).collect()
-        };
-        let (can, state) = (of_buses(TOPIC_OF_BUS)?, of_buses(TOPIC_OF_STATE)?);
+        let of_arm = ["joint_states", "joint_commands", "torques"];
+        let of_arm = of_arm.map(|topic| format!("/{}/{topic}", layout.arm));
+        let fixed = [NOTES, TIMING, DIAGNOSTICS, TF, TF_STATIC, DESCRIPTION].map(str::to_owned);
+        let others = fixed.into_iter().chain(of_arm.iter().cloned());
+        let [can, state] = layout.bus_topics(others).map(|topics| -> io::Result<Vec<Channel>> {
+            topics.iter().map(|topic| writer.channel::<Record<'_>>(topic, &digits)).collect()
+        });
+        let (can, state) = (can?, state?);
         let patches = layout.patches.iter().map(|Patch { topic, .. }| {
             let state = writer.channel::<PatchState<'_>>(topic, &[])?;
             Ok([state, writer.channel::<PointCloud<'_>>(&format!("{topic}/points"), &[])?])
         });
         let patches = patches.collect::<io::Result<_>>()?;
-        let arm = &layout.arm;
+        let [states, commands, torques] = &of_arm;
         let robot = layout.robot.is_some().then(|| {
-            let moving = writer.channel::<Transforms<'_>>("/tf", &[])?;
-            let still = writer.channel::<Transforms<'_>>("/tf_static", &[LATCHED])?;
-            Ok::<_, io::Error>([moving, still, writer.channel::<Text<'_>>("/robot_description", &[LATCHED])?])
+            let moving = writer.channel::<Transforms<'_>>(TF, &[])?;
+            let still = writer.channel::<Transforms<'_>>(TF_STATIC, &[LATCHED])?;
+            Ok::<_, io::Error>([moving, still, writer.channel::<Text<'_>>(DESCRIPTION, &[LATCHED])?])
         });
         Ok(Self {
             can,
             state,
             notes: writer.channel::<Note<'_>>(NOTES, &[])?,
-            joint_states: writer.channel::<JointState<'_>>(&format!("/{arm}/joint_states"), &[])?,
-            joint_commands: writer.channel::<JointState<'_>>(&format!("/{arm}/joint_commands"), &[])?,
-            torques: writer.channel::<Torques<'_>>(&format!("/{arm}/torques"), &[])?,
-            timing: writer.channel::<LoopTiming>("/gateway/timing", &[])?,
-            diagnostics: writer.channel::<Diagnostics<'_>>("/diagnostics", &[])?,
+            joint_states: writer.channel::<JointState<'_>>(states, &[])?,
+            joint_commands: writer.channel::<JointState<'_>>(commands, &[])?,
+            torques: writer.channel::<Torques<'_>>(torques, &[])?,
+            timing: writer.channel::<LoopTiming>(TIMING, &[])?,
+            diagnostics: writer.channel::<Diagnostics<'_>>(DIAGNOSTICS, &[])?,
             robot: robot.transpose()?,
             patches,
         })

@@ -15,6 +15,8 @@ use std::io;
 use std::path::Path;
 
 use nalgebra::{Matrix3, Point3, Vector3};
+use protocol::xml::{Foreign, foreign, kind_of_root};
+use roxmltree::Document;
 use thiserror::Error;
 
 pub use simplify::simplify;
@@ -73,6 +75,18 @@ pub enum MeshError {
         file: String,
         /// What the parser says, in one line.
         reason: String,
+    },
+    /// The file is another one, or stands for another one.
+    #[error("mesh {file}{}: {what}: {hint}", line.map_or_else(String::new, |line| format!(":{line}")))]
+    Foreign {
+        /// The file.
+        file: String,
+        /// The line, from 1, where it has one.
+        line: Option<usize>,
+        /// What it is.
+        what: String,
+        /// What to do.
+        hint: &'static str,
     },
     /// A part of the file is missing.
     #[error("mesh {file}: {reason}: it is cut off or damaged; copy or download it again")]
@@ -174,10 +188,18 @@ impl Mesh {
     /// # Errors
     /// As those of [`Mesh::load`].
     pub fn parse(name: &str, bytes: &[u8], up: UpAxis) -> Result<Self, MeshError> {
+        if let Some(Foreign { line, what, hint }) = foreign(bytes) {
+            return Err(MeshError::Foreign { file: name.to_owned(), line, what: what.to_owned(), hint });
+        }
         let extension = Path::new(name).extension().and_then(OsStr::to_str).unwrap_or_default();
+        let read = |triangles: Result<Vec<Triangle>, MeshError>| match triangles {
+            Err(_) => triangles.map_err(|error| xml(name, bytes).unwrap_or(error)),
+            Ok(none) if none.is_empty() => xml(name, bytes).map_or(Ok(none), Err),
+            found => found,
+        };
         let triangles = match extension.to_ascii_lowercase().as_str() {
-            "stl" => stl::triangles(name, bytes)?,
-            "obj" => obj::triangles(name, bytes)?,
+            "stl" => read(stl::triangles(name, bytes))?,
+            "obj" => read(obj::triangles(name, bytes))?,
             "dae" => collada::triangles(name, bytes, up)?,
             _ => return Err(MeshError::Extension { file: name.to_owned(), extension: extension.to_owned() }),
         };
@@ -189,6 +211,21 @@ impl Mesh {
     pub fn triangles(&self) -> &[Triangle] {
         &self.triangles
     }
+}
+
+/// The error for XML in a file that has another format by its name.
+fn xml(file: &str, bytes: &[u8]) -> Option<MeshError> {
+    if !bytes.trim_ascii_start().starts_with(b"<") {
+        return None;
+    }
+    let text = protocol::xml::text(bytes).ok()?;
+    let prepared = protocol::xml::prepare(&text).ok()?;
+    let document = Document::parse(&prepared.text).ok()?;
+    let name = document.root_element().tag_name().name();
+    let what =
+        kind_of_root(name).map_or_else(|| format!("XML with the outermost element {name}"), str::to_owned);
+    let hint = if name == "COLLADA" { "rename it to .dae" } else { "name the mesh itself" };
+    Some(MeshError::Foreign { file: file.to_owned(), line: None, what, hint })
 }
 
 fn too_many(file: &str, count: usize) -> MeshError {

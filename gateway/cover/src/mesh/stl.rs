@@ -114,7 +114,10 @@ fn ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
         return Ok(triangles);
     }
     let count = triangles.len();
-    Err(damaged(name, &format!("it ends without endsolid, after {count} triangles")))
+    Err(damaged(
+        name,
+        &format!("it ends without endsolid, after {count} triangles; if these are all, add that line"),
+    ))
 }
 
 #[cfg(test)]
@@ -221,9 +224,9 @@ mod tests {
             assert!(message.starts_with("mesh a.stl: "), "{message}");
         }
         let last = &whole[..whole.find("endsolid").unwrap()];
-        assert!(
-            refused(last.as_bytes()).contains("it ends without endsolid, after 4 triangles: it is cut off")
-        );
+        assert!(refused(last.as_bytes()).contains(
+            "it ends without endsolid, after 4 triangles; if these are all, add that line: it is cut off"
+        ));
         assert!(refused(whole.replace("vertex 0 1", "vertx 0 1").as_bytes()).contains("line 5: \"vertx\""));
         let line = "  vertex 2 1 1e1\n";
         assert!(whole.contains(line));

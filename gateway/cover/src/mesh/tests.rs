@@ -213,7 +213,8 @@ fn what_is_no_mesh_is_refused_in_one_line() {
     assert!(parse("a.obj", "v 0 0 0\nf 1 2 3\n").starts_with("mesh a.obj: "));
     assert!(parse("a.stl", "not an STL").starts_with("mesh a.stl: "));
     assert!(parse("a.dae", "<COLLADA>").starts_with("mesh a.dae: "));
-    assert!(parse("a.dae", "<svg/>").contains("its first element is svg, not COLLADA"));
+    assert!(parse("a.dae", "<svg/>").contains("its first element is svg (an SVG drawing), not COLLADA"));
+    assert!(parse("a.dae", "\n\n<COLLADA>\n&</COLLADA>").contains(": line 4: "));
     assert!(parse("a.dae", &dae("", "")).contains("it has no triangle"));
     assert!(parse("a.dae", &dae("<unit meter=\"0\"/>", PLAIN)).contains("its unit is \"0\" m"));
     assert!(parse("a.dae", &dae("<up_axis>UP</up_axis>", PLAIN)).contains("its up_axis is \"UP\""));
@@ -227,6 +228,24 @@ fn what_is_no_mesh_is_refused_in_one_line() {
     let many = vec![[Point3::origin(); 3]; MAX_TRIANGLES + 1];
     let many = message(Mesh::new("many", many));
     assert_eq!(many, "mesh many: 1000001 triangles, at most 1000000; decimate the mesh");
+}
+
+#[test]
+fn files_that_stand_for_others_are_named() {
+    let parse = |name: &str, text: &str| message(Mesh::parse(name, text.as_bytes(), UpAxis::Ignore));
+    for name in ["a.stl", "a.obj", "a.dae"] {
+        let lfs = parse(name, "version https://git-lfs.github.com/spec/v1\noid sha256:12\nsize 3\n");
+        let expected = "a Git LFS pointer to a file, not the file: fetch it with `git lfs pull`";
+        assert_eq!(lfs, format!("mesh {name}: {expected}"));
+        let page = parse(name, "\n<!DOCTYPE html><html><p>404");
+        assert!(page.ends_with("as a server sends for a wrong address: download the file itself"), "{page}");
+        let sdf = parse(name, "<?xml version='1.0'?><sdf/>");
+        assert!(sdf.contains("an SDF file, of Gazebo"), "{sdf}");
+    }
+    let renamed = parse("a.stl", "<COLLADA/>");
+    assert_eq!(renamed, "mesh a.stl: a COLLADA mesh: rename it to .dae");
+    let both = parse("a.obj", "v 0 0 0\n<<<<<<< HEAD\nv 1 0 0\n=======\nv 2 0 0\n>>>>>>> main\n");
+    assert!(both.starts_with("mesh a.obj:2: a merge conflict of git: keep one side"), "{both}");
 }
 
 #[test]

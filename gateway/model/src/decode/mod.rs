@@ -179,7 +179,8 @@ struct Bus {
     name: String,
     /// Another one than that of any bus before it.
     number: u64,
-    ids: Vec<Slot>,
+    /// By identifier, of those that came: a capture may name any number of buses, each with a few of them.
+    ids: Vec<Option<Box<Slot>>>,
     /// How long joints, torques and sums are, as the joints said whose number of joints has that length.
     length: Option<Length>,
 }
@@ -254,7 +255,7 @@ impl Decoder {
         // Joints say themselves how long they are.
         let is_joints = id == Id::command(Command::Joints);
         let lengths = Lengths::of_chain(bus.length.filter(|_| !is_joints));
-        let slot = bus.ids.get_mut(usize::from(id.to_bits())).expect("11 bits");
+        let slot = bus.ids.get_mut(usize::from(id.to_bits())).expect("11 bits").get_or_insert_default();
         let mut older = Vec::new();
         let packet = match format {
             Format::Fd => Packet::from_fd(frame),
@@ -300,7 +301,7 @@ impl Decoder {
     /// What a segment is when the second one does not come any more.
     fn give_up(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
         let slots = self.buses.iter_mut().find(|it| it.number == bus).map(|bus| &mut bus.ids);
-        let slot = slots.and_then(|slots| slots.get_mut(usize::from(id.to_bits())));
+        let slot = slots.and_then(|slots| slots.get_mut(usize::from(id.to_bits()))?.as_mut());
         let Some(slot) = slot.filter(|slot| slot.waiting.front() == Some(&number)) else {
             return Decoded::Foreign(Foreign::Data(PacketError::Incomplete));
         };
@@ -317,7 +318,7 @@ impl Decoder {
                 self.buses.remove(0);
             }
             self.seen += 1;
-            let ids = vec![Slot::default(); IDS];
+            let ids = vec![None; IDS];
             self.buses.push(Bus { name: name.to_owned(), number: self.seen, ids, length: None });
             self.buses.len() - 1
         });

@@ -125,6 +125,9 @@ fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec
         }
         let limits = if joint.kind == Kind::Continuous { [-PI, PI] } else { joint.limits };
         let [lower, upper] = limits;
+        if !joint.has_limit && joint.kind != Kind::Continuous {
+            return Err(urdf.error_at(joint, Problem::NoLimit { joint: name }));
+        }
         if !(lower < upper && (upper - lower).is_finite()) {
             return Err(urdf.error_at(joint, Problem::Limits { joint: name, lower, upper }));
         }
@@ -190,7 +193,12 @@ fn table(
             if !(-MAX_LENGTH_M..MAX_LENGTH_M).contains(&value) {
                 let next = joints.get(moved.len()).map(|joint| format!("joint {:?}", joint.name));
                 let to = next.unwrap_or_else(|| format!("link {tip:?}"));
-                return Err(urdf.error(Problem::Length { row: index + 1, to, what, value }));
+                let hint = if what == "a" || what == "d" {
+                    "choose a tip nearer to the root"
+                } else {
+                    "choose a root behind that joint, or narrow its limits"
+                };
+                return Err(urdf.error(Problem::Length { row: index + 1, to, what, value, hint }));
             }
         }
     }

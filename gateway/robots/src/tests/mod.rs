@@ -5,6 +5,7 @@
 mod common;
 mod examples;
 mod foreign;
+mod mended;
 mod random;
 mod reading;
 mod refusals;

@@ -110,6 +110,14 @@ normal = [0.0, 1.0, 0.0]
     assert_eq!(urdf.link_of("<b & c>"), Ok("one_link2"));
     let poses = urdf.link_poses(&["a", "<b & c>"]).unwrap();
     assert_eq!(poses.iter().filter(|pose| pose.moves()).count(), 3);
+    // Two names that become one word.
+    let mut skin = skin;
+    for (chain, name) in skin.robot.chains.iter_mut().zip(["le ft", "le_ft"]) {
+        name.clone_into(&mut chain.name);
+    }
+    let text = written(&skin);
+    let named = Urdf::parse("robot.urdf", &text.xml).unwrap();
+    assert_eq!((named.links().count(), text.links[1][0].as_str()), (urdf.links().count(), "le_ft_2_link1"));
     let error = urdf.link_poses(&["d"]).unwrap_err().to_string();
     assert!(error.starts_with("robot.urdf: no joint \"d\" moves; the nearest are "), "{error}");
 }

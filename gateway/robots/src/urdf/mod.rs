@@ -3,6 +3,7 @@
 mod read;
 mod shape;
 mod tree;
+mod xml;
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
 
@@ -10,6 +11,7 @@ use crate::error::{Problem, RobotError};
 use crate::nearest::nearest;
 
 pub use shape::{Geometry, Shape};
+pub use xml::text;
 
 /// A checked file: its links are one tree, and each joint moves one of them.
 #[derive(Clone, Debug, PartialEq)]
@@ -26,12 +28,15 @@ pub struct Urdf {
     root: usize,
 }
 
+/// The shapes of a link; the error of a faulty one is kept until somebody asks for them.
+type Shapes = Result<Vec<Shape>, RobotError>;
+
 /// A link.
 #[derive(Clone, Debug, PartialEq)]
 struct Link {
     name: String,
-    visuals: Vec<Shape>,
-    collisions: Vec<Shape>,
+    visuals: Shapes,
+    collisions: Shapes,
     /// Index of the joint that moves it.
     parent: Option<usize>,
 }
@@ -51,6 +56,8 @@ pub(crate) struct UrdfJoint {
     pub(crate) axis: Unit<Vector3<f64>>,
     /// Lower and upper, in rad or m, as written; zero where the file says nothing.
     pub(crate) limits: [f64; 2],
+    /// The file has a `limit` element with at least one of them.
+    pub(crate) has_limit: bool,
     /// In rad/s or m/s, as written.
     pub(crate) velocity: Option<f64>,
     pub(crate) mimic: Option<Mimic>,
@@ -96,7 +103,7 @@ impl UrdfJoint {
 }
 
 impl Urdf {
-    /// Reads a file's text; `file` is its name in errors.
+    /// Reads a file's text; `file` is its name in errors. [`text`] makes it of bytes.
     ///
     /// # Errors
     /// When it is not XML or not a URDF, when a value is not what is allowed, or when its links are not one tree.
@@ -125,17 +132,17 @@ impl Urdf {
     /// What a link looks like.
     ///
     /// # Errors
-    /// When there is no such link.
+    /// When there is no such link, or one of its shapes is faulty.
     pub fn visuals(&self, link: &str) -> Result<&[Shape], RobotError> {
-        Ok(self.link(link)?.1.visuals.as_slice())
+        self.link(link)?.1.visuals.as_deref().map_err(Clone::clone)
     }
 
     /// What of a link hits things.
     ///
     /// # Errors
-    /// When there is no such link.
+    /// When there is no such link, or one of its shapes is faulty.
     pub fn collisions(&self, link: &str) -> Result<&[Shape], RobotError> {
-        Ok(self.link(link)?.1.collisions.as_slice())
+        self.link(link)?.1.collisions.as_deref().map_err(Clone::clone)
     }
 
     /// The link that a link hangs on; none of the root, or of a link that does not exist.

@@ -1,11 +1,11 @@
 //! The file's text.
 
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
-use roxmltree::{Document, Error, Node};
+use roxmltree::{Document, Node};
 
 use super::shape::{Geometry, Shape};
 use super::tree::{self, Loose, Placed};
-use super::{Kind, Link, Mimic, Urdf, UrdfJoint};
+use super::{Kind, Link, Mimic, Shapes, Urdf, UrdfJoint, xml};
 use crate::error::{Problem, RobotError};
 
 /// An axis that is shorter has no direction.
@@ -13,44 +13,38 @@ const SHORTEST_AXIS: f64 = 1e-6;
 
 /// Reads a file.
 pub(super) fn read(file: &str, xml: &str) -> Result<Urdf, RobotError> {
-    let error = |problem| RobotError::new(file, None, problem);
-    let text = xml.trim_start_matches('\u{feff}').trim_start();
-    if text.is_empty() {
-        return Err(error(Problem::Empty));
-    }
-    let document = Document::parse(text).map_err(|reason| {
-        let is_xacro = matches!(&reason, Error::UnknownNamespace(prefix, _) if prefix == "xacro");
-        error(if is_xacro { Problem::Xacro } else { Problem::Xml(reason.to_string()) })
-    })?;
-    let skipped = xml.len() - text.len();
-    let breaks = xml.match_indices('\n').map(|(at, _)| at).collect();
-    Reader { file, document: &document, skipped, breaks }.robot()
+    let prepared = xml::prepared(file, xml)?;
+    let document = xml::parsed(file, &prepared)?;
+    let breaks = prepared.text.match_indices('\n').map(|(at, _)| at).collect();
+    Reader { file, document: &document, lines_before: prepared.lines_before, breaks }.robot()
 }
 
 /// A file that is being read.
 struct Reader<'a> {
     file: &'a str,
     document: &'a Document<'a>,
-    /// Bytes before the document.
-    skipped: usize,
-    /// Where lines end.
+    /// Lines before the document.
+    lines_before: usize,
+    /// Where the document's lines end.
     breaks: Vec<usize>,
 }
 
 impl<'a> Reader<'a> {
     fn robot(&self) -> Result<Urdf, RobotError> {
         let robot = self.document.root_element();
-        // Only the name before the colon tells: files bind it to anything, and many bind it and do not use it.
-        if let Some(node) = robot.descendants().find(|node| self.source(node).starts_with("<xacro:")) {
-            return Err(self.error(node, Problem::Xacro));
-        }
-        if robot.tag_name().name() != "robot" {
-            return Err(self.error(robot, Problem::NotARobot(robot.tag_name().name().to_owned())));
+        self.refuse_xacro(robot)?;
+        let outermost = robot.tag_name().name();
+        if outermost != "robot" {
+            let kind = protocol::xml::kind_of_root(outermost).map(|kind| format!(" ({kind})"));
+            let element = format!("{outermost:?}{}", kind.unwrap_or_default());
+            return Err(self.error(robot, Problem::NotARobot(element)));
         }
         let links = self.children(robot, "link").map(|node| self.link(node));
         let links = links.collect::<Result<Vec<_>, _>>()?;
         if links.is_empty() {
-            return Err(self.error(robot, Problem::NoLinks));
+            let of_srdf = ["group", "group_state", "disable_collisions", "virtual_joint", "end_effector"];
+            let is_srdf = of_srdf.iter().any(|name| self.child(robot, name).is_some());
+            return Err(self.error(robot, if is_srdf { Problem::Srdf } else { Problem::NoLinks }));
         }
         let joints = self.children(robot, "joint").map(|node| self.joint(node));
         let joints = joints.collect::<Result<Vec<_>, _>>()?;
@@ -58,14 +52,46 @@ impl<'a> Reader<'a> {
         tree::grow(self.file, name, links, joints)
     }
 
+    /// Refuses what xacro would have replaced. Definitions that nothing uses are no reason.
+    fn refuse_xacro(&self, robot: Node<'a, 'a>) -> Result<(), RobotError> {
+        // Only the name before the colon tells: files bind it to anything, and many bind it and do not use it.
+        let is_xacro = |node: &Node<'a, 'a>| self.source(node).starts_with("<xacro:");
+        let defines =
+            |node: &Node<'a, 'a>| is_xacro(node) && matches!(node.tag_name().name(), "property" | "arg");
+        let mut any = None;
+        for node in robot.descendants().filter(is_xacro) {
+            if !defines(&node) {
+                let name = format!("element <xacro:{}>", node.tag_name().name());
+                return Err(self.xacro(node, name));
+            }
+            any = any.or(Some(node));
+        }
+        if any.is_none() {
+            return Ok(());
+        }
+        let kept = |node: &Node<'a, 'a>| !node.ancestors().any(|above| defines(&above));
+        for node in robot.descendants().filter(kept) {
+            let text = node.is_text().then(|| node.text()).flatten();
+            let values = node.attributes().map(|attribute| attribute.value());
+            if let Some(expression) = values.chain(text).find_map(expression) {
+                return Err(self.xacro(node, format!("expression {expression}")));
+            }
+        }
+        Ok(())
+    }
+
+    fn xacro(&self, node: Node<'a, 'a>, what: String) -> RobotError {
+        self.error(node, Problem::Xacro { what, file: self.file.to_owned() })
+    }
+
     fn link(&self, node: Node<'a, 'a>) -> Result<Placed, RobotError> {
         let name = self.text(node, "link", "name")?;
         let thing = format!("link {name:?}");
         let shapes = |element| {
             let shapes = self.children(node, element).map(|node| self.shape(node, &thing));
-            shapes.filter_map(Result::transpose).collect::<Result<Vec<_>, _>>()
+            shapes.filter_map(Result::transpose).collect::<Shapes>()
         };
-        let (visuals, collisions) = (shapes("visual")?, shapes("collision")?);
+        let (visuals, collisions) = (shapes("visual"), shapes("collision"));
         Ok((Link { name, visuals, collisions, parent: None }, self.line(node)))
     }
 
@@ -83,7 +109,11 @@ impl<'a> Reader<'a> {
         let geometry = match node.tag_name().name() {
             "mesh" => {
                 let path = self.text(node, thing, "filename")?;
-                let scale = self.numbers(node, thing, "scale", "three factors")?.unwrap_or([1.0; 3]);
+                if let Some(expression) = expression(&path) {
+                    return Err(self.xacro(node, format!("expression {expression}")));
+                }
+                let allowed = "three factors, as in \"0.001 0.001 0.001\"";
+                let scale = self.numbers(node, thing, "scale", allowed)?.unwrap_or([1.0; 3]);
                 Geometry::Mesh { path, scale }
             }
             "box" => {
@@ -127,6 +157,7 @@ impl<'a> Reader<'a> {
         let joint = UrdfJoint {
             origin: self.origin(node, &thing)?,
             axis: self.axis(node, &thing, kind)?,
+            has_limit: limit.is_some_and(|it| it.has_attribute("lower") || it.has_attribute("upper")),
             limits: [read("lower")?.unwrap_or_default(), read("upper")?.unwrap_or_default()],
             velocity: read("velocity")?,
             mimic: self.child(node, "mimic").map(|node| self.mimic(node, &thing)).transpose()?,
@@ -215,7 +246,8 @@ impl<'a> Reader<'a> {
     ) -> Result<Option<f64>, RobotError> {
         let Some(text) = node.attribute(attribute) else { return Ok(None) };
         let number = text.trim().parse().ok().filter(|it: &f64| !it.is_nan());
-        number.map(Some).ok_or_else(|| self.value(node, thing, attribute, text, "a number"))
+        let allowed = if text.contains(',') { "one number, with a point" } else { "a number" };
+        number.map(Some).ok_or_else(|| self.value(node, thing, attribute, text, allowed))
     }
 
     /// A value that is not allowed; where a xacro expression was left, that is what is wrong.
@@ -227,10 +259,15 @@ impl<'a> Reader<'a> {
         value: &str,
         allowed: &'static str,
     ) -> RobotError {
-        if value.contains("${") || value.contains("$(") {
-            return self.error(node, Problem::Xacro);
+        if let Some(expression) = expression(value) {
+            return self.xacro(node, format!("expression {expression}"));
         }
-        let (thing, value) = (thing.to_owned(), value.to_owned());
+        let commas = if value.contains([',', ';']) && allowed.starts_with("three") {
+            "; blanks between them, no commas"
+        } else {
+            ""
+        };
+        let (thing, value, allowed) = (thing.to_owned(), value.to_owned(), format!("{allowed}{commas}"));
         self.error(node, Problem::Value { thing, attribute, value, allowed })
     }
 
@@ -239,11 +276,20 @@ impl<'a> Reader<'a> {
     }
 
     fn line(&self, node: Node<'a, 'a>) -> u32 {
-        let at = node.range().start + self.skipped;
-        u32::try_from(self.breaks.partition_point(|end| *end < at) + 1).unwrap_or(u32::MAX)
+        let at = node.range().start;
+        let line = self.lines_before + self.breaks.partition_point(|end| *end < at) + 1;
+        u32::try_from(line).unwrap_or(u32::MAX)
     }
 
     fn error(&self, node: Node<'a, 'a>, problem: Problem) -> RobotError {
         RobotError::new(self.file, Some(self.line(node)), problem)
     }
+}
+
+/// The first expression of xacro in a value, as it is written.
+fn expression(value: &str) -> Option<&str> {
+    let begin = [value.find("${"), value.find("$(")].into_iter().flatten().min()?;
+    let rest = value.get(begin..)?;
+    let end = rest.find(['}', ')']).map_or(rest.len(), |end| end + 1);
+    rest.get(..end)
 }

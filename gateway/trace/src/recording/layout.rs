@@ -4,9 +4,10 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 
 use model::central::Central;
-use robots::word;
+use robots::{Taken, chain_words, word};
 
 use super::robot::Robot;
+use super::{TOPIC_OF_BUS, TOPIC_OF_STATE};
 
 /// What positions are relative to, where no robot says it.
 const BASE: &str = "base";
@@ -56,7 +57,8 @@ impl Layout {
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let buses: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
-        let several_chains = skin.robot.chains.len() > 1;
+        let (chain_words, mut topics) = (chain_words(skin), Taken::default());
+        let bus_words = Taken::default().give(buses.iter().map(|bus| word(bus)).collect());
         let mut patches = Vec::new();
         for (index, chain) in skin.robot.chains.iter().enumerate() {
             let on_chain = |bus: &usize| skin.buses.get(*bus).is_some_and(|bus| bus.chain == index);
@@ -69,11 +71,12 @@ impl Layout {
                 let parts = (0..buses.len()).filter(on_chain).map(|bus| (bus, on_bus(bus)));
                 let parts: Vec<_> = parts.filter(|(_, cells)| !cells.is_empty()).collect();
                 let several = parts.len() > 1;
-                let of_chain = if several_chains { format!("{}_", word(&chain.name)) } else { String::new() };
-                let link = format!("{of_chain}link{joint}");
+                let of_chain = chain_words.get(index).filter(|word| !word.is_empty());
+                let link = of_chain.map_or_else(String::new, |word| format!("{word}_"));
+                let link = format!("{link}link{joint}");
                 patches.extend(parts.into_iter().map(|(bus, cells)| {
-                    let name = buses.get(bus).filter(|_| several).map(|bus| format!("_{}", word(bus)));
-                    let topic = format!("/skin/{link}{}", name.unwrap_or_default());
+                    let name = bus_words.get(bus).filter(|_| several).map(|word| format!("_{word}"));
+                    let topic = topics.give_one(format!("/skin/{link}{}", name.unwrap_or_default()));
                     Patch { topic, link: link.clone(), bus, joint: (index, joint), cells }
                 }));
             }
@@ -108,6 +111,17 @@ impl Layout {
         Self { robot: Some(robot), ..self }
     }
 
+    /// The topics of the buses' frames, and of those latched before a file. They give way to the patches' topics and `others`:
+    /// readers know a bus by its messages.
+    #[must_use]
+    pub fn bus_topics(&self, others: impl Iterator<Item = String>) -> [Vec<String>; 2] {
+        let mut taken = Taken::default();
+        let points = |Patch { topic, .. }: &Patch| [topic.clone(), format!("{topic}/points")];
+        taken.give(others.chain(self.patches.iter().flat_map(points)).collect());
+        [TOPIC_OF_BUS, TOPIC_OF_STATE]
+            .map(|before| taken.give(self.buses.iter().map(|bus| format!("{before}{bus}")).collect()))
+    }
+
     /// Whether the poses of links are recorded at a tick.
     #[must_use]
     pub const fn poses_at(&self, tick: u64) -> bool {
@@ -133,7 +147,10 @@ impl Layout {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
+    use crate::recording::NOTES;
     use model::testing;
 
     #[test]
@@ -156,5 +173,19 @@ mod tests {
         let first = layout.patches[0].link.clone();
         assert_eq!(topics[0], format!("/skin/{first}_{}", word(&skin.buses[0].name)));
         assert_eq!(topics[1], format!("/skin/{first}_vcan_1"));
+        // Names that become one word stay apart, and topics of buses give way to all others.
+        skin.buses[0].name = "notes".to_owned();
+        skin.buses[1].name = "vcan_1".to_owned();
+        skin.buses.push(protocol::skin::Bus { name: "vcan-1".to_owned(), ..skin.buses[0].clone() });
+        let cells: Vec<_> = skin.cells.iter().filter(|cell| cell.bus == 0).cloned().collect();
+        skin.cells.extend(cells.into_iter().map(|cell| protocol::skin::Cell { bus: 2, ..cell }));
+        let layout = Layout::new(&skin);
+        let topics: BTreeSet<_> = layout.patches.iter().map(|patch| patch.topic.as_str()).collect();
+        assert_eq!(topics.len(), layout.patches.len());
+        assert!(topics.contains(format!("/skin/{first}_vcan_1_2").as_str()), "{topics:?}");
+        let others = [NOTES, "/can/torques", "/state/vcan_1"].map(str::to_owned);
+        let [can, state] = layout.bus_topics(others.into_iter());
+        assert_eq!(can, ["/can/notes_2", "/can/vcan_1", "/can/vcan-1"]);
+        assert_eq!(state, ["/state/notes", "/state/vcan_1_2", "/state/vcan-1"]);
     }
 }

@@ -9,10 +9,10 @@ mod geometry;
 #[cfg(test)]
 mod tests;
 
-use std::borrow::Cow;
 use std::collections::HashMap;
 
 use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
+use protocol::xml::{Fault, kind_of_root};
 use roxmltree::{Document, Node};
 
 use super::{Affine, MAX_TRIANGLES, MeshError, Triangle, UpAxis, syntax, too_many};
@@ -26,12 +26,19 @@ const MAX_NODES: usize = 100_000;
 
 /// The triangles of a file's scene, in m.
 pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Triangle>, MeshError> {
-    let text = text(bytes).map_err(|error| syntax(name, &error))?;
-    let document = Document::parse(text.trim_start_matches('\u{feff}').trim_start())
-        .map_err(|error| syntax(name, &error.to_string()))?;
+    let wrong = |fault: Fault| syntax(name, &fault.to_string());
+    let text = protocol::xml::text(bytes).map_err(wrong)?;
+    let prepared = protocol::xml::prepare(&text).map_err(wrong)?;
+    let document = Document::parse(&prepared.text).map_err(|error| {
+        let (all, place) = (error.to_string(), format!(" at {}", error.pos()));
+        let row = usize::try_from(error.pos().row).unwrap_or_default() + prepared.lines_before;
+        syntax(name, &format!("line {row}: {}", all.strip_suffix(place.as_str()).unwrap_or(&all)))
+    })?;
     let root = document.root_element();
     if root.tag_name().name() != "COLLADA" {
-        return Err(syntax(name, &format!("its first element is {}, not COLLADA", root.tag_name().name())));
+        let found = root.tag_name().name();
+        let kind = kind_of_root(found).map(|kind| format!(" ({kind})")).unwrap_or_default();
+        return Err(syntax(name, &format!("its first element is {found}{kind}, not COLLADA")));
     }
     let names = Names::of(name, root.descendants());
     let mut reader = Reader { name, names, geometry: HashMap::new(), visited: 0, triangles: Vec::new() };
@@ -53,27 +60,6 @@ pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Tria
         }
     }
     Ok(reader.triangles)
-}
-
-/// The file's text: in UTF-8, in UTF-16 with a byte order mark, or in Latin-1 that is declared.
-fn text(bytes: &[u8]) -> Result<Cow<'_, str>, String> {
-    let wide = |read: fn([u8; 2]) -> u16| {
-        let words: Vec<_> = bytes.as_chunks().0.iter().map(|word| read(*word)).collect();
-        String::from_utf16(&words).map(Cow::Owned).map_err(|error| error.to_string())
-    };
-    match (bytes, core::str::from_utf8(bytes)) {
-        ([0xff, 0xfe, ..], _) => wide(u16::from_le_bytes),
-        ([0xfe, 0xff, ..], _) => wide(u16::from_be_bytes),
-        (_, Ok(text)) => Ok(Cow::Borrowed(text)),
-        (_, Err(error)) => {
-            let declaration = bytes.split(|byte| *byte == b'>').next().unwrap_or_default();
-            let declaration = String::from_utf8_lossy(declaration).to_ascii_lowercase();
-            if ["iso-8859-1", "latin1", "latin-1"].iter().any(|name| declaration.contains(name)) {
-                return Ok(bytes.iter().map(|byte| char::from(*byte)).collect());
-            }
-            Err(format!("it is not UTF-8, as XML without another encoding is: {error}"))
-        }
-    }
 }
 
 /// Names without their namespace, which some files have and some have not.

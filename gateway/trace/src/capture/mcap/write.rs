@@ -1,9 +1,11 @@
 //! The entries of a capture as an MCAP recording.
 
+use std::collections::HashMap;
 use std::fs::Metadata;
 use std::io::{self, Write};
 
 use protocol::candump::{Record, Timestamp};
+use robots::Taken;
 
 use crate::capture::{Entry, Note, NoteKind};
 use crate::recording::file::{Channel, FileWriter};
@@ -31,6 +33,9 @@ const WAITING: usize = 1 << 20;
 pub(crate) struct McapWriter<W: Write> {
     file: FileWriter<W>,
     channels: Vec<BusChannel>,
+    /// By bus, its topic: of [`CHANNELS`] buses at most.
+    topics: HashMap<String, String>,
+    taken: Taken,
     /// The channel of the last frame.
     last: usize,
     notes: Option<Channel>,
@@ -75,7 +80,18 @@ impl<W: Write> McapWriter<W> {
         };
         let (key, value) = if origin.of_log { SOURCE } else { OTHER_SOURCE };
         file.metadata(ORIGIN, &[(key.to_owned(), value.to_owned())].into())?;
-        Ok(Self { file, channels: Vec::new(), last: 0, notes: None, waiting: Some(Vec::new()), bytes: 0 })
+        let mut taken = Taken::default();
+        taken.give_one(NOTES.to_owned());
+        Ok(Self {
+            file,
+            channels: Vec::new(),
+            topics: HashMap::new(),
+            taken,
+            last: 0,
+            notes: None,
+            waiting: Some(Vec::new()),
+            bytes: 0,
+        })
     }
 
     /// Writes an entry.
@@ -137,12 +153,13 @@ impl<W: Write> McapWriter<W> {
         self.last = if let Some(place) = found {
             place
         } else {
-            let topic = format!("{TOPIC_OF_BUS}{}", name.trim_start_matches('/'));
+            let wanted = || format!("{TOPIC_OF_BUS}{}", name.trim_start_matches('/'));
+            let topic = self.topics.entry(name.to_owned()).or_insert_with(|| self.taken.give_one(wanted()));
             let padded = form.min_digits.to_string();
             let facts =
                 [(TIME_DIGITS, if form.nine_digits { "9" } else { "6" }), (SECONDS_DIGITS, padded.as_str())];
             let facts = facts.get(..if form.min_digits > 1 { 2 } else { 1 }).unwrap_or_default();
-            let channel = self.file.channel::<Record<'_>>(&topic, facts)?;
+            let channel = self.file.channel::<Record<'_>>(topic, facts)?;
             self.channels.push(BusChannel { interface: name.to_owned(), form, channel });
             self.channels.len() - 1
         };

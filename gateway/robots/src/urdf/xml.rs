@@ -1,0 +1,85 @@
+//! A file's bytes as XML, and the words for what is none.
+
+use std::borrow::Cow;
+
+use protocol::xml::{Fault, Foreign, Prepared, foreign, prepare};
+use roxmltree::{Document, Error};
+
+use crate::error::{Problem, RobotError};
+
+/// The text of a file's bytes, in the encoding that it declares.
+///
+/// # Errors
+/// When it is in another encoding, or a file that stands for another one.
+pub fn text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, RobotError> {
+    refuse_foreign(file, bytes)?;
+    protocol::xml::text(bytes).map_err(|fault| error(file, fault))
+}
+
+pub(super) fn prepared<'a>(file: &str, text: &'a str) -> Result<Prepared<'a>, RobotError> {
+    refuse_foreign(file, text.as_bytes())?;
+    let prepared = prepare(text).map_err(|fault| error(file, fault))?;
+    if prepared.text.is_empty() {
+        return Err(RobotError::new(file, None, Problem::Empty));
+    }
+    if !prepared.text.starts_with('<') {
+        let line = u32::try_from(prepared.lines_before + 1).ok();
+        return Err(RobotError::new(file, line, Problem::NotXml));
+    }
+    Ok(prepared)
+}
+
+pub(super) fn parsed<'a>(file: &str, prepared: &'a Prepared<'_>) -> Result<Document<'a>, RobotError> {
+    Document::parse(&prepared.text).map_err(|reason| {
+        let is_cut =
+            matches!(reason, Error::UnclosedRootNode | Error::UnexpectedEndOfStream | Error::NoRootNode);
+        let row = usize::try_from(reason.pos().row).unwrap_or_default();
+        let row = if is_cut { prepared.text.lines().count() } else { row };
+        error(file, Fault { line: Some(prepared.lines_before + row), what: words(&reason) })
+    })
+}
+
+fn refuse_foreign(file: &str, bytes: &[u8]) -> Result<(), RobotError> {
+    let Some(Foreign { line, what, hint }) = foreign(bytes) else { return Ok(()) };
+    let line = line.and_then(|line| u32::try_from(line).ok());
+    Err(RobotError::new(file, line, Problem::Xml(format!("{what}: {hint}"))))
+}
+
+fn error(file: &str, Fault { line, what }: Fault) -> RobotError {
+    let line = line.and_then(|line| u32::try_from(line).ok());
+    RobotError::new(file, line, Problem::Xml(what))
+}
+
+/// Describes an error of the parser, and what to do.
+#[expect(clippy::wildcard_enum_match_arm, reason = "the parser's own words do for all others")]
+fn words(reason: &Error) -> String {
+    let plain = |what: &str| what.to_owned();
+    match reason {
+        Error::MalformedEntityReference(_) | Error::UnknownEntityReference(..) => {
+            plain("a & that begins no entity of XML: write &amp; for it")
+        }
+        Error::UnexpectedDeclaration(_) => {
+            plain("an XML declaration that is not at the beginning of the file: delete it")
+        }
+        Error::UnexpectedCloseTag(expected, found, _) => {
+            format!("</{found}> stands where <{expected}> is to be closed: correct one of both")
+        }
+        Error::UnclosedRootNode | Error::UnexpectedEndOfStream | Error::NoRootNode => {
+            plain("it ends before its outermost element does: it is cut off; copy or download it again")
+        }
+        Error::DuplicatedAttribute(name, _) => {
+            format!("an element has the attribute {name} twice: delete one")
+        }
+        Error::NonXmlChar(letter, _) => {
+            format!("the character U+{:04X} cannot be in XML: delete it", u32::from(*letter))
+        }
+        Error::InvalidAttributeValue(_) => plain("a < in an attribute's value: write &lt; for it"),
+        Error::InvalidCharacterData(_) => plain("]]> in a text: write ]]&gt; for it"),
+        Error::InvalidComment(_) => plain("a comment with -- in it, or that ends with -: delete it"),
+        other => {
+            let (text, place) = (other.to_string(), format!(" at {}", other.pos()));
+            let text = text.strip_suffix(place.as_str()).unwrap_or(&text);
+            format!("not XML: {text}, in column {}: correct this line", other.pos().col)
+        }
+    }
+}

@@ -1,0 +1,76 @@
+//! Files that are not what their name says.
+
+/// What a file is instead, and what to do.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Foreign {
+    /// The line, from 1, where it has one.
+    pub line: Option<usize>,
+    /// What it is.
+    pub what: &'static str,
+    /// What to do.
+    pub hint: &'static str,
+}
+
+const CONFLICT: &[u8] = b"<<<<<<< ";
+
+/// Names a file that stands for another one: a pointer of Git LFS, a saved web page, an archive, or one in which git left both
+/// sides of a conflict.
+#[must_use]
+pub fn foreign(bytes: &[u8]) -> Option<Foreign> {
+    let whole = |what, hint| Some(Foreign { line: None, what, hint });
+    let text = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes).trim_ascii_start();
+    if text.starts_with(b"version https://git-lfs") {
+        return whole("a Git LFS pointer to a file, not the file", "fetch it with `git lfs pull`");
+    }
+    let is = |begin: &[u8]| text.get(..begin.len()).is_some_and(|head| head.eq_ignore_ascii_case(begin));
+    if is(b"<!doctype html") || is(b"<html") {
+        return whole("a web page (HTML), as a server sends for a wrong address", "download the file itself");
+    }
+    for (magic, what) in [
+        (&b"PK\x03\x04"[..], "a zip archive"),
+        (b"\x1f\x8b", "a gzip file"),
+        (b"\x28\xb5\x2f\xfd", "a zstd file"),
+    ] {
+        if bytes.starts_with(magic) {
+            return whole(what, "unpack it first");
+        }
+    }
+    let conflict = bytes.split(|byte| *byte == b'\n').position(|line| line.starts_with(CONFLICT))?;
+    let hint = "keep one side, and delete the lines <<<<<<<, =======, >>>>>>> and the other side";
+    Some(Foreign { line: Some(conflict + 1), what: "a merge conflict of git", hint })
+}
+
+/// Names the format whose outermost element has this name.
+#[must_use]
+pub fn kind_of_root(name: &str) -> Option<&'static str> {
+    Some(match name {
+        "sdf" | "gazebo" | "world" => "an SDF file, of Gazebo",
+        "mujoco" => "an MJCF file, of MuJoCo",
+        "robot" => "a robot's description (URDF or SRDF)",
+        "COLLADA" => "a COLLADA mesh",
+        "svg" => "an SVG drawing",
+        "launch" => "a launch file, of ROS",
+        "package" => "a package.xml, of ROS",
+        "html" => "a web page (HTML)",
+        "Error" => "an error message of a server",
+        _ => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_that_stand_for_others_are_named() {
+        let what = |bytes: &[u8]| foreign(bytes).map(|it| (it.line, it.what.split(' ').nth(1).unwrap()));
+        assert_eq!(what(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"), Some((None, "Git")));
+        assert_eq!(what(b"\n<!DOCTYPE html>\n<html>"), Some((None, "web")));
+        assert_eq!(what(b"<HTML lang='en'>"), Some((None, "web")));
+        assert_eq!(what(b"PK\x03\x04"), Some((None, "zip")));
+        assert_eq!(what(b"<r>\n<<<<<<< HEAD\n=======\n>>>>>>> x\n</r>"), Some((Some(2), "merge")));
+        for good in [&b""[..], b"<robot/>", b"solid a", b"<r>\n <<<<<<< HEAD</r>"] {
+            assert_eq!(foreign(good), None);
+        }
+    }
+}
