@@ -40,15 +40,20 @@ fn reach<'a>(arrows: &'a BTreeMap<&str, BTreeSet<&str>>, from: &str) -> BTreeSet
     direct.flat_map(|&to| reach(arrows, to).into_iter().chain([to])).collect()
 }
 
-/// The crates of the workspace, and what each uses of the others, its tests included.
-fn used() -> BTreeMap<String, BTreeSet<String>> {
+/// Asks cargo about the workspace.
+fn metadata() -> serde_json::Value {
     let cargo = Command::new(env!("CARGO"))
         .args(["metadata", "--no-deps", "--format-version", "1", "--offline", "--manifest-path"])
         .arg(concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml"))
         .output()
         .unwrap();
     assert!(cargo.status.success(), "{}", String::from_utf8_lossy(&cargo.stderr));
-    let metadata: serde_json::Value = serde_json::from_slice(&cargo.stdout).unwrap();
+    serde_json::from_slice(&cargo.stdout).unwrap()
+}
+
+/// Lists the crates of the workspace, and what each uses of the others, its tests included.
+fn used() -> BTreeMap<String, BTreeSet<String>> {
+    let metadata = metadata();
     let packages = metadata["packages"].as_array().unwrap();
     let name = |value: &serde_json::Value| value["name"].as_str().unwrap().to_owned();
     let ours: BTreeSet<_> = packages.iter().map(name).collect();
@@ -57,6 +62,16 @@ fn used() -> BTreeMap<String, BTreeSet<String>> {
         (name(package), dependencies.map(name).filter(|name| ours.contains(name)).collect())
     };
     packages.iter().map(of).collect()
+}
+
+#[test]
+fn ten_integration_programs_are_enough() {
+    let metadata = metadata();
+    let targets =
+        metadata["packages"].as_array().unwrap().iter().flat_map(|it| it["targets"].as_array().unwrap());
+    let programs: Vec<_> =
+        targets.filter(|target| target["kind"][0] == "test").map(|it| &it["name"]).collect();
+    assert!(programs.len() <= 10, "each links most of the workspace; make modules of {programs:?}");
 }
 
 #[test]

@@ -12,9 +12,9 @@ pub struct Taken(BTreeSet<String>);
 
 impl Taken {
     /// Gives out these names, in their order. A name that is taken, also by one before it, gets a number: `name_2`.
-    pub fn give(&mut self, wanted: Vec<String>) -> Vec<String> {
-        let is_free: Vec<_> = wanted.iter().map(|name| self.0.insert(name.clone())).collect();
-        let numbered = wanted.into_iter().zip(is_free);
+    pub fn give(&mut self, requested: Vec<String>) -> Vec<String> {
+        let is_free: Vec<_> = requested.iter().map(|name| self.0.insert(name.clone())).collect();
+        let numbered = requested.into_iter().zip(is_free);
         numbered.map(|(name, is_free)| if is_free { name } else { self.numbered(&name) }).collect()
     }
 

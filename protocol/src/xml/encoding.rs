@@ -21,7 +21,8 @@ pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
     let wide = |bytes: &[u8], read: fn([u8; 2]) -> u16| {
         let words: Vec<_> = bytes.as_chunks().0.iter().map(|word| read(*word)).collect();
         let text = String::from_utf16(&words).ok().filter(|_| bytes.len().is_multiple_of(2));
-        let wrong = || "it begins as UTF-16 and is none: it is cut off or damaged; copy or download it again";
+        let wrong =
+            || "it begins as UTF-16 and is none: it is truncated or damaged; copy or download it again";
         text.map(|text| Cow::Owned(redeclared(text)))
             .ok_or_else(|| Fault { line: None, what: wrong().to_owned() })
     };
@@ -129,6 +130,6 @@ mod tests {
             refused(b"<?xml version='1.0' encoding='GBK'?>\n<r n='\xc4\xe3'/>"),
             "line 2: it is not UTF-8, declared as gbk: save it as UTF-8, as with `iconv -f gbk -t utf-8 FILE > NEW`"
         );
-        assert!(refused(b"\xff\xfe<\0r\0/\0>").contains("cut off"));
+        assert!(refused(b"\xff\xfe<\0r\0/\0>").contains("truncated"));
     }
 }

@@ -1,6 +1,6 @@
 //! XML that other programs read and a strict parser refuses, made readable; and files that are something else.
 //!
-//! [`text`] decodes a file by its byte order mark or its declaration. [`prepare`] mends what changes no value: it binds
+//! [`text`] decodes a file by its byte order mark or its declaration. [`prepare`] repairs what changes no value: it binds
 //! prefixes that the file does not, blanks comments with `--` inside and a document type without definitions, and takes
 //! NUL bytes off the end. Lines stay where they are. [`foreign`] names files that are no XML or the wrong one.
 
@@ -65,7 +65,7 @@ pub struct Prepared<'a> {
     pub lines_before: usize,
 }
 
-/// Mends what changes no value.
+/// Repairs what changes no value.
 ///
 /// # Errors
 /// When it has a document type with definitions, an element with more than [`MAX_ATTRIBUTES`] attributes, or anything behind
@@ -174,7 +174,7 @@ pub fn prepare(file: &str) -> Result<Prepared<'_>, Fault> {
     if blanked.is_empty() && unbound.is_empty() {
         return Ok(Prepared { text: Cow::Borrowed(text), lines_before });
     }
-    let mut mended = String::with_capacity(text.len() + 40 * unbound.len());
+    let mut repaired = String::with_capacity(text.len() + 40 * unbound.len());
     let mut from = 0;
     let names =
         unbound.iter().map(|prefix| format!(" xmlns:{prefix}=\"unbound:{prefix}\"")).collect::<String>();
@@ -182,23 +182,23 @@ pub fn prepare(file: &str) -> Result<Prepared<'_>, Fault> {
     let mut changes: Vec<_> = blanked.into_iter().chain(insert).collect();
     changes.sort_by_key(|range| range.start);
     for range in changes {
-        mended.push_str(text.get(from..range.start).unwrap_or_default());
+        repaired.push_str(text.get(from..range.start).unwrap_or_default());
         if range.is_empty() {
-            mended.push_str(&names);
+            repaired.push_str(&names);
         }
         let old = text.get(range.clone()).unwrap_or_default();
-        mended.extend(old.chars().map(|letter| if letter == '\n' { '\n' } else { ' ' }));
+        repaired.extend(old.chars().map(|letter| if letter == '\n' { '\n' } else { ' ' }));
         from = range.end;
     }
-    mended.push_str(text.get(from..).unwrap_or_default());
-    Ok(Prepared { text: Cow::Owned(mended), lines_before })
+    repaired.push_str(text.get(from..).unwrap_or_default());
+    Ok(Prepared { text: Cow::Owned(repaired), lines_before })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn mended(text: &str) -> String {
+    fn repaired(text: &str) -> String {
         prepare(text).unwrap().text.into_owned()
     }
 
@@ -214,17 +214,17 @@ mod tests {
         assert_eq!(prepared.text, good);
         let before = prepare("\u{feff}\n\n <r/>\n").unwrap();
         assert_eq!((&*before.text, before.lines_before), ("<r/>", 2));
-        assert_eq!(mended("<r/>\n\0\0"), "<r/>");
+        assert_eq!(repaired("<r/>\n\0\0"), "<r/>");
     }
 
     #[test]
     fn prefixes_are_bound_at_the_outermost_element() {
         assert_eq!(
-            mended("<r n='1'><a drake:x='1'/><s:b/><s:b/></r>"),
+            repaired("<r n='1'><a drake:x='1'/><s:b/><s:b/></r>"),
             "<r xmlns:drake=\"unbound:drake\" xmlns:s=\"unbound:s\" n='1'><a drake:x='1'/><s:b/><s:b/></r>"
         );
         // A binding within the file stands for what is within it only.
-        let inner = mended("<r><a xmlns:s='x'/><s:b/></r>");
+        let inner = repaired("<r><a xmlns:s='x'/><s:b/></r>");
         assert!(inner.starts_with("<r xmlns:s=\"unbound:s\">"), "{inner}");
         let many: String = (0..65).map(|number| format!("<p{number}:a/>")).collect();
         assert!(refused(&format!("<r>{many}</r>")).contains("it has 65 prefixes of names, and at most 64"));
@@ -236,9 +236,9 @@ mod tests {
 
     #[test]
     fn comments_and_document_types_are_blanked() {
-        assert_eq!(mended("<r><!-- a\n -- b --><e/></r>"), "<r>      \n         <e/></r>");
-        assert_eq!(mended("<!DOCTYPE robot>\n<r/>"), "                \n<r/>");
-        assert_eq!(mended("<!DOCTYPE r SYSTEM \"a>b.dtd\"><r/>").trim_start(), "<r/>");
+        assert_eq!(repaired("<r><!-- a\n -- b --><e/></r>"), "<r>      \n         <e/></r>");
+        assert_eq!(repaired("<!DOCTYPE robot>\n<r/>"), "                \n<r/>");
+        assert_eq!(repaired("<!DOCTYPE r SYSTEM \"a>b.dtd\"><r/>").trim_start(), "<r/>");
         assert_eq!(
             refused("\n<!DOCTYPE r [ <!ENTITY a \"]>\"> ]>\n<r/>"),
             "line 2: a <!DOCTYPE with definitions, which are not read: delete it, and write what its entities stand for in their places"

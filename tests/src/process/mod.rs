@@ -5,7 +5,9 @@
 #![allow(
     missing_docs,
     missing_debug_implementations,
+    clippy::missing_errors_doc,
     clippy::missing_panics_doc,
+    clippy::new_without_default,
     clippy::unwrap_used,
     clippy::panic,
     clippy::indexing_slicing,

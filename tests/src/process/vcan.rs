@@ -44,7 +44,7 @@ pub fn own_network() {
             let found = tool("ip -json link show vcan0").stdout;
             assert_eq!(serde_json::from_slice::<serde_json::Value>(&found).unwrap()[0]["mtu"], 72, "vcan0");
         }
-        _ => panic!("this test needs vcan in a network of its own: `tests/vcan testrelease` runs it there"),
+        _ => panic!("this test needs vcan in a network of its own: `tests/vcan` runs it there"),
     }
 }
 

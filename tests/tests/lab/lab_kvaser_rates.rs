@@ -1,7 +1,7 @@
 //! Bit rates of a real driver, set and checked, and looked at with `ip`.
 //!
 //! Needs root and the lab machine's two emulated controllers:
-//! `tests/vcan testrelease lab_kvaser_rates`.
+//! `tests/vcan lab_kvaser_rates`.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::path::Path;

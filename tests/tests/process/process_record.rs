@@ -100,7 +100,8 @@ fn everything_that_a_run_knows_is_in_its_recording() {
         let last = &recorded.on(patch).last().unwrap().value;
         let (force, status) = (numbers(&last["force"]), numbers(&last["status"]));
         assert!(force.iter().all(|force| (force - 1.5).abs() < 0.01), "{last}");
-        assert!(status.iter().all(|status| (status - 2.0).abs() < 0.5), "{last}");
+        // In contact; on a busy machine its last reply may be stale.
+        assert!(status.iter().all(|status| (2.0..=3.0).contains(status)), "{last}");
         cells += last["node"].as_array().unwrap().len();
         let points = format!("{patch}/points");
         let cloud = &recorded.on(&points).last().unwrap().value;

@@ -19,7 +19,7 @@ use protocol::parameters::MAX_JOINTS;
 const EQUAL: u64 = 32;
 /// Changes of the right words meanwhile.
 const CHANGES: u32 = 4;
-/// The least change in one of the words, in steps.
+/// The smallest change that counts in one of the words, in steps.
 const STEPS: u16 = 16;
 
 /// Kinds of words that may be stuck, as [`Stuck::longest`] names them.

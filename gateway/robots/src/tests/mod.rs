@@ -5,7 +5,7 @@
 mod common;
 mod examples;
 mod foreign;
-mod mended;
+mod not_quite_xml;
 mod random;
 mod reading;
 mod refusals;

@@ -153,8 +153,8 @@ impl<W: Write> McapWriter<W> {
         self.last = if let Some(place) = found {
             place
         } else {
-            let wanted = || format!("{TOPIC_OF_BUS}{}", name.trim_start_matches('/'));
-            let topic = self.topics.entry(name.to_owned()).or_insert_with(|| self.taken.give_one(wanted()));
+            let proposed = || format!("{TOPIC_OF_BUS}{}", name.trim_start_matches('/'));
+            let topic = self.topics.entry(name.to_owned()).or_insert_with(|| self.taken.give_one(proposed()));
             let padded = form.min_digits.to_string();
             let facts =
                 [(TIME_DIGITS, if form.nine_digits { "9" } else { "6" }), (SECONDS_DIGITS, padded.as_str())];
