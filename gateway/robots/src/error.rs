@@ -244,7 +244,7 @@ pub enum Problem {
         what: &'static str,
         /// In m.
         value: f64,
-        /// What to do.
+        /// The remedy, as an order.
         hint: &'static str,
     },
     /// The chain is longer than a cell can compute.

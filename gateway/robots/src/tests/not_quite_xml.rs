@@ -204,3 +204,10 @@ fn a_faulty_shape_is_an_error_when_it_is_used() {
         }
     }
 }
+
+#[test]
+fn a_control_character_that_the_parser_quotes_leaves_one_line() {
+    // `refused` sees that it is one.
+    let message = refused("<robot name=\"r\"><link name=\"a\" /\n></robot>");
+    assert!(message.contains("\\u{a}"), "{message}");
+}

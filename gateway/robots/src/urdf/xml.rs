@@ -2,6 +2,7 @@
 
 use std::borrow::Cow;
 
+use protocol::usage::shown;
 use protocol::xml::{Fault, Foreign, Prepared, foreign, prepare};
 use roxmltree::{Document, Error};
 
@@ -79,7 +80,7 @@ fn words(reason: &Error) -> String {
         other => {
             let (text, place) = (other.to_string(), format!(" at {}", other.pos()));
             let text = text.strip_suffix(place.as_str()).unwrap_or(&text);
-            format!("not XML: {text}, in column {}: correct this line", other.pos().col)
+            format!("not XML: {}, in column {}: correct this line", shown(text), other.pos().col)
         }
     }
 }

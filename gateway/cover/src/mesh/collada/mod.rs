@@ -12,6 +12,7 @@ mod tests;
 use std::collections::HashMap;
 
 use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
+use protocol::usage::shown;
 use protocol::xml::{Fault, kind_of_root};
 use roxmltree::{Document, Node};
 
@@ -32,7 +33,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Tria
     let document = Document::parse(&prepared.text).map_err(|error| {
         let (all, place) = (error.to_string(), format!(" at {}", error.pos()));
         let row = usize::try_from(error.pos().row).unwrap_or_default() + prepared.lines_before;
-        syntax(name, &format!("line {row}: {}", all.strip_suffix(place.as_str()).unwrap_or(&all)))
+        syntax(name, &format!("line {row}: {}", shown(all.strip_suffix(place.as_str()).unwrap_or(&all))))
     })?;
     let root = document.root_element();
     if root.tag_name().name() != "COLLADA" {
