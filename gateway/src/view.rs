@@ -306,7 +306,7 @@ pub(crate) struct Page {
     _address_file: Option<AddressFile>,
 }
 
-/// What a page shows, and whether it can act on it.
+/// A page's subject, and whether the page can act on it.
 struct Shown<'a> {
     words: Vec<&'a OsStr>,
     skin: &'a Skin,

@@ -37,7 +37,7 @@ pub struct Options {
     pub skin: Skin,
     /// The robot's surface, where it is known.
     pub surface: Vec<Shell>,
-    /// What its pages come to.
+    /// The socket that pages connect to.
     pub listener: TcpListener,
     /// Who may use it.
     pub access: Access,

@@ -53,7 +53,7 @@ pub struct Options {
     pub kinds: Kinds,
     /// Where embedded buses are, if not where they usually are.
     pub directory: Option<PathBuf>,
-    /// What its pages come to.
+    /// The socket that pages connect to.
     pub listener: TcpListener,
     /// Who may use it.
     pub access: Access,

@@ -35,7 +35,7 @@ pub struct Access {
     pub may_act: bool,
     /// There is a recording that pages may play.
     pub may_play: bool,
-    /// What every request has to carry that asks for more than the page's code.
+    /// The token of all requests that ask for more than the page's code.
     pub token: Option<Token>,
 }
 

@@ -1,13 +1,13 @@
 //! Files that are not what their name says.
 
-/// What a file is instead, and what to do.
+/// A file that stands for another one, and the remedy.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Foreign {
     /// The line, from 1, where it has one.
     pub line: Option<usize>,
-    /// What it is.
+    /// The kind of file, after "it is".
     pub what: &'static str,
-    /// What to do.
+    /// The remedy, as an order.
     pub hint: &'static str,
 }
 

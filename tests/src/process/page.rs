@@ -44,7 +44,7 @@ impl Address {
         Self { host: host.to_owned(), query: query.to_owned() }
     }
 
-    /// What a browser opens.
+    /// Returns the address that a browser opens.
     pub fn url(&self) -> String {
         format!("http://{}/{}", self.host, self.query)
     }

@@ -66,7 +66,7 @@ pub fn quantity(value: f64, unit: &str) -> String {
     interval(value, None, unit)
 }
 
-/// The same with half the width of its 95 % interval, which has two digits; the number ends at the place of the second.
+/// Formats a number and half the width of its 95 % interval: two digits of the width, and the number to the same place.
 pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
     let size = value.abs().max(half.unwrap_or(0.0));
     if !value.is_finite() || unit.is_empty() && half.is_none() {

@@ -83,9 +83,9 @@ pub enum MeshError {
         file: String,
         /// The line, from 1, where it has one.
         line: Option<usize>,
-        /// What it is.
+        /// The kind of file, after "it is".
         what: String,
-        /// What to do.
+        /// The remedy, as an order.
         hint: &'static str,
     },
     /// A part of the file is missing.

@@ -361,7 +361,7 @@ impl Table {
         }
     }
 
-    /// Whether the skin describes a sender with this identifier on this bus.
+    /// Returns true if the skin describes a sender with this identifier on this bus.
     fn is_used(&self, id: Id) -> bool {
         let is_cell = |cell: CellId| self.place(cell).is_some();
         match (id.kind, Node::from_byte(id.node)) {

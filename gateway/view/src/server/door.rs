@@ -44,12 +44,12 @@ const PIECE: usize = 4 * 1024;
 struct Visitor {
     stream: TcpStream,
     head: Vec<u8>,
-    /// What is left of its answer, once that is known.
+    /// The answer, once it is known, and the bytes of it that were sent.
     answer: Option<(Answer, usize)>,
     until: Instant,
 }
 
-/// What becomes of a visitor.
+/// The next step with a visitor.
 enum Next {
     /// It has to wait.
     Stays(Visitor),

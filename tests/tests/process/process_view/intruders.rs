@@ -15,7 +15,7 @@ use rustix::process::{Resource, Rlimit, getrlimit, getuid, setrlimit};
 use skinbus_tests::process::page::{Address, Page, address};
 use skinbus_tests::process::{PRESSED, Place, Running, Summary, program, skin};
 
-/// What each of them does, all the time.
+/// Attacks; each intruder repeats one of them.
 const KINDS: [&str; 6] = ["no token", "old token", "slow heads", "silence", "storm", "foreign host"];
 /// A user that has nothing.
 const NOBODY: u32 = 65_534;
