@@ -244,7 +244,7 @@ pub enum Problem {
         what: &'static str,
         /// In m.
         value: f64,
-        /// The remedy, as an order.
+        /// The hint, as an order.
         hint: &'static str,
     },
     /// The chain is longer than a cell can compute.

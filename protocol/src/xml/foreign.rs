@@ -1,13 +1,13 @@
 //! Files that are not what their name says.
 
-/// A file that stands for another one, and the remedy.
+/// A file that stands for another one, and a hint.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Foreign {
     /// The line, from 1, where it has one.
     pub line: Option<usize>,
     /// The kind of file, after "it is".
     pub what: &'static str,
-    /// The remedy, as an order.
+    /// The hint, as an order.
     pub hint: &'static str,
 }
 

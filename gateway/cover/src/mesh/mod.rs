@@ -85,7 +85,7 @@ pub enum MeshError {
         line: Option<usize>,
         /// The kind of file, after "it is".
         what: String,
-        /// The remedy, as an order.
+        /// The hint, as an order.
         hint: &'static str,
     },
     /// A part of the file is missing.
