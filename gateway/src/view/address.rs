@@ -1,12 +1,12 @@
 //! The file with a page's address, for scripts.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, Permissions};
 use std::io::{self, Read, Write};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use protocol::usage::{Failure, print};
-use tempfile::Builder;
-use trace::files::folder_of;
+use trace::files::WholeFile;
 
 /// The most bytes of a file that may be an address.
 const LONGEST: u64 = 4096;
@@ -28,17 +28,24 @@ impl AddressFile {
         }
         let refused =
             |error: io::Error| Failure::usage(format!("--address-file {}: {error}", path.display()));
-        if is_stream(path).map_err(refused)? {
-            let written = OpenOptions::new()
-                .write(true)
-                .open(path)
-                .and_then(|mut file| file.write_all(text.as_bytes()));
-            return written.map(|()| None).map_err(refused);
+        let is_file = fs::symlink_metadata(path).is_ok_and(|about| about.is_file());
+        if is_file && !is_address(path) {
+            let why = "it exists, and is no page's address: name another file";
+            return Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, why)));
         }
-        let file = Builder::new().prefix(".skinbus-").tempfile_in(folder_of(path));
-        let mut file = file.map_err(|error| refused(error.kind().into()))?;
-        file.write_all(text.as_bytes()).map_err(refused)?;
-        file.persist(path).map_err(|error| refused(error.error))?;
+        let (whole, mut file) = WholeFile::create(path, is_file).map_err(refused)?;
+        let is_stream = whole.is_stream();
+        let written = || -> io::Result<()> {
+            if !is_stream {
+                file.set_permissions(Permissions::from_mode(0o600))?;
+            }
+            file.write_all(text.as_bytes())?;
+            whole.finish()
+        };
+        written().map_err(refused)?;
+        if is_stream {
+            return Ok(None);
+        }
         Ok(Some(Self { path: path.to_owned(), text }))
     }
 }
@@ -52,23 +59,9 @@ impl Drop for AddressFile {
     }
 }
 
-/// Checks what a path leads to: a pipe or a terminal, else a file that may be written or replaced.
-fn is_stream(path: &Path) -> io::Result<bool> {
-    let is_link = match fs::symlink_metadata(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(false),
-        about => about?.is_symlink(),
-    };
-    let about = fs::metadata(path);
-    if about.as_ref().is_ok_and(|about| !about.is_file() && !about.is_dir()) {
-        return Ok(true);
-    }
-    let is_left =
-        || start_of(path).is_ok_and(|text| text.starts_with("http://") && text.lines().count() == 1);
-    if is_link || about.is_ok_and(|about| about.is_dir()) || !is_left() {
-        let why = "it exists, and is no page's address: name another file";
-        return Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
-    }
-    Ok(false)
+/// Checks that a file is what an earlier page has left.
+fn is_address(path: &Path) -> bool {
+    start_of(path).is_ok_and(|text| text.starts_with("http://") && text.lines().count() == 1)
 }
 
 fn start_of(path: &Path) -> io::Result<String> {
@@ -80,7 +73,7 @@ fn start_of(path: &Path) -> io::Result<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::os::unix::fs::{PermissionsExt, symlink};
+    use std::os::unix::fs::symlink;
 
     #[test]
     fn an_address_is_its_users_alone_and_goes_with_its_page() {

@@ -66,6 +66,12 @@ impl WholeFile {
         &self.path
     }
 
+    /// Returns true for what is written to as it is.
+    #[must_use]
+    pub const fn is_stream(&self) -> bool {
+        self.file.is_none()
+    }
+
     /// Gives it its name; everything has been written.
     ///
     /// # Errors
