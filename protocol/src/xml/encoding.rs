@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use super::Fault;
+use super::{Fault, line_of};
 
 /// The characters of 0x80 to 0x9F in Windows-1252.
 const WINDOWS_1252: [char; 32] = [
@@ -48,8 +48,7 @@ pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
             WINDOWS_1252.get(usize::from(byte) - 0x80).copied().unwrap_or(char::REPLACEMENT_CHARACTER)
         }),
         other => {
-            let before = bytes.get(..error.valid_up_to()).unwrap_or_default();
-            let line = before.iter().filter(|byte| **byte == b'\n').count() + 1;
+            let line = line_of(bytes, error.valid_up_to());
             let from = if matches!(other, "" | "utf-8" | "utf8" | "us-ascii") { "latin1" } else { other };
             let declared = if other.is_empty() { String::new() } else { format!(", declared as {other}") };
             let what = format!(

@@ -15,7 +15,7 @@ use std::ops::Range;
 
 pub use encoding::text;
 pub use foreign::{Foreign, foreign, kind_of_root};
-use tags::{Part, parts};
+use tags::{Part, Tag, parts};
 
 /// The most attributes of an element: a parser compares each with all others.
 pub const MAX_ATTRIBUTES: usize = 256;
@@ -36,7 +36,7 @@ pub struct Fault {
 
 impl Fault {
     fn at(text: &str, offset: usize, what: impl Into<String>) -> Self {
-        Self { line: Some(line_of(text, offset)), what: what.into() }
+        Self { line: Some(line_of(text.as_bytes(), offset)), what: what.into() }
     }
 }
 
@@ -49,10 +49,9 @@ impl fmt::Display for Fault {
     }
 }
 
-/// The line, from 1, of a place in a text.
-#[must_use]
-pub fn line_of(text: &str, offset: usize) -> usize {
-    let before = text.as_bytes().get(..offset).unwrap_or(text.as_bytes());
+/// Returns the line, from 1, of a place in a text.
+fn line_of(text: &[u8], offset: usize) -> usize {
+    let before = text.get(..offset).unwrap_or(text);
     before.iter().filter(|byte| **byte == b'\n').count() + 1
 }
 
@@ -74,124 +73,154 @@ pub fn prepare(file: &str) -> Result<Prepared<'_>, Fault> {
     let end = file.trim_end_matches(|letter: char| letter == '\0' || letter.is_whitespace()).len();
     let whole = file.get(..end).unwrap_or(file);
     let text = whole.trim_start_matches('\u{feff}').trim_start();
-    let lines_before = line_of(whole, whole.len() - text.len()) - 1;
-    let fault = |offset, what: String| {
-        let Fault { line, what } = Fault::at(text, offset, what);
-        Fault { line: line.map(|line| line + lines_before), what }
-    };
-    let mut blanked = Vec::new();
-    let (mut used, mut bound) = (BTreeSet::new(), BTreeSet::from(["xml", "xmlns"]));
-    let (mut prefixes, mut bindings) = (BTreeSet::new(), 0);
-    let (mut root, mut depth, mut is_over) = (None, 0_usize, false);
+    let before = whole.len() - text.len();
+    let mut survey = Survey::default();
     for part in parts(text) {
-        let behind = |range: &Range<usize>| {
-            let there = text.get(range.clone()).unwrap_or_default();
-            let what = "something stands behind the end of the outermost element: delete it";
-            fault(range.end - there.trim_start().len(), what.to_owned())
+        survey.take(text, part).map_err(|(offset, what)| Fault::at(whole, before + offset, what))?;
+    }
+    survey.check()?;
+    Ok(Prepared { text: survey.repaired(text), lines_before: line_of(whole.as_bytes(), before) - 1 })
+}
+
+/// The findings of one pass over the parts of a text.
+#[derive(Debug, Default)]
+struct Survey<'a> {
+    /// Comments and document types that become blanks.
+    blanked: Vec<Range<usize>>,
+    /// Prefixes of elements and attributes.
+    used: BTreeSet<&'a str>,
+    /// Prefixes that the outermost element binds.
+    bound: BTreeSet<&'a str>,
+    /// All prefixes, and how often the text binds one.
+    prefixes: BTreeSet<&'a str>,
+    bindings: usize,
+    /// The end of the outermost element's name.
+    root: Option<usize>,
+    depth: usize,
+    /// The outermost element has ended.
+    is_over: bool,
+}
+
+impl<'a> Survey<'a> {
+    /// Takes the next part; an error has the offset of what it is about.
+    fn take(&mut self, text: &str, part: Part<'a>) -> Result<(), (usize, String)> {
+        let of = |range: &Range<usize>| text.get(range.clone()).unwrap_or_default();
+        let content = match &part {
+            Part::Text(range) => Some(range).filter(|range| !of(range).trim().is_empty()),
+            Part::Close(range) => Some(range),
+            Part::Open(tag) => Some(&tag.range),
+            Part::Comment(_) | Part::Type(_) | Part::Other => None,
         };
+        if self.is_over
+            && let Some(range) = content
+        {
+            let what = "something stands behind the end of the outermost element: delete it";
+            return Err((range.end - of(range).trim_start().len(), what.to_owned()));
+        }
         match part {
             Part::Comment(range) => {
                 let inner = text.get(range.start + 4..range.end.saturating_sub(3)).unwrap_or_default();
                 if inner.contains("--") || inner.ends_with('-') {
-                    blanked.push(range);
+                    self.blanked.push(range);
                 }
             }
             Part::Type(range) => {
-                if text.get(range.clone()).unwrap_or_default().contains('[') {
+                if of(&range).contains('[') {
                     let what = "a <!DOCTYPE with definitions, which are not read: delete it, and write what its \
                                 entities stand for in their places";
-                    return Err(fault(range.start, what.to_owned()));
+                    return Err((range.start, what.to_owned()));
                 }
-                blanked.push(range);
-            }
-            Part::Text(range)
-                if is_over && !text.get(range.clone()).unwrap_or_default().trim().is_empty() =>
-            {
-                return Err(behind(&range));
+                self.blanked.push(range);
             }
             Part::Text(_) | Part::Other => {}
-            Part::Close(range) => {
-                if is_over {
-                    return Err(behind(&range));
-                }
-                depth = depth.saturating_sub(1);
-                is_over = depth == 0 && root.is_some();
+            Part::Close(_) => {
+                self.depth = self.depth.saturating_sub(1);
+                self.is_over = self.depth == 0 && self.root.is_some();
             }
-            Part::Open(tag) => {
-                if is_over {
-                    return Err(behind(&tag.range));
+            Part::Open(tag) => self.open(&tag)?,
+        }
+        Ok(())
+    }
+
+    fn open(&mut self, tag: &Tag<'a>) -> Result<(), (usize, String)> {
+        let count = tag.attributes.len();
+        if count > MAX_ATTRIBUTES {
+            let name = tag.name.chars().take(40).collect::<String>();
+            let what = format!(
+                "element {name} has {count} attributes, and at most {MAX_ATTRIBUTES} are read: delete some"
+            );
+            return Err((tag.range.start, what));
+        }
+        self.bindings += tag.attributes.iter().filter(|name| name.split(':').next() == Some("xmlns")).count();
+        let names = tag.attributes.iter().copied().chain([tag.name]);
+        for (prefix, local) in names.filter_map(|name| name.split_once(':')) {
+            if prefix == "xmlns" {
+                self.prefixes.insert(local);
+                if self.root.is_none() {
+                    self.bound.insert(local);
                 }
-                let count = tag.attributes.len();
-                if count > MAX_ATTRIBUTES {
-                    let name = tag.name.chars().take(40).collect::<String>();
-                    let what = format!(
-                        "element {name} has {count} attributes, and at most {MAX_ATTRIBUTES} are read: delete some"
-                    );
-                    return Err(fault(tag.range.start, what));
-                }
-                let names = tag.attributes.iter().copied().chain([tag.name]);
-                bindings +=
-                    tag.attributes.iter().filter(|name| name.split(':').next() == Some("xmlns")).count();
-                for (prefix, local) in names.filter_map(|name| name.split_once(':')) {
-                    if prefix == "xmlns" {
-                        prefixes.insert(local);
-                        if root.is_none() {
-                            bound.insert(local);
-                        }
-                    } else {
-                        prefixes.insert(prefix);
-                        used.insert(prefix);
-                    }
-                }
-                if root.is_none() {
-                    root = Some(tag.range.start + 1 + tag.name.len());
-                }
-                if !tag.is_empty {
-                    depth += 1;
-                } else if depth == 0 {
-                    is_over = true;
-                }
+            } else {
+                self.prefixes.insert(prefix);
+                self.used.insert(prefix);
             }
         }
-    }
-    let is_name = |prefix: &&&str| {
-        let mut letters = prefix.chars();
-        letters.next().is_some_and(|first| first.is_alphabetic() || first == '_')
-            && letters.all(|letter| letter.is_alphanumeric() || "-_.".contains(letter))
-    };
-    let unbound: Vec<_> = used.difference(&bound).filter(is_name).collect();
-    let too_many = |count: usize, what: &str, most: usize| {
-        let what =
-            format!("it has {count} {what}, and at most {most} are read: delete those that nothing needs");
-        Err(Fault { line: None, what })
-    };
-    if prefixes.len() > MAX_PREFIXES {
-        return too_many(prefixes.len(), "prefixes of names", MAX_PREFIXES);
-    }
-    if bindings > MAX_BINDINGS {
-        return too_many(bindings, "xmlns attributes", MAX_BINDINGS);
-    }
-    if blanked.is_empty() && unbound.is_empty() {
-        return Ok(Prepared { text: Cow::Borrowed(text), lines_before });
-    }
-    let mut repaired = String::with_capacity(text.len() + 40 * unbound.len());
-    let mut from = 0;
-    let names =
-        unbound.iter().map(|prefix| format!(" xmlns:{prefix}=\"unbound:{prefix}\"")).collect::<String>();
-    let insert = root.filter(|_| !unbound.is_empty()).map(|at| at..at);
-    let mut changes: Vec<_> = blanked.into_iter().chain(insert).collect();
-    changes.sort_by_key(|range| range.start);
-    for range in changes {
-        repaired.push_str(text.get(from..range.start).unwrap_or_default());
-        if range.is_empty() {
-            repaired.push_str(&names);
+        self.root.get_or_insert(tag.range.start + 1 + tag.name.len());
+        if !tag.is_empty {
+            self.depth += 1;
+        } else if self.depth == 0 {
+            self.is_over = true;
         }
-        let old = text.get(range.clone()).unwrap_or_default();
-        repaired.extend(old.chars().map(|letter| if letter == '\n' { '\n' } else { ' ' }));
-        from = range.end;
+        Ok(())
     }
-    repaired.push_str(text.get(from..).unwrap_or_default());
-    Ok(Prepared { text: Cow::Owned(repaired), lines_before })
+
+    /// Checks what a parser's time grows with.
+    fn check(&self) -> Result<(), Fault> {
+        for (count, what, most) in [
+            (self.prefixes.len(), "prefixes of names", MAX_PREFIXES),
+            (self.bindings, "xmlns attributes", MAX_BINDINGS),
+        ] {
+            if count > most {
+                let what = format!(
+                    "it has {count} {what}, and at most {most} are read: delete those that nothing needs"
+                );
+                return Err(Fault { line: None, what });
+            }
+        }
+        Ok(())
+    }
+
+    /// Binds the prefixes that the outermost element does not, and blanks what a parser refuses.
+    fn repaired(self, text: &str) -> Cow<'_, str> {
+        let unbound = self.used.difference(&self.bound).filter(|prefix| is_name(prefix));
+        let names = unbound.map(|prefix| format!(" xmlns:{prefix}=\"unbound:{prefix}\"")).collect::<String>();
+        let insert = self.root.filter(|_| !names.is_empty()).map(|at| at..at);
+        let mut changes: Vec<_> = self.blanked.into_iter().chain(insert).collect();
+        if changes.is_empty() {
+            return Cow::Borrowed(text);
+        }
+        changes.sort_by_key(|range| range.start);
+        let mut repaired = String::with_capacity(text.len() + names.len());
+        let mut from = 0;
+        for range in changes {
+            repaired.push_str(text.get(from..range.start).unwrap_or_default());
+            if range.is_empty() {
+                repaired.push_str(&names);
+            }
+            let old = text.get(range.clone()).unwrap_or_default();
+            repaired.extend(old.chars().map(|letter| if letter == '\n' { '\n' } else { ' ' }));
+            from = range.end;
+        }
+        repaired.push_str(text.get(from..).unwrap_or_default());
+        Cow::Owned(repaired)
+    }
+}
+
+/// Returns true for a prefix that a file may bind; `xml` and `xmlns` are bound to begin with.
+fn is_name(prefix: &str) -> bool {
+    let mut letters = prefix.chars();
+    !matches!(prefix, "xml" | "xmlns")
+        && letters.next().is_some_and(|first| first.is_alphabetic() || first == '_')
+        && letters.all(|letter| letter.is_alphanumeric() || "-_.".contains(letter))
 }
 
 #[cfg(test)]
