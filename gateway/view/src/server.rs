@@ -1,8 +1,8 @@
 //! The server of the page: HTTP for its files, and a WebSocket for what changes.
 //!
-//! Requests come through a [`door`], which opens to those that ask for this host, come from a page of this server, and carry the token
-//! where there is one. Behind it each page has a thread, and gets the newest snapshot whenever it can take one; a slow or stalled page
-//! holds up only its own.
+//! Requests come through a door (`door.rs`), which opens to those that ask for this host, come from a page of this server, and
+//! carry the token where there is one. Behind it each page has a thread, and gets the newest snapshot whenever it can take one; a
+//! slow or stalled page holds up only its own.
 
 mod answer;
 mod door;
