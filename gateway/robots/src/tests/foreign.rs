@@ -35,7 +35,7 @@ fn word(problem: &Problem) -> &'static str {
     let words = [
         (matches!(problem, Problem::Mimic { .. }), "mimic"),
         (matches!(problem, Problem::Kind { .. }), "floating"),
-        (matches!(problem, Problem::Limits { .. }), "limits"),
+        (matches!(problem, Problem::NoLimit { .. } | Problem::Limits { .. }), "limits"),
         (matches!(problem, Problem::Reach { .. }), "reach"),
         (matches!(problem, Problem::NoMovingJoint { .. }), "none moves"),
         (matches!(problem, Problem::TooManyJoints { .. }), "joints"),
