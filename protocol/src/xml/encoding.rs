@@ -60,6 +60,17 @@ pub fn text(bytes: &[u8]) -> Result<Cow<'_, str>, Fault> {
     }
 }
 
+/// The name by which `iconv` knows the encoding of a file in UTF-16; `None` for other encodings.
+#[must_use]
+pub fn utf16(bytes: &[u8]) -> Option<&'static str> {
+    match bytes {
+        [0xff, 0xfe, ..] | [0xfe, 0xff, ..] => Some("utf-16"),
+        [b'<', 0, b'?', 0, ..] => Some("utf-16le"),
+        [0, b'<', 0, b'?', ..] => Some("utf-16be"),
+        _ => None,
+    }
+}
+
 /// The encoding that the declaration names, in small letters.
 fn declared(bytes: &[u8]) -> Option<String> {
     let head = bytes.get(..bytes.len().min(1024)).unwrap_or_default();
@@ -106,15 +117,17 @@ mod tests {
         let dash = text(b"<?xml version='1.0' encoding='cp1252'?><r n='\x96\xfc'/>").unwrap().into_owned();
         assert!(dash.contains("n='\u{2013}\u{fc}'"), "{dash}");
         let wide = WORDS.replace("ENC", "UTF-16");
-        for mark in ["", "\u{feff}"] {
+        for (mark, names) in [("", ["utf-16le", "utf-16be"]), ("\u{feff}", ["utf-16"; 2])] {
             let words: Vec<_> = format!("{mark}{wide}").encode_utf16().collect();
             let little: Vec<_> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
             let big: Vec<_> = words.iter().flat_map(|word| word.to_be_bytes()).collect();
             assert_eq!(text(&little).unwrap(), expected);
             assert_eq!(text(&big).unwrap(), expected);
+            assert_eq!([&little, &big].map(|bytes| utf16(bytes).unwrap()), names);
         }
         // What is UTF-8 is no Latin-1, whatever it declares.
         let both = WORDS.replace("ENC", "latin1");
+        assert_eq!(utf16(both.as_bytes()), None);
         assert_eq!(text(both.as_bytes()).unwrap(), both);
     }
 

@@ -13,7 +13,7 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::ops::Range;
 
-pub use encoding::text;
+pub use encoding::{text, utf16};
 pub use foreign::{Foreign, foreign, kind_of_root};
 use tags::{Part, Tag, parts};
 

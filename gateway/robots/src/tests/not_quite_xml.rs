@@ -134,12 +134,10 @@ fn a_declared_encoding_is_read() {
     };
     let latin =
         |text: &str| text.chars().map(|letter| u8::try_from(u32::from(letter)).unwrap()).collect::<Vec<_>>();
-    let wide = |text: &str| text.encode_utf16().flat_map(u16::to_le_bytes).collect::<Vec<_>>();
     let mut expected = read(&declared("UTF-8"));
     for bytes in [
         latin(&declared("ISO-8859-1")),
         latin(&declared("windows-1252")),
-        wide(&format!("\u{feff}{}", declared("UTF-16"))),
     ] {
         let decoded = text("t.urdf", &bytes).unwrap();
         assert_eq!(decoded, declared("UTF-8"), "the declaration is of the text, too");
@@ -151,6 +149,23 @@ fn a_declared_encoding_is_read() {
         message.starts_with("t.urdf:2: it is not UTF-8, declared as utf-8: save it as UTF-8"),
         "{message}"
     );
+}
+
+#[test]
+fn utf_16_is_refused_as_by_ros_with_a_command_that_mends_it() {
+    let declared = wrap(ARM).replace("<?xml version=\"1.0\"?>", "<?xml version=\"1.0\" encoding=\"UTF-16\"?>");
+    for (mark, name) in [("\u{feff}", "utf-16"), ("", "utf-16le")] {
+        let wide: Vec<_> = format!("{mark}{declared}").encode_utf16().flat_map(u16::to_le_bytes).collect();
+        assert_eq!(
+            text("t.urdf", &wide).unwrap_err().to_string(),
+            format!(
+                "t.urdf: it is UTF-16, which ROS does not read either: save it as UTF-8, as with `iconv -f {name} -t utf-8 FILE > NEW`"
+            )
+        );
+    }
+    // The command leaves the declaration as it is.
+    assert_eq!(text("t.urdf", declared.as_bytes()).unwrap(), declared);
+    read(&declared);
 }
 
 #[test]

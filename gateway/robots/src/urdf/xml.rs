@@ -3,17 +3,24 @@
 use std::borrow::Cow;
 
 use protocol::usage::shown;
-use protocol::xml::{Fault, Foreign, Prepared, foreign, prepare};
+use protocol::xml::{Fault, Foreign, Prepared, foreign, prepare, utf16};
 use roxmltree::{Document, Error};
 
 use crate::error::{Problem, RobotError};
 
-/// The text of a file's bytes, in the encoding that it declares.
+/// The text of a file's bytes: UTF-8, or Latin-1 or Windows-1252 where it declares it. UTF-16 is refused, as by ROS's parser
+/// (urdfdom): a robot that is imported here loads there.
 ///
 /// # Errors
-/// When it is in another encoding, or a file that stands for another one.
+/// A file in another encoding, or one that stands for another file (a Git LFS pointer, a saved web page).
 pub fn text<'a>(file: &str, bytes: &'a [u8]) -> Result<Cow<'a, str>, RobotError> {
     refuse_foreign(file, bytes)?;
+    if let Some(name) = utf16(bytes) {
+        let what = format!(
+            "it is UTF-16, which ROS does not read either: save it as UTF-8, as with `iconv -f {name} -t utf-8 FILE > NEW`"
+        );
+        return Err(error(file, Fault { line: None, what }));
+    }
     protocol::xml::text(bytes).map_err(|fault| error(file, fault))
 }
 
