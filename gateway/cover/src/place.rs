@@ -9,6 +9,7 @@ use rand_pcg::Pcg64Mcg;
 
 use crate::Options;
 use crate::figures::median;
+use crate::grid::Grid;
 use crate::relax::{Field, Site};
 use crate::surface::{Sample, Surface, cell_area, real};
 
@@ -27,6 +28,13 @@ const NEAR: f64 = 0.015;
 /// What a tilted sample costs when a cell's place is chosen, per squared pitch and 1 minus the cosine: 9 degrees are
 /// worth a fifth of a pitch.
 const TILT_COST: f64 = 3.0;
+
+/// The nearest that two cells on the same side lie to each other, in pitches. Relaxation leaves a few nearer ones where a
+/// surface is folded or narrow.
+const CLOSEST: f64 = 0.6;
+
+/// The smallest cosine of the angle between the normals of two cells on the same side.
+const SAME_SIDE: f64 = 0.5;
 
 /// A place for a cell, in the link's frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -53,7 +61,7 @@ pub(crate) fn place(surface: &Surface<'_>, options: &Options, link: usize) -> Ve
     for _ in 0..TRIES {
         let mut sites = field.grow(&order, apart, dice.random_range(0.0..FRAC_PI_3));
         field.relax(&mut sites, apart);
-        let spots = spots(surface, &field, &sites, pitch);
+        let spots = thinned(spots(surface, &field, &sites, pitch), pitch);
         let Some(spacing) = spacing(&spots, pitch) else {
             return spots;
         };
@@ -67,6 +75,24 @@ pub(crate) fn place(surface: &Surface<'_>, options: &Options, link: usize) -> Ve
         apart *= (pitch / spacing).clamp(0.7, 1.3);
     }
     best.map_or_else(Vec::new, |(_, spots)| spots)
+}
+
+/// The places without those that lie nearer than [`CLOSEST`] to an earlier one on the same side.
+fn thinned(spots: Vec<Spot>, pitch: f64) -> Vec<Spot> {
+    let apart = CLOSEST * pitch;
+    let mut grid = Grid::new(apart);
+    let mut kept: Vec<Spot> = Vec::new();
+    for spot in spots {
+        let near = |other: &Spot| {
+            other.normal.dot(&spot.normal) > SAME_SIDE && (other.point - spot.point).norm() < apart
+        };
+        let is_crowded = grid.around(grid.cube(&spot.point)).filter_map(|index| kept.get(index)).any(near);
+        if !is_crowded {
+            grid.insert(&spot.point, kept.len());
+            kept.push(spot);
+        }
+    }
+    kept
 }
 
 /// The median distance from a place to the nearest one that faces about the same way, in m.

@@ -44,6 +44,13 @@ fn sound(skin: &Skin, options: &Options) {
         buses.entry(cell.bus).or_default().push(cell);
         assert!((vectors(cell).1.norm() - 1.0).abs() < 1e-9);
     }
+    for (index, cell) in skin.cells.iter().enumerate() {
+        for other in skin.cells[..index].iter().filter(|other| other.link == cell.link) {
+            let ((point, normal), (other_point, other_normal)) = (vectors(cell), vectors(other));
+            let apart = (point - other_point).norm() / options.pitch;
+            assert!(apart >= 0.6 || normal.dot(&other_normal) <= 0.5, "{apart} pitches: {cell:?} {other:?}");
+        }
+    }
     let cells: usize = skin.links.iter().map(|figures| figures.cells).sum();
     assert_eq!(skin.cells.len(), cells);
     assert_eq!(buses.len(), cells.div_ceil(options.nodes_per_bus));
