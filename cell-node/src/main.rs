@@ -42,7 +42,7 @@ struct Arguments {
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
     /// As from the factory: without parameters, and on a bus with sums without a node id, which the network and
-    /// `gateway commission` assign; what flash holds is used
+    /// `skinbus commission` assign; what flash holds is used
     #[arg(long)]
     fresh: bool,
     /// Open the bus again when it is gone, and wait for it at the start, instead of ending

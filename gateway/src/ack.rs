@@ -1,4 +1,4 @@
-//! `gateway ack`.
+//! `skinbus ack`.
 
 use std::path::PathBuf;
 
@@ -19,7 +19,7 @@ use super::output;
 /// Cells that were halted answer again from the next joints on. An argument that is the name of a file is a
 /// skin, whose buses have their formats from it; else it is a bus.
 #[derive(Args, Debug)]
-#[command(after_help = "Examples:\n  gateway ack vcan0\n  gateway ack gateway/examples/ur5-253.toml")]
+#[command(after_help = "Examples:\n  skinbus ack vcan0\n  skinbus ack gateway/examples/ur5-253.toml")]
 pub(crate) struct Ack {
     /// A bus, or a skin's description
     #[arg(value_name = "BUS|SKIN")]

@@ -1,4 +1,4 @@
-//! `gateway calibrate`.
+//! `skinbus calibrate`.
 
 mod picture;
 mod recorded;
@@ -45,9 +45,9 @@ use super::visuals::Packages;
 /// wrong use or configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway calibrate skin.toml -o found.toml && gateway commission found.toml
-  gateway calibrate skin.toml --from run.mcap --page found.html
-  gateway calibrate skin.toml --dry-run > motion.json")]
+  skinbus calibrate skin.toml -o found.toml && skinbus commission found.toml
+  skinbus calibrate skin.toml --from run.mcap --page found.html
+  skinbus calibrate skin.toml --dry-run > motion.json")]
 pub(crate) struct Calibrate {
     /// The skin's description: robot, buses and cells; poses of cells need not be right
     skin: PathBuf,
@@ -197,7 +197,7 @@ impl Calibrate {
     ) -> Result<Calibration, Failure> {
         if matches!(skin.controller.kind, ControllerKind::External { .. }) {
             return Err(Failure::usage(
-                "[controller] kind = \"external\": another program moves this robot; record it with `gateway run --record` and \
+                "[controller] kind = \"external\": another program moves this robot; record it with `skinbus run --record` and \
                  give the recording with --from",
             ));
         }
@@ -216,7 +216,7 @@ impl Calibrate {
             let last = complaints.pop().unwrap_or_else(|| "the run did not come to its end".to_owned());
             return Err(Failure::run(last));
         }
-        complaints.iter().for_each(|line| note(format_args!("gateway: {line}")));
+        complaints.iter().for_each(|line| note(format_args!("skinbus: {line}")));
         if summary.control.ticks_skipped > 0 {
             let (ticks, broadcasts) = (summary.control.ticks_skipped, summary.control.broadcasts_skipped);
             note(format_args!("the loop skipped {ticks} ticks, and {broadcasts} broadcasts with them"));

@@ -1,4 +1,4 @@
-//! `gateway cells`.
+//! `skinbus cells`.
 
 mod show;
 
@@ -30,9 +30,9 @@ const DRAW: Duration = Duration::from_millis(500);
 /// version, `.` where nothing is received.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway cells vcan0
-  gateway cells can0 --skin skin.toml --watch
-  gateway cells vcan0 --json | jq '.cells[] | select(.configured | not) | .node'")]
+  skinbus cells vcan0
+  skinbus cells can0 --skin skin.toml --watch
+  skinbus cells vcan0 --json | jq '.cells[] | select(.configured | not) | .node'")]
 pub(crate) struct Cells {
     /// The bus
     bus: String,
@@ -86,7 +86,7 @@ impl Cells {
             let (name, seconds) = (&self.bus, watch.elapsed().as_secs_f64());
             let others = match watch.others() {
                 0 => String::new(),
-                others => format!(" ({others} frames are of no cell; `gateway dump` shows them)"),
+                others => format!(" ({others} frames are of no cell; `skinbus dump` shows them)"),
             };
             return Err(Failure::run(format!(
                 "no cell sent anything on {name} for {seconds:.1} s{others}: start them, or switch them on"

@@ -1,4 +1,4 @@
-//! `gateway commission`.
+//! `skinbus commission`.
 
 mod show;
 
@@ -29,10 +29,10 @@ use super::{input, output};
 /// have not, and the table gives the reason; 2: wrong use or configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway commission skin.toml
-  gateway commission skin.toml --dry-run
-  gateway commission skin.toml --verify --json | jq '.buses[0].failed'
-  gateway commission skin.toml --node-ids as-wired.toml && gateway run as-wired.toml --no-spawn")]
+  skinbus commission skin.toml
+  skinbus commission skin.toml --dry-run
+  skinbus commission skin.toml --verify --json | jq '.buses[0].failed'
+  skinbus commission skin.toml --node-ids as-wired.toml && skinbus run as-wired.toml --no-spawn")]
 pub(crate) struct Commission {
     /// The skin's description
     skin: PathBuf,

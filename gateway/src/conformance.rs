@@ -1,4 +1,4 @@
-//! `gateway conformance`.
+//! `skinbus conformance`.
 
 mod show;
 
@@ -33,10 +33,10 @@ const LONGEST: Span = Span::from_millis(80_000);
 /// 0: nothing failed; 1: something failed, or the test could not be done; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway conformance --bus can0 --node 12
-  gateway conformance --bus can0 --node 12 --restart './relay off; sleep 0.2; ./relay on' --junit cell.xml
-  gateway conformance --bus can0 --node 12 --only CONF,COUNT-1
-  gateway conformance --bus can0 --node 12 --restore conformance-can0-12.json")]
+  skinbus conformance --bus can0 --node 12
+  skinbus conformance --bus can0 --node 12 --restart './relay off; sleep 0.2; ./relay on' --junit cell.xml
+  skinbus conformance --bus can0 --node 12 --only CONF,COUNT-1
+  skinbus conformance --bus can0 --node 12 --restore conformance-can0-12.json")]
 pub(crate) struct Conformance {
     /// The bus
     #[arg(long, value_name = "NAME")]

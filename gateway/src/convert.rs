@@ -1,4 +1,4 @@
-//! `gateway convert`.
+//! `skinbus convert`.
 
 mod live;
 mod torques;
@@ -33,19 +33,19 @@ const PIECE: usize = 1 << 18;
 /// Convert a capture: a candump log to an MCAP recording, or back; or its torques to CSV
 ///
 /// The format of IN is detected from its first bytes, that of OUT from the end of its name: .mcap is a recording, .log
-/// or .txt a candump log, - a log on standard output, .csv the torques of each epoch, as `gateway explain` computes
+/// or .txt a candump log, - a log on standard output, .csv the torques of each epoch, as `skinbus explain` computes
 /// them. Frames come back bit for bit: times, names of buses, directions, FD flags, raw
 /// DLCs, error and remote frames; comments, drop lines and lines that cannot be read keep their places. What OUT has no
 /// place for is reported. OUT appears when it is complete; of a pipe it grows, as a log under its name and as a recording
 /// under OUT.part, and has what came a tenth of a second after it came. Exit code 0: done, 1: it cannot be done, 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway convert run.mcap run.log
-  gateway convert run.mcap run-*.mcap all.log
-  gateway convert run.mcap - --plain | log2asc -I /dev/stdin vcan0
-  gateway convert run.mcap torques.csv
-  gateway convert run.log torques.csv --skin skin.toml
-  candump -L can0 | gateway convert - can0.mcap")]
+  skinbus convert run.mcap run.log
+  skinbus convert run.mcap run-*.mcap all.log
+  skinbus convert run.mcap - --plain | log2asc -I /dev/stdin vcan0
+  skinbus convert run.mcap torques.csv
+  skinbus convert run.log torques.csv --skin skin.toml
+  candump -L can0 | skinbus convert - can0.mcap")]
 pub(crate) struct Convert {
     /// A candump log or an MCAP recording, or several as one: all parts of a split one in any order, or others, which are read
     /// in the order of their first frames; - for standard input
@@ -280,7 +280,7 @@ impl Convert {
         if is_standard(&self.to) && io::stdout().is_terminal() {
             let why = "standard output is a terminal, and a log may have anything in it";
             return Err(Failure::usage(format!(
-                "-: {why}: pipe it on, name a file, or look at it with `gateway dump`"
+                "-: {why}: pipe it on, name a file, or look at it with `skinbus dump`"
             )));
         }
         let other = fs::metadata(&self.to).is_ok_and(|there| !there.is_file() && !there.is_dir());

@@ -1,4 +1,4 @@
-//! `gateway dbc`.
+//! `skinbus dbc`.
 
 use std::path::PathBuf;
 
@@ -19,9 +19,9 @@ use super::print::list;
 /// from bus to bus, so there is one file for each. Of a recording, that is the bus that it was recorded on.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway dbc gateway/examples/ur5-253.toml -o skin.dbc
-  gateway dbc skin.toml --bus can1 > can1.dbc
-  gateway dbc run.mcap -o run.dbc
+  skinbus dbc gateway/examples/ur5-253.toml -o skin.dbc
+  skinbus dbc skin.toml --bus can1 > can1.dbc
+  skinbus dbc run.mcap -o run.dbc
   candump -L vcan0 | python3 -m cantools decode -s skin.dbc")]
 pub(crate) struct Dbc {
     /// The skin's description, or a recording of a run, which has it in it

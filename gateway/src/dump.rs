@@ -1,4 +1,4 @@
-//! `gateway dump`.
+//! `skinbus dump`.
 
 mod show;
 mod table;
@@ -40,12 +40,12 @@ use super::print::{json, list};
 /// --stats there are tables at the end instead.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway dump vcan0 --kind torque --node 12
-  gateway dump run.log --kind joints,sync --from 2 --to 2.5
-  gateway dump run.mcap --contact --json | jq -c 'select(.kind == \"torque\") | [.node, .epoch, .values.torque_nm]'
-  gateway dump run.mcap run-*.mcap --stats
-  gateway dump can0 --stats --to 10
-  candump -L can0 | gateway dump - --max 100")]
+  skinbus dump vcan0 --kind torque --node 12
+  skinbus dump run.log --kind joints,sync --from 2 --to 2.5
+  skinbus dump run.mcap --contact --json | jq -c 'select(.kind == \"torque\") | [.node, .epoch, .values.torque_nm]'
+  skinbus dump run.mcap run-*.mcap --stats
+  skinbus dump can0 --stats --to 10
+  candump -L can0 | skinbus dump - --max 100")]
 pub(crate) struct Dump {
     /// A candump log or MCAP recording when there is a file of this name, - for standard input, else a bus; all parts
     /// of a split recording are one, in any order

@@ -1,4 +1,4 @@
-//! `gateway experiment`.
+//! `skinbus experiment`.
 
 mod benches;
 mod folder;
@@ -35,16 +35,16 @@ use folder::Folder;
 ///
 /// DIR gets report.html, each figure as SVG and its data as CSV, results.json with every finding beside the paper's and
 /// its verdict, and the recordings of the benches, when everything is measured; nothing is written when that fails or is
-/// interrupted. A folder that is not empty needs --force. `gateway experiment list` lists the experiments.
+/// interrupted. A folder that is not empty needs --force. `skinbus experiment list` lists the experiments.
 ///
 /// The moving arm's benches are 253 processes on an embedded bus of their own; those of scale have up to 10 000 cells, a
 /// process a bus. All of it takes about five minutes, half of that scale.
 /// Exit code 0: done, whatever the verdicts; 1: something failed, or was ended; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway experiment list
-  gateway experiment fig9 fig10 -o laws
-  gateway experiment all -o experiments")]
+  skinbus experiment list
+  skinbus experiment fig9 fig10 -o laws
+  skinbus experiment all -o experiments")]
 pub(crate) struct Experiment {
     /// Experiments, or all, or list
     #[arg(value_name = "NAME", required = true)]

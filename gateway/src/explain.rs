@@ -1,4 +1,4 @@
-//! `gateway explain`.
+//! `skinbus explain`.
 
 mod show;
 
@@ -24,10 +24,10 @@ use super::print::json;
 /// and what all of them add up to, beside the central computation. What the capture does not contain is listed.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway explain run.log --skin gateway/examples/ur5-253.toml --epoch 77
-  gateway explain run.mcap --epoch 77 --cell 12
-  gateway explain run.mcap run-*.mcap --epoch 77 --at 700
-  gateway explain run.mcap --epoch 77 --at 20 --joint 2 --json")]
+  skinbus explain run.log --skin gateway/examples/ur5-253.toml --epoch 77
+  skinbus explain run.mcap --epoch 77 --cell 12
+  skinbus explain run.mcap run-*.mcap --epoch 77 --at 700
+  skinbus explain run.mcap --epoch 77 --at 20 --joint 2 --json")]
 pub(crate) struct Explain {
     /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input
     #[arg(required = true, value_name = "FILE")]

@@ -1,4 +1,4 @@
-//! `gateway fit`.
+//! `skinbus fit`.
 
 mod text;
 
@@ -18,14 +18,14 @@ use super::print::{json, list};
 /// Compute whether a skin fits on real buses: load, time from joints to the last answer, cells and buses
 ///
 /// The worst case: all frames are taken as long as bit stuffing can make them, all cells as answering, and the bus as
-/// free of errors. Heartbeats count; commands and what only a bench sends do not. For the load of a run see `gateway
+/// free of errors. Heartbeats count; commands and what only a bench sends do not. For the load of a run see `skinbus
 /// shadow`. Default rates: those of the description where it has them for every bus, else a table over common ones.
 /// docs/reference/bus-timing.md describes the computation.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway fit gateway/examples/ur5-253.toml
-  gateway fit gateway/examples/ur5-253.toml --nominal 1M --data 5M
-  gateway skin generate --cells 253 --buses 3 > three.toml; gateway fit three.toml --nominal 500k --format classic")]
+  skinbus fit gateway/examples/ur5-253.toml
+  skinbus fit gateway/examples/ur5-253.toml --nominal 1M --data 5M
+  skinbus skin generate --cells 253 --buses 3 > three.toml; skinbus fit three.toml --nominal 500k --format classic")]
 pub(crate) struct Fit {
     /// The skin's description
     #[arg(value_name = "SKIN")]

@@ -1,4 +1,4 @@
-//! `gateway frame`: packets by hand.
+//! `skinbus frame`: packets by hand.
 
 use std::fmt::Write;
 use std::time::{Duration, Instant};
@@ -33,9 +33,9 @@ const ANSWER: Duration = Duration::from_secs(1);
 /// code 1 says that no cell for which a stimulus or a configure is meant was heard, or that one refused.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples, which press cell 12 with 3 N from the next joints on:
-  cansend vcan0 $(gateway frame configure --node 12 --write mode 1)
-  cansend vcan0 $(gateway frame stimulus --node 12 --force 3.0)
-  gateway frame stimulus --node 12 --force 3.0 --bus vcan0")]
+  cansend vcan0 $(skinbus frame configure --node 12 --write mode 1)
+  cansend vcan0 $(skinbus frame stimulus --node 12 --force 3.0)
+  skinbus frame stimulus --node 12 --force 3.0 --bus vcan0")]
 pub(crate) struct Frame {
     #[command(subcommand)]
     what: What,
@@ -53,16 +53,16 @@ pub(crate) struct Frame {
 #[derive(Debug, Subcommand)]
 enum What {
     /// Stop answering until a resume
-    #[command(after_help = "Example:\n  gateway frame halt")]
+    #[command(after_help = "Example:\n  skinbus frame halt")]
     Halt,
     /// Leave the halted state
-    #[command(after_help = "Example:\n  gateway frame resume")]
+    #[command(after_help = "Example:\n  skinbus frame resume")]
     Resume,
     /// Answer with a heartbeat when all that the last joints asked is done
-    #[command(after_help = "Example:\n  gateway frame sync")]
+    #[command(after_help = "Example:\n  skinbus frame sync")]
     Sync,
     /// Answer with the pages of counters and sensors
-    #[command(after_help = "Example:\n  gateway frame report")]
+    #[command(after_help = "Example:\n  skinbus frame report")]
     Report,
     Joints(Positions),
     Stimulus(Stimulus),
@@ -72,8 +72,8 @@ enum What {
 /// The joint positions of an epoch
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
-  gateway frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
+  skinbus frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
+  skinbus frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
 struct Positions {
     /// The number of this broadcast, 0 to 255; cells drop a repetition of the last one
     #[arg(long, value_name = "E")]
@@ -95,13 +95,13 @@ struct Angles {
 
 /// A stimulus: the contact state of a cell in test mode
 ///
-/// The cell must be in test mode: `gateway frame configure --node N --write mode 1`. A stimulus takes effect with
+/// The cell must be in test mode: `skinbus frame configure --node N --write mode 1`. A stimulus takes effect with
 /// the next joints, and holds until another one replaces it; without --force the force is 0.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway frame stimulus --node 12 --force 3.0
-  gateway frame stimulus --node everyone --epoch 7 --force 0.5 --proximity 0.9
-  gateway frame stimulus --node 12 --acceleration 0 0 1")]
+  skinbus frame stimulus --node 12 --force 3.0
+  skinbus frame stimulus --node everyone --epoch 7 --force 0.5 --proximity 0.9
+  skinbus frame stimulus --node 12 --acceleration 0 0 1")]
 struct Stimulus {
     /// The cell: a node id, or everyone
     #[arg(long, value_name = "NODE")]
@@ -152,10 +152,10 @@ struct Stimulus {
 #[command(
     verbatim_doc_comment,
     after_help = "Examples:
-  gateway frame configure --node 12 --read pose
-  gateway frame configure --node 12 --write mode 1
-  gateway frame configure --node everyone --write row2 -0.425 0 0 0
-  gateway frame configure --node 12 --write 99 1 -1 0x7FFF"
+  skinbus frame configure --node 12 --read pose
+  skinbus frame configure --node 12 --write mode 1
+  skinbus frame configure --node everyone --write row2 -0.425 0 0 0
+  skinbus frame configure --node 12 --write 99 1 -1 0x7FFF"
 )]
 struct Configure {
     /// The cell: a node id, or everyone
@@ -244,7 +244,7 @@ fn verdict(
     }
     if answers.present().is_empty() {
         return Err(Failure::run(format!(
-            "no {who} was heard on {bus} for {waited} s: `gateway cells {bus}` lists who is there; the bus' format \
+            "no {who} was heard on {bus} for {waited} s: `skinbus cells {bus}` lists who is there; the bus' format \
              may be --format {other}"
         )));
     }

@@ -299,7 +299,7 @@ impl ReceiveEnd {
             Ok(heard) => self.is_down &= !heard,
             Err(ref error) if error.may_pass() => {
                 if !std::mem::replace(&mut self.is_down, true) {
-                    output::note(format_args!("gateway: {error}; waiting"));
+                    output::note(format_args!("skinbus: {error}; waiting"));
                 }
             }
             Err(_) => {}

@@ -1,4 +1,4 @@
-//! `gateway`: the bench's command line. A module a command, each a thin layer over the crates below; errors are one line, exit codes are 0 (done),
+//! `skinbus`: the bench's command line. A module a command, each a thin layer over the crates below; errors are one line, exit codes are 0 (done),
 //! 1 (failed, or different), 2 (wrong use or configuration) and 3 (the robot was halted at the end).
 
 #![allow(
@@ -47,8 +47,9 @@ use protocol::usage::{Failure, end, one_line};
 /// Bridges a robot skin's bus to a control loop.
 #[derive(Debug, Parser)]
 #[command(
+    name = "skinbus",
     version,
-    after_help = "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.\n\nExample:\n  gateway demo"
+    after_help = "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.\n\nExample:\n  skinbus demo"
 )]
 struct Arguments {
     #[command(subcommand)]
@@ -120,7 +121,7 @@ fn main() -> ExitCode {
         Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
         Err(wrong) => Err(Failure::usage(refusal(&wrong))),
     };
-    end("gateway", done)
+    end("skinbus", done)
 }
 
 /// What clap says, in one line; where its guess would mislead, what there is instead.

@@ -1,4 +1,4 @@
-//! `gateway recover`: makes a recording whole whose writer was killed.
+//! `skinbus recover`: makes a recording whole whose writer was killed.
 
 use std::path::PathBuf;
 
@@ -16,7 +16,7 @@ use super::output::{Force, apart};
 /// it is. A run repairs by itself what earlier ones left in its recording's folder. Exit code 0: there is a new file,
 /// or nothing was wrong; 1: it cannot be done, no message came back, or fewer than are known to be lost; 2: wrong use.
 #[derive(Args, Debug)]
-#[command(after_help = "Example:\n  gateway recover run.mcap.part -o run.mcap")]
+#[command(after_help = "Example:\n  skinbus recover run.mcap.part -o run.mcap")]
 pub(crate) struct Recover {
     /// The recording: an MCAP file of any program
     file: PathBuf,

@@ -1,4 +1,4 @@
-//! `gateway replay`.
+//! `skinbus replay`.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -35,10 +35,10 @@ const RECEIVE_BUFFER: u32 = 8 << 20;
     _ => arg,
 }))]
 #[command(after_help = "Examples:
-  gateway replay run.log --only inputs --speed 0.5
-  gateway replay run.mcap --expect --spawn --lockstep
-  gateway replay run.mcap run-*.mcap --expect --spawn --lockstep
-  gateway replay foreign.log --map can0=vcan0 --max --loop 10")]
+  skinbus replay run.log --only inputs --speed 0.5
+  skinbus replay run.mcap --expect --spawn --lockstep
+  skinbus replay run.mcap run-*.mcap --expect --spawn --lockstep
+  skinbus replay foreign.log --map can0=vcan0 --max --loop 10")]
 pub(crate) struct Replay {
     /// A candump log or an MCAP recording; all parts of a split recording are one, in any order
     #[arg(required = true, value_name = "FILE")]

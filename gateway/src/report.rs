@@ -1,4 +1,4 @@
-//! `gateway report`.
+//! `skinbus report`.
 
 use std::fs;
 use std::io::{self, Write};
@@ -19,11 +19,11 @@ use super::output::{Force, apart, note};
 /// Exit code 0: the report is written; 1: it cannot be; 2: wrong use, or no recording of a run.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway report run.mcap -o run.html
-  gateway report run.mcap --svg figures --force
-  gateway report run.mcap run-*.mcap -o all.html")]
+  skinbus report run.mcap -o run.html
+  skinbus report run.mcap --svg figures --force
+  skinbus report run.mcap run-*.mcap -o all.html")]
 pub(crate) struct Report {
-    /// The recording of a run: what `gateway run SKIN --record FILE` wrote; all parts of a split one in any order
+    /// The recording of a run: what `skinbus run SKIN --record FILE` wrote; all parts of a split one in any order
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// The page; else the recording's name with .html
@@ -73,7 +73,7 @@ impl Report {
             return Err(failure);
         }
         if let Some(missing) = report.missing.as_ref().filter(|_| !report.is_damaged) {
-            note(format_args!("gateway: {}: {missing}", report.name));
+            note(format_args!("skinbus: {}: {missing}", report.name));
         }
         let figures = drawings(&report.page).count();
         let beside =

@@ -1,4 +1,4 @@
-//! `gateway run` and `gateway demo`.
+//! `skinbus run` and `skinbus demo`.
 
 mod show;
 
@@ -135,9 +135,9 @@ impl Recording {
 ///
 /// Needs nothing: the cells are processes on an embedded bus of the demonstration's own, unless SKINBUS_DIR names a
 /// directory, so any number of demonstrations and runs go on side by side. It prints the command that shows the frames on
-/// its bus, and where it records them as candump text. Exit codes are those of `gateway run`.
+/// its bus, and where it records them as candump text. Exit codes are those of `skinbus run`.
 #[derive(Args, Debug)]
-#[command(after_help = "Example:\n  gateway demo --duration 5")]
+#[command(after_help = "Example:\n  skinbus demo --duration 5")]
 pub(crate) struct Demo {
     #[command(flatten)]
     common: Common,
@@ -159,8 +159,8 @@ pub(crate) struct Demo {
 /// cells ended by an error of its own.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
-  gateway run skin.toml --duration 60 --no-spawn --candump run.log --summary run.json")]
+  skinbus run gateway/examples/ur5-253.toml --scenario gateway/examples/demo.toml
+  skinbus run skin.toml --duration 60 --no-spawn --candump run.log --summary run.json")]
 pub(crate) struct Run {
     /// The skin's description
     skin: PathBuf,
@@ -211,7 +211,7 @@ impl Demo {
         let place = options.directory.as_ref();
         let place = place.map(|path| format!("SKINBUS_DIR={} ", quoted_os(path.as_os_str())));
         let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
-        options.announced.push(format!("its frames in words: {place}gateway dump vcan0 --bus-kind {kind}"));
+        options.announced.push(format!("its frames in words: {place}skinbus dump vcan0 --bus-kind {kind}"));
         let Common { recording, summary, view, page, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
@@ -350,7 +350,7 @@ fn bench(
     lines.extend(lost.iter().map(ToString::to_string));
     let Some(last) = lines.pop() else { return Ok(()) };
     for line in lines {
-        note(format_args!("gateway: {line}"));
+        note(format_args!("skinbus: {line}"));
     }
     Err(Failure::with_code(code, last))
 }

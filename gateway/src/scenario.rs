@@ -1,4 +1,4 @@
-//! `gateway scenario check`.
+//! `skinbus scenario check`.
 
 use std::path::PathBuf;
 
@@ -32,8 +32,8 @@ enum Command {
 /// and one line with the line and column, the key, the value and what is allowed, when something is wrong.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway scenario check gateway/examples/demo.toml --skin gateway/examples/ur5-253.toml
-  gateway scenario check scenario.toml --skin skin.toml --json | jq '.events[] | select(.what == \"touch\")'")]
+  skinbus scenario check gateway/examples/demo.toml --skin gateway/examples/ur5-253.toml
+  skinbus scenario check scenario.toml --skin skin.toml --json | jq '.events[] | select(.what == \"touch\")'")]
 struct Check {
     /// The scenario's description
     file: PathBuf,

@@ -1,4 +1,4 @@
-//! `gateway sensing`.
+//! `skinbus sensing`.
 
 use bench::sensing::{open, switch};
 use clap::Args;
@@ -15,12 +15,12 @@ use super::arguments::{BusKind, FORMATS, Word, one_of};
 ///
 /// Takes effect at once, waits until every cell on the bus has confirmed it, and lists those that do not. A gateway
 /// that runs on the bus restores it: it switches a restarted cell to its last mode. Which changes count is parameter 8,
-/// which a skin has under [events]: `gateway frame configure --write events`.
+/// which a skin has under [events]: `skinbus frame configure --write events`.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway sensing vcan0 event
-  gateway sensing vcan0 continuous 62.5 --node 12
-  gateway sensing vcan0 off")]
+  skinbus sensing vcan0 event
+  skinbus sensing vcan0 continuous 62.5 --node 12
+  skinbus sensing vcan0 off")]
 pub(crate) struct Sensing {
     /// The bus
     bus: String,

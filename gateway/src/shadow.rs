@@ -1,4 +1,4 @@
-//! `gateway shadow`.
+//! `skinbus shadow`.
 
 mod show;
 
@@ -38,13 +38,13 @@ const RECEIVE_BUFFER: usize = 8 << 20;
 /// leaves out.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway shadow run.mcap
-  gateway shadow run.mcap run-*.mcap
-  gateway shadow run.log --nominal 500k --data 2M
-  gateway shadow run.mcap --rates vcan0=1M/8M --rates vcan1=500k
-  gateway shadow run.log --skin skin.toml
-  gateway shadow run.log --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
-  gateway shadow vcan0 vcan1 --duration 10")]
+  skinbus shadow run.mcap
+  skinbus shadow run.mcap run-*.mcap
+  skinbus shadow run.log --nominal 500k --data 2M
+  skinbus shadow run.mcap --rates vcan0=1M/8M --rates vcan1=500k
+  skinbus shadow run.log --skin skin.toml
+  skinbus shadow run.log --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
+  skinbus shadow vcan0 vcan1 --duration 10")]
 pub(crate) struct ShadowCommand {
     /// A candump log or MCAP recording when there is a file of this name, all parts of a split recording in any order,
     /// - for standard input, else buses

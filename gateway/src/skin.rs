@@ -1,4 +1,4 @@
-//! `gateway skin generate`, `gateway skin import`, `gateway skin check`, `gateway skin show` and `gateway skin urdf`.
+//! `skinbus skin generate`, `skinbus skin import`, `skinbus skin check`, `skinbus skin show` and `skinbus skin urdf`.
 
 mod covering;
 mod import;
@@ -48,8 +48,8 @@ enum Command {
 /// The same options give the same text; its first line is the command that generates it.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway skin generate -o skin.toml
-  gateway skin generate --cells 508 --buses 2 --format classic > skin.toml")]
+  skinbus skin generate -o skin.toml
+  skinbus skin generate --cells 508 --buses 2 --format classic > skin.toml")]
 struct Generate {
     /// The robot that wears the skin
     #[arg(long, value_parser = one_of(ROBOTS), default_value = "ur5")]
@@ -82,8 +82,8 @@ struct Generate {
 /// when something is wrong.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway skin check gateway/examples/ur5-253.toml
-  gateway skin check skin.toml --node 12")]
+  skinbus skin check gateway/examples/ur5-253.toml
+  skinbus skin check skin.toml --node 12")]
 struct Check {
     /// The skin's description
     file: PathBuf,

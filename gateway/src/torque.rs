@@ -1,4 +1,4 @@
-//! `gateway torque`.
+//! `skinbus torque`.
 
 use core::f64::consts::TAU;
 use std::path::{Path, PathBuf};
@@ -36,8 +36,8 @@ const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: 
   vcan0:12,2.5,0 -1.2 1.0 -1.4 -1.57 0
 
 Examples:
-  gateway torque skin.toml --cell 12 --force 2.5 --joints \"0 -1.2 1.0 -1.4 -1.57 0\"
-  gateway torque skin.toml --batch rows.csv --json > torques.jsonl")]
+  skinbus torque skin.toml --cell 12 --force 2.5 --joints \"0 -1.2 1.0 -1.4 -1.57 0\"
+  skinbus torque skin.toml --batch rows.csv --json > torques.jsonl")]
 pub(crate) struct Torque {
     /// The skin's description
     #[arg(value_name = "SKIN")]

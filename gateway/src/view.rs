@@ -1,4 +1,4 @@
-//! `gateway view`, and the option `--view` of runs.
+//! `skinbus view`, and the option `--view` of runs.
 
 mod address;
 mod token;
@@ -52,12 +52,12 @@ const LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 0);
 /// as far as they are found. It ends with Ctrl-C.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  gateway demo --view
-  gateway view gateway/examples/ur5-253.toml --bus-kind embedded
-  gateway view can1 --skin humanoid.toml
-  gateway view run.mcap run-*.mcap --at 12.5
-  gateway view run.log --skin skin.toml
-  gateway view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
+  skinbus demo --view
+  skinbus view gateway/examples/ur5-253.toml --bus-kind embedded
+  skinbus view can1 --skin humanoid.toml
+  skinbus view run.mcap run-*.mcap --at 12.5
+  skinbus view run.log --skin skin.toml
+  skinbus view skin.toml --listen 0.0.0.0:8100 --token-file token --read-only")]
 pub(crate) struct View {
     /// A skin's description, whose buses are listened to; or some of its buses, with --skin; or a candump log or MCAP
     /// recording, or all parts of a split one in any order

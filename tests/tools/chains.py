@@ -2,7 +2,7 @@
 
     chains.py URDF CELLS JOINTS DUMP     CELLS: link,px,py,pz,nx,ny,nz; cell i has node id i
                                          JOINTS: the chain's joints, base to tip, with commas
-                                         DUMP: `gateway dump --json --kind joints,stimulus,torque` of the recording
+                                         DUMP: `skinbus dump --json --kind joints,stimulus,torque` of the recording
 
 Each torque is compared with that of the force in the cell's last stimulus, at the positions that were broadcast in its
 epoch. Torques within 0.1 s of a stimulus are left out: the force may be the one before. Prints the number of torques, the

@@ -186,7 +186,7 @@ impl Facts {
             (false, 0) => None,
             (false, 1..) => {
                 Some(Finding::fault(format!("cells are on {on} already: {all}")).hint(
-                    "gateway run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them",
+                    "skinbus run ... --no-spawn  # and doctor ... --no-spawn, to use them; or stop them",
                 ))
             }
             (true, 0) => Some(
@@ -271,7 +271,7 @@ impl Facts {
             (true, _) => None,
             (false, true) => Some(Finding::ok("cell-node is beside vcan-setup")),
             (false, false) => Some(Finding::fault(absent).hint(
-                "cargo build --release  # in the project's folder; or name it with gateway run --cell-node",
+                "cargo build --release  # in the project's folder; or name it with skinbus run --cell-node",
             )),
         }
     }

@@ -1,4 +1,4 @@
-//! What a capture holds, in numbers: `gateway dump --stats`.
+//! What a capture holds, in numbers: `skinbus dump --stats`.
 //!
 //! ```text
 //!   frames, each decoded ──> Stats ──> Report: buses, kinds, epochs, refused frames, losses, cells

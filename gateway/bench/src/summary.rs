@@ -133,7 +133,7 @@ impl Summary {
         let first = errors.first().map_or("", String::as_str);
         let parts = files.iter().map(|file| &file.path).filter(|path| path.ends_with(".part"));
         let parts: String = parts
-            .map(|path| format!("; what was recorded is in {path}: repair it with `gateway recover {path}`"))
+            .map(|path| format!("; what was recorded is in {path}: repair it with `skinbus recover {path}`"))
             .collect();
         (!errors.is_empty() || *lost_write > 0).then(|| {
             format!("the recording is incomplete, {lost_write} frames were not written: {first}{parts}")

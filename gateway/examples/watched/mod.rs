@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 /// The release build's gateway, which lies a folder above the examples.
 pub(crate) fn gateway() -> PathBuf {
     let program = std::env::current_exe().expect("this program has a path");
-    program.parent().and_then(Path::parent).expect("it lies in a folder of the build").join("gateway")
+    program.parent().and_then(Path::parent).expect("it lies in a folder of the build").join("skinbus")
 }
 
 /// Seconds until a command has done its work, and the peak memory of its process in MB.

@@ -44,7 +44,7 @@ pub fn section() -> Section {
             "What joints, replies and heartbeats need of a bus when every cell is in contact: 62.5 epochs and 4 heartbeats of \
              each cell a second, 16 bytes in a packet, 11-bit identifiers, and as many stuff bits as a frame can have. Above \
              100 % it does not fit, whatever the order. Sums along the tree need as many frames on one shared bus. These are the \
-             numbers of gateway fit, which shows more about one skin.",
+             numbers of skinbus fit, which shows more about one skin.",
         )
         .text(format!(
             "The paper asks for time only. Transceivers drive about {NODES} nodes, one of which is the gateway: so the table has \

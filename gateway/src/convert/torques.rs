@@ -66,7 +66,7 @@ struct Rows<W: Write> {
 }
 
 impl<W: Write> Rows<W> {
-    /// The numbers are those of `gateway explain`; `first` is the time of the capture's first frame.
+    /// The numbers are those of `skinbus explain`; `first` is the time of the capture's first frame.
     #[expect(clippy::cast_precision_loss, reason = "to a nanosecond within three months")]
     fn write(&mut self, first: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
         let EpochTorque { at_ns, epoch, positions, explanation } = epoch;

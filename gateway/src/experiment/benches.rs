@@ -45,7 +45,7 @@ struct Files {
 }
 
 impl Benches {
-    /// Runs `gateway run` on the arm and reads what it recorded.
+    /// Runs `skinbus run` on the arm and reads what it recorded.
     pub(super) fn run(&self, reply: Reply, effort: Effort) -> Result<Run, Failure> {
         let name = arm::name(reply);
         let what = format!("the bench of the moving arm ({name})");
@@ -73,7 +73,7 @@ impl Benches {
         Ok(Run { rows, summary, joints })
     }
 
-    /// Runs `gateway run` on a bench of so many cells, each bus' cells in one process, and reads its summary. One that
+    /// Runs `skinbus run` on a bench of so many cells, each bus' cells in one process, and reads its summary. One that
     /// failed or was halted, as the machine cannot do it, has a summary too; one whose cells ended by an error of their own
     /// measures nothing.
     pub(super) fn scaled(&self, bench: &Bench) -> Result<Value, Failure> {
@@ -110,7 +110,7 @@ impl Benches {
         for (path, text) in [&files.skin, &files.scenario].into_iter().zip(texts) {
             write_whole(path, text, true).map_err(|error| at(what, path, &error))?;
         }
-        let own = std::env::current_exe().map_err(|error| at(what, Path::new("gateway"), &error))?;
+        let own = std::env::current_exe().map_err(|error| at(what, Path::new("skinbus"), &error))?;
         let mut command = Command::new(&own);
         command.arg("run").arg(&files.skin).arg("--scenario").arg(&files.scenario);
         command.arg("--summary").arg(&files.summary).args(["--bus-kind", "embedded", "--quiet"]);
@@ -157,7 +157,7 @@ fn at(what: &str, path: &Path, error: &dyn std::fmt::Display) -> Failure {
 fn last_words(ended: &Output) -> String {
     let said = String::from_utf8_lossy(&ended.stderr);
     let last = said.trim_end().lines().last().unwrap_or("it printed nothing").to_owned();
-    last.strip_prefix("gateway: ").map(str::to_owned).unwrap_or(last)
+    last.strip_prefix("skinbus: ").map(str::to_owned).unwrap_or(last)
 }
 
 fn read_summary(what: &str, path: &Path) -> Result<Value, Failure> {

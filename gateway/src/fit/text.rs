@@ -1,4 +1,4 @@
-//! The tables of `gateway fit`.
+//! The tables of `skinbus fit`.
 
 use analysis::fit::case::{Answers, Case};
 use analysis::fit::limits::{Limit, NODES, Need};

@@ -1,4 +1,4 @@
-//! Cells on the visual meshes of links, for `gateway skin import --cover`.
+//! Cells on the visual meshes of links, for `skinbus skin import --cover`.
 
 use std::ops::RangeInclusive;
 use std::path::Path;

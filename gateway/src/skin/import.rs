@@ -1,4 +1,4 @@
-//! `gateway skin import`.
+//! `skinbus skin import`.
 
 use std::path::{Path, PathBuf};
 
@@ -28,10 +28,10 @@ if it is to be given, its bus and its node id:
   link5,0.05,0,-0.1,1,0,0,vcan0,1
 
 Examples:
-  gateway skin import panda.urdf --tip hand --cells cells.csv -o panda.toml
-  gateway skin import panda.urdf --tip hand --cover link5,link6 -o panda.toml
-  gateway skin import two-arms.urdf --tip left_hand --tip right_hand -o both.toml
-  gateway run panda.toml --duration 10"
+  skinbus skin import panda.urdf --tip hand --cells cells.csv -o panda.toml
+  skinbus skin import panda.urdf --tip hand --cover link5,link6 -o panda.toml
+  skinbus skin import two-arms.urdf --tip left_hand --tip right_hand -o both.toml
+  skinbus run panda.toml --duration 10"
 )]
 pub(super) struct Import {
     /// The robot's description; of a xacro file, what `xacrodoc FILE -o ROBOT.urdf` writes
@@ -114,7 +114,7 @@ impl Import {
     /// What made the skin, with the files' names alone.
     fn command(&self) -> String {
         let name = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-        let mut command = format!("gateway skin import {}", name(&self.urdf));
+        let mut command = format!("skinbus skin import {}", name(&self.urdf));
         for tip in &self.tip {
             command += &format!(" --tip {tip}");
         }

@@ -1,4 +1,4 @@
-//! `gateway skin show`.
+//! `skinbus skin show`.
 
 use std::path::{Path, PathBuf};
 
@@ -24,7 +24,7 @@ const SHORTEST: f64 = 1e-6;
 /// Each joint stands as near to 0 as its limits allow. If the skin has robot.urdf, the robot's links are drawn too, as far as
 /// their meshes are found; else lines lead from frame to frame. FILE.html#vcan1:72 shows node 72 of vcan1.
 #[derive(Args, Debug)]
-#[command(after_help = "Example:\n  gateway skin show skin.toml -o skin.html")]
+#[command(after_help = "Example:\n  skinbus skin show skin.toml -o skin.html")]
 pub(super) struct Show {
     /// The skin's description
     #[arg(value_name = "SKIN")]

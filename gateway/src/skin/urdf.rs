@@ -1,4 +1,4 @@
-//! `gateway skin urdf`.
+//! `skinbus skin urdf`.
 
 use std::path::PathBuf;
 
@@ -15,7 +15,7 @@ use super::super::output::{Force, apart};
 /// axis, with the limits of the skin; fixed rows are fixed joints, and a link `tip` is behind the last row. A link is drawn as a
 /// cylinder. Two chains that begin with the same rows share links; the controller's max_speed is the joints' velocity.
 #[derive(Args, Debug)]
-#[command(after_help = "Example:\n  gateway skin urdf skin.toml -o robot.urdf")]
+#[command(after_help = "Example:\n  skinbus skin urdf skin.toml -o robot.urdf")]
 pub(super) struct Urdf {
     /// The skin's description
     #[arg(value_name = "SKIN")]

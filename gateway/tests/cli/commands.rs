@@ -1,4 +1,4 @@
-//! `gateway dump`, `frame`, `ack` and `skin` as processes.
+//! `skinbus dump`, `frame`, `ack` and `skin` as processes.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod live;
@@ -25,7 +25,7 @@ const DOCUMENT: &str = concat!(
 const FD: &str = include_str!("../../../protocol/tests/golden/fd.log");
 
 fn gateway(arguments: &str) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(arguments.split(' ').filter(|word| !word.is_empty()));
     command.env("NO_COLOR", "1").env("SKINBUS_DIR", "/nowhere/skinbus");
     command
@@ -266,15 +266,15 @@ fn wrong_use_is_one_line_and_exit_code_2() {
         ("dump nosuch.mcap", "there is no file nosuch.mcap, and no bus of that name: say where the file is"),
         ("dump a/b.log", "there is no file a/b.log, and no bus of that name: say where the file is"),
     ] {
-        assert_eq!(refusal(arguments, 2), format!("gateway: {expected}"), "{arguments}");
+        assert_eq!(refusal(arguments, 2), format!("skinbus: {expected}"), "{arguments}");
     }
     for command in ["dump", "ack"] {
         let said = refusal(&format!("{command} nosuch --bus-kind embedded"), 2);
-        let expected = "gateway: there is no file nosuch, and as a bus: no embedded bus nosuch is served in ";
+        let expected = "skinbus: there is no file nosuch, and as a bus: no embedded bus nosuch is served in ";
         assert!(said.starts_with(expected), "{said}");
     }
     let said = refusal("list", 2);
-    assert!(said.starts_with("gateway: there is no command list; there are demo, run, "), "{said}");
+    assert!(said.starts_with("skinbus: there is no command list; there are demo, run, "), "{said}");
     assert!(said.contains(", cells, "), "{said}");
     let skin = format!("{}/Cargo.toml", env!("CARGO_MANIFEST_DIR"));
     let said = refusal(&format!("dump {skin}"), 1);
@@ -299,7 +299,7 @@ fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
     let nowhere = directory.path().join("none/skin.toml");
     let nowhere = format!("-o {}", nowhere.display());
     let why = "No such file or directory (os error 2); name a file in a folder that can be written";
-    assert_eq!(refusal(&format!("{generate} {nowhere}"), 2), format!("gateway: {nowhere}: {why}"));
+    assert_eq!(refusal(&format!("{generate} {nowhere}"), 2), format!("skinbus: {nowhere}: {why}"));
 
     let shown = output(gateway(&format!("skin check {}", file.display())));
     let (hash, lines): (Vec<_>, Vec<_>) = shown.lines().partition(|line| line.starts_with("hash: "));
@@ -380,10 +380,10 @@ fn what_is_wrong_with_a_scenario_has_a_line_and_a_column() {
         text(&stderr).trim_end().to_owned()
     };
     let wrong = said("[[touch]]\ncells = [1, 9]\nforce_n = 3.0\n");
-    assert_eq!(wrong, "gateway: s.toml:2:13: touch[0].cells[1] = 9: no cell of \"vcan0\" has this node");
+    assert_eq!(wrong, "skinbus: s.toml:2:13: touch[0].cells[1] = 9: no cell of \"vcan0\" has this node");
     let drop = "[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\n";
     let refused = said(drop);
-    assert!(refused.starts_with("gateway: the fault \"drop\" of vcan0 at 1 s: a run"), "{refused}");
+    assert!(refused.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s: a run"), "{refused}");
 }
 
 #[test]
@@ -427,7 +427,7 @@ fn a_check_refuses_what_a_recorded_run_would_refuse() {
     {
         std::fs::write(&skin, with(urdf)).unwrap();
         let said = refusal(&format!("skin check {}", skin.display()), 2);
-        assert!(said.starts_with("gateway: robot.urdf: ") && said.contains(why), "{said}");
+        assert!(said.starts_with("skinbus: robot.urdf: ") && said.contains(why), "{said}");
     }
 }
 

@@ -1,4 +1,4 @@
-//! `gateway convert` as a process: its errors for bad input, and the files on the disk afterwards.
+//! `skinbus convert` as a process: its errors for bad input, and the files on the disk afterwards.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 mod public;
@@ -31,7 +31,7 @@ impl Folder {
     }
 
     fn gateway(&self, arguments: &str) -> Command {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+        let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
         command.args(arguments.split(' ').filter(|word| !word.is_empty())).current_dir(self.0.path());
         command
     }
@@ -151,15 +151,15 @@ fn what_is_no_capture_is_refused_by_its_name() {
     let folder = Folder::new(&files);
     assert_eq!(
         folder.refuses("convert run.zip run.mcap", 2),
-        "gateway: run.zip is a zip archive, and no candump log or MCAP recording: unpack it first"
+        "skinbus: run.zip is a zip archive, and no candump log or MCAP recording: unpack it first"
     );
     assert_eq!(
         folder.refuses("convert empty.log run.mcap", 1),
-        "gateway: empty.log: it is empty: there is no frame in it"
+        "skinbus: empty.log: it is empty: there is no frame in it"
     );
     assert_eq!(
         folder.refuses("convert words.txt run.mcap", 1),
-        "gateway: words.txt: there is no frame in 3 lines; what candump prints or logs is read: \
+        "skinbus: words.txt: there is no frame in 3 lines; what candump prints or logs is read: \
          lines like `(1700000000.123456) vcan0 123#00` or `vcan0  123   [1]  00`"
     );
     assert!(folder.refuses("convert run.pcapng run.mcap", 2).contains("is a packet capture"));
@@ -181,14 +181,14 @@ fn what_is_no_capture_is_refused_by_its_name() {
     }
     assert_eq!(
         folder.refuses("convert empty.mcap run.log", 1),
-        "gateway: empty.mcap: there is no frame in it"
+        "skinbus: empty.mcap: there is no frame in it"
     );
     let gone = folder.refuses("convert gone.log run.mcap", 2);
-    assert_eq!(gone, "gateway: gone.log: No such file or directory (os error 2)");
-    assert_eq!(folder.refuses("convert . run.mcap", 2), "gateway: .: it is a folder, a file is needed");
+    assert_eq!(gone, "skinbus: gone.log: No such file or directory (os error 2)");
+    assert_eq!(folder.refuses("convert . run.mcap", 2), "skinbus: .: it is a folder, a file is needed");
     let nowhere = "No such file or directory (os error 2); name a file in a folder that can be written";
     let said = folder.refuses("convert words.txt none/run.mcap", 2);
-    assert_eq!(said, format!("gateway: none/run.mcap: {nowhere}"));
+    assert_eq!(said, format!("skinbus: none/run.mcap: {nowhere}"));
 }
 
 #[test]
@@ -197,7 +197,7 @@ fn a_bad_line_is_named_and_kept_and_with_strict_it_is_the_end() {
     let folder = Folder::new(&[("run.log", log.as_bytes())]);
     assert_eq!(
         folder.refuses("convert run.log run.mcap --strict", 1),
-        "gateway: run.log:2: column 4: digits of a second; without --strict it would be kept as it is"
+        "skinbus: run.log:2: column 4: digits of a second; without --strict it would be kept as it is"
     );
     assert_eq!(
         folder.says("convert run.log run.mcap", 0),
@@ -236,11 +236,11 @@ fn an_output_that_exists_is_left_alone_unless_it_is_to_be_overwritten() {
     let folder = Folder::new(&[("run.log", LOG.as_bytes()), ("run.mcap", b"precious")]);
     assert_eq!(
         folder.refuses("convert run.log run.mcap", 2),
-        "gateway: run.mcap: it exists: name another file, or overwrite it with --force"
+        "skinbus: run.mcap: it exists: name another file, or overwrite it with --force"
     );
     assert_eq!(
         folder.refuses("convert run.log . --force", 2),
-        "gateway: .: a name that ends in .mcap is a recording, in .log or .txt a candump log, in .csv its torques, and - is \
+        "skinbus: .: a name that ends in .mcap is a recording, in .log or .txt a candump log, in .csv its torques, and - is \
          standard output"
     );
     folder.says("convert run.log run.mcap --force", 0);
@@ -252,19 +252,19 @@ fn an_output_that_exists_is_left_alone_unless_it_is_to_be_overwritten() {
 fn what_makes_no_sense_is_refused() {
     let folder = Folder::new(&[("run.log", LOG.as_bytes())]);
     let usage = |arguments| folder.refuses(arguments, 2);
-    assert!(usage("convert run.log run.asc").starts_with("gateway: run.asc: a name that ends in .mcap"));
+    assert!(usage("convert run.log run.asc").starts_with("skinbus: run.asc: a name that ends in .mcap"));
     assert_eq!(
         usage("convert run.log run.mcap --plain"),
-        "gateway: --plain is for a candump log: a recording keeps everything"
+        "skinbus: --plain is for a candump log: a recording keeps everything"
     );
     assert!(
-        usage("convert run.log run.mcap --digits 9").starts_with("gateway: --digits is for a candump log")
+        usage("convert run.log run.mcap --digits 9").starts_with("skinbus: --digits is for a candump log")
     );
     assert!(usage("convert run.log run.txt --digits 7").contains("[possible values: 6, 9]"));
     folder.says("convert run.log run.mcap", 0);
     assert_eq!(
         folder.refuses("convert run.mcap again.mcap", 2),
-        "gateway: run.mcap is an MCAP recording already: copy it"
+        "skinbus: run.mcap is an MCAP recording already: copy it"
     );
 }
 
@@ -296,7 +296,7 @@ fn of_a_recording_without_its_end_all_that_is_there_is_converted_and_that_is_sai
         link_down.lines().count()
     );
     let strict = folder.refuses("convert cut.mcap strict.log --strict", 1);
-    assert_eq!(format!("{strict}\n"), format!("gateway: {expected}"));
+    assert_eq!(format!("{strict}\n"), format!("skinbus: {expected}"));
 }
 
 #[test]
@@ -308,7 +308,7 @@ fn a_damaged_recording_is_refused_and_leaves_nothing() {
     fs::write(folder.path("bad.mcap"), &bytes).unwrap();
     let said = folder.refuses("convert bad.mcap bad.log", 1);
     assert!(
-        said.starts_with("gateway: bad.mcap is damaged: ") && said.contains(" notes before that were read; "),
+        said.starts_with("skinbus: bad.mcap is damaged: ") && said.contains(" notes before that were read; "),
         "{said}"
     );
     // What is before the damage can be had as text.
@@ -323,7 +323,7 @@ fn a_full_disk_is_said_and_a_reader_may_leave() {
     let folder = Folder::new(&[]);
     recording(&folder);
     let said = folder.refuses("convert long.mcap /dev/full", 1);
-    assert!(said.starts_with("gateway: /dev/full: No space left on device"), "{said}");
+    assert!(said.starts_with("skinbus: /dev/full: No space left on device"), "{said}");
     let mut child =
         folder.gateway("convert long.mcap -").stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     drop(child.stdout.take());

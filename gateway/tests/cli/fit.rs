@@ -1,4 +1,4 @@
-//! `gateway fit` as a process: its output as in the documents, and its errors.
+//! `skinbus fit` as a process: its output as in the documents, and its errors.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::path::Path;
@@ -9,7 +9,7 @@ use serde_json::Value;
 const BUS_MD: &str = include_str!("../../../docs/how-to/size-a-bus.md");
 
 fn gateway(arguments: &str) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
     command.args(arguments.split_whitespace()).current_dir(root).env("NO_COLOR", "1").output().unwrap()
 }
@@ -94,7 +94,7 @@ fn what_can_does_not_allow_is_refused_in_one_line() {
             "--data is for CAN FD, and here all buses are classic: leave it out, or add --format fd",
         ),
     ] {
-        assert_eq!(refusal(&format!("fit {skin} {arguments}")), format!("gateway: {said}"));
+        assert_eq!(refusal(&format!("fit {skin} {arguments}")), format!("skinbus: {said}"));
     }
     for arguments in ["--data 5M", "--nominal fast --data 5M", "--table --nominal 1M", "--computation nan"] {
         assert!(refusal(&format!("fit {skin} {arguments}")).ends_with("try '--help'"));

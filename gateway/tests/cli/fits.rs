@@ -57,7 +57,7 @@ impl Files {
     }
 
     fn gateway(&self, arguments: &str) -> String {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+        let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
         command.args(arguments.split(' ')).current_dir(self.0.path()).env("NO_COLOR", "1");
         let Output { status, stdout, stderr } = command.output().unwrap();
         let said = String::from_utf8(stderr).unwrap();

@@ -1,4 +1,4 @@
-//! Traffic of other people, and damaged traffic of ours, read by `gateway dump`.
+//! Traffic of other people, and damaged traffic of ours, read by `skinbus dump`.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 mod traffic;
@@ -235,7 +235,7 @@ fn identifiers_are_bounded_and_what_is_beyond_them_is_counted() {
 }
 
 fn gateway(folder: &Path, arguments: &str) -> String {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(arguments.split(' ')).current_dir(folder).env("NO_COLOR", "1");
     let Output { status, stdout, stderr } = command.output().unwrap();
     let said = String::from_utf8(stderr).unwrap();

@@ -1,4 +1,4 @@
-//! `gateway dbc`, `gateway explain`, and the parts of `gateway dump` that are not lines, as processes.
+//! `skinbus dbc`, `skinbus explain`, and the parts of `skinbus dump` that are not lines, as processes.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::path::Path;
@@ -7,7 +7,7 @@ use std::process::{Command, Output};
 use tempfile::TempDir;
 
 fn gateway(folder: &Path, arguments: &str) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(arguments.split(' ').filter(|word| !word.is_empty())).current_dir(folder);
     command.env("NO_COLOR", "1").env("SKINBUS_DIR", "/nowhere/skinbus").output().unwrap()
 }
@@ -50,12 +50,12 @@ fn a_dbc_goes_to_standard_output_or_into_a_file_that_is_not_there_yet() {
     let written = || std::fs::read_to_string(folder.join("one.dbc")).unwrap();
     assert_eq!(written(), text);
     let said = refusal(folder, "dbc classic.toml --joined -o one.dbc", 2);
-    assert_eq!(said, "gateway: -o one.dbc: it exists: name another file, or overwrite it with --force");
+    assert_eq!(said, "skinbus: -o one.dbc: it exists: name another file, or overwrite it with --force");
     assert_eq!(written(), text);
     output(folder, "dbc classic.toml --joined -o one.dbc --force");
     assert!(written().contains("Classic: a packet travels in frames of up to 8 bytes under one identifier"));
     let said = refusal(folder, "dbc one.toml -o nowhere/one.dbc", 2);
-    assert!(said.starts_with("gateway: -o nowhere/one.dbc: "), "{said}");
+    assert!(said.starts_with("skinbus: -o nowhere/one.dbc: "), "{said}");
     assert!(said.ends_with("; name a file in a folder that can be written"), "{said}");
 }
 
@@ -65,7 +65,7 @@ fn a_recording_without_a_skin_is_refused() {
     std::fs::write(folder.path().join("run.log"), "(1.000000) vcan0 123#00\n").unwrap();
     assert!(gateway(folder.path(), "convert run.log run.mcap").status.success());
     let said = refusal(folder.path(), "dbc run.mcap", 2);
-    assert_eq!(said, "gateway: run.mcap has no skin in it: name the skin's own file");
+    assert_eq!(said, "skinbus: run.mcap has no skin in it: name the skin's own file");
 }
 
 #[test]
@@ -74,10 +74,10 @@ fn of_several_buses_one_is_chosen() {
     let folder = folder.path();
     let said = refusal(folder, "dbc two.toml", 2);
     let expected =
-        "gateway: two.toml has 2 buses, and a DBC describes one: add --bus with one of vcan0, vcan1";
+        "skinbus: two.toml has 2 buses, and a DBC describes one: add --bus with one of vcan0, vcan1";
     assert_eq!(said, expected);
     let said = refusal(folder, "dbc two.toml --bus can7", 2);
-    assert_eq!(said, "gateway: two.toml has no bus \"can7\"; its buses are vcan0, vcan1");
+    assert_eq!(said, "skinbus: two.toml has no bus \"can7\"; its buses are vcan0, vcan1");
     for bus in ["vcan0", "vcan1"] {
         let text = output(folder, &format!("dbc two.toml --bus {bus}"));
         assert!(text.contains(&format!("BA_ \"DBName\" \"{bus}\";")), "{text}");
@@ -89,12 +89,12 @@ fn a_classic_bus_is_described_only_as_joined_packets() {
     let folder = skins();
     let folder = folder.path();
     let said = refusal(folder, "dbc classic.toml", 2);
-    let expected = "gateway: bus vcan0 is classic: a packet is several frames under one identifier, which a \
+    let expected = "skinbus: bus vcan0 is classic: a packet is several frames under one identifier, which a \
                     DBC cannot tell apart; --joined describes their bytes joined, for a program that joins them \
                     first";
     assert_eq!(said, expected);
     let said = refusal(folder, "dbc one.toml --joined", 2);
-    assert_eq!(said, "gateway: --joined is for classic buses; on vcan0 a packet is one FD frame");
+    assert_eq!(said, "skinbus: --joined is for classic buses; on vcan0 a packet is one FD frame");
 }
 
 /// Where a golden log is.
@@ -140,7 +140,7 @@ fn a_capture_in_numbers_is_a_table_or_an_object() {
         assert!(table.contains(part), "{part}: {table}");
     }
     let said = refusal(folder, "dump small.log --stats --kind torque", 2);
-    assert_eq!(said, "gateway: the argument '--stats' cannot be used with '--kind <KIND>'; try '--help'");
+    assert_eq!(said, "skinbus: the argument '--stats' cannot be used with '--kind <KIND>'; try '--help'");
 }
 
 #[test]
@@ -170,7 +170,7 @@ fn with_strict_the_first_line_that_cannot_be_read_is_the_end() {
     let log = "(1.000000) vcan0 002##50000000000000000000000000000632A\n(1.000000) vcan0 12#11\n(1.0) x\n";
     std::fs::write(folder.join("odd.log"), log).unwrap();
     let Output { status, stdout, stderr } = gateway(folder, "dump odd.log --strict");
-    let said = "gateway: odd.log:2: column 18: an identifier of 3 or 8 hexadecimal digits\n";
+    let said = "skinbus: odd.log:2: column 18: an identifier of 3 or 8 hexadecimal digits\n";
     assert_eq!((status.code(), std::str::from_utf8(&stderr)), (Some(1), Ok(said)));
     assert_eq!(std::str::from_utf8(&stdout).unwrap().lines().count(), 1);
     let Output { status, stdout, .. } = gateway(folder, "dump odd.log");
@@ -336,7 +336,7 @@ fn what_cannot_be_explained_is_one_line() {
             "invalid value '256' for '--epoch <N>': 256 is not in 0..=255; try '--help'",
         ),
     ] {
-        assert_eq!(refusal(folder, arguments, code), format!("gateway: {expected}"), "{arguments}");
+        assert_eq!(refusal(folder, arguments, code), format!("skinbus: {expected}"), "{arguments}");
     }
 }
 
@@ -346,7 +346,7 @@ fn the_skin_is_the_one_in_the_recording() {
     let folder = folder.path();
     assert_eq!(gateway(folder, "convert run.log run.mcap").status.code(), Some(0));
     let said = refusal(folder, "explain run.mcap --epoch 7", 2);
-    assert_eq!(said, "gateway: run.mcap has no skin in it: name one with --skin");
+    assert_eq!(said, "skinbus: run.mcap has no skin in it: name one with --skin");
     let mcap = output(folder, "explain run.mcap --skin skin.toml --epoch 7 --json");
     let log = output(folder, "explain run.log --skin skin.toml --epoch 7 --json");
     assert_eq!(mcap.replace("run.mcap", "run.log"), log);

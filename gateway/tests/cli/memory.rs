@@ -11,7 +11,7 @@ const BOUND: &str = "--as=700000000";
 
 fn bounded(folder: &Path, line: &str) -> Output {
     let mut command = Command::new("prlimit");
-    command.args([BOUND, "--", env!("CARGO_BIN_EXE_gateway")]).args(line.split(' '));
+    command.args([BOUND, "--", env!("CARGO_BIN_EXE_skinbus")]).args(line.split(' '));
     command.current_dir(folder).output().unwrap()
 }
 

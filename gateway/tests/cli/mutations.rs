@@ -43,7 +43,7 @@ fn run(folder: &Path, line: &str) -> (ExitStatus, String) {
     let said = File::create(folder.join("said")).unwrap();
     let mut command = Command::new("sh");
     command.args(["-c", "ulimit -v $1 && shift && exec \"$@\"", "sh", ADDRESSES]);
-    command.arg(env!("CARGO_BIN_EXE_gateway")).args(line.split(' '));
+    command.arg(env!("CARGO_BIN_EXE_skinbus")).args(line.split(' '));
     command.current_dir(folder).env("SKINBUS_DIR", folder.join("bus")).env("RUST_BACKTRACE", "0");
     let mut child = command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(said).spawn().unwrap();
     let began = Instant::now();

@@ -14,7 +14,7 @@ fn recordings() -> PathBuf {
 
 /// Standard output of a command that has nothing to complain of.
 fn output(arguments: &str) -> String {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(arguments.split(' ')).current_dir(recordings()).env("NO_COLOR", "1").env("COLUMNS", "100");
     let Output { status, stdout, stderr } = command.output().unwrap();
     let said = String::from_utf8(stderr).unwrap();
@@ -78,7 +78,7 @@ fn another_skin_than_the_recorded_one_is_remarked() {
     let said = |skin: &str, command: &str| {
         let path = folder.path().join("skin.toml");
         fs::write(&path, skin).unwrap();
-        let mut gateway = Command::new(env!("CARGO_BIN_EXE_gateway"));
+        let mut gateway = Command::new(env!("CARGO_BIN_EXE_skinbus"));
         gateway.args(command.split(' ')).arg("--skin").arg(path).current_dir(recordings());
         String::from_utf8(gateway.output().unwrap().stderr).unwrap()
     };

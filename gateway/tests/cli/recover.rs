@@ -383,7 +383,7 @@ fn what_is_no_recording_is_named() {
 }
 
 fn gateway(folder: &Path, words: &str) -> Output {
-    let program = env!("CARGO_BIN_EXE_gateway");
+    let program = env!("CARGO_BIN_EXE_skinbus");
     Command::new(program).args(words.split(' ')).current_dir(folder).output().unwrap()
 }
 
@@ -422,7 +422,7 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
     let begun = usize::try_from(Summary::read(&bytes).unwrap().unwrap().chunk_indexes[1].chunk_start_offset);
     fs::write(path("begun.mcap"), &bytes[..begun.unwrap() + 40]).unwrap();
     let said = says("recover begun.mcap", 1);
-    assert!(said.starts_with("gateway: begun.mcap: no message came back: 0 messages"), "{said}");
+    assert!(said.starts_with("skinbus: begun.mcap: no message came back: 0 messages"), "{said}");
     assert!(!path("begun-recovered.mcap").exists());
     let index = Summary::read(&bytes).unwrap().unwrap().chunk_indexes;
     let [from, to] = [1, 4].map(|at| usize::try_from(index[at].chunk_start_offset).unwrap());
@@ -435,23 +435,23 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
             && said.contains(" 20 of 100 messages"),
         "{said}"
     );
-    let exists = "gateway: -o there.mcap: it exists: name another file, or overwrite it with --force";
+    let exists = "skinbus: -o there.mcap: it exists: name another file, or overwrite it with --force";
     assert_eq!(says("recover run.mcap.part -o there.mcap", 2), exists);
     assert_eq!(fs::read_to_string(path("there.mcap")).unwrap(), "somebody's");
     says("recover run.mcap.part -o there.mcap --force", 0);
     assert_eq!(messages(&fs::read(path("there.mcap")).unwrap()).len(), 40);
-    let itself = "gateway: -o whole.mcap is a file that this command reads: name another file";
+    let itself = "skinbus: -o whole.mcap is a file that this command reads: name another file";
     assert_eq!(says("recover whole.mcap -o whole.mcap --force", 2), itself);
     assert!(
         says("recover a.zip", 1)
-            .starts_with("gateway: a.zip: it is no MCAP file: it begins with 50 4b 03 04")
+            .starts_with("skinbus: a.zip: it is no MCAP file: it begins with 50 4b 03 04")
     );
     assert!(says("recover gone.mcap", 2).contains("gone.mcap: No such file"));
-    let nowhere = "gateway: -o none/new.mcap: No such file or directory (os error 2); name a file in a folder that can be \
+    let nowhere = "skinbus: -o none/new.mcap: No such file or directory (os error 2); name a file in a folder that can be \
                    written";
     assert_eq!(says("recover run.mcap.part -o none/new.mcap", 2), nowhere);
     let held = fs::File::open(path("run.mcap.part")).unwrap();
     rustix::fs::flock(&held, rustix::fs::FlockOperation::LockExclusive).unwrap();
-    let recorded = "gateway: run.mcap.part is being recorded: wait for the run's end";
+    let recorded = "skinbus: run.mcap.part is being recorded: wait for the run's end";
     assert_eq!(says("recover run.mcap.part", 2), recorded);
 }

@@ -1,4 +1,4 @@
-//! `gateway report` as a process: its errors for files that are no recording of a run, and the files on the disk afterwards.
+//! `skinbus report` as a process: its errors for files that are no recording of a run, and the files on the disk afterwards.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::fs;
@@ -10,7 +10,7 @@ use tempfile::TempDir;
 const LOG: &str = "(1.000001) vcan0 123#11\n(2.000000) vcan0 22C##5AABB\n";
 
 fn gateway(folder: &Path, arguments: &str) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(arguments.split(' ')).current_dir(folder).output().unwrap()
 }
 
@@ -32,7 +32,7 @@ fn refuses(folder: &TempDir, arguments: &str, code: i32) -> String {
         "{arguments}: {said}"
     );
     assert_eq!(names(folder.path()), before, "{arguments}");
-    said.trim_end().strip_prefix("gateway: ").unwrap().to_owned()
+    said.trim_end().strip_prefix("skinbus: ").unwrap().to_owned()
 }
 
 #[test]
@@ -44,7 +44,7 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
     write("begun.mcap", b"\x89MCAP0\r\n");
     write("picture.mcap", b"PK\x03\x04 and more");
     assert!(gateway(folder.path(), "convert run.log foreign.mcap").status.success());
-    let made = "`gateway run SKIN --record run.mcap` makes what a report needs";
+    let made = "`skinbus run SKIN --record run.mcap` makes what a report needs";
     assert_eq!(refuses(&folder, "empty.mcap", 2), format!("empty.mcap holds no run: it is empty; {made}"));
     assert_eq!(
         refuses(&folder, "foreign.mcap", 2),

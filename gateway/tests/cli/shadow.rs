@@ -1,4 +1,4 @@
-//! `gateway shadow` as a process: whole, cut-off, empty and foreign recordings, and what it refuses.
+//! `skinbus shadow` as a process: whole, cut-off, empty and foreign recordings, and what it refuses.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
 use std::fmt::Write as _;
@@ -13,7 +13,7 @@ use serde_json::Value;
 const CORPUS: &[u8] = include_bytes!("../../../protocol/tests/golden/candump_corpus.log");
 
 fn gateway(folder: &Path, arguments: &str) -> (Option<i32>, String, String) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(arguments.split(' ')).current_dir(folder).env("SKINBUS_DIR", "/nowhere/skinbus");
     let Output { status, stdout, stderr } = command.output().unwrap();
     (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
@@ -107,22 +107,22 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
     }
     fs::write(folder.path().join("run.log"), log()).unwrap();
     for (arguments, code, begin) in [
-        ("shadow empty.log", 1, "gateway: empty.log: it is empty: there is no frame in it"),
-        ("shadow notes.txt", 1, "gateway: notes.txt: there is no frame in 1 line; what candump prints"),
-        ("shadow x.zip", 2, "gateway: x.zip is "),
-        ("shadow .", 2, "gateway: . is a directory"),
-        ("shadow nowhere", 2, "gateway: there is no file nowhere, and as a bus: "),
-        ("shadow run.log notes.txt", 2, "gateway: notes.txt has no frame in it: name captures alone"),
+        ("shadow empty.log", 1, "skinbus: empty.log: it is empty: there is no frame in it"),
+        ("shadow notes.txt", 1, "skinbus: notes.txt: there is no frame in 1 line; what candump prints"),
+        ("shadow x.zip", 2, "skinbus: x.zip is "),
+        ("shadow .", 2, "skinbus: . is a directory"),
+        ("shadow nowhere", 2, "skinbus: there is no file nowhere, and as a bus: "),
+        ("shadow run.log notes.txt", 2, "skinbus: notes.txt has no frame in it: name captures alone"),
         (
             "shadow run.log vcan0",
             2,
-            "gateway: run.log, vcan0: one file, the parts of one recording, or buses",
+            "skinbus: run.log, vcan0: one file, the parts of one recording, or buses",
         ),
-        ("shadow run.log --duration 3", 2, "gateway: --duration is for live buses"),
-        ("shadow run.log --nominal 2M", 2, "gateway: nominal bit rate 2000000 bit/s: CAN allows"),
-        ("shadow run.log --data 9M", 2, "gateway: data bit rate 9000000 bit/s: CAN FD allows"),
-        ("shadow run.log --rates can0=1M/9M", 2, "gateway: invalid value 'can0=1M/9M'"),
-        ("shadow run.log --ber 2", 2, "gateway: --ber: bit-error rate 2: 0 to 0.01"),
+        ("shadow run.log --duration 3", 2, "skinbus: --duration is for live buses"),
+        ("shadow run.log --nominal 2M", 2, "skinbus: nominal bit rate 2000000 bit/s: CAN allows"),
+        ("shadow run.log --data 9M", 2, "skinbus: data bit rate 9000000 bit/s: CAN FD allows"),
+        ("shadow run.log --rates can0=1M/9M", 2, "skinbus: invalid value 'can0=1M/9M'"),
+        ("shadow run.log --ber 2", 2, "skinbus: --ber: bit-error rate 2: 0 to 0.01"),
     ] {
         let (got, text, said) = gateway(folder.path(), arguments);
         assert_eq!(

@@ -22,7 +22,7 @@ fn place() -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
     mknodat(CWD, path("fifo"), FileType::Fifo, Mode::from_raw_mode(0o600), 0).unwrap();
-    let skin = Command::new(env!("CARGO_BIN_EXE_gateway"))
+    let skin = Command::new(env!("CARGO_BIN_EXE_skinbus"))
         .args(["skin", "generate", "--cells", "3"])
         .output()
         .unwrap();
@@ -38,7 +38,7 @@ fn place() -> TempDir {
 fn command(folder: &Path, line: &str) -> Command {
     // A shell starts what it puts in the background with SIGINT ignored, and children inherit that.
     let mut command = Command::new("env");
-    command.args(["--default-signal=INT,TERM", env!("CARGO_BIN_EXE_gateway")]).args(line.split(' '));
+    command.args(["--default-signal=INT,TERM", env!("CARGO_BIN_EXE_skinbus")]).args(line.split(' '));
     command.current_dir(folder).env("SKINBUS_DIR", folder.join("bus")).stdin(Stdio::null());
     command
 }

@@ -1,4 +1,4 @@
-//! `gateway convert RUN.mcap torques.csv`: each row beside `gateway explain --json` of its epoch.
+//! `skinbus convert RUN.mcap torques.csv`: each row beside `skinbus explain --json` of its epoch.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(clippy::float_cmp, reason = "0, and counts")]
 
@@ -19,7 +19,7 @@ fn recordings() -> PathBuf {
 }
 
 fn gateway(folder: &Path, arguments: &str) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(arguments.split(' ').filter(|word| !word.is_empty())).current_dir(folder).output().unwrap()
 }
 
@@ -59,7 +59,7 @@ fn same(one: f64, other: &Value) -> bool {
     (one - other).abs() <= 4e-16 * other.abs()
 }
 
-/// Compares rows with what `gateway explain` says of their epochs; how many torques were not 0.
+/// Compares rows with what `skinbus explain` says of their epochs; how many torques were not 0.
 fn compared(folder: &TempDir, rows: &[Row], capture: &str) -> usize {
     let (mut loaded, mut next) = (0, 0.0);
     for row in rows.iter().step_by(EACH).chain(rows.last()) {
@@ -159,28 +159,28 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
     fs::write(folder.path().join("foreign.log"), "(1.000001) can7 123#11\n").unwrap();
     fs::write(folder.path().join("mine.csv"), "mine").unwrap();
     for (arguments, code, line) in [
-        ("classic.log out.csv", 2, "gateway: classic.log has no skin in it: name one with --skin"),
+        ("classic.log out.csv", 2, "skinbus: classic.log has no skin in it: name one with --skin"),
         (
             "foreign.log out.csv --skin fd.toml",
             1,
-            "gateway: foreign.log: none of its buses (can7) is one of the skin's (vcan0)",
+            "skinbus: foreign.log: none of its buses (can7) is one of the skin's (vcan0)",
         ),
-        ("- out.csv", 2, "gateway: standard input is read once: name the skin with --skin"),
-        ("fd.mcap out.csv --plain", 2, "gateway: --plain is for a candump log, and out.csv is a CSV file"),
+        ("- out.csv", 2, "skinbus: standard input is read once: name the skin with --skin"),
+        ("fd.mcap out.csv --plain", 2, "skinbus: --plain is for a candump log, and out.csv is a CSV file"),
         (
             "fd.mcap out.log --skin fd.toml",
             2,
-            "gateway: --skin fd.toml is for torques: name an OUT that ends in .csv",
+            "skinbus: --skin fd.toml is for torques: name an OUT that ends in .csv",
         ),
         (
             "fd.mcap mine.csv",
             2,
-            "gateway: mine.csv: it exists: name another file, or overwrite it with --force",
+            "skinbus: mine.csv: it exists: name another file, or overwrite it with --force",
         ),
         (
             "fd.mcap fd.csv/out.csv",
             2,
-            "gateway: fd.csv/out.csv: No such file or directory (os error 2); name a file in a folder that can be written",
+            "skinbus: fd.csv/out.csv: No such file or directory (os error 2); name a file in a folder that can be written",
         ),
     ] {
         assert_eq!(said(&folder, &format!("convert {arguments}"), code), line);

@@ -5,7 +5,7 @@
 //! ```
 //!
 //! [`crate::message`] reads and writes packets as types. Everything that shows, lists or takes fields by name reads
-//! these tables: `dump` (text and JSON), DBC files, `gateway frame`, the tables of `docs/reference/protocol.md`.
+//! these tables: `dump` (text and JSON), DBC files, `skinbus frame`, the tables of `docs/reference/protocol.md`.
 
 mod field;
 mod file;

@@ -246,7 +246,7 @@ impl Skin {
     /// # Errors
     /// The first thing that is wrong with it.
     pub fn parse(path: &str, text: &str) -> Result<Self, DocumentError> {
-        let what = "this is a scenario, not a skin: `gateway run SKIN --scenario SCENARIO` takes both";
+        let what = "this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, check::skin)
             .map_err(|error: DocumentError| error.or_mistaken(text, SCENARIO_KEYS, KEYS, what))
     }

@@ -493,7 +493,7 @@ fn a_scenario_is_known_for_what_it_is() {
         .to_string();
     assert_eq!(
         said,
-        "s.toml: this is a scenario, not a skin: `gateway run SKIN --scenario SCENARIO` takes both"
+        "s.toml: this is a scenario, not a skin: `skinbus run SKIN --scenario SCENARIO` takes both"
     );
     let said = says("[controller]", "[motion]\n[controller]");
     assert!(said.contains("unknown field `motion`"), "a skin with a key too many: {said}");

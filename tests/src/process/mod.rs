@@ -83,7 +83,7 @@ pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// Finds a program under test, `gateway`, `cell-node` or `vcan-setup`: beside this test program, or in the folder that
+/// Finds a program under test, `skinbus`, `cell-node` or `vcan-setup`: beside this test program, or in the folder that
 /// `SKINBUS_PROGRAMS` names.
 ///
 /// # Panics

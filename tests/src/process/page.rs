@@ -181,7 +181,7 @@ pub fn watched_skin(place: &Place, more: &str) -> (Running, Address) {
         "run skin.toml --bus-kind {} --scenario scenario.toml --view --summary run.json {more}",
         place.kind()
     );
-    let run = place.start("gateway", &words);
+    let run = place.start("skinbus", &words);
     let address = address(&run);
     (run, address)
 }

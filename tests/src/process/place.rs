@@ -109,7 +109,7 @@ impl Place {
     /// A bench of `skin.toml` and `scenario.toml` for some seconds, with a log and a summary.
     pub fn bench(&self, seconds: f64, more: &str) -> Running {
         self.start(
-            "gateway",
+            "skinbus",
             &format!(
                 "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} \
                  --candump run.log --force --summary run.json {more}",

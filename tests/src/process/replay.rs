@@ -121,7 +121,7 @@ impl Place {
     pub fn replay(&self, file: &str, more: &str) -> Running {
         let kind = self.kind();
         self.start(
-            "gateway",
+            "skinbus",
             &format!("replay {file} --bus-kind {kind} --summary replay.json --force {more}"),
         )
     }

@@ -70,7 +70,7 @@ pub fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
          --force {more}",
         place.kind()
     );
-    place.start("gateway", &words)
+    place.start("skinbus", &words)
 }
 
 /// Waits until the roots' sums of three epochs in a row hold so many cells.

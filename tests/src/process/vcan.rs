@@ -113,9 +113,9 @@ pub fn small_skin(cells: usize) -> String {
     generate(&Target { cells, broadcast_hz: 20.0, ..Target::default() }).unwrap()
 }
 
-/// `cansend vcan0 $(gateway frame ...)`, as a person would.
+/// `cansend vcan0 $(skinbus frame ...)`, as a person would.
 pub fn cansend(place: &Place, frame: &str) {
-    let printed = place.start("gateway", &format!("frame {frame}")).end().well().stdout;
+    let printed = place.start("skinbus", &format!("frame {frame}")).end().well().stdout;
     for line in printed.lines() {
         tool(&format!("cansend vcan0 {line}"));
     }

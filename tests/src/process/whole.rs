@@ -47,14 +47,14 @@ pub fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summary {
     place.scenario(SCENARIO);
     // Nothing is to be read from the host's files while it runs: where time is instructions, waiting for them
     // would let it pass.
-    for name in ["gateway", "cell-node"] {
+    for name in ["skinbus", "cell-node"] {
         tool(&format!("cp {} {}", program(name).display(), place.path(name).display()));
         Running::start(place.command_of(&place.path(name), "--version")).end().well();
     }
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     let run =
         "run skin.toml --scenario scenario.toml --bus-kind socketcan --quiet --summary run.json --force";
-    let bench = Running::start(place.command_of(&place.path("gateway"), run));
+    let bench = Running::start(place.command_of(&place.path("skinbus"), run));
     let ended = bench.end_after(Duration::from_secs(SECONDS.into()) + Duration::from_secs(60)).well();
     eprintln!("{}", ended.stdout);
     let summary = place.summary();

@@ -138,7 +138,7 @@ fn emulators_end_with_a_gateway_that_is_killed_or_interrupted() {
 
 /// The one line of a run that does not begin.
 fn refused(place: &Place, words: &str) -> String {
-    let ended = place.start("gateway", &format!("run skin.toml --bus-kind embedded --quiet {words}")).end();
+    let ended = place.start("skinbus", &format!("run skin.toml --bus-kind embedded --quiet {words}")).end();
     ended.refusal(ended.code().unwrap()).to_owned()
 }
 
@@ -171,7 +171,7 @@ fn with_emulator(place: &Place, script: Option<&str>) -> Ended {
         place.script("programs/qemu-system-arm", script);
     }
     let words = format!("run skin.toml --bus-kind embedded --quiet --firmware {} --emulate 8", firmware());
-    let mut command = place.command("gateway", &words);
+    let mut command = place.command("skinbus", &words);
     command.env("PATH", &folder);
     Running::start(command).end()
 }
@@ -183,11 +183,11 @@ fn an_emulator_that_is_missing_or_ends_is_named_with_its_last_line() {
     place.pressed();
     let line = with_emulator(&place, None);
     let missing =
-        "gateway: qemu-system-arm is not in PATH, and --emulate needs it: apt-get install qemu-system-arm";
+        "skinbus: qemu-system-arm is not in PATH, and --emulate needs it: apt-get install qemu-system-arm";
     assert_eq!(line.refusal(2), missing);
     let ends = "#!/bin/sh\necho 'qemu-system-arm: unsupported machine type' >&2\nexit 1\n";
     let ended = with_emulator(&place, Some(ends));
-    let said = "gateway: the emulator of cell 8 on vcan0 ended before its cell was commissioned (exit status: 1: \
+    let said = "skinbus: the emulator of cell 8 on vcan0 ended before its cell was commissioned (exit status: 1: \
                 qemu-system-arm: unsupported machine type)";
     assert_eq!(ended.refusal(1), said);
     place.is_left_clean();

@@ -57,7 +57,7 @@ fn conforms(format: Format) {
     place.test_client_of(format).waits_for("a heartbeat of the cell", |_| true);
     let words = format!("conformance --bus vcan0 --bus-kind embedded --node 12 --format {}", format.name());
     let failed = |only: &[&str]| -> Vec<String> {
-        let mut command = place.command("gateway", &words);
+        let mut command = place.command("skinbus", &words);
         command.args(["--restart", "sh restart.sh", "--force"]).args(only);
         let ended = Running::start(command).end_after(Duration::from_secs(120));
         assert!(ended.stdout.contains(" passed, "), "{ended:#?}");

@@ -85,7 +85,7 @@ impl Host {
         let words = format!(
             "run skin.toml --bus-kind embedded --scenario scenario.toml --duration {seconds} --no-spawn --summary run.json"
         );
-        let bench = self.start(&program("gateway"), &words);
+        let bench = self.start(&program("skinbus"), &words);
         bench.hears_the_loop();
         bench
     }

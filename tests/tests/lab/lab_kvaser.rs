@@ -176,7 +176,7 @@ fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
         "run skin.toml --bus-kind {kind} --scenario scenario.toml --duration {seconds} --no-spawn \
          --candump run.log --summary run.json"
     );
-    place.start("gateway", &words)
+    place.start("skinbus", &words)
 }
 
 /// How many packets a log has, and how many segments that found no other in time.

@@ -105,7 +105,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
     // What the cells answer now was lost with the bus then, and is no difference.
     for capture in ["run.mcap", "run.log"] {
-        place.start("gateway", &format!("convert {capture} notes.log --force")).end().well();
+        place.start("skinbus", &format!("convert {capture} notes.log --force")).end().well();
         let lines = place.read("notes.log");
         assert_eq!(
             lines.lines().filter(|line| *line == "# the bus 'vcan1' was lost").count(),
@@ -119,7 +119,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
         );
         let replay =
             format!("replay {capture} --skin skin.toml --spawn --expect --lockstep --bus-kind embedded");
-        place.start("gateway", &replay).end().well();
+        place.start("skinbus", &replay).end().well();
     }
 }
 
@@ -157,14 +157,14 @@ fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() 
         test_client.waits_for_torques(1..=4);
     }
     // The robot is halted and resumed while the bus does not receive it.
-    place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
-    bench.hears("the robot is halted: somebody sent a halt frame; `gateway ack vcan0 --bus-kind embedded`");
+    place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
+    bench.hears("the robot is halted: somebody sent a halt frame; `skinbus ack vcan0 --bus-kind embedded`");
     let second = serve(&place, "vcan1");
     bench.hears("vcan1 works again");
     (1..=4).for_each(|cell| bench.tells_on("vcan1", cell, "come back"));
     let [_, vcan1, _] = test_clients(&place);
     vcan1.waits_for_halted_cells(1..=4);
-    place.start("gateway", "ack vcan2 --bus-kind embedded").end().well();
+    place.start("skinbus", "ack vcan2 --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     assert_eq!(bench.cells(), cells, "no cell was restarted");
@@ -190,12 +190,12 @@ fn cells_that_were_away_receive_a_missed_resume_and_a_missed_touch() {
     place.scenario(&[&text[..touch], &others[0], "\n", &others[1], "\n", &vcan1].concat());
     let first = serve(&place, "vcan1");
     let bench = place.running_bench(60.0, "");
-    place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
+    place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     TestClient::on(&place, "vcan1", Format::Classic).waits_for_halted_cells(1..=4);
     first.signal(Signal::KILL);
     first.end();
     bench.hears(LOST);
-    place.start("gateway", "ack vcan0 --bus-kind embedded").end().well();
+    place.start("skinbus", "ack vcan0 --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     // More than the two seconds after which the cells that are away are touched.
     TestClient::on(&place, "vcan2", Format::Fd).waits_for_joints(150);
@@ -217,7 +217,7 @@ fn a_bus_that_is_lost_at_the_end_makes_the_run_fail_with_its_figures() {
     bench.signal(Signal::TERM);
     let ended = bench.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    assert!(ended.stderr.ends_with("gateway: lost at the end of the run: vcan1\n"), "{ended:#?}");
+    assert!(ended.stderr.ends_with("skinbus: lost at the end of the run: vcan1\n"), "{ended:#?}");
     let summary = place.summary();
     summary.adds_up();
     assert_eq!(summary.0["buses"][1]["outages"]["at_end"], true, "{:#}", summary.0);
@@ -239,7 +239,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted_until_it_is_back() {
     bench.hears("the robot is halted: too many bad cycles in a row: the torque is not valid");
     let second = serve(&place, "vcan1");
     bench.hears("vcan1 works again");
-    place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     ended_well(&place, bench, Some(second), 1);
@@ -261,7 +261,7 @@ fn a_gateway_that_has_no_bus_left_ends() {
     vcan1.end().well();
     let ended = bench.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    let said = "gateway: the embedded bus vcan1 was closed: its server ended\n";
+    let said = "skinbus: the embedded bus vcan1 was closed: its server ended\n";
     assert!(ended.stderr.ends_with(said), "{ended:#?}");
     place.is_left_clean();
     let summary = place.summary();
@@ -276,23 +276,23 @@ fn each_bus_has_the_requested_kind() {
     let place = place();
     let run = |kinds: &str| {
         place
-            .start("gateway", &format!("run skin.toml --scenario scenario.toml --duration 1 --quiet {kinds}"))
+            .start("skinbus", &format!("run skin.toml --scenario scenario.toml --duration 1 --quiet {kinds}"))
     };
     let refused = |kinds: &str| run(kinds).end().refusal(2).to_owned();
     assert_eq!(
         refused("--bus-kind embedded --bus-kind vcan7=embedded"),
-        "gateway: --bus-kind vcan7=embedded: there is no bus vcan7 here, but vcan0, vcan1, vcan2"
+        "skinbus: --bus-kind vcan7=embedded: there is no bus vcan7 here, but vcan0, vcan1, vcan2"
     );
     assert_eq!(
         refused("--bus-kind vcan1=embedded --bus-kind vcan1=socketcan"),
-        "gateway: --bus-kind is given twice for vcan1: embedded and socketcan; leave out one"
+        "skinbus: --bus-kind is given twice for vcan1: embedded and socketcan; leave out one"
     );
     let said = refused("--bus-kind vcan1=vcan");
     assert!(said.contains("\"vcan1=vcan\" is no kind of bus: auto, socketcan and embedded are"), "{said}");
     // Whatever the kernel has, it has no vcan1 of ours.
     let said = refused("--bus-kind embedded --bus-kind vcan1=socketcan");
     assert!(
-        said.starts_with("gateway: vcan1: this kernel has no") || said.contains("no interface vcan1"),
+        said.starts_with("skinbus: vcan1: this kernel has no") || said.contains("no interface vcan1"),
         "{said}"
     );
     run("--bus-kind vcan0=embedded --bus-kind vcan1=embedded --bus-kind vcan2=embedded").end().well();

@@ -11,7 +11,7 @@ const START: [&str; 2] = ["--start", "0 -1.2 1.0 -1.4 -1.57 0"];
 
 /// Exit code, result unless it was refused, and standard error.
 fn calibrate(place: &Place, words: &str) -> (Option<i32>, Option<Value>, String) {
-    let mut command = place.command("gateway", &format!("calibrate skin.toml --json --force {words}"));
+    let mut command = place.command("skinbus", &format!("calibrate skin.toml --json --force {words}"));
     let output = command.args(START).output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     let found = (!output.stdout.is_empty())
@@ -66,19 +66,19 @@ fn what_cannot_be_calibrated_is_refused_in_one_line() {
     let place = Place::new();
     place.skin(2);
     let refused = |words: &str| {
-        let output = place.command("gateway", &format!("calibrate skin.toml {words}")).output().unwrap();
+        let output = place.command("skinbus", &format!("calibrate skin.toml {words}")).output().unwrap();
         assert_eq!(output.status.code(), Some(2));
         String::from_utf8(output.stderr).unwrap()
     };
     assert_eq!(
         refused("--start 0.5 --dry-run"),
-        "gateway: the pose has 1 positions; the robot has 6 joints: give one for each\n"
+        "skinbus: the pose has 1 positions; the robot has 6 joints: give one for each\n"
     );
-    assert_eq!(refused("--duration 5s --dry-run"), "gateway: a motion of 5 s: 20 to 3600 s are allowed\n");
+    assert_eq!(refused("--duration 5s --dry-run"), "skinbus: a motion of 5 s: 20 to 3600 s are allowed\n");
     place.write("sheet.toml", "noise_g = 3.0\n");
     assert_eq!(
         refused("--data-sheet sheet.toml --dry-run"),
-        "gateway: sheet.toml:1:11: noise_g = 3: 0 to 1 are possible\n"
+        "skinbus: sheet.toml:1:11: noise_g = 3: 0 to 1 are possible\n"
     );
     place.write("empty.log", "(1.000000) vcan0 080##1\n");
     let said = refused("--from empty.log");

@@ -28,7 +28,7 @@ fn piece(text: &mut String, first: u64) {
 /// The gateway with an address space of 100 MB, and without the room that allocators take for each thread.
 fn bounded(from: &str, to: &str) -> Command {
     let mut command = Command::new("sh");
-    let gateway = program("gateway");
+    let gateway = program("skinbus");
     command.args(["-c", "ulimit -v 100000 && exec \"$0\" \"$@\""]).arg(gateway).args(["convert", from, to]);
     command
 }

@@ -35,7 +35,7 @@ profile = "step"
 const HEAD: &str = "link,px,py,pz,nx,ny,nz";
 
 fn run(place: &Place, words: &str) -> Ended {
-    place.start("gateway", words).end().well()
+    place.start("skinbus", words).end().well()
 }
 
 /// `skin.toml` of an example robot with these cells, and a scenario that presses all of them.
@@ -162,7 +162,7 @@ fn a_joint_that_slides_has_its_own_units() {
     let plain = objects(&place, "dump run.log --json --kind torque --from 1");
     let plain = plain.iter().rev().find(|object| object["epoch"] == epoch).unwrap();
     assert_eq!(numbers(&plain["values"]["torque_nm"])[0] * 4.0, sent[0]);
-    let ended = place.start("gateway", "dump run.log --skin nowhere.toml").end();
+    let ended = place.start("skinbus", "dump run.log --skin nowhere.toml").end();
     assert!(ended.refusal(2).contains("nowhere.toml"));
 
     // The skin of another robot is named, and not believed.
@@ -175,7 +175,7 @@ fn a_joint_that_slides_has_its_own_units() {
     let raw: Value = serde_json::from_str(ended.stdout.lines().last().unwrap()).unwrap();
     let same: Value = objects(&place, "dump run.log --json --kind torque --from 1").pop().unwrap();
     assert_eq!(raw["values"], same["values"]);
-    let ended = place.start("gateway", "explain run.mcap --skin other.toml --epoch 3").end();
+    let ended = place.start("skinbus", "explain run.mcap --skin other.toml --epoch 3").end();
     assert!(ended.refusal(1).contains(another), "{}", ended.stderr);
 }
 

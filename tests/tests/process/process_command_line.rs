@@ -12,7 +12,7 @@ use std::process::Command;
 use process::program;
 
 const PATH: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/reference/command-line.md");
-const PROGRAMS: [&str; 3] = ["gateway", "cell-node", "vcan-setup"];
+const PROGRAMS: [&str; 3] = ["skinbus", "cell-node", "vcan-setup"];
 
 /// What a command prints for `-h`.
 fn help(command: &[&str]) -> String {

@@ -1,4 +1,4 @@
-//! `gateway commission` and `gateway cells` beside cells that are processes, on an embedded bus.
+//! `skinbus commission` and `skinbus cells` beside cells that are processes, on an embedded bus.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -60,13 +60,13 @@ impl Workshop {
     }
 
     fn commission(&self, more: &str) -> Running {
-        self.place.start("gateway", &format!("commission skin.toml --bus-kind embedded {more}"))
+        self.place.start("skinbus", &format!("commission skin.toml --bus-kind embedded {more}"))
     }
 
     /// The list of cells as JSON.
     fn list(&self, more: &str) -> Result<Value, Ended> {
         let ended =
-            self.place.start("gateway", &format!("cells vcan0 --bus-kind embedded --json {more}")).end();
+            self.place.start("skinbus", &format!("cells vcan0 --bus-kind embedded --json {more}")).end();
         match ended.code() {
             Some(0) => Ok(serde_json::from_str(&ended.stdout).unwrap()),
             _ => Err(ended),
@@ -198,7 +198,7 @@ fn cells_that_hang_delay_no_others_and_are_named() {
         assert!(why.starts_with("does not answer ") || why.starts_with("is not on the bus"), "{why}");
     }
     assert!(
-        ended.stderr.contains("gateway: 3 of 12 cells are not commissioned, see the table;"),
+        ended.stderr.contains("skinbus: 3 of 12 cells are not commissioned, see the table;"),
         "{ended:#?}"
     );
     hung.signal(Signal::CONT);
@@ -243,7 +243,7 @@ fn node_ids_on_the_bus_are_written_into_a_copy_of_the_description() {
     assert!(listed["cells"].as_array().unwrap().iter().all(|cell| cell["skin"] == "yes"), "{listed:#}");
     // A bench of the copy runs with the cells that are there.
     let run = "run as-is.toml --no-spawn --bus-kind embedded --duration 0.5 --quiet";
-    workshop.place.start("gateway", run).end().well();
+    workshop.place.start("skinbus", run).end().well();
 }
 
 #[test]
@@ -260,7 +260,7 @@ fn new_cells_get_node_ids_from_the_network_and_then_their_parameters() {
     };
     let _cells: Vec<_> = (1..=8).rev().map(cell).collect();
     let commission = |more: &str| {
-        place.start("gateway", &format!("commission skin.toml --bus-kind embedded {more}")).end()
+        place.start("skinbus", &format!("commission skin.toml --bus-kind embedded {more}")).end()
     };
     // A slow machine may not have started all of them before the first one ends.
     until("all of them", || (commission("--quiet --node-ids as-is.toml").code() == Some(0)).then_some(()));
@@ -296,7 +296,7 @@ fn several_buses_are_commissioned_at_the_same_time_or_one_alone() {
     });
     let commission = |more: &str| {
         place
-            .start("gateway", &format!("commission skin.toml --bus-kind embedded --json --quiet {more}"))
+            .start("skinbus", &format!("commission skin.toml --bus-kind embedded --json --quiet {more}"))
             .end()
     };
     until("the second bus", || (commission("--bus vcan1").code() == Some(0)).then_some(()));
@@ -313,7 +313,7 @@ fn a_list_is_redrawn_while_it_is_watched() {
     let workshop = Workshop::new(&skin(3));
     let watched = workshop
         .place
-        .start("gateway", "cells vcan0 --bus-kind embedded --watch --json --for 2.2")
+        .start("skinbus", "cells vcan0 --bus-kind embedded --watch --json --for 2.2")
         .end()
         .well();
     let lines: Vec<Value> = watched.stdout.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
@@ -355,10 +355,10 @@ fn beside_a_gateway_nothing_is_sent() {
     let bench = place.running_bench(30.0, "");
     let text = place.read("skin.toml");
     place.write("other.toml", &older(&text));
-    let said = place.start("gateway", "commission other.toml --bus-kind embedded --quiet").end();
-    assert_eq!(said.refusal(1), "gateway: another gateway is on vcan0: stop it first");
+    let said = place.start("skinbus", "commission other.toml --bus-kind embedded --quiet").end();
+    assert_eq!(said.refusal(1), "skinbus: another gateway is on vcan0: stop it first");
     // Listing disturbs no one.
-    let listed = place.start("gateway", "cells vcan0 --bus-kind embedded --skin skin.toml").end().well();
+    let listed = place.start("skinbus", "cells vcan0 --bus-kind embedded --skin skin.toml").end().well();
     assert_eq!(listed.stdout.lines().count(), 1 + 8 + 1, "{}", listed.stdout);
     assert!(
         listed.stdout.ends_with("8 cells on vcan0 (embedded), 8 in contact, and a gateway\n"),
@@ -378,7 +378,7 @@ fn an_interrupted_commissioning_says_how_far_it_came() {
     running.signal(Signal::INT);
     let ended = running.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    assert!(ended.stderr.ends_with("gateway: interrupted; nothing was written yet\n"), "{ended:#?}");
+    assert!(ended.stderr.ends_with("skinbus: interrupted; nothing was written yet\n"), "{ended:#?}");
     workshop.none_is_mixed();
 }
 
@@ -387,34 +387,34 @@ fn what_cannot_be_done_is_one_line() {
     let place = Place::new();
     place.write("skin.toml", &skin(4));
     let said = |words: &str, code: i32| {
-        place.start("gateway", &format!("{words} --bus-kind embedded")).end().refusal(code).to_owned()
+        place.start("skinbus", &format!("{words} --bus-kind embedded")).end().refusal(code).to_owned()
     };
     for command in ["commission skin.toml", "cells vcan0"] {
         let line = said(command, 2);
-        assert!(line.starts_with("gateway: no embedded bus vcan0 is served in "), "{line}");
+        assert!(line.starts_with("skinbus: no embedded bus vcan0 is served in "), "{line}");
     }
     let line = said("commission skin.toml --bus vcan7", 2);
-    assert_eq!(line, "gateway: bus vcan7 is not in skin.toml, which has vcan0");
+    assert_eq!(line, "skinbus: bus vcan7 is not in skin.toml, which has vcan0");
     let line = said("cells vcan7 --skin skin.toml", 2);
-    assert_eq!(line, "gateway: bus vcan7 is not in skin.toml, which has vcan0");
+    assert_eq!(line, "skinbus: bus vcan7 is not in skin.toml, which has vcan0");
     assert_eq!(
         said("commission nowhere.toml", 2),
-        "gateway: nowhere.toml: No such file or directory (os error 2)"
+        "skinbus: nowhere.toml: No such file or directory (os error 2)"
     );
 
     let bus = place.start("vcan-setup", "serve vcan0");
     bus.prints("serving ");
     let line = said("commission skin.toml --quiet", 1);
-    assert_eq!(line, "gateway: no cells are on vcan0: start them, or switch them on, and run this again");
+    assert_eq!(line, "skinbus: no cells are on vcan0: start them, or switch them on, and run this again");
     let line = said("cells vcan0 --for 0.4", 1);
-    assert!(line.starts_with("gateway: no cell sent anything on vcan0 for 0.4 s: "), "{line}");
+    assert!(line.starts_with("skinbus: no cell sent anything on vcan0 for 0.4 s: "), "{line}");
 
     place.write("other.toml", &skin(4).replace("serial = 1000", "serial = 2000"));
     let _cells = place.start("cell-node", "--bus vcan0 --nodes 1-4 --skin other.toml --bus-kind embedded");
-    let expected = "gateway: none of the cells on vcan0 is one of skin.toml: their serial numbers are 200001, \
+    let expected = "skinbus: none of the cells on vcan0 is one of skin.toml: their serial numbers are 200001, \
                     200002, 200003, 200004; name the description that has them";
     until("cells of another skin", || {
-        let ended = place.start("gateway", "commission skin.toml --bus-kind embedded --quiet").end();
+        let ended = place.start("skinbus", "commission skin.toml --bus-kind embedded --quiet").end();
         (ended.refusal(1) == expected).then_some(())
     });
 }

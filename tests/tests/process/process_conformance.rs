@@ -1,4 +1,4 @@
-//! `gateway conformance` against a cell that is a process: it passes, is put back, and everything that may go wrong is said in
+//! `skinbus conformance` against a cell that is a process: it passes, is put back, and everything that may go wrong is said in
 //! a line.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -52,13 +52,13 @@ impl Cell {
     fn settles(&self) {
         until("the cell", || {
             let words = format!("frame configure --node 5 --read identity {}", self.bus());
-            self.place.start("gateway", &words).end().code().filter(|code| *code == 0)
+            self.place.start("skinbus", &words).end().code().filter(|code| *code == 0)
         });
     }
 
     fn conformance(&self, more: &str) -> Running {
         let words = format!("conformance --bus vcan0 --bus-kind embedded --node 5 {more}");
-        self.place.start("gateway", &words)
+        self.place.start("skinbus", &words)
     }
 
     fn bus(&self) -> String {
@@ -75,7 +75,7 @@ impl Cell {
     fn has(&self) -> Vec<String> {
         let read = |parameter: &&str| {
             let words = format!("frame configure --node 5 --read {parameter} {}", self.bus());
-            self.place.start("gateway", &words).end().well().stdout
+            self.place.start("skinbus", &words).end().well().stdout
         };
         ["mount", "pose", "contact", "timing", "mode", "events", "16", "21"].iter().map(read).collect()
     }
@@ -146,7 +146,7 @@ fn a_test_that_is_interrupted_puts_the_cell_back() {
         test.signal(signal);
         let ended = test.end();
         assert_eq!(ended.code(), Some(1), "{ended:#?}");
-        assert_eq!(ended.stderr, "gateway: interrupted; the cell has been put back\n");
+        assert_eq!(ended.stderr, "skinbus: interrupted; the cell has been put back\n");
         assert!(ended.stdout.contains("not tested"), "{ended:#?}");
         assert_eq!(cell.has(), before);
         assert!(!cell.place.path("conformance-vcan0-5.json").exists());
@@ -165,7 +165,7 @@ fn after_a_kill_the_file_puts_the_cell_back() {
     let refused = cell.conformance("").end();
     assert_eq!(
         refused.refusal(2),
-        "gateway: conformance-vcan0-5.json is there from an earlier test that did not put the cell back: do that with \
+        "skinbus: conformance-vcan0-5.json is there from an earlier test that did not put the cell back: do that with \
          --restore conformance-vcan0-5.json, or delete it"
     );
     cell.conformance("--restore conformance-vcan0-5.json").end().well();
@@ -201,26 +201,26 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     for (words, code, line) in refusals {
         let ended = cell.conformance(words).end();
         assert_eq!(ended.code(), Some(code), "{ended:#?}");
-        assert_eq!(ended.stderr, format!("gateway: {line}\n"));
+        assert_eq!(ended.stderr, format!("skinbus: {line}\n"));
     }
     let of = |node: u8| {
         let words = format!("conformance --bus vcan0 --bus-kind embedded --node {node} --only J");
-        cell.place.start("gateway", &words).end()
+        cell.place.start("skinbus", &words).end()
     };
     assert_eq!(
         of(6).refusal(1),
-        "gateway: cell 6 sends nothing on vcan0, only 5: switch it on, or give the node id that it has"
+        "skinbus: cell 6 sends nothing on vcan0, only 5: switch it on, or give the node id that it has"
     );
     let words = "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml";
     let other = cell.place.start("cell-node", words);
     cell.settles();
     until("the other cell", || {
-        let listed = cell.place.start("gateway", "cells vcan0 --bus-kind embedded --json").end();
+        let listed = cell.place.start("skinbus", "cells vcan0 --bus-kind embedded --json").end();
         listed.stdout.contains("\"node\": 3").then_some(())
     });
     assert_eq!(
         of(5).refusal(1),
-        "gateway: other cells are on vcan0: 3; joints and halts of the test reach them too: take them away, or say \
+        "skinbus: other cells are on vcan0: 3; joints and halts of the test reach them too: take them away, or say \
          --others-will-stop"
     );
     let tolerated = cell.conformance("--others-will-stop --only CMD").end().well();
@@ -247,7 +247,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     }
     assert_eq!(
         test.end().refusal(1),
-        "gateway: 2 cells send as node 5 on vcan0, with the serial numbers 77 and 100005: take away all but one"
+        "skinbus: 2 cells send as node 5 on vcan0, with the serial numbers 77 and 100005: take away all but one"
     );
     // One that begins to command in the middle.
     let test = cell.conformance("");
@@ -257,7 +257,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert_eq!(
         ended.stderr,
-        "gateway: 003##500000000000000000000000000004782 was sent by somebody else: stop the gateway that is on this bus\n"
+        "skinbus: 003##500000000000000000000000000004782 was sent by somebody else: stop the gateway that is on this bus\n"
     );
     assert_eq!(cell.has(), before);
     let test = cell.conformance("--only CMD");
@@ -266,7 +266,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
         std::thread::sleep(Duration::from_millis(20));
     }
     let said = test.end();
-    assert!(said.refusal(1).starts_with("gateway: a gateway is on vcan0 (003##5"), "{said:#?}");
+    assert!(said.refusal(1).starts_with("skinbus: a gateway is on vcan0 (003##5"), "{said:#?}");
 }
 
 #[test]

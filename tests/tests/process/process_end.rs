@@ -60,7 +60,7 @@ fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
     place.pressed();
     // A terminal signals the whole process group at once.
     let mut command = place.command(
-        "gateway",
+        "skinbus",
         "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 60 --summary run.json",
     );
     let bench = Running::start({
@@ -89,7 +89,7 @@ fn a_signal_while_starting_is_a_failed_run_with_a_summary_and_a_log() {
     let bench = place.bench(60.0, "--quiet --record run.mcap");
     until("the first cells", || (!bench.cells().is_empty()).then_some(()));
     bench.signal(Signal::INT);
-    assert_eq!(bench.end().refusal(1), "gateway: interrupted while starting");
+    assert_eq!(bench.end().refusal(1), "skinbus: interrupted while starting");
     place.is_left_clean();
     assert_eq!(place.summary().0["failure"], "interrupted while starting");
     // Frames received before are in the log, if there were any.
@@ -116,7 +116,7 @@ fn a_bus_that_goes_away_ends_the_run_with_one_line_and_the_frames_until_then() {
     };
     let said: Vec<_> = ended.stderr.lines().filter(|line| !usual(line)).collect();
     assert_eq!(said.len(), 3, "which bus, how much is in the log, and why it ended: {said:#?}");
-    assert_eq!(said[2], "gateway: the embedded bus vcan0 was closed: its server ended");
+    assert_eq!(said[2], "skinbus: the embedded bus vcan0 was closed: its server ended");
     assert_eq!(place.files(), ["run.json", "run.log", "scenario.toml", "skin.toml"]);
     let summary = place.summary();
     summary.adds_up();
@@ -133,7 +133,7 @@ fn a_reader_that_ends_loses_the_table_and_not_the_summary() {
     let script = "\"$0\" run skin.toml --bus-kind embedded --scenario scenario.toml --duration 0.5 \
                   --summary run.json --quiet | true";
     let mut command = std::process::Command::new("sh");
-    command.args(["-c", script]).arg(process::program("gateway"));
+    command.args(["-c", script]).arg(process::program("skinbus"));
     command.current_dir(place.path("")).env("SKINBUS_DIR", place.buses());
     Running::start(command).end();
     place.is_left_clean();

@@ -10,7 +10,7 @@ use serde_json::Value;
 #[test]
 fn the_moving_arm_is_run_recorded_drawn_and_rated() {
     let place = Place::new();
-    let ended = place.start("gateway", "experiment fig7 fig6 fig8 --quick -o results").end();
+    let ended = place.start("skinbus", "experiment fig7 fig6 fig8 --quick -o results").end();
     assert!(ended.status.success(), "{}", ended.stderr);
     assert!(ended.stderr.contains("fig6: torques of the moving arm"), "{}", ended.stderr);
     let results: Value = serde_json::from_str(&place.read("results/results.json")).unwrap();
@@ -55,7 +55,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_rated() {
 #[test]
 fn benches_over_their_cells_are_run_drawn_and_rated() {
     let place = Place::new();
-    let ended = place.start("gateway", "experiment scale --quick -o results").end();
+    let ended = place.start("skinbus", "experiment scale --quick -o results").end();
     assert!(ended.status.success(), "{}", ended.stderr);
     let results: Value = serde_json::from_str(&place.read("results/results.json")).unwrap();
     let findings = results["experiments"][0]["findings"].as_array().unwrap();
@@ -105,14 +105,14 @@ fn a_failed_or_interrupted_experiment_leaves_nothing() {
             "the bench of the moving arm (single)",
         ),
     ] {
-        let ended = place.start("gateway", words).end();
+        let ended = place.start("skinbus", words).end();
         assert_eq!(ended.status.code(), Some(code), "{words}: {}", ended.stderr);
         let error = ended.stderr.lines().last().unwrap_or_default();
-        assert!(error.starts_with("gateway: ") && error.contains(said), "{words}: {}", ended.stderr);
+        assert!(error.starts_with("skinbus: ") && error.contains(said), "{words}: {}", ended.stderr);
         assert!(!place.path("results").exists(), "{words}");
     }
     assert_eq!(place.read("file"), "mine");
-    let running = place.start("gateway", "experiment fig7 --quick -o results");
+    let running = place.start("skinbus", "experiment fig7 --quick -o results");
     running.hears("fig7: ");
     running.signal(Signal::INT);
     let ended = running.end();

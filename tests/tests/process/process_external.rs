@@ -72,13 +72,13 @@ fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_
     first.signal(Signal::KILL);
     assert_eq!(first.end().signal(), Some(9));
     bench.hears(&format!(
-        "the robot is halted: too many bad cycles in a row: {NOBODY}; `gateway ack vcan0 --bus-kind embedded`"
+        "the robot is halted: too many bad cycles in a row: {NOBODY}; `skinbus ack vcan0 --bus-kind embedded`"
     ));
     // A hello does not resume the robot; a person has to do that.
     let second = python(&place);
     second.prints("HALTED");
     assert!(!bench.stderr().contains("goes on"), "{}", bench.stderr());
-    place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     place.test_client().waits_for_motion();
     bench.signal(Signal::TERM);
@@ -153,12 +153,12 @@ fn ends_without_controller(control: impl FnOnce(&Place), why: &str) {
     place.is_left_clean();
     assert_eq!(ended.code(), Some(4), "{ended:#?}");
     let line = ended.stderr.trim_end();
-    assert!(line.starts_with("gateway: ") && !line.contains('\n'), "one line, though quiet: {ended:#?}");
+    assert!(line.starts_with("skinbus: ") && !line.contains('\n'), "one line, though quiet: {ended:#?}");
     assert!(line.contains(why) && line.contains("controller.sock"), "{line}");
     let summary = place.summary();
     summary.adds_up();
     assert_eq!(summary.0["outcome"], "no_controller", "{:#}", summary.0);
-    assert_eq!(summary.0["no_controller"], line.trim_start_matches("gateway: "));
+    assert_eq!(summary.0["no_controller"], line.trim_start_matches("skinbus: "));
     assert_eq!(summary.0["halts"], serde_json::json!([]), "it had time to begin");
     assert!(ended.stdout.lines().nth(1).unwrap().contains("no controller"), "{}", ended.stdout);
 }

@@ -188,10 +188,10 @@ fn cells_that_end_by_an_error_of_their_own_are_the_runs_outcome_and_their_reason
         let last = ended.stderr.lines().last().unwrap();
         if quiet {
             assert_eq!(ended.stderr.lines().count(), 1, "{ended:#?}");
-            let line = format!("gateway: 4 cells ended by errors of their own: 1-4 on vcan1 ({why})");
+            let line = format!("skinbus: 4 cells ended by errors of their own: 1-4 on vcan1 ({why})");
             assert_eq!(last, line);
         } else {
-            assert_eq!(last, "gateway: 4 cells ended by errors of their own, given above: 1-4 on vcan1");
+            assert_eq!(last, "skinbus: 4 cells ended by errors of their own, given above: 1-4 on vcan1");
             let note = format!("the process of cells 1 to 4 on vcan1 ended (exit status: 1: {why})\n");
             assert!(ended.stderr.contains(&note), "{ended:#?}");
         }
@@ -207,8 +207,8 @@ fn a_second_gateway_ends_with_one_line_and_the_first_goes_on_undisturbed() {
     let second = "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 1 --summary second.json \
                   --candump second.log --force --quiet";
     for more in ["", " --no-spawn"] {
-        let ended = place.start("gateway", &format!("{second}{more}")).end();
-        let said = "gateway: another gateway is on vcan0: stop one of the two, or set SKINBUS_DIR to \
+        let ended = place.start("skinbus", &format!("{second}{more}")).end();
+        let said = "skinbus: another gateway is on vcan0: stop one of the two, or set SKINBUS_DIR to \
                     another directory for this run";
         assert_eq!(ended.refusal(1), said);
     }
@@ -247,7 +247,7 @@ fn cells_on_the_bus_are_not_started_twice() {
         "cell 3",
         |message| matches!(message, Message::Network { from: Node::Cell(cell), .. } if cell.get() == 3),
     );
-    let said = "gateway: cells are on the bus already: 2, 3 on vcan0; use them with --no-spawn, stop them, or set \
+    let said = "skinbus: cells are on the bus already: 2, 3 on vcan0; use them with --no-spawn, stop them, or set \
                 SKINBUS_DIR to another directory for this run";
     assert_eq!(place.bench(1.0, "--quiet").end().refusal(1), said);
     drop((cells, server));
@@ -367,12 +367,12 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
     let bench = place.running_bench(60.0, "");
     let test_client = place.test_client();
     test_client.waits_for_motion();
-    let sent = place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
+    let sent = place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     assert_eq!(sent.stderr, "sent on vcan0 (embedded)\n");
     bench.hears(
-        "the robot is halted: somebody sent a halt frame; `gateway ack vcan0 --bus-kind embedded` resumes it",
+        "the robot is halted: somebody sent a halt frame; `skinbus ack vcan0 --bus-kind embedded` resumes it",
     );
-    place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     let test_client = place.test_client();
     test_client.waits_for("a torque", torque_of(1));
@@ -439,7 +439,7 @@ fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
     test_client.waits_for("cell 3 that has its node id", settled);
     test_client.waits_for("another halt", |message| *message == Message::Halt);
     test_client.waits_for("a cell 3 that is halted", says(State::HALTED));
-    place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
     test_client.waits_for("its torque", torque_of(3));
     bench.signal(Signal::TERM);
     bench.end().well();

@@ -51,7 +51,7 @@ fn kill_again_and_again(seed: u64, times_killed: u32) -> Vec<f64> {
     let mut older = Vec::new();
     for number in 0..times_killed {
         let log = place.path(&format!("{number}.log"));
-        let bench = place.start("gateway", &format!("{RUN} --duration 60 --candump {number}.log"));
+        let bench = place.start("skinbus", &format!("{RUN} --duration 60 --candump {number}.log"));
         until("the first line", || fs::metadata(&log).is_ok_and(|log| log.len() > 0).then_some(()));
         std::thread::sleep(Duration::from_millis(random.random_range(0..2_000)));
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos();
@@ -99,15 +99,15 @@ fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
     };
     for (name, force) in [("new.log", ""), ("run.log", "--force")] {
         let words = format!("{RUN} --duration 60 --summary {name}.json --candump {name} {force}");
-        let bench = place.start("gateway", &words);
+        let bench = place.start("skinbus", &words);
         bench.hears_the_loop();
         follow(name);
         let options = ["", "--force"];
         for option in options {
             let words = format!("run skin.toml --bus-kind embedded --candump {name} {option}");
             let why = "another run is writing it: name another file, or wait for that run's end";
-            let said = place.start("gateway", &words).end();
-            assert_eq!(said.refusal(2), format!("gateway: --candump {name}: {why}"));
+            let said = place.start("skinbus", &words).end();
+            assert_eq!(said.refusal(2), format!("skinbus: --candump {name}: {why}"));
         }
         bench.signal(Signal::INT);
         bench.end().well();
@@ -141,7 +141,7 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
     let place = Place::new();
     place.skin(3);
     place.write("in.log", "(1.000000) vcan0 123#11\n");
-    place.start("gateway", "convert in.log in.mcap").end().well();
+    place.start("skinbus", "convert in.log in.mcap").end().well();
     place.write("mine", "mine\n");
     for (option, words, name) in WRITERS {
         let path = place.path(name);
@@ -164,10 +164,10 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
                     continue;
                 }
                 let words = words.replace("NAME", name) + overwrite;
-                let ended = place.start("gateway", &words).end();
+                let ended = place.start("skinbus", &words).end();
                 assert_eq!(ended.code(), Some(2), "{make}, {words}: {ended:#?}");
                 let said = ended.stderr.lines().last().unwrap();
-                assert!(said.starts_with(&format!("gateway: {option}{name}: ")), "{words}: {said}");
+                assert!(said.starts_with(&format!("skinbus: {option}{name}: ")), "{words}: {said}");
                 let elsewhere = why.replace("name another one", "or another one");
                 assert!(said.ends_with(why) || said.ends_with(&elsewhere), "{make}, {words}: {said}");
                 assert!(place.files() == before && !place.path("nowhere").exists(), "{words}");
@@ -186,10 +186,10 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
     // Whole folders: one in which there is something.
     fs::create_dir(place.path("results")).unwrap();
     place.write("results/notes.txt", "mine\n");
-    let said = place.start("gateway", "experiment fig10 --quick -o results").end();
+    let said = place.start("skinbus", "experiment fig10 --quick -o results").end();
     assert_eq!(
         said.refusal(2),
-        "gateway: -o results: there is something in it: name another folder, or overwrite files in it with --force"
+        "skinbus: -o results: there is something in it: name another folder, or overwrite files in it with --force"
     );
     assert_eq!(names(&place.path("results")), ["notes.txt"]);
 }
@@ -203,7 +203,7 @@ fn a_log_into_a_pipe_whose_reader_stops_does_not_keep_a_run_from_ending() {
     let reader = fs::OpenOptions::new().read(true).write(true).open(&fifo).unwrap();
     for (signal, summary) in [(Signal::INT, "int.json"), (Signal::TERM, "term.json")] {
         let words = format!("{RUN} --duration 60 --quiet --candump log.fifo --summary {summary}");
-        let bench = place.start("gateway", &words);
+        let bench = place.start("skinbus", &words);
         // Nothing has room any more: for a second nothing came.
         let (mut there, mut same) = (0, 0);
         until("a full pipe", || {
@@ -227,7 +227,7 @@ fn no_command_overwrites_what_it_reads_even_with_force() {
     let place = Place::new();
     place.pressed();
     place.write("in.log", "(1.000000) vcan0 123#11\n");
-    place.start("gateway", "convert in.log in.mcap").end().well();
+    place.start("skinbus", "convert in.log in.mcap").end().well();
     let read = |name| fs::read(place.path(name)).unwrap();
     let names = ["skin.toml", "scenario.toml", "in.log", "in.mcap"];
     let before = names.map(read);
@@ -242,9 +242,9 @@ fn no_command_overwrites_what_it_reads_even_with_force() {
         ("-o ", "report in.mcap -o".to_owned(), "in.mcap"),
         ("-o ", "dbc skin.toml -o".to_owned(), "skin.toml"),
     ] {
-        let ended = place.start("gateway", &format!("{words} {name} --force")).end();
+        let ended = place.start("skinbus", &format!("{words} {name} --force")).end();
         let why = "is a file that this command reads: name another file";
-        assert_eq!(ended.refusal(2), format!("gateway: {option}{name} {why}"), "{words}");
+        assert_eq!(ended.refusal(2), format!("skinbus: {option}{name} {why}"), "{words}");
     }
     assert!(names.map(read) == before);
 }
@@ -254,12 +254,12 @@ fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
     let place = Place::new();
     place.pressed();
     let run = format!("{RUN} --duration 0.3 --quiet --summary /dev/null --candump /dev/stdout");
-    let ended = place.start("gateway", &run).end().well();
+    let ended = place.start("skinbus", &run).end().well();
     let (frames, table): (Vec<_>, Vec<_>) = ended.stdout.lines().partition(|line| line.starts_with('('));
     assert!(frames.len() > 50 && table.len() > 10, "{ended:#?}");
     // A file that the shell has opened is not truncated, whatever is in it.
     let mut command = place.command_of(Path::new("/bin/sh"), "");
-    let gateway = process::program("gateway");
+    let gateway = process::program("skinbus");
     let script = format!(
         "echo before > both; {} {RUN} --duration 0.3 --quiet --candump /dev/stdout >> both",
         gateway.display()
@@ -277,7 +277,7 @@ fn failed(place: &Place, ended: &process::Ended) -> Summary {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     let summary = place.summary();
     assert_eq!(summary.0["outcome"], "failed");
-    let why = ended.stderr.lines().last().unwrap().strip_prefix("gateway: ").unwrap();
+    let why = ended.stderr.lines().last().unwrap().strip_prefix("skinbus: ").unwrap();
     assert_eq!(summary.0["failure"], why);
     summary.adds_up();
     summary
@@ -312,7 +312,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     // Its log breaks off, and it goes on to its end.
     let mut command = place.command_of(Path::new("/bin/sh"), "");
     let run = format!("{RUN} --duration 2 --candump run.log --summary run.json --force");
-    command.args(["-c", &format!("ulimit -f 64; exec {} {run}", process::program("gateway").display())]);
+    command.args(["-c", &format!("ulimit -f 64; exec {} {run}", process::program("skinbus").display())]);
     let ended = Running::start(command).end();
     let summary = failed(&place, &ended);
     assert!(ended.stderr.contains("run.log: File too large"), "{ended:#?}");
@@ -336,7 +336,7 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
     let place = Place::new();
     let run = |quiet: &str| {
         let words = format!("demo --duration 60 --cells-per-process 64 {quiet}");
-        let mut command = place.command("gateway", &words);
+        let mut command = place.command("skinbus", &words);
         command.env_remove("SKINBUS_DIR").env("TMPDIR", place.path(""));
         Running::start(command)
     };
@@ -348,7 +348,7 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
         // The printed command shows its frames.
         let line = said.lines().find_map(|line| line.strip_prefix("its frames in words: ")).unwrap();
         let (directory, dump) = line.strip_prefix("SKINBUS_DIR=").unwrap().split_once(" gateway ").unwrap();
-        let mut dump = place.command("gateway", &format!("{dump} --kind torque --max 3"));
+        let mut dump = place.command("skinbus", &format!("{dump} --kind torque --max 3"));
         dump.env("SKINBUS_DIR", directory);
         let dumped = Running::start(dump).end().well();
         assert_eq!(dumped.stdout.lines().count(), 3, "{dumped:#?}");
@@ -378,7 +378,7 @@ fn a_demonstration_that_is_refused_announces_nothing() {
     let place = Place::new();
     fs::create_dir(place.buses()).unwrap();
     fs::set_permissions(place.buses(), fs::Permissions::from_mode(0o755)).unwrap();
-    let refused = place.start("gateway", "demo --duration 1").end();
+    let refused = place.start("skinbus", "demo --duration 1").end();
     let said = refused.refusal(2);
     assert!(said.contains("buses") && said.contains("0755"), "{said}");
     assert_eq!(place.files(), ["buses"]);
@@ -387,8 +387,8 @@ fn a_demonstration_that_is_refused_announces_nothing() {
 #[test]
 fn a_skin_that_a_test_makes_is_one_that_generate_makes() {
     let place = Place::new();
-    place.start("gateway", "skin generate --cells 8 -o skin.toml").end().well();
+    place.start("skinbus", "skin generate --cells 8 -o skin.toml").end().well();
     assert_eq!(place.read("skin.toml"), skin(8));
-    place.start("gateway", "skin generate --cells 9 -o skin.toml --force").end().well();
+    place.start("skinbus", "skin generate --cells 9 -o skin.toml --force").end().well();
     assert_eq!(place.read("skin.toml"), skin(9));
 }

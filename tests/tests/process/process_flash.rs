@@ -68,7 +68,7 @@ fn a_damaged_file_is_not_used_and_the_gateway_names_the_cell() {
              delete the file",
             image.len()
         ),
-        "gateway: cells without parameters: 3, 5 on vcan0; write them with `gateway commission`, or delete \
+        "skinbus: cells without parameters: 3, 5 on vcan0; write them with `skinbus commission`, or delete \
          their flash files if these are damaged"
             .to_owned(),
     ];
@@ -131,8 +131,8 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
     let text = place.read("skin.toml");
     let other = text.replace("alpha_c = 1.0", "alpha_c = 1.5");
     place.write("skin.toml", &other);
-    let said = "gateway: cells that are configured for another skin than skin.toml: 1, 2, 3, 4, 5, 6, 7, 8 on \
-                vcan0; write it into them with `gateway commission`, or delete their flash files";
+    let said = "skinbus: cells that are configured for another skin than skin.toml: 1, 2, 3, 4, 5, 6, 7, 8 on \
+                vcan0; write it into them with `skinbus commission`, or delete their flash files";
     assert_eq!(place.bench(1.0, "--flash flash --quiet").end().refusal(1), said);
     place.is_left_clean();
 
@@ -144,7 +144,7 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
         ended.stderr.contains("is not used: it belongs to cell 6 with serial number 100006"),
         "{ended:#?}"
     );
-    assert!(ended.stderr.contains("gateway: cells without parameters: 6 on vcan0"), "{ended:#?}");
+    assert!(ended.stderr.contains("skinbus: cells without parameters: 6 on vcan0"), "{ended:#?}");
     place.is_left_clean();
     assert_eq!(images(&place), before);
 }
@@ -153,7 +153,7 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
 fn a_directory_that_is_not_there_is_named() {
     let place = Place::new();
     place.pressed();
-    let said = "gateway: --flash flash: there is no such directory; make it first";
+    let said = "skinbus: --flash flash: there is no such directory; make it first";
     assert_eq!(place.bench(1.0, "--flash flash").end().refusal(2), said);
     let cell =
         place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 1 --skin skin.toml --flash flash");

@@ -47,7 +47,7 @@ fn ended_halted(ended: &process::Ended, summary: &Summary, reason: &str) -> Valu
     assert_eq!(
         ended.stderr.lines().last().unwrap(),
         format!(
-            "gateway: the robot was halted at {at:.3} s (epoch {epoch}) and not resumed: {reason}{HISTORY}"
+            "skinbus: the robot was halted at {at:.3} s (epoch {epoch}) and not resumed: {reason}{HISTORY}"
         )
     );
     let head = ended.stdout.lines().nth(1).unwrap();
@@ -136,7 +136,7 @@ fn a_lost_bus_that_halts_is_named_and_the_exit_code_is_that_of_the_halt() {
     place.is_left_clean();
     let summary = place.summary();
     let halted = ended_halted(&ended, &summary, "too many bad cycles in a row: the torque is not valid");
-    assert!(ended.stderr.contains("\ngateway: lost at the end of the run: vcan1\n"), "{ended:#?}");
+    assert!(ended.stderr.contains("\nskinbus: lost at the end of the run: vcan1\n"), "{ended:#?}");
     let before = before(&summary, &halted);
     let last = before.last().unwrap();
     assert_eq!((&last["valid"], &last["lost_buses"]), (&false.into(), &serde_json::json!(["vcan1"])));
@@ -151,9 +151,9 @@ fn a_resumed_halt_is_reported_and_the_run_succeeds() {
     let bench = place.running_bench(60.0, "");
     let test_client = place.test_client();
     test_client.waits_for_epoch(10);
-    place.start("gateway", "frame halt --bus vcan0 --bus-kind embedded").end().well();
+    place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     bench.hears("the robot is halted: somebody sent a halt frame");
-    place.start("gateway", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     bench.signal(Signal::TERM);
     let ended = bench.end().well();
@@ -173,12 +173,12 @@ fn an_incomplete_recording_takes_precedence_over_a_halt() {
     let place = place(25);
     let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 1 --candump /dev/full \
                  --summary run.json --quiet";
-    let ended = place.start("gateway", words).end();
+    let ended = place.start("skinbus", words).end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     let said: Vec<_> = ended.stderr.lines().collect();
     let halted = format!(" and not resumed: too many bad cycles in a row: {NOBODY}{HISTORY}");
     assert!(said.iter().any(|line| line.ends_with(&halted)), "{ended:#?}");
-    assert!(said.last().unwrap().starts_with("gateway: the recording is incomplete, "), "{ended:#?}");
+    assert!(said.last().unwrap().starts_with("skinbus: the recording is incomplete, "), "{ended:#?}");
     let summary = place.summary();
     assert_eq!(summary.0["outcome"], "failed");
     assert!(summary.0["halted"].is_string() && !before(&summary, &summary.0["halts"][0]).is_empty());

@@ -59,7 +59,7 @@ fn arm() -> Place {
 }
 
 fn run(place: &Place, words: &str) -> Ended {
-    place.start("gateway", words).end()
+    place.start("skinbus", words).end()
 }
 
 /// A command that is refused with exit code 2 in one line, and writes nothing.
@@ -310,19 +310,19 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
         // What only the skin's check knows, by the line of the file.
         (
             format!("# mine\n{head}\nfore,0,0,0,0,0,1\n\nfore,3,0,0,0,0,1\n"),
-            "gateway: cells.csv: line 5: position px,py,pz = 3,0,0 of link \"fore\" can come 3.",
+            "skinbus: cells.csv: line 5: position px,py,pz = 3,0,0 of link \"fore\" can come 3.",
         ),
         (
             format!("{head},bus,node\nfore,0,0,0,0,0,1,,300\n"),
-            "gateway: cells.csv: line 2: node = \"300\": 1 to 254 are possible",
+            "skinbus: cells.csv: line 2: node = \"300\": 1 to 254 are possible",
         ),
         (
             format!("{head},bus,node\nfore,0,0,0,0,0,1,,\nupper,0,0,0,0,0,1,,1\n"),
-            "gateway: cells.csv: line 3: node 1 of bus \"vcan0\" is that of line 2 already",
+            "skinbus: cells.csv: line 3: node 1 of bus \"vcan0\" is that of line 2 already",
         ),
         (
             format!("{head},bus\nfore,0,0,0,0,0,1,my bus\n"),
-            "gateway: cells.csv: line 2: bus \"my bus\": its name has 1 to 15 letters",
+            "skinbus: cells.csv: line 2: bus \"my bus\": its name has 1 to 15 letters",
         ),
     ] {
         place.write("cells.csv", &text);
@@ -351,7 +351,7 @@ fn a_robot_has_at_most_32_joints() {
         refused(
             &place,
             &format!("skin import arms.urdf --tip a12 --tip b12 --tip c12{cells}"),
-            "gateway: arms.urdf: 36 joints move between the root and the tips; a robot has 1 to 32: give fewer --tip",
+            "skinbus: arms.urdf: 36 joints move between the root and the tips; a robot has 1 to 32: give fewer --tip",
         );
         run(&place, &format!("skin import arms.urdf --tip a12 --tip b12{cells}")).well();
     }
@@ -368,7 +368,7 @@ fn each_covered_link_has_a_cell() {
     place.write("arm.urdf", &knob);
     let cover = |links: &str, more: &str| {
         let mut command = place
-            .command("gateway", "skin import arm.urdf --tip bare --package arm_parts=parts --pitch 0.04");
+            .command("skinbus", "skin import arm.urdf --tip bare --package arm_parts=parts --pitch 0.04");
         command.args(["--cover", links]).args(more.split_whitespace()).output().unwrap()
     };
     let boxes = "--keep-out fore:-1,-1,-1,1,1,1";
@@ -376,17 +376,17 @@ fn each_covered_link_has_a_cell() {
         (
             "upper,bare",
             "",
-            "gateway: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
+            "skinbus: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
         ),
         (
             "bare",
             "",
-            "gateway: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
+            "skinbus: --cover bare: there is no room for a cell on its 0.0001 m2: lower the pitch, or",
         ),
         (
             "upper,fore",
             boxes,
-            "gateway: --cover fore: the boxes of --keep-out leave nothing of it: make them smaller",
+            "skinbus: --cover fore: the boxes of --keep-out leave nothing of it: make them smaller",
         ),
     ] {
         let output = cover(links, more);
@@ -426,7 +426,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
             assert!((fixed - central).abs() < 0.01 && (fixed - central - difference).abs() < 1e-12, "{row}");
         }
     }
-    let mut single = place.command("gateway", "torque skin.toml --json --cell vcan0:1 --force 10 --joints");
+    let mut single = place.command("skinbus", "torque skin.toml --json --cell vcan0:1 --force 10 --joints");
     single.arg("0 0.5");
     let out = single.output().unwrap();
     assert!(out.status.success());
@@ -438,10 +438,10 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         ("--cell 1 --force 1 --joints 0", "one is needed for each of the chain's 2 joints, shoulder, elbow"),
         ("--cell 1 --force 1 --joints 0,x", "position \"x\" of elbow: a number in rad is needed"),
         ("--cell 1 --force -1 --joints 0,0.5", "force -1 N: a force presses against the outward normal"),
-        ("--cell 1 --force 95.998 --joints 0,0.5", "gateway: --cell 1: force 95.998 N: "),
+        ("--cell 1 --force 95.998 --joints 0,0.5", "skinbus: --cell 1: force 95.998 N: "),
         (
             "--cell vcan0:1 --force 1 --joints 45,0.5",
-            "gateway: --cell vcan0:1: position 45 rad: shoulder takes -6.2832 to 6.2832 rad",
+            "skinbus: --cell vcan0:1: position 45 rad: shoulder takes -6.2832 to 6.2832 rad",
         ),
         ("--cell 1 --joints 0,0.5", "--force"),
         ("--cell 1 --force 1 --joints 0,0.5 --batch rows.csv", "cannot be used with"),
@@ -457,26 +457,26 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         ("cell,force_n,q\n", "there is no row in it"),
         (
             "cell,force_n,q\n7,1,0 0.5\n",
-            "gateway: rows.csv, row 1: cell 7: the skin has no such cell on vcan0",
+            "skinbus: rows.csv, row 1: cell 7: the skin has no such cell on vcan0",
         ),
         (
             "cell,force_n,q\n1,1,0 0.5\nvcan5:1,1,0 0.5\n",
-            "gateway: rows.csv, row 2: cell vcan5:1: the skin's buses are vcan0",
+            "skinbus: rows.csv, row 2: cell vcan5:1: the skin's buses are vcan0",
         ),
-        ("cell,force_n,q\n1,1,0\n", "gateway: rows.csv, row 1: cell 1: 1 position: one is needed"),
+        ("cell,force_n,q\n1,1,0\n", "skinbus: rows.csv, row 1: cell 1: 1 position: one is needed"),
         (
             "cell,force_n,q\n1,x,0 0.5\n",
-            "gateway: rows.csv: line 2: force_n = \"x\": a finite number is needed",
+            "skinbus: rows.csv: line 2: force_n = \"x\": a finite number is needed",
         ),
         ("1,1,0 0.5\n2,1,0 0.5\n", "and it is \"1,1,0 0.5\": write the header above it"),
         (
             "cell,force_n,q\n1,1,0 0.5\nvcan0:2,96,0 0.5\n",
-            "gateway: rows.csv, row 2: cell vcan0:2: force 96 N: a force presses against the outward normal with 0 to \
+            "skinbus: rows.csv, row 2: cell vcan0:2: force 96 N: a force presses against the outward normal with 0 to \
              95.997 N, the range of three contact words",
         ),
         (
             "cell,force_n,q\n2,1,0 -6.3\n",
-            "gateway: rows.csv, row 1: cell 2: position -6.3 rad: elbow takes -6.2832 to 6.2832 rad",
+            "skinbus: rows.csv, row 1: cell 2: position -6.3 rad: elbow takes -6.2832 to 6.2832 rad",
         ),
     ] {
         place.write("rows.csv", text);

@@ -122,26 +122,26 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     recorded(&place);
     let parts = parts(&place).join(" ");
     // Cell 1 is pressed from the beginning of the run on: more than half of all epochs ago.
-    let ended = place.start("gateway", "explain run-3.mcap --epoch 200 --cell 1").end().well();
+    let ended = place.start("skinbus", "explain run-3.mcap --epoch 200 --cell 1").end().well();
     assert!(ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus of -"), "{ended:#?}");
     assert!(!ended.stdout.contains("not known"), "{ended:#?}");
-    let whole = place.start("gateway", &format!("explain {parts} --epoch 200 --cell 1")).end().well();
+    let whole = place.start("skinbus", &format!("explain {parts} --epoch 200 --cell 1")).end().well();
     let contact = |text: &str| text.lines().find(|line| line.contains("  contact  ")).unwrap().to_owned();
     assert_eq!(contact(&whole.stdout), contact(&ended.stdout));
 
     let stats = |files: &str| -> Value {
-        let ended = place.start("gateway", &format!("dump {files} --stats --json")).end().well();
+        let ended = place.start("skinbus", &format!("dump {files} --stats --json")).end().well();
         serde_json::from_str(&ended.stdout).unwrap()
     };
     let lines =
-        |files: &str| place.start("gateway", &format!("dump {files}")).end().well().stdout.lines().count();
+        |files: &str| place.start("skinbus", &format!("dump {files}")).end().well().stdout.lines().count();
     let one_by_one: usize = parts.split(' ').map(lines).sum();
     assert_eq!(lines(&parts), one_by_one);
     let all = stats(&parts);
     assert_eq!(all["source"], "run.mcap to run-3.mcap (4 parts)");
-    let ended = place.start("gateway", &format!("convert {parts} all.log --plain")).end().well();
+    let ended = place.start("skinbus", &format!("convert {parts} all.log --plain")).end().well();
     assert!(ended.stderr.contains(&format!("{one_by_one} frames")), "{ended:#?}");
-    place.start("gateway", &format!("shadow {parts}")).end().well();
+    place.start("skinbus", &format!("shadow {parts}")).end().well();
 
     // No packet of the part before counts as lost in this one.
     let summary = place.summary();
@@ -154,7 +154,7 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
         let mut found = findings.filter(|finding| finding.what.starts_with("packets of cells lost"));
         assert!(found.next().unwrap().ours.value <= lost as f64, "{files:?}");
     }
-    place.start("gateway", &format!("report {parts}")).end().well();
+    place.start("skinbus", &format!("report {parts}")).end().well();
     assert!(place.path("run.html").exists());
 }
 
@@ -162,27 +162,27 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
 fn files_that_are_not_the_parts_of_one_recording_are_named() {
     let place = Place::new();
     recorded(&place);
-    let refused = |files: &str| place.start("gateway", &format!("dump {files}")).end().refusal(2).to_owned();
-    let said = "gateway: part 1 of the recording is missing between run.mcap and run-2.mcap: name all parts from the \
+    let refused = |files: &str| place.start("skinbus", &format!("dump {files}")).end().refusal(2).to_owned();
+    let said = "skinbus: part 1 of the recording is missing between run.mcap and run-2.mcap: name all parts from the \
                 first to the last, or one alone";
     assert_eq!(refused("run-2.mcap run.mcap run-3.mcap"), said);
     fs::copy(place.path("run-1.mcap"), place.path("again.mcap")).unwrap();
-    let said = "gateway: run-1.mcap and again.mcap are both part 1 of the recording: name one of them";
+    let said = "skinbus: run-1.mcap and again.mcap are both part 1 of the recording: name one of them";
     assert_eq!(refused("run.mcap run-1.mcap again.mcap run-2.mcap"), said);
     let line = refused("run.mcap run-1.mcap run.log");
-    assert_eq!(line, "gateway: run.mcap is a part of a recording, and run.log is none: name the parts alone");
+    assert_eq!(line, "skinbus: run.mcap is a part of a recording, and run.log is none: name the parts alone");
     let line = refused("run.mcap nothing.mcap");
-    assert!(line.starts_with("gateway: there is no file nothing.mcap: "), "{line}");
+    assert!(line.starts_with("skinbus: there is no file nothing.mcap: "), "{line}");
     fs::rename(place.path("run.mcap"), place.path("run-recovered.mcap")).unwrap();
     place.bench(0.1, "--record other.mcap").end().well();
     let line = refused("other.mcap run-1.mcap");
     assert!(
-        line.starts_with("gateway: other.mcap and run-1.mcap are of different recordings, begun at "),
+        line.starts_with("skinbus: other.mcap and run-1.mcap are of different recordings, begun at "),
         "{line}"
     );
     // The file name does not matter; nor do parts that are missing at an end.
-    place.start("gateway", "dump run-2.mcap run-1.mcap run-recovered.mcap").end().well();
-    place.start("gateway", "dump run-3.mcap run-2.mcap").end().well();
+    place.start("skinbus", "dump run-2.mcap run-1.mcap run-recovered.mcap").end().well();
+    place.start("skinbus", "dump run-3.mcap run-2.mcap").end().well();
 }
 
 #[test]
@@ -207,7 +207,7 @@ fn parts_of_a_killed_run_come_back_recovered_or_as_they_are() {
     let (ended, replayed) = place.replayed(&format!("{whole} {last}"), "--expect --spawn --max");
     let as_it_is = replayed.all_came_back(&ended);
     assert!(ended.stderr.contains("it has no end"), "{ended:#?}");
-    place.start("gateway", &format!("recover {last} -o z-recovered.mcap")).end().well();
+    place.start("skinbus", &format!("recover {last} -o z-recovered.mcap")).end().well();
     let (ended, replayed) = place.replayed(&format!("z-recovered.mcap {whole}"), route);
     assert_eq!(replayed.all_came_back(&ended), as_it_is);
     let (ended, replayed) = place.replayed("z-recovered.mcap", route);

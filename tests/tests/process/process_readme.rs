@@ -14,7 +14,7 @@ use process::{Ended, Place, Running, program};
 const README: &str = include_str!("../../../README.md");
 const PICTURE: &str = include_str!("../../../docs/explanation/report-torque.svg");
 /// Programs that `cargo build --release` makes for the user. They are built already, so the build is replaced.
-const PROGRAMS: [&str; 3] = ["gateway", "cell-node", "vcan-setup"];
+const PROGRAMS: [&str; 3] = ["skinbus", "cell-node", "vcan-setup"];
 /// The other programs that the commands may use. Nothing else is found.
 const TOOLS: [&str; 6] = ["ln", "mkdir", "python3", "sed", "sleep", "tac"];
 /// For all commands; a machine that others use too takes a third of it.
@@ -115,7 +115,7 @@ fn every_command_does_what_it_should() {
 
     // Each line of the quoted output begins as a line of the demo's output.
     let table = blocks(README).into_iter().find(|(_, block)| block.starts_with("ur5-253 ")).unwrap().1;
-    let demo = printed(&ended, "gateway demo");
+    let demo = printed(&ended, "skinbus demo");
     let mut rest = demo;
     for line in table.lines().filter(|line| *line != "...") {
         let rank = line.trim_start().split("  ").next().unwrap();
@@ -144,19 +144,19 @@ fn commands_in_the_text_are_run_too() {
 fn failing_and_unknown_commands_fail_here() {
     let build = "cargo build --release";
     let path = "export PATH=$PWD/target/release:$PATH";
-    let version = "gateway --version";
+    let version = "skinbus --version";
     assert!(
-        run(&Place::new(), &[build, path, version]).well().stdout.contains("+ gateway --version\ngateway ")
+        run(&Place::new(), &[build, path, version]).well().stdout.contains("+ skinbus --version\nskinbus ")
     );
     for commands in [
         vec![version],
         vec!["cargo build"],
-        vec![build, path, "gateway skin check nothing.toml", version],
-        vec![build, path, "gateway skin check nothing.toml & sleep 0", version],
+        vec![build, path, "skinbus skin check nothing.toml", version],
+        vec![build, path, "skinbus skin check nothing.toml & sleep 0", version],
         vec![build, path, "nothing.toml & sleep 0"],
         vec![build, path, "tests/nothing"],
         vec![build, path, "sudo vcan-setup status"],
-        vec![build, path, "gateway skin generate | nothing"],
+        vec![build, path, "skinbus skin generate | nothing"],
     ] {
         let ended = run(&Place::new(), &commands);
         assert!(ended.code().is_some_and(|code| code != 0), "{commands:?}: {ended:#?}");

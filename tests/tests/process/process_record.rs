@@ -135,7 +135,7 @@ fn two_hundred_and_fifty_three_cells_are_recorded_without_a_gap() {
     // What stands before the first message is small: of little more than that, there are messages.
     let file = fs::read(place.path("run.mcap")).unwrap();
     fs::write(place.path("cut.mcap"), &file[..300_000]).unwrap();
-    place.start("gateway", "recover cut.mcap").end().well();
+    place.start("skinbus", "recover cut.mcap").end().well();
     assert!(Recorded::read(&place.path("cut-recovered.mcap")).messages.len() > 1_000);
 }
 
@@ -153,7 +153,7 @@ fn two_buses_of_classic_frames_have_a_topic_each() {
         let log: Vec<_> = log.lines().filter(|line| line.split(' ').nth(1) == Some(bus)).collect();
         assert!(!log.is_empty() && log == lines, "{bus}");
     }
-    let described = place.start("gateway", "dbc run.mcap --bus vcan1 --joined").end().well();
+    let described = place.start("skinbus", "dbc run.mcap --bus vcan1 --joined").end().well();
     assert_eq!(
         described.stdout,
         dbc::dbc(&Skin::parse("skin.toml", &skin_of(8, 2, Format::Classic)).unwrap(), 1)
@@ -209,14 +209,14 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     place.pressed();
     let run = "run skin.toml --bus-kind embedded --duration 1";
     let refused = |more: &str| {
-        let ended = place.start("gateway", &format!("{run} {more}")).end();
+        let ended = place.start("skinbus", &format!("{run} {more}")).end();
         ended.refusal(2).to_owned()
     };
     place.write("old.mcap", "somebody's");
     let said = refused("--record old.mcap");
     assert_eq!(
         said,
-        "gateway: --record old.mcap: it exists: name another file, or overwrite it with --force"
+        "skinbus: --record old.mcap: it exists: name another file, or overwrite it with --force"
     );
     place.write("late-1.mcap", "somebody's");
     assert!(refused("--record late.mcap").contains("late-1.mcap exists"));
@@ -224,14 +224,14 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     let said = refused("--candump old.log");
     assert_eq!(
         said,
-        "gateway: --candump old.log: it exists: name another file, or overwrite it with --force"
+        "skinbus: --candump old.log: it exists: name another file, or overwrite it with --force"
     );
-    assert_eq!(refused("--record run.log"), "gateway: --record run.log: a recording's name ends in .mcap");
+    assert_eq!(refused("--record run.log"), "skinbus: --record run.log: a recording's name ends in .mcap");
     fs::create_dir(place.path("dir.mcap")).unwrap();
     assert!(refused("--record dir.mcap").contains("is a directory; name a file"));
     let gone = refused("--record gone/run.mcap");
     let why = "No such file or directory (os error 2); name a file in a folder that can be written";
-    assert_eq!(gone, format!("gateway: --record gone/run.mcap: {why}"));
+    assert_eq!(gone, format!("skinbus: --record gone/run.mcap: {why}"));
     assert!(refused("--record run.mcap --record-split 10").contains("a size from 1MB on"));
     assert!(
         refused("--record same.mcap --summary same.mcap")
@@ -269,7 +269,7 @@ fn a_file_that_another_program_moves_while_it_is_written_counts_as_lost_and_the_
 
 /// A bench in a shell that first runs a command.
 fn in_shell(place: &Place, before: &str, run: &str, after: &str) -> process::Ended {
-    let gateway = process::program("gateway");
+    let gateway = process::program("skinbus");
     let script = format!("{before} && {{ {} {run}; code=$?; {after}; exit $code; }}", gateway.display());
     let mut command = place.command_of(Path::new("/bin/sh"), "");
     command.args(["-c", &script]);
@@ -285,7 +285,7 @@ fn broke_off(place: &Place, ended: &process::Ended, why: &str) {
     assert!(said.iter().all(|line| line.contains(why)), "{ended:#?}");
     assert!(said.first().is_some_and(|line| line.starts_with("run.mcap: ")), "{ended:#?}");
     assert!(
-        ended.stderr.lines().last().unwrap().starts_with("gateway: the recording is incomplete, "),
+        ended.stderr.lines().last().unwrap().starts_with("skinbus: the recording is incomplete, "),
         "{ended:#?}"
     );
     let summary = place.summary();
@@ -340,7 +340,7 @@ fn a_full_disk_ends_the_recording_and_not_the_run() {
     let save = "cp run.json run.mcap ../; ls > ../left";
     let script = format!(
         "{enter} && {{ {} {run}; code=$?; {save}; exit $code; }}",
-        process::program("gateway").display()
+        process::program("skinbus").display()
     );
     let mut command = place.command_of(Path::new("unshare"), "--user --map-root-user --mount sh -c");
     command.arg(script);
@@ -383,7 +383,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
     let mut lost = Vec::new();
     for number in 0..times {
         let bench = place.start(
-            "gateway",
+            "skinbus",
             "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 60 --record run.mcap",
         );
         let (heard, listener) = listen(&place);
@@ -399,7 +399,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
         assert!(part.exists() && !place.path("run.mcap").exists());
         let repaired = place.path("run-recovered.mcap");
         if number % 2 == 0 {
-            let ended = place.start("gateway", "recover run.mcap.part").end().well();
+            let ended = place.start("skinbus", "recover run.mcap.part").end().well();
             assert!(
                 ended.stdout.starts_with("run-recovered.mcap, ") && ended.stdout.contains(" messages, "),
                 "{ended:#?}"
@@ -408,7 +408,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
         } else {
             // Any run that records beside it.
             let run = "run skin.toml --bus-kind embedded --duration 0.01 --record other.mcap --quiet";
-            let ended = place.start("gateway", run).end().well();
+            let ended = place.start("skinbus", run).end().well();
             let says =
                 "run.mcap.part was left by a run that was killed; repaired, it is run-recovered.mcap: ";
             assert!(ended.stderr.lines().any(|line| line.starts_with(says)), "{ended:#?}");

@@ -28,11 +28,11 @@ fn skin_refusal(old: &str, new: &str, expected: &str) {
     let line = text[..at].matches('\n').count() + 1 + usize::from(new.starts_with("[["));
     place.write("skin.toml", &text.replacen(old, new, 1));
     let run = "run skin.toml --bus-kind embedded --duration 1 --candump run.log --summary run.json";
-    let said = refusal(&place, "gateway", run, 2);
-    let at = format!("gateway: skin.toml:{line}:");
+    let said = refusal(&place, "skinbus", run, 2);
+    let at = format!("skinbus: skin.toml:{line}:");
     assert!(said.starts_with(&at) && said.contains(&format!(": {expected}")), "{said}\n{at} {expected}");
     let cell = refusal(&place, "cell-node", "--bus vcan0 --node 1 --skin skin.toml", 2);
-    assert_eq!(cell.strip_prefix("cell-node"), said.strip_prefix("gateway"));
+    assert_eq!(cell.strip_prefix("cell-node"), said.strip_prefix("skinbus"));
 }
 
 #[test]
@@ -79,8 +79,8 @@ fn a_fault_that_processes_cannot_make_is_refused() {
     place.scenario(&format!(
         "{PRESSED}\n[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\nbus = \"vcan0\"\n"
     ));
-    let said = refusal(&place, "gateway", "run skin.toml --scenario scenario.toml --bus-kind embedded", 2);
-    assert!(said.starts_with("gateway: the fault \"drop\" of vcan0 at 1 s: a run with processes"), "{said}");
+    let said = refusal(&place, "skinbus", "run skin.toml --scenario scenario.toml --bus-kind embedded", 2);
+    assert!(said.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s: a run with processes"), "{said}");
 }
 
 #[test]
@@ -107,8 +107,8 @@ fn a_scenario_that_does_not_fit_the_skin_is_refused() {
     ] {
         place.scenario(&scenario);
         let run = "run skin.toml --scenario scenario.toml --bus-kind embedded --summary run.json";
-        let said = refusal(&place, "gateway", run, 2);
-        assert!(said.starts_with(&format!("gateway: {expected}")), "{said}");
+        let said = refusal(&place, "skinbus", run, 2);
+        assert!(said.starts_with(&format!("skinbus: {expected}")), "{said}");
     }
 }
 
@@ -131,8 +131,8 @@ fn files_that_are_not_there_are_named() {
              --vcan-setup",
         ),
     ] {
-        let said = refusal(&place, "gateway", &format!("{words} --bus-kind embedded --candump run.log"), 2);
-        assert_eq!(said, format!("gateway: {expected}"));
+        let said = refusal(&place, "skinbus", &format!("{words} --bus-kind embedded --candump run.log"), 2);
+        assert_eq!(said, format!("skinbus: {expected}"));
     }
     let said = refusal(&place, "cell-node", "--bus vcan0 --node 1 --skin nowhere.toml", 2);
     assert_eq!(said, "cell-node: nowhere.toml: No such file or directory (os error 2)");
@@ -143,11 +143,11 @@ fn a_file_that_is_no_program_is_named() {
     let place = Place::new();
     place.pressed();
     let said =
-        refusal(&place, "gateway", "run skin.toml --cell-node skin.toml --bus-kind embedded --quiet", 2);
-    assert_eq!(said, "gateway: ./skin.toml does not start: Permission denied (os error 13)");
+        refusal(&place, "skinbus", "run skin.toml --cell-node skin.toml --bus-kind embedded --quiet", 2);
+    assert_eq!(said, "skinbus: ./skin.toml does not start: Permission denied (os error 13)");
     // One that starts and is no cell.
     let said =
-        refusal(&place, "gateway", "run skin.toml --cell-node /bin/true --bus-kind embedded --quiet", 1);
+        refusal(&place, "skinbus", "run skin.toml --cell-node /bin/true --bus-kind embedded --quiet", 1);
     assert!(
         said.ends_with(" on vcan0 ended while starting (exit status: 0); see the message above"),
         "{said}"
@@ -168,14 +168,14 @@ fn files_that_cannot_be_written_are_noticed_before_the_run() {
             ("/sys/file", "Permission denied (os error 13)"),
         ] {
             let said =
-                refusal(&place, "gateway", &format!("run skin.toml --bus-kind embedded {option} {file}"), 2);
+                refusal(&place, "skinbus", &format!("run skin.toml --bus-kind embedded {option} {file}"), 2);
             let hint = "name a file in a folder that can be written";
-            assert_eq!(said, format!("gateway: {option} {file}: {why}; {hint}"));
+            assert_eq!(said, format!("skinbus: {option} {file}: {why}; {hint}"));
         }
     }
     let both = "run skin.toml --bus-kind embedded --candump file --summary file";
-    let said = refusal(&place, "gateway", both, 2);
-    assert_eq!(said, "gateway: --summary and --candump name the same file: name two");
+    let said = refusal(&place, "skinbus", both, 2);
+    assert_eq!(said, "skinbus: --summary and --candump name the same file: name two");
 }
 
 #[test]
@@ -187,7 +187,7 @@ fn a_run_that_fails_to_start_leaves_old_recordings_and_has_a_summary() {
     let run = "run skin.toml --bus-kind embedded --candump run.log --summary run.json --cell-node /bin/true \
                --quiet --force --record run.mcap";
     place.write("run.mcap", "of yesterday\n");
-    refusal(&place, "gateway", run, 1);
+    refusal(&place, "skinbus", run, 1);
     assert_eq!(place.read("run.mcap"), "of yesterday\n");
     assert_eq!(place.read("run.log"), "of yesterday\n");
     assert_eq!(place.summary().0["outcome"], "failed");
@@ -206,8 +206,8 @@ fn a_bus_that_does_not_exist_is_named_with_its_hint() {
              (--bus-kind embedded)"
         }
     };
-    let said = refusal(&place, "gateway", "run skin.toml --bus-kind socketcan --candump run.log", 2);
-    assert_eq!(said, format!("gateway: {expected}"));
+    let said = refusal(&place, "skinbus", "run skin.toml --bus-kind socketcan --candump run.log", 2);
+    assert_eq!(said, format!("skinbus: {expected}"));
     let cell = "--bus nosuch0 --node 1 --skin skin.toml --bus-kind";
     assert_eq!(
         refusal(&place, "cell-node", &format!("{cell} socketcan"), 2),
@@ -226,7 +226,7 @@ fn buses_are_not_kept_where_others_may_look() {
     let place = Place::new();
     place.pressed();
     std::fs::create_dir(place.path("open")).unwrap();
-    let mut command = place.command("gateway", "run skin.toml --bus-kind embedded --candump run.log");
+    let mut command = place.command("skinbus", "run skin.toml --bus-kind embedded --candump run.log");
     command.env("SKINBUS_DIR", place.path("open"));
     let ended = process::Running::start(command).end();
     let said = ended.refusal(2);
@@ -243,8 +243,8 @@ fn an_unusable_socket_of_an_external_controller_is_named_before_cells_are_starte
     let refused = |socket: &str, expected: &str| {
         let external = format!("kind = \"external\"\nsocket = \"{socket}\"");
         place.write("skin.toml", &text.replace("kind = \"kinesthetic\"", &external));
-        let said = refusal(&place, "gateway", "run skin.toml --bus-kind embedded --candump run.log", 2);
-        assert_eq!(said, format!("gateway: {socket}: {expected}"));
+        let said = refusal(&place, "skinbus", "run skin.toml --bus-kind embedded --candump run.log", 2);
+        assert_eq!(said, format!("skinbus: {socket}: {expected}"));
     };
     refused("nowhere/c.sock", "cannot listen on this socket: No such file or directory (os error 2)");
     place.write("plain", "");
@@ -260,23 +260,23 @@ fn wrong_options_are_one_line() {
     let seconds = "a time above 0 s, up to 1e7 s (10, 500ms, 90s, 10min, 2h); try '--help'";
     let needed = "the following required arguments were not provided";
     for (program, words, expected) in [
-        ("gateway", "run skin.toml --duration 0", format!("invalid value '0' for '--duration <TIME>': {seconds}")),
-        ("gateway", "run skin.toml --duration -1", format!("invalid value '-1' for '--duration <TIME>': {seconds}")),
-        ("gateway", "run skin.toml --duration nan", format!("invalid value 'nan' for '--duration <TIME>': {seconds}")),
+        ("skinbus", "run skin.toml --duration 0", format!("invalid value '0' for '--duration <TIME>': {seconds}")),
+        ("skinbus", "run skin.toml --duration -1", format!("invalid value '-1' for '--duration <TIME>': {seconds}")),
+        ("skinbus", "run skin.toml --duration nan", format!("invalid value 'nan' for '--duration <TIME>': {seconds}")),
         (
-            "gateway",
+            "skinbus",
             "run skin.toml --bus-kind ethernet",
             "invalid value 'ethernet' for '--bus-kind <[BUS=]KIND>': \"ethernet\" is no kind of bus: auto, socketcan and \
              embedded are; try '--help'"
                 .to_owned(),
         ),
         (
-            "gateway",
+            "skinbus",
             "run skin.toml --cells-per-process 0",
             "invalid value '0' for '--cells-per-process <N>': 0 is not in 1..=254; try '--help'".to_owned(),
         ),
-        ("gateway", "run", format!("{needed}: <SKIN>; try '--help'")),
-        ("gateway", "run skin.toml --fast", "unexpected argument '--fast' found; a similar argument exists: '--flash'; try '--help'".to_owned()),
+        ("skinbus", "run", format!("{needed}: <SKIN>; try '--help'")),
+        ("skinbus", "run skin.toml --fast", "unexpected argument '--fast' found; a similar argument exists: '--flash'; try '--help'".to_owned()),
         ("cell-node", "--bus vcan0 --skin skin.toml", format!("{needed}: --node <N>; try '--help'")),
         (
             "cell-node",

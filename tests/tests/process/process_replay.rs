@@ -167,7 +167,7 @@ fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
     place.write("moved.toml", &moved);
     let ended = place.replay("run.log", "--expect --spawn --skin moved.toml --quiet").end();
     let line = ended.refusal(1);
-    let said = "gateway: cells have another configuration than in the recording: 3 (recorded ";
+    let said = "skinbus: cells have another configuration than in the recording: 3 (recorded ";
     assert!(
         line.starts_with(said) && line.ends_with("on vcan0; name the recording's skin with --skin"),
         "{line}"
@@ -177,19 +177,19 @@ fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
     let ended = place.replay("run.log", "--expect --spawn --skin other.toml --quiet").end();
     let line = ended.refusal(1);
     assert!(
-        line.starts_with("gateway: the recording is of another skin: all 8 cells have another "),
+        line.starts_with("skinbus: the recording is of another skin: all 8 cells have another "),
         "{line}"
     );
     place.is_left_clean();
 
     let bench = by_hand(&place, "1-6");
     let ended = place.replay("run.log", "--expect --quiet").end();
-    let said = "gateway: cells of the recording are absent: 7, 8 on vcan0; start them with cell-node, or all with \
+    let said = "skinbus: cells of the recording are absent: 7, 8 on vcan0; start them with cell-node, or all with \
                 --spawn";
     assert_eq!(ended.refusal(1), said);
     let ended = place.replay("run.log", &format!("{FRESH} --quiet")).end();
     let said =
-        "gateway: cells are on vcan0 already: 1, 2, 3, 4, 5, 6; leave out --spawn to use them, or stop them";
+        "skinbus: cells are on vcan0 already: 1, 2, 3, 4, 5, 6; leave out --spawn to use them, or stop them";
     assert_eq!(ended.refusal(1), said);
     drop(bench);
 }
@@ -205,7 +205,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     place.is_left_clean();
     assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[1, 0, 0][..]), "{:#}", replayed.0);
     assert!(
-        ended.stderr.contains("gateway: replies are not as they were recorded: 1 different"),
+        ended.stderr.contains("skinbus: replies are not as they were recorded: 1 different"),
         "{ended:#?}"
     );
     let text = replayed.text("/expect/first/text");
@@ -329,7 +329,7 @@ fn a_foreign_capture_goes_to_another_bus_as_it_is() {
     place.write("foreign.log", log);
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
-    let dump = place.start("gateway", "dump vcan0 --bus-kind embedded --max 4");
+    let dump = place.start("skinbus", "dump vcan0 --bus-kind embedded --max 4");
     dump.hears("vcan0 is embedded");
     let (ended, replayed) = place.replayed("foreign.log", "--map can7=vcan0 --map can8=vcan0");
     ended.well();
@@ -361,7 +361,7 @@ fn a_cell_that_measures_obeys_for_the_replay_with_test_mode() {
     test_client.sends(&mode(1, Request::Write { number, words: [0; WORDS] }));
     test_client.waits_for("a cell that measures", answers(1, 0));
     let ended = place.replay("run.log", "--expect --to 1 --quiet").end();
-    let said = "gateway: cells measure and do not obey stimuli, as they did in the recording: 3; --test-mode lets them \
+    let said = "skinbus: cells measure and do not obey stimuli, as they did in the recording: 3; --test-mode lets them \
                 obey while the replay lasts";
     assert_eq!(ended.refusal(1), said);
     let (ended, replayed) = place.replayed("run.log", "--expect --max --to 1 --test-mode");

@@ -36,7 +36,7 @@ fn a_bus_that_ends_in_mid_replay_is_one_line_and_a_table() {
     server.signal(Signal::TERM);
     let ended = replay.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    let said = "gateway: the embedded bus vcan0 was closed: its server ended";
+    let said = "skinbus: the embedded bus vcan0 was closed: its server ended";
     assert_eq!(ended.stderr.lines().filter(|line| line.contains("was closed")).collect::<Vec<_>>(), [said]);
     assert!(ended.stdout.contains("sent") && place.files().contains(&"replay.json".to_owned()), "{ended:#?}");
     drop((cells, server));
@@ -77,7 +77,7 @@ fn a_gateway_and_a_replay_notice_each_other() {
     for route in ["", "--expect"] {
         let ended = place.replay("old.log", &format!("--quiet {route}")).end();
         let said =
-            "gateway: another gateway is on vcan0: stop it, or send the capture to another bus with --map";
+            "skinbus: another gateway is on vcan0: stop it, or send the capture to another bus with --map";
         assert_eq!(ended.refusal(1), said);
     }
     bench.signal(Signal::TERM);
@@ -89,7 +89,7 @@ fn a_gateway_and_a_replay_notice_each_other() {
     place.test_client().sends(&Message::Joints { epoch: protocol::packet::Epoch(200), joints });
     let ended = replay.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
-    assert!(ended.stderr.contains("gateway: another gateway is on vcan0"), "{ended:#?}");
+    assert!(ended.stderr.contains("skinbus: another gateway is on vcan0"), "{ended:#?}");
     place.is_left_clean();
 }
 
@@ -104,43 +104,43 @@ fn invalid_input_is_refused_in_one_line() {
     let zip = place.path("some.zip");
     fs::write(&zip, b"PK\x03\x04..............").unwrap();
     for (words, code, said) in [
-        ("empty.log", 1, "gateway: empty.log: there is no frame in it"),
-        ("none.log", 1, "gateway: none.log: there is no frame in it"),
-        ("nothing.log", 2, "gateway: nothing.log: No such file"),
-        ("some.zip", 2, "gateway: some.zip is a zip"),
-        ("-", 2, "gateway: a capture is read twice, which standard input cannot be"),
-        ("some.log --strict", 1, "gateway: some.log:2: column 4: digits of a second"),
-        ("some.log --from 5", 2, "gateway: nothing remains to be sent: some.log lasts 2.000 s"),
-        ("some.log --map can0=can1", 2, "gateway: --map can0=can1: some.log has no bus can0; it has vcan0"),
-        ("some.log --bus can0", 2, "gateway: --bus can0: some.log has no bus can0; it has vcan0"),
+        ("empty.log", 1, "skinbus: empty.log: there is no frame in it"),
+        ("none.log", 1, "skinbus: none.log: there is no frame in it"),
+        ("nothing.log", 2, "skinbus: nothing.log: No such file"),
+        ("some.zip", 2, "skinbus: some.zip is a zip"),
+        ("-", 2, "skinbus: a capture is read twice, which standard input cannot be"),
+        ("some.log --strict", 1, "skinbus: some.log:2: column 4: digits of a second"),
+        ("some.log --from 5", 2, "skinbus: nothing remains to be sent: some.log lasts 2.000 s"),
+        ("some.log --map can0=can1", 2, "skinbus: --map can0=can1: some.log has no bus can0; it has vcan0"),
+        ("some.log --bus can0", 2, "skinbus: --bus can0: some.log has no bus can0; it has vcan0"),
         (
             "some.log --map vcan0",
             2,
-            "gateway: invalid value 'vcan0' for '--map <FROM=TO>': a bus of the capture and",
+            "skinbus: invalid value 'vcan0' for '--map <FROM=TO>': a bus of the capture and",
         ),
         (
             "some.log --speed 101",
             2,
-            "gateway: invalid value '101' for '--speed <X>': a number from 0.1 to 100",
+            "skinbus: invalid value '101' for '--speed <X>': a number from 0.1 to 100",
         ),
         (
             "some.log --speed 0.01",
             2,
-            "gateway: invalid value '0.01' for '--speed <X>': a number from 0.1 to 100",
+            "skinbus: invalid value '0.01' for '--speed <X>': a number from 0.1 to 100",
         ),
         (
             "some.log --only replies --expect",
             2,
-            "gateway: --expect lets cells answer, and --only sends recorded",
+            "skinbus: --expect lets cells answer, and --only sends recorded",
         ),
-        ("some.log --expect --spawn", 2, "gateway: --spawn: some.log has no skin attached"),
+        ("some.log --expect --spawn", 2, "skinbus: --spawn: some.log has no skin attached"),
         (
             "some.log --map vcan0=can9 --spawn --skin skin.toml",
             2,
-            "gateway: --spawn: the capture goes to can9, and the",
+            "skinbus: --spawn: the capture goes to can9, and the",
         ),
-        ("some.log --spawn --skin nothing.toml", 2, "gateway: nothing.toml: "),
-        ("some.log", 2, "gateway: no embedded bus vcan0 is served"),
+        ("some.log --spawn --skin nothing.toml", 2, "skinbus: nothing.toml: "),
+        ("some.log", 2, "skinbus: no embedded bus vcan0 is served"),
     ] {
         let ended = place
             .replay(
@@ -156,7 +156,7 @@ fn invalid_input_is_refused_in_one_line() {
     // A recording without heartbeats.
     let ended = place.replay("torques.log", "--expect --spawn --skin skin.toml --quiet").end();
     assert!(
-        ended.refusal(1).starts_with("gateway: cells of the recording are absent: 12 on vcan0"),
+        ended.refusal(1).starts_with("skinbus: cells of the recording are absent: 12 on vcan0"),
         "{ended:#?}"
     );
 }

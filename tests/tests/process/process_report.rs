@@ -206,7 +206,7 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
     let place = Place::new();
     recorded_bench(&place, 2.0);
     let before = place.files();
-    let ended = place.start("gateway", "report run.mcap --svg figures").end().well();
+    let ended = place.start("skinbus", "report run.mcap --svg figures").end().well();
     let (whole, _) = page(&place, "run.mcap");
     let all: Vec<_> =
         figures(&whole).map(|it| it.name.as_str()).chain(drawings(&whole).map(Drawing::name)).collect();
@@ -219,7 +219,7 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
     }
     files.sort();
     assert_eq!(names(&place.path("figures")), files);
-    assert!(html.ends_with("</html>\n") && html.contains("gateway run skin.toml"));
+    assert!(html.ends_with("</html>\n") && html.contains("skinbus run skin.toml"));
     let after: Vec<_> = place.files().into_iter().filter(|name| !before.contains(name)).collect();
     assert_eq!(after, ["figures", "run.html"]);
 
@@ -238,24 +238,24 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
             "--svg run.mcap/more: Not a directory (os error 20); name a folder that can be written",
         ),
     ] {
-        let refused = place.start("gateway", &format!("report run.mcap {options}")).end();
-        assert_eq!(refused.refusal(2), format!("gateway: {said}"));
+        let refused = place.start("skinbus", &format!("report run.mcap {options}")).end();
+        assert_eq!(refused.refusal(2), format!("skinbus: {said}"));
     }
     assert!(!place.path("more").exists() && !place.path("new.html").exists());
-    let refused = place.start("gateway", "report run.mcap -o new.html --nominal 2M").end();
+    let refused = place.start("skinbus", "report run.mcap -o new.html --nominal 2M").end();
     assert!(refused.refusal(2).contains("nominal bit rate 2000000 bit/s"), "{refused:?}");
 
     let bytes = fs::read(place.path("run.mcap")).unwrap();
     fs::write(place.path("cut.mcap"), &bytes[..bytes.len() / 2]).unwrap();
-    let ended = place.start("gateway", "report cut.mcap").end().well();
+    let ended = place.start("skinbus", "report cut.mcap").end().well();
     assert_eq!(ended.stderr.matches('\n').count(), 1, "{ended:?}");
-    for words in ["gateway: cut.mcap: it has no end", "of the 2 s that the run was to last", "s are missing"]
+    for words in ["skinbus: cut.mcap: it has no end", "of the 2 s that the run was to last", "s are missing"]
     {
         assert!(ended.stderr.contains(words), "{words}: {ended:?}");
     }
     assert!(place.read("cut.html").contains("Not all of the run is here: it has no end"));
     // As much as a recovery finds.
-    place.start("gateway", "recover cut.mcap -o recovered.mcap").end().well();
+    place.start("skinbus", "recover cut.mcap -o recovered.mcap").end().well();
     let recovered = Recorded::read(&place.path("recovered.mcap"));
     let ticks = recovered.on("/gateway/timing").count();
     let (link_down, missing) = page(&place, "cut.mcap");
@@ -334,7 +334,7 @@ fn touches_are_shown_when_and_where_the_recorder_saw_them_and_losses_where_cells
     assert!(moments.rows.iter().any(|row| row[1] == "vcan0: cell 3 is silent"), "{moments:?}");
     let touches = table(&page, "Touches, cells of a link together");
     assert!(touches.rows.iter().all(|row| row[2].contains("run.mcap --at ")), "{touches:?}");
-    // The command counts from the first frame, as `gateway explain --at` does.
+    // The command counts from the first frame, as `skinbus explain --at` does.
     let frame = recorded.on("/can/vcan0").map(|message| message.nanos).min().unwrap();
     let first = forces.iter().filter(|(_, _, force)| *force > 0.0).map(|(nanos, ..)| *nanos).min().unwrap();
     let at: f64 = touches.rows[0][2].rsplit(' ').next().unwrap().parse().unwrap();

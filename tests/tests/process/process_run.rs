@@ -225,7 +225,7 @@ fn cells_that_measure_are_named_and_only_the_others_are_pressed() {
     test_client.waits_for("its answer", |message| matches!(message, Message::Configured { tag: 9, .. }));
 
     let ended = place.bench(1.5, "--no-spawn").end().well();
-    let said = "cells that measure, the scenario does not press them (`gateway frame configure --node N --write \
+    let said = "cells that measure, the scenario does not press them (`skinbus frame configure --node N --write \
                 mode 1` puts one into test mode): 3 on vcan0\n";
     assert!(ended.stderr.contains(said), "{ended:#?}");
     assert!(ended.stdout.contains("cells that measure"), "{}", ended.stdout);
@@ -249,7 +249,7 @@ fn a_gateway_without_cells_names_the_missing_ones() {
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
     let ended = place.bench(1.0, "--no-spawn --quiet").end();
-    let said = "gateway: cells that are not ready: 1, 2, 3, 4, 5, 6, 7, 8 on vcan0; start them with cell-node, \
+    let said = "skinbus: cells that are not ready: 1, 2, 3, 4, 5, 6, 7, 8 on vcan0; start them with cell-node, \
                 or leave out --no-spawn";
     assert_eq!(ended.refusal(1), said);
     assert_eq!(place.files(), ["buses", "run.json", "scenario.toml", "skin.toml"]);

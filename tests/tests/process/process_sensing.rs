@@ -38,11 +38,11 @@ fn ends(bench: Running) {
 
 /// What a command in this place prints, when it does what it should.
 fn switches(place: &Place, words: &str) -> String {
-    place.start("gateway", &format!("sensing vcan0 {words} --bus-kind embedded")).end().well().stdout
+    place.start("skinbus", &format!("sensing vcan0 {words} --bus-kind embedded")).end().well().stdout
 }
 
 fn refusal(place: &Place, words: &str, code: i32) -> String {
-    place.start("gateway", &format!("sensing {words} --bus-kind embedded")).end().refusal(code).to_owned()
+    place.start("skinbus", &format!("sensing {words} --bus-kind embedded")).end().refusal(code).to_owned()
 }
 
 #[test]
@@ -84,7 +84,7 @@ fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
     (1..=CELLS).for_each(tells);
     assert_eq!(switches(&place, "off"), "8 cells on vcan0 (embedded): off\n");
 
-    let why = "gateway: no cell 99 answers on vcan0: start it, or name the bus' format with --format classic";
+    let why = "skinbus: no cell 99 answers on vcan0: start it, or name the bus' format with --format classic";
     assert_eq!(refusal(&place, "vcan0 event --node 99", 1), why);
     ends(bench);
     place.is_left_clean();
@@ -183,18 +183,18 @@ fn an_invalid_request_is_refused_in_one_line() {
     let place = Place::new();
     assert_eq!(
         refusal(&place, "vcan0 continuous", 2),
-        "gateway: continuous needs a rate, such as `continuous 62.5`"
+        "skinbus: continuous needs a rate, such as `continuous 62.5`"
     );
     assert_eq!(
         refusal(&place, "vcan0 event 10", 2),
-        "gateway: HZ = 10: only continuous has a rate; leave it out"
+        "skinbus: HZ = 10: only continuous has a rate; leave it out"
     );
     assert_eq!(
         refusal(&place, "vcan0 continuous 60", 2),
-        "gateway: HZ = 60: its period must be a whole number of ms; the nearest are 58.8235 and 62.5000 Hz"
+        "skinbus: HZ = 60: its period must be a whole number of ms; the nearest are 58.8235 and 62.5000 Hz"
     );
     let nowhere = refusal(&place, "vcan0 event", 2);
-    assert!(nowhere.starts_with("gateway: ") && nowhere.contains("vcan0"), "{nowhere}");
+    assert!(nowhere.starts_with("skinbus: ") && nowhere.contains("vcan0"), "{nowhere}");
 }
 
 /// Cells that have taken stimuli before a gateway listens: from another sender, and from a gateway that was killed.
@@ -301,7 +301,7 @@ fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_t
     let stuck: Vec<_> =
         stuck.map(|cell| (&cell["node"], cell["stuck"]["torque"].as_u64() > Some(31))).collect();
     assert_eq!(stuck, [(&json!(5), true)], "{:#}", summary.0["cells"]);
-    place.start("gateway", "report run.mcap -o run.html").end().well();
+    place.start("skinbus", "report run.mcap -o run.html").end().well();
     let page = place.read("run.html");
     assert!(page.contains("stuck cells, which should have sent other words (vcan0 5: "), "not in the report");
 }

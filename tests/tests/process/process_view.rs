@@ -1,4 +1,4 @@
-//! `gateway view`: a page's WebSocket beside a real bench, and clients that mean no good.
+//! `skinbus view`: a page's WebSocket beside a real bench, and clients that mean no good.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod intruders;
@@ -174,7 +174,7 @@ fn pages_that_may_only_look_press_nothing() {
     place.write("skin.toml", &(skin(4) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(QUIET);
     let run = place.running_bench(30.0, "");
-    let view = place.start("gateway", "view skin.toml --bus-kind embedded --read-only");
+    let view = place.start("skinbus", "view skin.toml --bus-kind embedded --read-only");
     let mut page = Page::new(&address(&view));
     assert_eq!(page.scene["may_press"], false);
     page.press(2, 5.0);
@@ -201,7 +201,7 @@ fn pages_that_may_only_look_press_nothing() {
         ("--listen nowhere", "--listen"),
         ("", "vcan0"),
     ] {
-        let ended = place.start("gateway", &format!("view skin.toml --bus-kind embedded {words}")).end();
+        let ended = place.start("skinbus", &format!("view skin.toml --bus-kind embedded {words}")).end();
         let said = ended.refusal(2);
         assert!(said.contains(expected), "{words}: {said}");
     }
@@ -210,10 +210,10 @@ fn pages_that_may_only_look_press_nothing() {
 #[test]
 fn one_bus_of_a_skin_is_shown_alone() {
     let place = Place::new();
-    place.start("gateway", "skin generate --cells 10 --buses 2 -o skin.toml").end().well();
+    place.start("skinbus", "skin generate --cells 10 --buses 2 -o skin.toml").end().well();
     place.scenario(QUIET);
     let run = place.running_bench(30.0, "");
-    let view = place.start("gateway", "view vcan1 --skin skin.toml --bus-kind embedded");
+    let view = place.start("skinbus", "view vcan1 --skin skin.toml --bus-kind embedded");
     let mut page = Page::new(&address(&view));
     assert_eq!(page.scene["buses"].as_array().unwrap().len(), 1);
     assert_eq!(page.scene["buses"][0]["name"], "vcan1");
@@ -232,7 +232,7 @@ fn one_bus_of_a_skin_is_shown_alone() {
         ("view vcan7 --skin skin.toml", "bus vcan7 is not in skin.toml, which has vcan0, vcan1"),
         ("view vcan1 --skin skin.toml --at 3", "--at is of a recording, and buses are listened to"),
     ] {
-        let ended = place.start("gateway", &format!("{words} --bus-kind embedded")).end();
+        let ended = place.start("skinbus", &format!("{words} --bus-kind embedded")).end();
         assert!(ended.refusal(2).contains(expected), "{words}: {}", ended.refusal(2));
     }
 }
@@ -245,8 +245,8 @@ fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
         place.path("lift.urdf"),
     )
     .unwrap();
-    place.start("gateway", "skin import lift.urdf --tip arm7 -o skin.toml").end().well();
-    let view = place.start("gateway", "view skin.toml --wait --bus-kind embedded");
+    place.start("skinbus", "skin import lift.urdf --tip arm7 -o skin.toml").end().well();
+    let view = place.start("skinbus", "view skin.toml --wait --bus-kind embedded");
     view.hears("view: http://");
     let address = address(&view);
     let scene = Page::new(&address).scene;
@@ -327,7 +327,7 @@ fn a_token_is_taken_from_a_file_the_environment_or_the_command_line() {
         (format!("{run} --token-file token"), "", false),
         (run.to_owned(), SECRET, false),
     ] {
-        let mut command = place.command("gateway", &words);
+        let mut command = place.command("skinbus", &words);
         command.env("SKINBUS_TOKEN", variable);
         let served = Running::start(command);
         let address = address(&served);
@@ -341,19 +341,19 @@ fn a_token_is_taken_from_a_file_the_environment_or_the_command_line() {
     }
     // What can only look needs none on this machine, and one elsewhere.
     for (words, has_token) in [("--read-only", false), ("--read-only --listen 0.0.0.0:0", true)] {
-        let served = place.start("gateway", &format!("{view} {words}"));
+        let served = place.start("skinbus", &format!("{view} {words}"));
         let address = address(&served);
         assert_eq!(!address.query.is_empty(), has_token, "{words}: {}", address.url());
         Page::new(&address);
         served.signal(rustix::process::Signal::INT);
         served.end().well();
     }
-    let mut command = place.command("gateway", &format!("{run} --candump run.log"));
+    let mut command = place.command("skinbus", &format!("{run} --candump run.log"));
     command.env("SKINBUS_TOKEN", "short");
     let refused = Running::start(command).end();
     assert_eq!(
         refused.refusal(2),
-        "gateway: SKINBUS_TOKEN: a token has 16 to 256 letters or digits, and nothing else"
+        "skinbus: SKINBUS_TOKEN: a token has 16 to 256 letters or digits, and nothing else"
     );
     assert!(!place.path("run.log").exists(), "nothing was done");
 }

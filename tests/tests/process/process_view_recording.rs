@@ -1,4 +1,4 @@
-//! `gateway view` over recordings of earlier builds: what a page gets at a moment is what `gateway dump` says up to it.
+//! `skinbus view` over recordings of earlier builds: what a page gets at a moment is what `skinbus dump` says up to it.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -26,7 +26,7 @@ impl Recording {
             std::fs::copy(from, place.path(name)).unwrap();
         }
         let files: Vec<_> = names.iter().map(|name| (*name).to_owned()).collect();
-        let served = place.start("gateway", &format!("view {} --at 0 {more}", files.join(" ")));
+        let served = place.start("skinbus", &format!("view {} --at 0 {more}", files.join(" ")));
         let page = Page::new(&address(&served));
         let mut it = Self { place, files, _served: served, page };
         it.page.hears("all is read", |said| said["playback"]["read"] == 1.0);
@@ -36,7 +36,7 @@ impl Recording {
     /// All that `dump` has with these options.
     fn dumped(&self, more: &str) -> Vec<Value> {
         let words = format!("dump {} --json {more}", self.files.join(" "));
-        let dumped = self.place.start("gateway", &words).end().well();
+        let dumped = self.place.start("skinbus", &words).end().well();
         dumped.stdout.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
     }
 
@@ -121,8 +121,8 @@ fn a_log_needs_a_skin_and_is_shown_with_it() {
     let place = Place::new();
     let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings");
     std::fs::copy(from.join("classic.log"), place.path("classic.log")).unwrap();
-    let ended = place.start("gateway", "view classic.log").end();
-    assert_eq!(ended.refusal(2), "gateway: classic.log has no skin in it: name one with --skin");
+    let ended = place.start("skinbus", "view classic.log").end();
+    assert_eq!(ended.refusal(2), "skinbus: classic.log has no skin in it: name one with --skin");
 }
 
 #[test]
@@ -145,7 +145,7 @@ fn what_cannot_be_shown_is_named() {
         ),
         ("view text.log text.log", "text.log is named twice: name it once"),
     ] {
-        let ended = place.start("gateway", words).end();
+        let ended = place.start("skinbus", words).end();
         assert!(ended.refusal(2).contains(expected), "{words}: {}", ended.refusal(2));
     }
 }
@@ -200,6 +200,6 @@ fn a_replay_has_a_page_which_ends_with_it() {
     replay.signal(rustix::process::Signal::INT);
     replay.end();
     place.is_left_clean();
-    let ended = place.start("gateway", "replay fd.mcap --view --map vcan0=vcan1").end();
+    let ended = place.start("skinbus", "replay fd.mcap --view --map vcan0=vcan1").end();
     assert!(ended.refusal(2).contains("cannot be used with"), "{ended:?}");
 }

@@ -75,7 +75,7 @@ impl Place {
     }
 
     fn gateway(&self, arguments: &str) -> String {
-        self.run(&program("gateway"), arguments, None)
+        self.run(&program("skinbus"), arguments, None)
     }
 
     fn debian(&self, tool: &str, arguments: &str) -> String {

@@ -64,7 +64,7 @@ fn import(place: &Place, rows: &[Vec<&str>], torque_format: &str) -> PathBuf {
     place.write("cells.csv", &cells);
     let urdf = robots().join(rows[0][1]);
     let words = format!("skin import {} --tip {} --cells cells.csv -o skin.toml", urdf.display(), rows[0][3]);
-    place.start("gateway", &words).end().well();
+    place.start("skinbus", &words).end().well();
     let name = "name = \"vcan0\"\n";
     let skin = place.read("skin.toml");
     assert_eq!(skin.matches(name).count(), 1);
@@ -82,7 +82,7 @@ fn check_calculator(robot: &str) {
         writeln!(batch, "{node},{},{}", row[11], row[13]).unwrap();
     }
     place.write("rows.csv", &batch);
-    let said = place.start("gateway", "torque skin.toml --batch rows.csv --json").end().well().stdout;
+    let said = place.start("skinbus", "torque skin.toml --batch rows.csv --json").end().well().stdout;
     let answers: Vec<Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(answers.len(), rows.len());
     let (mut central_off, mut fixed_off) = (0.0_f64, Vec::new());
@@ -119,7 +119,7 @@ fn check_moving(robot: &str) {
         "version = 1\nduration_s = 6.0\n\n[[touch]]\nat_s = 0.3\nfor_s = 9.0\nall = true\nforce_n = 1.5\nprofile = \"step\"\n",
     );
     place.bench(4.0, "--record run.mcap").end().well();
-    let dump = place.start("gateway", "dump run.mcap --json --kind joints,stimulus,torque").end().well();
+    let dump = place.start("skinbus", "dump run.mcap --json --kind joints,stimulus,torque").end().well();
     place.write("dump.jsonl", &dump.stdout);
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tools/chains.py");
     let joints = rows[0][12].replace(' ', ",");

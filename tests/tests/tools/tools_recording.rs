@@ -82,13 +82,13 @@ fn the_robot_and_its_cells_are_where_forward_kinematics_says() {
     let python = tests.join("../target/tools/bin/python");
     let script = tests.join("tools/recording.py");
     let examples = tests.join("../gateway/examples");
-    place.start("gateway", "skin generate --cells 12 -o rows.toml").end().well();
+    place.start("skinbus", "skin generate --cells 12 -o rows.toml").end().well();
     for (skin, file, tips) in [
         ("urdf.toml", "panda.urdf", "--tip hand"),
         ("two.toml", "two-arms.urdf", "--tip left_palm --tip right_palm"),
     ] {
         let import = format!("skin import {}/{file} {tips} -o {skin}", examples.display());
-        place.start("gateway", &import).end().well();
+        place.start("skinbus", &import).end().well();
     }
     // The same arms by what is written of their rows.
     let two = place.read("two.toml");
@@ -107,7 +107,7 @@ fn the_robot_and_its_cells_are_where_forward_kinematics_says() {
         let run = format!(
             "run {skin}.toml --scenario moving.toml --bus-kind embedded --duration 1 --quiet --record {skin}.mcap"
         );
-        place.start("gateway", &run).end().well();
+        place.start("skinbus", &run).end().well();
         let words = format!("{} tf {skin}.mcap", script.display());
         let compared = process::Running::start(place.command_of(&python, &words)).end().well();
         println!("{skin}: {}", compared.stdout.trim());

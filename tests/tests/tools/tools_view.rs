@@ -1,4 +1,4 @@
-//! The page of `gateway run --view` in a real browser: a click presses a cell, and the arm gives way.
+//! The page of `skinbus run --view` in a real browser: a click presses a cell, and the arm gives way.
 //!
 //! `tests/tools/install` makes the browser ready; `tests/tools/run` does that, and then runs this.
 #![allow(
@@ -246,7 +246,7 @@ fn a_recording_is_gone_through_in_a_browser() {
     let place = Place::new();
     let from = concat!(env!("CARGO_MANIFEST_DIR"), "/recordings/fd.mcap");
     std::fs::copy(from, place.path("fd.mcap")).unwrap();
-    let view = place.start("gateway", "view fd.mcap");
+    let view = place.start("skinbus", "view fd.mcap");
     let url = format!("{}#at=0.9", address(&view).url());
     let mut browser = Browser::new(1400, 900);
     browser.open(&url);
@@ -303,7 +303,7 @@ fn a_page_in_software_draws_an_arm_that_moves() {
         "version = 1\nduration_s = 120.0\n\n[motion]\nkind = \"sine\"\nstart_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n\
          amplitude_rad = [0.5, 0.3, 0.4, 0.3, 0.2, 0.2]\nperiod_s = 10.0\n",
     );
-    let run = place.start("gateway", "run skin.toml --bus-kind embedded --scenario scenario.toml --view");
+    let run = place.start("skinbus", "run skin.toml --bus-kind embedded --scenario scenario.toml --view");
     let url = address(&run).url();
     let mut browser = Browser::new(1400, 900);
     browser.open(&url);

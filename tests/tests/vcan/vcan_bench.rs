@@ -64,7 +64,7 @@ fn what_candump_logged_is_the_same_run_when_we_decode_it() {
     let frames = candump.frames();
     let dumped = |file: &str| {
         let dump =
-            place.start("gateway", &format!("dump {file} --kind torque,stimulus,command")).end().well();
+            place.start("skinbus", &format!("dump {file} --kind torque,stimulus,command")).end().well();
         let mut lines: Vec<_> = dump.stdout.lines().map(without_time).map(str::to_owned).collect();
         lines.sort();
         lines
@@ -76,7 +76,7 @@ fn what_candump_logged_is_the_same_run_when_we_decode_it() {
     assert!(shared == all && ours.torques().len() == theirs.torques().len(), "{shared} of {all}");
 }
 
-/// A line of `gateway dump` from the interface's name on.
+/// A line of `skinbus dump` from the interface's name on.
 fn without_time(line: &str) -> &str {
     line.find("vcan0").map_or(line, |at| &line[at..])
 }

@@ -138,12 +138,12 @@ fn a_bus_that_is_missing_when_a_run_begins_is_refused_with_its_hint() {
     vcan2.remove();
     let refused = place.bench(1.0, "--quiet --bus-kind vcan3=embedded").end();
     assert!(
-        refused.refusal(2).starts_with("gateway: there is no interface vcan2: make it with `"),
+        refused.refusal(2).starts_with("skinbus: there is no interface vcan2: make it with `"),
         "{refused:#?}"
     );
     let refused = place.bench(1.0, "--quiet --bus-kind vcan1=embedded --bus-kind vcan2=embedded").end();
     assert!(
-        refused.refusal(2).starts_with("gateway: there is no interface vcan3: make it with `"),
+        refused.refusal(2).starts_with("skinbus: there is no interface vcan3: make it with `"),
         "{refused:#?}"
     );
     place.is_left_clean();

@@ -64,7 +64,7 @@ fn goes_on_when_reported(place: &Place, bench: &Running, cells: &[(Pid, String)]
         matches!(message, Message::Network { from: Node::Cell(_), page: NetworkPage::Heartbeat(heartbeat), .. }
             if heartbeat.state.has(State::HALTED))
     });
-    place.start("gateway", "ack vcan0 --bus-kind socketcan").end().well();
+    place.start("skinbus", "ack vcan0 --bus-kind socketcan").end().well();
     bench.hears("the robot goes on");
     all_answer(place);
     assert_eq!(bench.cells(), cells, "no cell was restarted");
@@ -111,14 +111,14 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
     let cells = bench.cells();
     vcan0.down();
     bench.hears(DOWN);
-    let hint = "`gateway ack vcan0 --bus-kind socketcan` resumes it";
+    let hint = "`skinbus ack vcan0 --bus-kind socketcan` resumes it";
     bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}; {hint}"));
     for cell in 1..=6 {
         bench.tells(cell, "fallen silent");
     }
-    let refused = place.start("gateway", "ack vcan0 --bus-kind socketcan").end();
+    let refused = place.start("skinbus", "ack vcan0 --bus-kind socketcan").end();
     let said = refused.refusal(2);
-    assert!(said.starts_with(&format!("gateway: there is no file vcan0, and as a bus: {DOWN}")), "{said}");
+    assert!(said.starts_with(&format!("skinbus: there is no file vcan0, and as a bus: {DOWN}")), "{said}");
     vcan0.up();
     bench.hears("vcan0 works again");
     for cell in 1..=6 {
@@ -140,8 +140,8 @@ fn a_transmit_queue_that_stays_full_costs_what_could_not_be_sent_and_nothing_aft
     vcan0.fill();
     bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}"));
     bench.tells(1, "fallen silent");
-    let full = place.start("gateway", "frame sync --bus vcan0 --bus-kind socketcan").end();
-    let said = "gateway: vcan0 took no frame for 100 ms: its queue is full; send less, or ask whether anybody is on \
+    let full = place.start("skinbus", "frame sync --bus vcan0 --bus-kind socketcan").end();
+    let said = "skinbus: vcan0 took no frame for 100 ms: its queue is full; send less, or ask whether anybody is on \
                 the bus";
     assert_eq!(full.refusal(1), said);
     vcan0.empty();
@@ -185,7 +185,7 @@ fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept()
     vcan5.remove();
     let Ended { status, stdout, stderr } = bench.end();
     assert!(status.code() == Some(1) && stdout.contains(" s, failed "), "{stdout}{stderr}");
-    assert_eq!(stderr.lines().last(), Some(format!("gateway: {removed}").as_str()));
+    assert_eq!(stderr.lines().last(), Some(format!("skinbus: {removed}").as_str()));
     assert_eq!(stderr.matches(removed).count(), 1, "{stderr}");
     assert!(!stderr.contains("cell-node: "), "{stderr}");
     place.is_left_clean();
@@ -217,13 +217,13 @@ fn a_bus_that_cannot_be_used_is_refused_with_its_hint() {
             .end()
             .refusal(2)
             .to_owned();
-        assert_eq!(gateway.strip_prefix("gateway: "), cell.strip_prefix("cell-node: "));
+        assert_eq!(gateway.strip_prefix("skinbus: "), cell.strip_prefix("cell-node: "));
         gateway
     };
     vcan0.down();
     let says = |bus: &str, wrong: &str| {
         let said = run(bus);
-        assert!(said.starts_with(&format!("gateway: {wrong}")), "{said}");
+        assert!(said.starts_with(&format!("skinbus: {wrong}")), "{said}");
     };
     says("vcan0", DOWN);
     let _narrow = Vcan::with_mtu("vcan6", 16);
@@ -314,8 +314,8 @@ fn a_second_gateway_is_refused_and_the_first_is_undisturbed() {
     all_answer(&place);
     let second = "run skin.toml --scenario scenario.toml --duration 1 --summary second.json --candump second.log --force --quiet";
     for more in ["", " --no-spawn"] {
-        let ended = place.start("gateway", &format!("{second}{more}")).end();
-        let said = "gateway: another gateway is on vcan0: stop one of the two, or give this one another bus";
+        let ended = place.start("skinbus", &format!("{second}{more}")).end();
+        let said = "skinbus: another gateway is on vcan0: stop one of the two, or give this one another bus";
         assert_eq!(ended.refusal(1), said);
     }
     assert_eq!(place.files(), ["run.log", "scenario.toml", "second.json", "second.log", "skin.toml"]);
@@ -346,7 +346,7 @@ fn of_two_gateways_that_start_at_the_same_time_at_most_one_goes_on() {
             let words = format!(
                 "run skin.toml --scenario scenario.toml --duration 2 --quiet --summary {name}.json --force {more}"
             );
-            place.start("gateway", &words)
+            place.start("skinbus", &words)
         };
         let both = ["one", "other"].map(run).map(Running::end);
         let good = both.iter().filter(|ended| ended.code() == Some(0)).count();

@@ -156,5 +156,5 @@ fn lateness_at_two_milliseconds_is_printed_beside_canplayers() {
         eprintln!("by its own count {}, idle {}", replayed.0["late_us"], replayed.0["idle_late_us"]);
     });
     eprintln!("lateness at 2 ms, by candump's times, after the quickest, us (50 %, 90 %, max):");
-    eprintln!("  gateway replay {ours:?}, canplayer {theirs:?}");
+    eprintln!("  skinbus replay {ours:?}, canplayer {theirs:?}");
 }

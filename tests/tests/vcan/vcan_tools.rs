@@ -144,7 +144,7 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
     test_client.waits_for("a torque", torque_of(1, true));
     cansend(&place, "halt");
     bench.hears(
-        "the robot is halted: somebody sent a halt frame; `gateway ack vcan0 --bus-kind socketcan` resumes it",
+        "the robot is halted: somebody sent a halt frame; `skinbus ack vcan0 --bus-kind socketcan` resumes it",
     );
     let test_client = place.test_client();
     let joints = Cell::new(0);
@@ -152,7 +152,7 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
         joints.set(joints.get() + u32::from(matches!(message, Message::Joints { .. })));
         joints.get() == 10
     });
-    place.start("gateway", "ack vcan0 --bus-kind socketcan").end().well();
+    place.start("skinbus", "ack vcan0 --bus-kind socketcan").end().well();
     bench.hears("the robot goes on");
     let test_client = place.test_client();
     for cell in 1..=4 {

@@ -14,7 +14,7 @@ use super::{json, named, query};
 /// Check whether a bench would run on this machine, with a hint for each fault
 ///
 /// Looks at the kernel, the interfaces, permissions, buffers and nodes on the buses already (it listens for
-/// 600 ms, and sends nothing), and reports what would stop `gateway run`. Changes nothing. Run it as the user
+/// 600 ms, and sends nothing), and reports what would stop `skinbus run`. Changes nothing. Run it as the user
 /// who runs the gateway. Exit code 0: a bench would run; 1: it would not; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
@@ -29,7 +29,7 @@ pub(crate) struct Doctor {
     /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
     #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
     bus_kind: Choice,
-    /// The cells are on the bus already, or are real: as with `gateway run --no-spawn`
+    /// The cells are on the bus already, or are real: as with `skinbus run --no-spawn`
     #[arg(long)]
     no_spawn: bool,
     /// Print JSON

@@ -17,7 +17,7 @@ use crate::plan::Target;
 pub struct Facts {
     /// Which kind of bus is requested.
     pub choice: Choice,
-    /// Whether the cells are there already, as `gateway run --no-spawn` has it.
+    /// Whether the cells are there already, as `skinbus run --no-spawn` has it.
     pub no_spawn: bool,
     /// How this program is called so that `sudo` finds it.
     pub program: String,

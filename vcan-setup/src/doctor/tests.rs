@@ -282,7 +282,7 @@ fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
     );
     let there = listens(cells(1..=14), false);
     assert!(there[0].starts_with(
-        "fault: cells are on vcan0 already: 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12 and 2 more | gateway run ... --no-spawn"
+        "fault: cells are on vcan0 already: 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12 and 2 more | skinbus run ... --no-spawn"
     ));
     assert_eq!(listens(cells(1..=100), true), Vec::<String>::new());
     assert_eq!(

@@ -9,7 +9,7 @@
 //! last bit of a double.
 //!
 //! Frames of simulated wires are left out: no real bus has them, and their identifiers number wires and not cells.
-//! `gateway dump` shows them.
+//! `skinbus dump` shows them.
 //!
 //! A DBC knows nothing of the CRC beyond its place, nor that a packet on a classic bus travels in several frames
 //! under one identifier. For a classic bus the text describes packets, for programs that join the frames first.

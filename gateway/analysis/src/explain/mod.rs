@@ -1,4 +1,4 @@
-//! Why a torque is what it is: `gateway explain`.
+//! Why a torque is what it is: `skinbus explain`.
 //!
 //! ```text
 //!   frames up to some joints ──> Watch ──> contact state and answer of each cell ─┐

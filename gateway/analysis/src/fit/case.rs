@@ -12,7 +12,7 @@ use super::response::{Response, Stream, response};
 const HEARTBEAT_NS: u64 = 250_000_000;
 /// With sensors on, a frame of acceleration follows every fourth heartbeat.
 const ACCELERATION_NS: u64 = 4 * HEARTBEAT_NS;
-/// How much of the period `gateway skin generate` gives to slots, in hundredths.
+/// How much of the period `skinbus skin generate` gives to slots, in hundredths.
 const SLOTS_SHARE: u64 = 75;
 
 /// What the cells of a bus answer joints with, all of them in contact.
@@ -317,7 +317,7 @@ fn torques(skin: &Skin, bus: usize) -> Answers {
 }
 
 /// The tree as the wires of a bus allow it; `None` when a cell is unreachable. Without a described slot, one as
-/// `gateway skin generate` would choose.
+/// `skinbus skin generate` would choose.
 pub(super) fn sums(
     skin: &Skin,
     bus: usize,

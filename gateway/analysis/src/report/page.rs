@@ -231,7 +231,7 @@ mod tests {
                 Table::new(
                     "moments",
                     ["at", "look"],
-                    [["2 s".to_owned(), "gateway view 'a b' --at 2".to_owned()]],
+                    [["2 s".to_owned(), "skinbus view 'a b' --at 2".to_owned()]],
                 )
                 .of_commands(),
             ],
@@ -240,7 +240,7 @@ mod tests {
         Page {
             title: "A page & more".to_owned(),
             intro: "<script>".to_owned(),
-            facts: vec![("command".to_owned(), "gateway run 'a' > b".to_owned())],
+            facts: vec![("command".to_owned(), "skinbus run 'a' > b".to_owned())],
             sections: vec![section("one"), section("two"), section("three")],
         }
     }
@@ -285,7 +285,7 @@ mod tests {
         assert!(right.contains(&"12".to_owned()) && right.contains(&"–".to_owned()));
         assert!(!right.contains(&"vcan0 1".to_owned()));
         let commands: Vec<_> = all("code").into_iter().map(text).collect();
-        assert_eq!(commands[..2], ["look <here>", "gateway view 'a b' --at 2"]);
-        assert!(text(all("footer")[0]).contains("gateway run 'a' > b"));
+        assert_eq!(commands[..2], ["look <here>", "skinbus view 'a b' --at 2"]);
+        assert!(text(all("footer")[0]).contains("skinbus run 'a' > b"));
     }
 }

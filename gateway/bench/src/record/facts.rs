@@ -19,7 +19,7 @@ pub type Facts = BTreeMap<String, String>;
 #[must_use]
 pub fn program(command_line: &[String], began_nanos: u64) -> Facts {
     facts([
-        ("program", format!("gateway {}", env!("CARGO_PKG_VERSION"))),
+        ("program", format!("skinbus {}", env!("CARGO_PKG_VERSION"))),
         ("git_revision", env!("SKINBUS_GIT_REVISION").to_owned()),
         ("command_line", command_line.join(" ")),
         ("began_ns", began_nanos.to_string()),

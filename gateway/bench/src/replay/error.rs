@@ -76,7 +76,7 @@ pub enum ReplayError {
     Merged,
     /// There is no skin for the cells that are to be started.
     #[error(
-        "--spawn: {0} has no skin attached, as recordings of `gateway run --record` have: name it with --skin SKIN.toml"
+        "--spawn: {0} has no skin attached, as recordings of `skinbus run --record` have: name it with --skin SKIN.toml"
     )]
     NoSkin(String),
     /// The skin does not have a bus.

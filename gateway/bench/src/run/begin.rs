@@ -168,7 +168,7 @@ impl Bench<'_> {
             ("do not answer, the run goes on without them", silent),
             ("have no parameters, the run goes on without them", unconfigured),
             (
-                "measure, the scenario does not press them (`gateway frame configure --node N --write mode 1` puts one \
+                "measure, the scenario does not press them (`skinbus frame configure --node N --write mode 1` puts one \
                  into test mode)",
                 measuring,
             ),

@@ -101,7 +101,7 @@ pub enum RunError {
     },
     /// Cells have no parameters.
     #[error(
-        "cells without parameters: {0}; write them with `gateway commission`, or delete their flash files if these are \
+        "cells without parameters: {0}; write them with `skinbus commission`, or delete their flash files if these are \
          damaged"
     )]
     Unconfigured(String),
@@ -118,7 +118,7 @@ pub enum RunError {
     },
     /// Cells have another configuration.
     #[error(
-        "cells that are configured for another skin than {}: {cells}; write it into them with `gateway commission`, or \
+        "cells that are configured for another skin than {}: {cells}; write it into them with `skinbus commission`, or \
          delete their flash files",
         .skin.display()
     )]

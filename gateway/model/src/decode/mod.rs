@@ -1,4 +1,4 @@
-//! What frames mean, as text: `gateway dump` shows it beside the raw frame.
+//! What frames mean, as text: `skinbus dump` shows it beside the raw frame.
 //!
 //! ```text
 //!   frame, time, bus ──> Decoder ──> Decoded ──> one line of text

@@ -1,4 +1,4 @@
-//! `gateway skin generate`: describes a skin of hexagonal cells on a robot's arm.
+//! `skinbus skin generate`: describes a skin of hexagonal cells on a robot's arm.
 //!
 //! The cells lie in rings around the upper arm and the forearm, each ring turned by half a cell against
 //! the next, so that neighbours are a hexagon's neighbours. The result is the text of a `skin.toml`.

@@ -107,7 +107,7 @@ pub enum Difference {
         version: Option<u16>,
     },
     /// A cell computes with other parameters than the skin's.
-    #[error("cell {0} is configured for another skin: configure it with `gateway commission`")]
+    #[error("cell {0} is configured for another skin: configure it with `skinbus commission`")]
     OtherSkin(CellId),
     /// A described wire does not work.
     #[error("the wire from {first} to {second} {}: look at its plugs", carries.between(first.cell, second.cell))]

@@ -351,7 +351,7 @@ impl Scenario {
     /// # Errors
     /// The first thing that is wrong with it.
     pub fn parse(path: &str, text: &str, skin: &Skin) -> Result<Self, DocumentError> {
-        let what = "this is a skin, not a scenario: `gateway run SKIN --scenario SCENARIO` takes both";
+        let what = "this is a skin, not a scenario: `skinbus run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, |raw| check::scenario(raw, skin))
             .map_err(|error: DocumentError| error.or_mistaken(text, KEYS, &[], what))
     }

@@ -199,7 +199,7 @@ fn what_comes_and_goes_needs_a_length_and_a_skin_is_no_scenario() {
     let said = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap_err().to_string();
     let endless = "[[touch]]\nall = true\nforce_n = 3.0\nprofile = \"half-sine\"\n";
     assert_eq!(said(endless), "s.toml:1:1: touch[0].for_s: needed with profile = \"half-sine\"");
-    let taken = "this is a skin, not a scenario: `gateway run SKIN --scenario SCENARIO` takes both";
+    let taken = "this is a skin, not a scenario: `skinbus run SKIN --scenario SCENARIO` takes both";
     assert_eq!(said(SKIN), format!("s.toml: {taken}"));
 }
 

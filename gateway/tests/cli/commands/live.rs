@@ -158,11 +158,11 @@ fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
             let all = says(&format!("frame configure --node everyone --read mount {with}"));
             assert_eq!((all.0, all.1.lines().count()), (Some(0), 1), "{all:?}");
             let refused = says(&format!("frame configure --node 12 --write mode 1 {with}"));
-            assert!(refused.0 == Some(1) && refused.2.starts_with("gateway: configured 12 tag 0: "), "{refused:?}");
+            assert!(refused.0 == Some(1) && refused.2.starts_with("skinbus: configured 12 tag 0: "), "{refused:?}");
             let nobody = says(&format!("frame stimulus --node 250 {with}"));
             assert_eq!((nobody.0, nobody.1.as_str()), (Some(1), ""));
             let expected = format!(
-                "gateway: no cell 250 was heard on vcan0 for 1 s: `gateway cells vcan0` lists who is there; the bus' \
+                "skinbus: no cell 250 was heard on vcan0 for 1 s: `skinbus cells vcan0` lists who is there; the bus' \
                  format may be --format {}\n",
                 format.other().name()
             );
@@ -202,10 +202,10 @@ fn too_few_files_are_refused_before_anything_is_started() {
     output(gateway(&format!("skin generate --cells 3 -o {}", skin.display())));
     let mut command = Command::new("sh");
     command.args(["-c", "ulimit -n 12; exec \"$0\" run \"$1\" --duration 1 --bus-kind embedded"]);
-    command.arg(env!("CARGO_BIN_EXE_gateway")).arg(&skin).env("SKINBUS_DIR", parent.path().join("skinbus"));
+    command.arg(env!("CARGO_BIN_EXE_skinbus")).arg(&skin).env("SKINBUS_DIR", parent.path().join("skinbus"));
     let Output { status, stderr, .. } = command.output().unwrap();
     let said =
-        "gateway: 12 files may be open at once, and this bench needs 33: say `ulimit -n 33` before it\n";
+        "skinbus: 12 files may be open at once, and this bench needs 33: say `ulimit -n 33` before it\n";
     assert_eq!((status.code(), text(&stderr)), (Some(2), said));
 }
 
@@ -238,7 +238,7 @@ fn cells_on_a_foreign_bus_reports_that_frames_came_and_none_of_a_cell() {
     let Output { status, stderr, .. } = child.wait_with_output().unwrap();
     let said = text(&stderr);
     assert_eq!(status.code(), Some(1), "{said}");
-    assert!(said.contains(" frames are of no cell; `gateway dump` shows them): start them"), "{said}");
+    assert!(said.contains(" frames are of no cell; `skinbus dump` shows them): start them"), "{said}");
 }
 
 #[test]
@@ -286,7 +286,7 @@ fn a_bus_that_ends_ends_its_dump_with_an_error() {
     let dump = bench.dump("");
     drop(bench);
     let Output { status, stderr, .. } = dump.wait_with_output().unwrap();
-    let said = "gateway: the embedded bus vcan0 was closed: its server ended\n";
+    let said = "skinbus: the embedded bus vcan0 was closed: its server ended\n";
     assert_eq!((status.code(), text(&stderr)), (Some(1), said));
 }
 
@@ -322,7 +322,7 @@ fn a_dump_reports_lost_frames_though_its_bus_has_ended() {
     let missing = said.strip_prefix("vcan0: ").and_then(|said| {
         said.strip_suffix(
             " frames are missing: they came faster than they were shown\n\
-             gateway: the embedded bus vcan0 was closed: its server ended\n",
+             skinbus: the embedded bus vcan0 was closed: its server ended\n",
         )
     });
     let missing: u32 = missing.unwrap_or_else(|| panic!("{said}")).parse().unwrap();

@@ -69,7 +69,7 @@ fn commands(help: &str) -> Vec<String> {
 }
 
 fn gateway(folder: &Path) -> Command {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     // Whoever is there: no bus can be served or attached to.
     command.current_dir(folder).env("NO_COLOR", "1").env("SKINBUS_DIR", "/nowhere/skinbus");
     command

@@ -83,7 +83,7 @@ fn an_identifier_that_does_not_fit_is_named_and_no_frame() {
     let (code, out, said) = run(&folder, "convert id_needs_29_bits.mcap -");
     assert_eq!((code, out.as_str()), (Some(1), ""));
     assert!(said.contains("18F010FE does not fit an identifier of 11 bits: at most 7FF"), "{said}");
-    assert!(said.ends_with("gateway: id_needs_29_bits.mcap: there is no frame in it\n"), "{said}");
+    assert!(said.ends_with("skinbus: id_needs_29_bits.mcap: there is no frame in it\n"), "{said}");
 }
 
 #[test]
@@ -206,10 +206,10 @@ fn files_of_one_capture_are_read_in_the_order_of_their_frames() {
         folder.refuses("convert one.mcap again.mcap", 2).ends_with("is an MCAP recording already: copy it")
     );
     let said = folder.refuses("convert split_0.mcap split_0.mcap x.log", 2);
-    assert_eq!(said, "gateway: split_0.mcap is named twice: name it once");
+    assert_eq!(said, "skinbus: split_0.mcap is named twice: name it once");
     let said = folder.refuses("convert split_0.mcap three_digits.log x.log", 2);
     assert!(
-        said.starts_with("gateway: three_digits.log is a candump log, and split_0.mcap an MCAP recording"),
+        said.starts_with("skinbus: three_digits.log is a candump log, and split_0.mcap an MCAP recording"),
         "{said}"
     );
 }
@@ -248,7 +248,7 @@ fn texts_of_other_programs_are_named_with_what_to_do() {
     ] {
         let folder = folder(&[file]);
         let name = file.strip_prefix("kinds/").unwrap();
-        let begin = format!("gateway: {name} is {what}, and no candump log or MCAP recording: ");
+        let begin = format!("skinbus: {name} is {what}, and no candump log or MCAP recording: ");
         for command in
             ["dump NAME", "convert NAME -", "convert NAME out.log", "shadow NAME", "view NAME", "dbc NAME"]
         {
@@ -274,7 +274,7 @@ fn a_capture_is_shown_and_another_text_is_named_as_dump_names_it() {
     ] {
         let said = folder.refuses(command, 1);
         assert!(
-            said.starts_with("gateway: words.txt: there is no frame in 1000 lines; what candump prints"),
+            said.starts_with("skinbus: words.txt: there is no frame in 1000 lines; what candump prints"),
             "{command}: {said}"
         );
     }
@@ -329,7 +329,7 @@ fn what_came_through_a_pipe_outlives_a_killed_convert() {
         assert!(!folder.path(to).exists());
         let said = folder.refuses("convert - run.mcap", 2);
         assert!(
-            said.contains("run.mcap.part is there, of a program that was killed: `gateway recover"),
+            said.contains("run.mcap.part is there, of a program that was killed: `skinbus recover"),
             "{said}"
         );
         let (code, said, _) = run(&folder, "recover run.mcap.part -o run.mcap");

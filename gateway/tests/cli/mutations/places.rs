@@ -297,7 +297,7 @@ fn comes_back(seed: &Seed, what: &str, file: &[u8], place: &Range<usize>) {
 
 /// What a command says of a file: exit code, and what it prints.
 fn run(folder: &Path, words: &str) -> (Option<i32>, Vec<String>, String) {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_gateway"));
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
     command.args(words.split(' ')).current_dir(folder).env("SKINBUS_DIR", folder.join("bus"));
     let ended = command.output().unwrap();
     let lines = String::from_utf8_lossy(&ended.stdout).lines().map(str::to_owned).collect();

@@ -27,7 +27,7 @@ const BEGAN: u64 = 1_700_000_000_000_000_000;
 
 /// The description of a small skin.
 pub(crate) fn skin() -> String {
-    let made = Command::new(env!("CARGO_BIN_EXE_gateway"))
+    let made = Command::new(env!("CARGO_BIN_EXE_skinbus"))
         .args(["skin", "generate", "--cells", "3"])
         .output()
         .unwrap();

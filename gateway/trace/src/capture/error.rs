@@ -35,7 +35,7 @@ pub enum CaptureError {
     },
     /// From here on it is not what it was.
     #[error(
-        "{name} is damaged: {what}; {entries} frames and notes before that were read; `gateway recover` makes a new \
+        "{name} is damaged: {what}; {entries} frames and notes before that were read; `skinbus recover` makes a new \
          file of what is whole"
     )]
     Damaged {

@@ -31,7 +31,7 @@ pub enum PartsError {
         other: PathBuf,
     },
     /// Logs and recordings are not one capture.
-    #[error("{} is a candump log, and {} an MCAP recording: make a log of it first with `gateway convert`", .log.display(), .mcap.display())]
+    #[error("{} is a candump log, and {} an MCAP recording: make a log of it first with `skinbus convert`", .log.display(), .mcap.display())]
     Formats {
         /// The log.
         log: PathBuf,

@@ -134,7 +134,7 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
             Err(why) => {
                 let hint = why.may_be_recording().then(|| {
                     format!(
-                        "; if it is a recording that broke off, `gateway recover {name} -o NAME` copies it"
+                        "; if it is a recording that broke off, `skinbus recover {name} -o NAME` copies it"
                     )
                 });
                 say(&format!("{name} is left alone: {why}{}", hint.unwrap_or_default()));

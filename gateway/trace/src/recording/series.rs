@@ -451,7 +451,7 @@ impl<T> Series<T> {
                 Err(error) => {
                     let path = part.path.display();
                     self.said.push(Said::Else(format!(
-                        "{path}: {error}; what was recorded is in it: repair it with `gateway recover {path}`"
+                        "{path}: {error}; what was recorded is in it: repair it with `skinbus recover {path}`"
                     )));
                     let bytes = file.metadata().map_or(0, |about| about.len());
                     self.written.push(kept.in_file(&part.path, bytes));

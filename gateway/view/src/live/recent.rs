@@ -50,7 +50,7 @@ pub struct FrameSaid {
     pub at_s: f64,
     /// The frame as candump writes it.
     pub frame: String,
-    /// Verdict and meaning, as `gateway dump` has them.
+    /// Verdict and meaning, as `skinbus dump` has them.
     pub said: String,
     /// Whether it is a torque, which can be explained.
     pub is_torque: bool,

@@ -160,7 +160,7 @@ fn run(seconds: u64, with_intruders: bool) -> Outcome {
     place.write("skin.toml", &(skin(12) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(&PRESSED.replace("60.0", "3600.0"));
     let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --view --duration 3600 --summary run.json --quiet";
-    let run = place.start("gateway", words);
+    let run = place.start("skinbus", words);
     let address = address(&run);
     let intruders = KINDS.iter().filter(|_| with_intruders).map(|kind| Intruder::start(kind, &address.host));
     let mut intruders: Vec<_> = intruders.collect();
@@ -245,7 +245,7 @@ fn a_page_that_may_open_few_files_still_lets_in_who_has_the_token() {
     let place = Place::new();
     place.skin(4);
     let mut command = place.command_of(Path::new("sh"), "-c");
-    let gateway = program("gateway");
+    let gateway = program("skinbus");
     let words = format!("ulimit -n 64; exec {} view skin.toml --wait --bus-kind embedded", gateway.display());
     command.arg(words);
     let served = Running::start(command);

@@ -9,7 +9,7 @@
 //!
 //! Replies, losses and errors are not in a recording as numbers; the frames are. They go through the same
 //! [`Table`](model::table::Table) that the gateway had, and so come to the same accounts. The load of a
-//! real bus is that of `gateway shadow` for the same recording.
+//! real bus is that of `skinbus shadow` for the same recording.
 
 mod bus_figures;
 mod moments;
@@ -44,7 +44,7 @@ pub enum ReportError {
     Capture(#[from] CaptureError),
     /// Frames alone.
     #[error(
-        "{name} is no MCAP recording, and frames alone are not enough: `gateway run SKIN --record run.mcap` makes what a \
+        "{name} is no MCAP recording, and frames alone are not enough: `skinbus run SKIN --record run.mcap` makes what a \
          report needs"
     )]
     Log {
@@ -52,7 +52,7 @@ pub enum ReportError {
         name: String,
     },
     /// Of another program, or of nothing.
-    #[error("{name} holds no run: {what}; `gateway run SKIN --record run.mcap` makes what a report needs")]
+    #[error("{name} holds no run: {what}; `skinbus run SKIN --record run.mcap` makes what a report needs")]
     Foreign {
         /// Its name.
         name: String,

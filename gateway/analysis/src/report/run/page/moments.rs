@@ -21,11 +21,11 @@ struct Moment {
 
 impl Draft<'_> {
     /// The command that shows the recording at a time, in s after its first message; `--at` counts from its first frame,
-    /// as that of `gateway explain` does.
+    /// as that of `skinbus explain` does.
     pub(super) fn look(&self, at: f64) -> String {
         let seconds = (at - self.run.first_frame.unwrap_or(0.0)).max(0.0);
         let files: Vec<_> = self.run.files.iter().map(|file| quoted(file)).collect();
-        format!("gateway view {} --at {seconds:.3}", files.join(" "))
+        format!("skinbus view {} --at {seconds:.3}", files.join(" "))
     }
 
     /// Touches, link by link.
