@@ -48,7 +48,7 @@ struct Arguments {
     /// Open the bus again when it is gone, and wait for it at the start, instead of ending
     #[arg(long)]
     reconnect: bool,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
     #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
     bus_kind: Choice,
     /// End when this process, the parent, ends

@@ -35,7 +35,7 @@ fn write_line(log: &mut String, line: u64) {
 /// Million lines a second, and the peak memory of the process in MB.
 fn convert(gateway: &Path, from: &Path, to: &Path, lines: u64) -> (f64, f64) {
     let mut command = Command::new(gateway);
-    command.arg("convert").arg(from).arg(to).arg("--force").stderr(Stdio::null());
+    command.arg("convert").arg(from).arg(to).arg("--overwrite").stderr(Stdio::null());
     let (seconds, memory) = watched::run(&mut command);
     (lines as f64 / seconds / 1e6, memory)
 }

@@ -44,7 +44,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             files: vec![file.clone()],
             kinds: Kinds::all(kind),
             only: Only::All,
-            pick: model::decode::pick::Pick::default(),
             buses: Vec::new(),
             map: Vec::new(),
             part: Part::default(),
@@ -54,11 +53,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             lockstep: false,
             expect: None,
             spawn: None,
-            vcan_setup: None,
             test_mode: false,
             timeout: Duration::from_millis(100),
             receive_buffer: 1 << 20,
-            strict: true,
             quiet: true,
         };
         let before = clock_gettime(ClockId::ProcessCPUTime);

@@ -85,7 +85,7 @@ fn main() {
         ("--json, 1M/8M", &["--data", "8M", "--json"]),
     ] {
         let mut command = Command::new(&gateway);
-        command.arg("shadow").arg(&log).args(arguments).stdout(Stdio::null());
+        command.arg("fit").arg(&log).args(arguments).stdout(Stdio::null());
         let (seconds, memory) = watched::run(&mut command);
         let (rate, times) = (frames as f64 / seconds / 1e6, lasts / seconds);
         println!("{name:25}{rate:.2} million frames/s, {times:.0} times real time, {memory:.0} MB");

@@ -1,7 +1,7 @@
 //! Arguments that several commands share, and how words become values.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::ops::RangeInclusive;
 
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
@@ -56,18 +56,10 @@ pub(crate) fn nanos(text: &str) -> Result<u64, String> {
     nanos.ok_or_else(|| "a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h)".to_owned())
 }
 
-/// Of which kind a bus is.
-#[derive(Args, Clone, Copy, Debug)]
-pub(crate) struct BusKind {
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
-    pub(crate) bus_kind: Choice,
-}
-
 /// Of which kinds several buses are.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct BusKinds {
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not; for one bus of
+    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus; for one bus of
     /// several BUS=KIND, as often as there are buses
     #[arg(long, value_name = "[BUS=]KIND")]
     bus_kind: Vec<OneKind>,
@@ -76,7 +68,12 @@ pub(crate) struct BusKinds {
 impl BusKinds {
     /// The kinds of any buses.
     pub(crate) fn of_any(&self) -> Result<Kinds, Failure> {
-        Kinds::of_words(&self.bus_kind, Choice::Auto).map_err(Failure::usage)
+        self.or(Choice::Auto)
+    }
+
+    /// The kinds of any buses; this one of those that no option names.
+    pub(crate) fn or(&self, otherwise: Choice) -> Result<Kinds, Failure> {
+        Kinds::of_words(&self.bus_kind, otherwise).map_err(Failure::usage)
     }
 
     /// The kinds of these buses, and of no others.
@@ -85,18 +82,22 @@ impl BusKinds {
     }
 }
 
-/// Which programs are started, and how many cells share one.
-#[derive(Args, Clone, Debug)]
-pub(crate) struct Programs {
+/// A whole number from the environment, for what few set: `name` is the variable.
+pub(crate) fn of_environment(name: &str, allowed: RangeInclusive<u32>) -> Result<Option<u32>, Failure> {
+    let Some(given) = std::env::var_os(name).filter(|given| !given.is_empty()) else { return Ok(None) };
+    let number = given.to_str().and_then(|text| text.parse().ok()).filter(|number| allowed.contains(number));
+    number.map(Some).ok_or_else(|| {
+        let (given, [min, max]) = (given.display(), [allowed.start(), allowed.end()]);
+        Failure::usage(format!("the environment variable {name}={given}: {min} to {max} is possible"))
+    })
+}
+
+/// How many cells share a process.
+#[derive(Args, Clone, Copy, Debug)]
+pub(crate) struct Processes {
     /// Put up to N cells into one process
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=254))]
     pub(crate) cells_per_process: u8,
-    /// The program of the cells, when it is not beside this one
-    #[arg(long, value_name = "PATH")]
-    pub(crate) cell_node: Option<PathBuf>,
-    /// The program that serves embedded buses, when it is not beside this one
-    #[arg(long, value_name = "PATH")]
-    pub(crate) vcan_setup: Option<PathBuf>,
 }
 
 /// The names of a skin's buses.

@@ -23,6 +23,7 @@ use model::scenario::Scenario;
 use protocol::bus::GATEWAY_RECEIVE_BUFFER;
 use protocol::document::{self, Place};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
+use protocol::id::CellId;
 use protocol::parameters::{Events, Sensing};
 use protocol::skin::{ControllerKind, Skin};
 use protocol::time::{Micros, Span};
@@ -30,8 +31,8 @@ use protocol::usage::{Failure, print};
 use trace::capture::{Entry, Reader};
 use trace::recording::series::{Attached, Split};
 
-use super::arguments::{BusKinds, Programs, bus_names, seconds};
-use super::output::{Force, apart, note};
+use super::arguments::{BusKinds, bus_names, seconds};
+use super::output::{Overwrite, apart, note, print_beside};
 use super::print::{count, json};
 use super::robot_file::{RobotOfSkin, urdf_of};
 use super::visuals::Packages;
@@ -40,23 +41,23 @@ use super::visuals::Packages;
 ///
 /// Moves the robot through poses and swings within its limits, records what the cells' accelerometers show, and estimates
 /// for every cell which joint moves it, its position, its orientation, and bias and gain of its sensor, each with how far
-/// it is certain. Simulated cells get accelerometers with the errors of a data sheet. With --from a recording is used instead,
+/// it is certain. Simulated cells get accelerometers with the errors of a data sheet. With --recording a recording is used instead,
 /// also one of a robot that another program moved. Exit code 0: every cell can be trusted; 1: some cannot, or it failed; 2:
 /// wrong use or configuration.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus calibrate skin.toml -o found.toml && skinbus commission found.toml
-  skinbus calibrate skin.toml --from run.mcap --page found.html
+  skinbus calibrate skin.toml --recording run.mcap --page found.html
   skinbus calibrate skin.toml --dry-run > motion.json")]
 pub(crate) struct Calibrate {
     /// The skin's description: robot, buses and cells; poses of cells need not be right
     skin: PathBuf,
     /// Write a copy of the description with the poses that were found
-    #[arg(long, short, value_name = "NEW.toml")]
+    #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Use a recording or candump log instead of a run; all parts of a split one
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["record", "no_spawn", "dry_run"])]
-    from: Vec<PathBuf>,
+    recording: Vec<PathBuf>,
     /// Keep the recording of the run
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
@@ -82,9 +83,6 @@ pub(crate) struct Calibrate {
     /// What the data sheet of the accelerometers says, as TOML, with the keys of a scenario's [sensors.acceleration]. Else a BMA250
     #[arg(long, value_name = "FILE")]
     data_sheet: Option<PathBuf>,
-    /// Which accelerometers simulated cells have
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    seed: u64,
     /// Move nothing: print the motion as JSON
     #[arg(long)]
     dry_run: bool,
@@ -94,17 +92,15 @@ pub(crate) struct Calibrate {
     #[command(flatten)]
     kinds: BusKinds,
     #[command(flatten)]
-    programs: Programs,
-    #[command(flatten)]
     packages: Packages,
     /// Show no progress
     #[arg(long, short)]
     quiet: bool,
     /// One JSON object instead of text
-    #[arg(long)]
+    #[arg(long, short)]
     json: bool,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
 }
 
 impl Calibrate {
@@ -117,11 +113,11 @@ impl Calibrate {
             ("--record", self.record.as_deref()),
             ("--page", self.page.as_deref()),
         ];
-        apart(written, [self.skin.as_path()].into_iter().chain(self.from.iter().map(PathBuf::as_path)))?;
+        apart(written, [self.skin.as_path()].into_iter().chain(self.recording.iter().map(PathBuf::as_path)))?;
         for (option, path) in written {
-            path.map_or(Ok(()), |path| self.force.check(option, path))?;
+            path.map_or(Ok(()), |path| self.overwrite.check(option, path))?;
         }
-        let calibration = if self.from.is_empty() {
+        let calibration = if self.recording.is_empty() {
             let motion = plan(&skin, &settings.bounds, &settings.sheet, settings.gravity);
             let motion = motion.map_err(Failure::usage)?;
             if self.dry_run {
@@ -129,20 +125,17 @@ impl Calibrate {
             }
             self.live(&skin, &text, &settings, motion)?
         } else {
-            read(&self.from, &skin, &settings)?
+            read(&self.recording, &skin, &settings)?
         };
         if let Some(path) = &self.output {
             let new = calibrated(&skin, &text, &calibration).map_err(Failure::usage)?;
-            self.force.write("-o", path, &new)?;
+            self.overwrite.write("-o", path, &new)?;
         }
-        if self.json {
-            print(&json(&calibration)?)?;
-        } else {
-            print(&report(&skin, &calibration))?;
-        }
+        let shown = if self.json { json(&calibration)? } else { report(&skin, &calibration) };
+        print_beside([self.output.as_deref(), self.page.as_deref()], &shown)?;
         if let Some(path) = &self.page {
             let page = picture::page(&self.skin, &skin, &self.packages, &calibration);
-            self.force.write("--page", path, &page)?;
+            self.overwrite.write("--page", path, &page)?;
         }
         match calibration.summary.troubled {
             0 => Ok(()),
@@ -198,7 +191,7 @@ impl Calibrate {
         if matches!(skin.controller.kind, ControllerKind::External { .. }) {
             return Err(Failure::usage(
                 "[controller] kind = \"external\": another program moves this robot; record it with `skinbus run --record` and \
-                 give the recording with --from",
+                 give it with --recording",
             ));
         }
         let folder = tempfile::tempdir().map_err(Failure::run)?;
@@ -248,7 +241,6 @@ impl Calibrate {
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "20 to 3600 s: checked")]
         let mut scenario = Scenario::idle(Span(length_us as u64));
         scenario.motion.start = motion.at(0.0).position;
-        scenario.seed = self.seed;
         scenario.sensors.acceleration = (!self.no_spawn).then_some(settings.sheet);
         let mut sensing = skin.clone();
         sensing.buses.iter_mut().for_each(|bus| bus.sensing = Sensing::Event);
@@ -268,12 +260,11 @@ impl Calibrate {
             directory: None,
             spawn: !self.no_spawn,
             emulated: None,
-            cells_per_process: self.programs.cells_per_process.into(),
+            // A process a bus: what is looked at is not how cells share a machine.
+            cells_per_process: usize::from(CellId::MAX.get()),
             flash: None,
-            cell_node: self.programs.cell_node.clone(),
-            vcan_setup: self.programs.vcan_setup.clone(),
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
-            record: record::Options { candump: None, mcap: Some(mcap), force: self.force.force },
+            record: record::Options { candump: None, mcap: Some(mcap), force: self.overwrite.overwrite },
             quiet: self.quiet,
             planned: Some(motion),
             announced: Vec::new(),

@@ -13,7 +13,7 @@ use protocol::skin::Skin;
 use protocol::usage::{Failure, draw, print, shown_lines};
 
 use self::show::{Known, Shown};
-use super::arguments::{BusKind, bus_of, seconds};
+use super::arguments::{BusKinds, bus_of, seconds};
 use super::input;
 use super::print::{json, json_line};
 
@@ -37,28 +37,29 @@ pub(crate) struct Cells {
     /// The bus
     bus: String,
     /// Compare with this description: which cells have its configuration, and which are missing
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     /// Update the list until Ctrl-C
     #[arg(long)]
     watch: bool,
     /// One JSON object; with --watch, one a line
-    #[arg(long)]
+    #[arg(long, short)]
     json: bool,
-    /// Listen for so many seconds [default: 1; without end with --watch]
-    #[arg(long = "for", value_name = "S", value_parser = seconds, allow_negative_numbers = true)]
-    seconds: Option<f64>,
+    /// Listen for this time [default: 1s; without end with --watch]
+    #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
+    duration: Option<f64>,
     #[command(flatten)]
-    kind: BusKind,
+    kinds: BusKinds,
 }
 
 impl Cells {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let known = self.known()?;
+        let kind = self.kinds.of([self.bus.as_str()])?.of(&self.bus);
         let stopped = input::stopped()?;
         let format = known.as_ref().map(|known| known.format);
-        let mut watch = Watch::open(&self.bus, self.kind.bus_kind, format).map_err(Failure::usage)?;
-        let seconds = self.seconds.or_else(|| (!self.watch).then_some(LISTEN_S));
+        let mut watch = Watch::open(&self.bus, kind, format).map_err(Failure::usage)?;
+        let seconds = self.duration.or_else(|| (!self.watch).then_some(LISTEN_S));
         let show = |watch: &Watch| {
             let shown = Shown::of(watch, known.as_ref());
             match (self.json, self.watch) {

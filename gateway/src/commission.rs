@@ -13,10 +13,10 @@ use model::commission::node_ids::{NodeIds, renumbered};
 use model::commission::{Outcome, Progress, Wish};
 use protocol::document;
 use protocol::skin::Skin;
-use protocol::usage::{Failure, print};
+use protocol::usage::Failure;
 
 use super::arguments::{BusKinds, bus_names, bus_of};
-use super::output::Force;
+use super::output::{Overwrite, print_beside};
 use super::print::{list, some};
 use super::{input, output};
 
@@ -51,12 +51,12 @@ pub(crate) struct Commission {
     #[arg(long, value_name = "FILE")]
     node_ids: Option<PathBuf>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
     /// One JSON object instead of the table
-    #[arg(long)]
+    #[arg(long, short)]
     json: bool,
 }
 
@@ -70,7 +70,8 @@ impl Commission {
             None => (0..skin.buses.len()).collect(),
         };
         // Before cells are written, so that a file that cannot be written is reported first.
-        let begun = self.node_ids.as_ref().map(|path| self.force.create("--node-ids", path)).transpose()?;
+        let begun =
+            self.node_ids.as_ref().map(|path| self.overwrite.create("--node-ids", path)).transpose()?;
         let wish = Wish { dry_run: self.dry_run, verify: self.verify };
         let stopped = input::stopped()?;
         let kinds = self.kinds.of(bus_names(&skin))?;
@@ -94,7 +95,8 @@ impl Commission {
         if !self.quiet && !self.json {
             whole.notes(self.node_ids.is_some()).iter().for_each(output::note);
         }
-        print(&if self.json { super::print::json(&whole)? } else { whole.table() })?;
+        let shown = if self.json { super::print::json(&whole)? } else { whole.table() };
+        print_beside([self.node_ids.as_deref()], &shown)?;
         if let Some((file, out)) = begun {
             let node_ids: NodeIds =
                 done.iter().flat_map(|done| &done.report.cells).map(|it| (it.serial, it.number)).collect();

@@ -13,13 +13,12 @@ use conformance::live::Live;
 use conformance::survey::Survey;
 use conformance::{Saved, Session};
 use protocol::can::Format;
-use protocol::id::CellId;
 use protocol::time::Span;
-use protocol::usage::{Failure, print};
+use protocol::usage::Failure;
 
 use self::show::Whole;
-use super::arguments::{BusKind, FORMATS, node, one_of};
-use super::output::Force;
+use super::arguments::{BusKinds, FORMATS, Named, cell, one_of};
+use super::output::{Overwrite, print_beside};
 use super::{input, output};
 
 /// How long a test may take, beside listening and putting back.
@@ -33,25 +32,25 @@ const LONGEST: Span = Span::from_millis(80_000);
 /// 0: nothing failed; 1: something failed, or the test could not be done; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  skinbus conformance --bus can0 --node 12
-  skinbus conformance --bus can0 --node 12 --restart './relay off; sleep 0.2; ./relay on' --junit cell.xml
-  skinbus conformance --bus can0 --node 12 --only CONF,COUNT-1
-  skinbus conformance --bus can0 --node 12 --restore conformance-can0-12.json")]
+  skinbus conformance --bus can0 --cell 12
+  skinbus conformance --bus can0 --cell 12 --restart './relay off; sleep 0.2; ./relay on' --junit cell.xml
+  skinbus conformance --bus can0 --cell 12 --requirement CONF,COUNT-1
+  skinbus conformance --bus can0 --cell 12 --restore conformance-can0-12.json")]
 pub(crate) struct Conformance {
-    /// The bus
+    /// The bus, if --cell does not name it
     #[arg(long, value_name = "NAME")]
-    bus: String,
-    /// The cell's node id
-    #[arg(long, value_name = "N", value_parser = node)]
-    node: CellId,
+    bus: Option<String>,
+    /// The cell
+    #[arg(long, value_name = "[BUS:]NODE", value_parser = cell)]
+    cell: Named,
     #[command(flatten)]
-    kind: BusKind,
+    kinds: BusKinds,
     /// The frame format of the bus [default: that of the cell's heartbeats]
     #[arg(long, value_parser = one_of(FORMATS))]
     format: Option<Format>,
     /// Test these requirements only: CONF-7, or CONF for all of that name
     #[arg(long, value_name = "ID", value_delimiter = ',')]
-    only: Vec<String>,
+    requirement: Vec<String>,
     /// A command that switches the cell off and on, for what shows only at a start; run by sh -c
     #[arg(long, value_name = "COMMAND")]
     restart: Option<String>,
@@ -62,27 +61,39 @@ pub(crate) struct Conformance {
     #[arg(long, value_name = "FILE")]
     save: Option<PathBuf>,
     /// Test nothing: put back what an earlier test saved, and delete the file
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["only", "restart", "json", "junit", "save"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["requirement", "restart", "json", "junit", "save"])]
     restore: Option<PathBuf>,
     /// Print one JSON object instead of the table
-    #[arg(long)]
+    #[arg(long, short)]
     json: bool,
     /// Write a JUnit report too
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
 }
 
 impl Conformance {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let only = Only::new(&self.only).map_err(|word| {
-            Failure::usage(format!("--only {word}: no requirement has this id; CONF-7 and CONF are examples"))
+        let only = Only::new(&self.requirement).map_err(|word| {
+            Failure::usage(format!(
+                "--requirement {word}: no requirement has this id; CONF-7 and CONF are examples"
+            ))
         })?;
         let stopped = input::stopped()?;
-        let name = self.bus.as_str();
-        let path =
-            self.save.clone().unwrap_or_else(|| format!("conformance-{name}-{}.json", self.node).into());
+        let name = match (&self.bus, &self.cell.bus) {
+            (None, None) => return Err(Failure::usage("--bus is missing: name the bus of the cell")),
+            (Some(bus), Some(other)) if bus != other => {
+                return Err(Failure::usage(format!(
+                    "--cell {} is not on {bus}: leave out one of the two",
+                    self.cell
+                )));
+            }
+            (Some(bus), _) | (None, Some(bus)) => bus.as_str(),
+        };
+        let node = self.cell.node;
+        let kind = self.kinds.of([name])?.of(name);
+        let path = self.save.clone().unwrap_or_else(|| format!("conformance-{name}-{}.json", node).into());
         if self.restore.is_none() && path.exists() {
             let path = path.display();
             return Err(Failure::usage(format!(
@@ -90,21 +101,20 @@ impl Conformance {
                  or delete it"
             )));
         }
-        let junit = self.junit.as_ref().map(|path| self.force.create("--junit", path)).transpose()?;
-        let mut live =
-            Live::open(name, self.kind.bus_kind, stopped, self.restart.clone()).map_err(Failure::usage)?;
+        let junit = self.junit.as_ref().map(|path| self.overwrite.create("--junit", path)).transpose()?;
+        let mut live = Live::open(name, kind, stopped, self.restart.clone()).map_err(Failure::usage)?;
         let survey = Survey::take(&mut live, name).map_err(Failure::run)?;
         let format = survey
-            .check(self.node, name, self.format, self.others_will_stop || self.restore.is_some())
+            .check(node, name, self.format, self.others_will_stop || self.restore.is_some())
             .map_err(Failure::run)?;
-        let mut session = Session::new(&mut live, name, self.node, format, LONGEST);
+        let mut session = Session::new(&mut live, name, node, format, LONGEST);
         if let Some(path) = &self.restore {
             return put_back(&mut session, &read(path)?, path);
         }
         let began = Instant::now();
         let saved = session.save().map_err(Failure::run)?;
-        let saved = saved.map_err(|why| Failure::run(format!("cell {} on {name}: {why}", self.node)))?;
-        Force { force: false }.write("--save", &path, &super::print::json(&saved)?)?;
+        let saved = saved.map_err(|why| Failure::run(format!("cell {} on {name}: {why}", node)))?;
+        Overwrite { overwrite: false }.write("--save", &path, &super::print::json(&saved)?)?;
         let stopped = conformance::run(&mut session, &only).err();
         let back = put_back(&mut session, &saved, &path);
         let whole = Whole::new(
@@ -115,8 +125,10 @@ impl Conformance {
             stopped.as_ref(),
         );
         // None of them keeps the others from being written.
-        let shown =
-            super::print::json(&whole).and_then(|json| print(&if self.json { json } else { whole.text() }));
+        let shown = super::print::json(&whole).and_then(|json| {
+            let shown = if self.json { json } else { whole.text() };
+            print_beside([self.junit.as_deref()], &shown)
+        });
         let reported =
             junit.map_or(Ok(()), |(file, out)| output::finish("--junit", file, out, &whole.junit()));
         back.and(shown).and(reported)?;

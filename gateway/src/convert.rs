@@ -23,7 +23,7 @@ use trace::files::WholeFile;
 use self::live::Live;
 use super::arguments::{Word, one_of};
 use super::input::{captures, no_frame, others, place, skin_for};
-use super::output::{Force, apart, note, refused};
+use super::output::{Overwrite, apart, note, refused};
 
 /// Lines that cannot be read and are reported; further ones are counted.
 const NAMED: u64 = 100;
@@ -55,7 +55,7 @@ pub(crate) struct Convert {
     #[arg(value_name = "OUT")]
     to: PathBuf,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
     /// End at the first line that is no frame though it begins like one, or when IN has no end; write nothing then
     #[arg(long)]
     strict: bool,
@@ -69,7 +69,7 @@ pub(crate) struct Convert {
     #[arg(long)]
     plain: bool,
     /// For a CSV file: the skin's description; else the one in the recording
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
 }
 
@@ -98,7 +98,7 @@ impl Convert {
         let to = self.to.display();
         if !is_standard(&self.to) {
             apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
-            self.force.check("", &self.to)?;
+            self.overwrite.check("", &self.to)?;
             if !text && size(&self.from).is_none() {
                 live::check(&self.to).map_err(|error| refused("", &self.to, &error))?;
             }
@@ -119,7 +119,7 @@ impl Convert {
         let mut sink = if live && self.is_new() {
             let refused = |error: io::Error| refused("", &self.to, &error);
             Sink::Live(
-                Live::create(&self.to, self.force.force, (format, style, of_log), stopped)
+                Live::create(&self.to, self.overwrite.overwrite, (format, style, of_log), stopped)
                     .map_err(refused)?,
             )
         } else {
@@ -222,7 +222,7 @@ impl Convert {
             return Err(Failure::usage(format!("{option} is for a candump log, and {to} is a CSV file")));
         }
         apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
-        self.force.check("", &self.to)?;
+        self.overwrite.check("", &self.to)?;
         let skin = skin_for(&self.from, self.skin.as_deref())?;
         let (mut reader, bar, live) = self.open()?;
         let stopped = stop::flag();
@@ -268,7 +268,7 @@ impl Convert {
         let begun = if is_standard(&self.to) {
             io::stdout().as_fd().try_clone_to_owned().map(|file| (None, file.into()))
         } else {
-            WholeFile::create_unless(&self.to, self.force.force, stopped)
+            WholeFile::create_unless(&self.to, self.overwrite.overwrite, stopped)
                 .map(|(whole, file)| (Some(whole), file))
         };
         let (whole, file) = begun.map_err(|error| refused("", &self.to, &error))?;

@@ -11,11 +11,10 @@ use std::time::{Duration, Instant};
 use analysis::stats::Report;
 use bench::listen::now;
 use clap::Args;
-use model::decode::pick::{self, Pick, Selector};
+use model::decode::pick::{IdMask, Party, Pick, Selector};
 use protocol::bus::Options;
 use protocol::can::Format;
 use protocol::candump::{Record, Timestamp};
-use protocol::id::Node;
 use protocol::skin::Skin;
 use protocol::stop::{self, Stoppable};
 use protocol::usage::{Failure, print, written};
@@ -23,7 +22,7 @@ use serde::Serialize;
 use trace::capture::{Entry, Extras, NoteKind, Reader, Topic};
 
 use self::show::{How, Show};
-use super::arguments::{BusKind, Word, nanos, one_of};
+use super::arguments::{BusKinds, Word, nanos, one_of};
 use super::input::{
     self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame, place, remark_another, skin_beside, stopped,
 };
@@ -40,14 +39,16 @@ use super::print::{json, list};
 /// --stats there are tables at the end instead.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  skinbus dump vcan0 --kind torque --node 12
+  skinbus dump vcan0 --kind torque --cell 12
+  skinbus dump vcan0 vcan1 --id 200:600 -n 3
+  skinbus dump run.mcap --bus vcan1 --cell 5
   skinbus dump run.log --kind joints,sync --from 2 --to 2.5
   skinbus dump run.mcap --contact --json | jq -c 'select(.kind == \"torque\") | [.node, .epoch, .values.torque_nm]'
   skinbus dump run.mcap run-*.mcap --stats
   skinbus dump can0 --stats --to 10
-  candump -L can0 | skinbus dump - --max 100")]
+  candump -L can0 | skinbus dump - -n 100")]
 pub(crate) struct Dump {
-    /// A candump log or MCAP recording when there is a file of this name, - for standard input, else a bus; all parts
+    /// A candump log or MCAP recording when there is a file of this name, - for standard input, else buses; all parts
     /// of a split recording are one, in any order
     #[arg(required = true, value_name = "BUS|FILE")]
     sources: Vec<PathBuf>,
@@ -55,9 +56,16 @@ pub(crate) struct Dump {
     /// joints, sync, resume, report alone, wire, foreign (also what is damaged), and damaged
     #[arg(long, value_name = "KIND", value_delimiter = ',')]
     kind: Vec<Selector>,
-    /// Only packets from or to these: a node id, gateway, everyone
-    #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node)]
-    node: Vec<Node>,
+    /// Only packets from or to these cells; also gateway and everyone
+    #[arg(long, value_name = "[BUS:]NODE", value_delimiter = ',')]
+    cell: Vec<Party>,
+    /// Only frames of these buses
+    #[arg(long, value_name = "NAME", value_delimiter = ',')]
+    bus: Vec<String>,
+    /// Only frames with this identifier, in hexadecimal: 3 digits are 11 bits, 8 digits 29; of two numbers the second is the mask
+    /// of the bits that are compared
+    #[arg(long, value_name = "ID[:MASK]", value_delimiter = ',')]
+    id: Vec<IdMask>,
     /// Only traffic of touches: torques and sums that are not all zero, stimuli and sensors with a contact force
     /// or a proximity, heartbeats of active cells
     #[arg(long)]
@@ -68,35 +76,32 @@ pub(crate) struct Dump {
     /// Only up to, and without, so many seconds after the first frame; ends a live dump
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     to: Option<u64>,
-    /// End after N frames that are shown or counted
-    #[arg(long, value_name = "N")]
-    max: Option<u64>,
+    /// End after so many frames that are shown or counted
+    #[arg(long, short = 'n', value_name = "COUNT")]
+    count: Option<u64>,
     /// Without the raw frames: the time since the first frame, the bus, and the decoded frame
     #[arg(long, conflicts_with_all = ["json", "stats"])]
     brief: bool,
     /// One JSON object a line; with --stats, one in all
-    #[arg(long)]
+    #[arg(long, short)]
     json: bool,
     /// At the end, instead of lines: frames and rates by kind, gaps, losses, damaged frames, a line for each cell and
     /// for each foreign identifier
     ///
-    /// A live bus is counted until --to, --max or Ctrl-C. Frames that the filters leave out would not be
-    /// counted, which makes losses and unanswered joints wrong; so only --from, --to and --max go with it.
-    #[arg(long, conflicts_with_all = ["kind", "node", "contact"])]
+    /// A live bus is counted until --to, --count or Ctrl-C. Frames that the filters leave out would not be
+    /// counted, which makes losses and unanswered joints wrong; so only --bus, --from, --to and --count go with it.
+    #[arg(long, conflicts_with_all = ["kind", "cell", "id", "contact"])]
     stats: bool,
-    /// End at the first line of a log that cannot be read
-    #[arg(long)]
-    strict: bool,
     /// The frame format of packets; auto accepts both
     #[arg(long, value_parser = one_of(ANY_FORMAT), default_value = "auto")]
     format: Packets,
     /// The skin's description, which gives torques and positions their units; else the one in the recording
     ///
     /// Without one, torques are read as Q3.12, and joints as revolute.
-    #[arg(long, value_name = "FILE", conflicts_with = "stats")]
+    #[arg(long, value_name = "SKIN", conflicts_with = "stats")]
     skin: Option<PathBuf>,
     #[command(flatten)]
-    on: BusKind,
+    kinds: BusKinds,
 }
 
 /// The frame format of packets, or none in advance.
@@ -121,8 +126,15 @@ impl Dump {
             (false, false, true) => How::Brief { colour },
             (false, false, false) => How::Lines { colour },
         };
-        let pick = Pick { kinds: self.kind.clone(), nodes: self.node.clone(), from: self.from, to: self.to };
-        let max = self.max.unwrap_or(u64::MAX);
+        let pick = Pick {
+            kinds: self.kind.clone(),
+            parties: self.cell.clone(),
+            buses: self.bus.clone(),
+            ids: self.id.clone(),
+            from: self.from,
+            to: self.to,
+        };
+        let max = self.count.unwrap_or(u64::MAX);
         let to_out = BufWriter::new(Stoppable::new(&out));
         let mut show = Show::new(to_out, self.format, pick, self.contact, how, max);
         if let Some(path) = &self.skin {
@@ -139,14 +151,18 @@ impl Dump {
                     show.describe(&skin);
                 }
             }
-            let done = captured(&mut reader, &mut show, self.strict);
+            let done = captured(&mut reader, &mut show);
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {
             // Signals are caught before it reports that it listens.
             let stopped = stopped()?;
-            let mut receive_end =
-                ReceiveEnd::open(&title, self.on.bus_kind, self.format, Options::default())?;
-            ("live", None, live(&mut receive_end, &mut show, self.to, &stopped))
+            let kinds = self.kinds.of_any()?;
+            let open = |source: &PathBuf| {
+                let name = source.display().to_string();
+                ReceiveEnd::open(&name, kinds.of(&name), self.format, Options::default())
+            };
+            let mut receive_ends = self.sources.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+            ("live", None, live(&mut receive_ends, &mut show, self.to, &stopped))
         };
         written(show.finish().and_then(|()| show.flush()))?;
         let report = show.report();
@@ -165,15 +181,15 @@ impl Dump {
     fn is_capture(&self) -> Result<bool, Failure> {
         let sources = &self.sources;
         let other = sources.iter().find(|source| !is_file(source));
-        if let Some(bus) = other.filter(|_| sources.len() > 1) {
+        if let (Some(bus), Some(file)) = (other, sources.iter().find(|source| is_file(source))) {
+            let (bus, file) = (bus.display(), file.display());
             return Err(Failure::usage(format!(
-                "there is no file {}: several captures are the parts of one recording, and a bus is dumped alone",
-                bus.display()
+                "there is no file {bus}, and {file} is one: name the parts of one recording, or buses"
             )));
         }
         if let Some(folder) = sources.iter().find(|source| source.is_dir()) {
             let folder = folder.display();
-            return Err(Failure::usage(format!("{folder} is a directory: name a candump log or a bus")));
+            return Err(Failure::usage(format!("{folder} is a directory: name a candump log or buses")));
         }
         Ok(other.is_none())
     }
@@ -197,7 +213,7 @@ fn as_json(source: &str, format: &str, report: &Report, extras: Option<&Extras>)
 }
 
 /// Shows a capture.
-fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> Result<(), Failure> {
+fn captured(reader: &mut Reader, show: &mut Show<impl Write>) -> Result<(), Failure> {
     let name = reader.name().to_owned();
     let (mut frames, mut missing) = (0_u64, Missing::default());
     let done = loop {
@@ -228,9 +244,6 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> R
                             "{place}: {lost} frames are missing here: the recorder lost them"
                         ));
                     }
-                    NoteKind::Unreadable(why) if strict => {
-                        return Err(Failure::run(format!("{place}: {why}")));
-                    }
                     NoteKind::Unreadable(why) => output::note(format_args!("{place}: {why}")),
                 }
             }
@@ -252,9 +265,9 @@ fn captured(reader: &mut Reader, show: &mut Show<impl Write>, strict: bool) -> R
 /// How often waiting first segments are checked for their timeout.
 const SETTLE: Duration = Duration::from_millis(20);
 
-/// Shows a bus until a signal, or until it is closed.
+/// Shows buses until a signal, or until one is closed.
 fn live(
-    receive_end: &mut ReceiveEnd,
+    receive_ends: &mut [ReceiveEnd],
     show: &mut Show<impl Write>,
     to: Option<u64>,
     stopped: &AtomicBool,
@@ -264,33 +277,53 @@ fn live(
         if stopped.load(Ordering::Relaxed) || end.is_some_and(|end| Instant::now() >= end) {
             break Ok(());
         }
-        let shown = match receive_end.hear(if show.is_waiting() { SETTLE } else { LOOK }) {
-            Ok(false) => show.handle_time(now()),
+        match received(receive_ends, show) {
+            // Frames lost until then are reported all the same.
+            Err(failure) => break Err(failure),
             Ok(true) => {
                 // The end also comes when no more frames do.
                 end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
-                receive_end.frames().try_for_each(|received| {
-                    if show.has_enough() {
-                        return Ok(());
-                    }
-                    let time = Timestamp::six_digits(received.at_nanos);
-                    let interface = receive_end.bus().name();
-                    show.frame(&Record { time, interface, frame: received.frame, direction: None })
-                })
             }
-            // Frames lost until then are reported all the same.
-            Err(error) => break Err(Failure::run(error)),
-        };
-        if let Err(error) = shown.and_then(|()| show.flush()) {
-            break written(Err(error));
+            Ok(false) => {}
         }
         if show.has_enough() {
             break Ok(());
         }
     };
-    match receive_end.missing("shown") {
-        0 => {}
-        missing => show.dropped(receive_end.bus().name(), missing),
+    for receive_end in receive_ends {
+        match receive_end.missing("shown") {
+            0 => {}
+            missing => show.dropped(receive_end.bus().name(), missing),
+        }
     }
     done
+}
+
+/// Waits for frames, and shows those that have come; whether there were any.
+fn received(receive_ends: &mut [ReceiveEnd], show: &mut Show<impl Write>) -> Result<bool, Failure> {
+    let wait = if show.is_waiting() { SETTLE } else { LOOK };
+    // A bus that is alone is waited for where it is received from: one system call instead of two.
+    let is_alone = receive_ends.len() == 1;
+    if !is_alone {
+        input::wait(receive_ends, wait)?;
+    }
+    let mut any = false;
+    for receive_end in receive_ends {
+        if !receive_end.hear(if is_alone { wait } else { Duration::ZERO }).map_err(Failure::run)? {
+            continue;
+        }
+        any = true;
+        let shown = receive_end.frames().try_for_each(|received| {
+            if show.has_enough() {
+                return Ok(());
+            }
+            let time = Timestamp::six_digits(received.at_nanos);
+            let interface = receive_end.bus().name();
+            show.frame(&Record { time, interface, frame: received.frame, direction: None })
+        });
+        written(shown)?;
+    }
+    let settled = if any { Ok(()) } else { show.handle_time(now()) };
+    written(settled.and_then(|()| show.flush()))?;
+    Ok(any)
 }

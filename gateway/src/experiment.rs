@@ -24,9 +24,9 @@ use paper::{Effort, Experiment as Named, Lab, Session, files};
 use protocol::usage::{Failure, print, quoted_os};
 use serde_json::Value;
 
-use super::arguments::Programs;
+use super::arguments::Processes;
 use super::input::stopped;
-use super::output::{Force, note};
+use super::output::{Overwrite, note};
 use super::print::{Rows, json};
 use benches::Benches;
 use folder::Folder;
@@ -35,7 +35,7 @@ use folder::Folder;
 ///
 /// DIR gets report.html, each figure as SVG and its data as CSV, results.json with every finding beside the paper's and
 /// its verdict, and the recordings of the benches, when everything is measured; nothing is written when that fails or is
-/// interrupted. A folder that is not empty needs --force. `skinbus experiment list` lists the experiments.
+/// interrupted. A folder that is not empty needs --overwrite. `skinbus experiment list` lists the experiments.
 ///
 /// The moving arm's benches are 253 processes on an embedded bus of their own; those of scale have up to 10 000 cells, a
 /// process a bus. All of it takes about five minutes, half of that scale.
@@ -53,12 +53,12 @@ pub(crate) struct Experiment {
     #[arg(long, short, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
     /// Measure little: a few cells, a few seconds, to see that everything works
     #[arg(long)]
     quick: bool,
     #[command(flatten)]
-    programs: Programs,
+    processes: Processes,
     /// Show no progress and no findings
     #[arg(long, short)]
     quiet: bool,
@@ -98,7 +98,7 @@ impl Experiment {
         let named: Vec<Named> = Named::ALL.into_iter().filter(target).collect();
         let stop = stopped()?;
         // Before anything is measured, so that a folder that cannot be written is reported first.
-        let folder = Folder::create(output, self.force)?;
+        let folder = Folder::create(output, self.overwrite)?;
         let page = self.perform(&named, &folder, stop)?;
         keep(&page, &folder)?;
         // What was measured stays when it cannot be drawn.
@@ -114,8 +114,7 @@ impl Experiment {
     fn perform(&self, named: &[Named], folder: &Folder, stop: Arc<AtomicBool>) -> Result<Page, Failure> {
         let effort = if self.quick { Effort::Quick } else { Effort::Full };
         let progress = Progress::new(named.iter().map(|named| named.seconds(effort)).sum(), self.quiet);
-        let benches =
-            Benches { folder: folder.inside(), programs: self.programs.clone(), stop: Arc::clone(&stop) };
+        let benches = Benches { folder: folder.inside(), processes: self.processes, stop: Arc::clone(&stop) };
         let mut lab = Here { benches, stop, idle: None };
         let mut session = Session::new(effort);
         let mut sections = Vec::with_capacity(named.len());

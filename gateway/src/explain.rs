@@ -1,6 +1,7 @@
 //! `skinbus explain`.
 
 mod show;
+mod torque;
 
 use std::path::PathBuf;
 
@@ -17,41 +18,55 @@ use super::input::{no_frame, remark_another, skin_of};
 use super::output;
 use super::print::json;
 
-/// Explain the torque of one epoch
+/// Explain the torque of one epoch, or compute that of a force on a cell
 ///
 /// Reads a capture up to the joints of that epoch and shows each cell's contact state, the force that it computes from
 /// it, the Jacobian, their product in double precision, the nearest step of 2^-12 Nm, and the word that the cell sent;
 /// and what all of them add up to, beside the central computation. What the capture does not contain is listed.
+///
+/// With --force or --batch it computes instead, for a skin or the one in a recording, the torques of a force on a cell: the
+/// central ones in double precision with the numbers of the skin's file, and the cell's with the code that a cell runs, on
+/// the words of its parameters and of the joints' positions. Positions of sliding joints are within their limits, angles
+/// within a turn each way or their limits, if those are wider.
 #[derive(Args, Debug)]
-#[command(after_help = "Examples:
+#[command(after_help = "ROWS.csv has a line for each row, positions with spaces between them:
+  cell,force_n,q
+  vcan0:12,2.5,0 -1.2 1.0 -1.4 -1.57 0
+
+Examples:
   skinbus explain run.log --skin gateway/examples/ur5-253.toml --epoch 77
   skinbus explain run.mcap --epoch 77 --cell 12
   skinbus explain run.mcap run-*.mcap --epoch 77 --at 700
-  skinbus explain run.mcap --epoch 77 --at 20 --joint 2 --json")]
+  skinbus explain run.mcap --epoch 77 --at 20 --joint 2 --json
+  skinbus explain skin.toml --cell 12 --force 2.5 --joints \"0 -1.2 1.0 -1.4 -1.57 0\"
+  skinbus explain skin.toml --batch rows.csv --json > torques.jsonl")]
 pub(crate) struct Explain {
-    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input
+    /// A candump log or an MCAP recording, or all parts of a split one in any order; - for standard input. With --force or
+    /// --batch a skin's description, or a recording
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// The number of the joints, modulo 256
-    #[arg(long, value_name = "N")]
-    epoch: u8,
+    #[arg(long, value_name = "E", required_unless_present_any = ["force", "batch"])]
+    epoch: Option<u8>,
     /// Only joints from so many seconds after the first frame on
-    #[arg(long, value_name = "S", value_parser = nanos, default_value = "0")]
+    #[arg(long, value_name = "S", value_parser = nanos, default_value = "0", conflicts_with_all = ["force", "batch"])]
     at: u64,
     /// Which joints of this epoch, when there are several
-    #[arg(long, value_name = "K", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "K", default_value_t = 1, conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u32).range(1..))]
     occurrence: u32,
-    /// One cell in every step: its node id, or BUS:NODE
-    #[arg(long, value_name = "CELL", value_parser = cell)]
+    /// One cell in every step
+    #[arg(long, value_name = "[BUS:]NODE", value_parser = cell)]
     cell: Option<Named>,
     /// One joint, cell by cell
-    #[arg(long, value_name = "J", value_parser = clap::value_parser!(u8).range(1..=32))]
+    #[arg(long, value_name = "J", conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u8).range(1..=32))]
     joint: Option<u8>,
+    #[command(flatten)]
+    given: torque::Given,
     /// The skin's description; else the one in the recording
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// One JSON object
-    #[arg(long)]
+    /// One JSON object; with --batch, one a row
+    #[arg(long, short)]
     json: bool,
 }
 
@@ -66,6 +81,9 @@ struct Whole<'a> {
 
 impl Explain {
     pub(crate) fn run(self) -> Result<(), Failure> {
+        let Some(epoch) = self.epoch else {
+            return self.given.compute(&self.files, self.cell.as_ref(), self.json);
+        };
         let skin = match &self.skin {
             Some(path) => Skin::read(path).map_err(Failure::usage)?,
             None => skin_of(&self.files)?,
@@ -73,7 +91,7 @@ impl Explain {
         self.check(&skin)?;
         let mut reader = Reader::open_all(&self.files).map_err(Failure::usage)?;
         let name = reader.name().to_owned();
-        let requested = Requested { epoch: Epoch(self.epoch), from_ns: self.at, occurrence: self.occurrence };
+        let requested = Requested { epoch: Epoch(epoch), from_ns: self.at, occurrence: self.occurrence };
         let found = find(&mut reader, &skin, requested).map_err(Failure::run)?;
         for (count, what) in [
             (found.dropped, "frames are missing before this point; contact states may be out of date"),
@@ -108,7 +126,7 @@ impl Explain {
             explanation.total.retain(|total| total.joint == joint);
         }
         if self.json {
-            let whole = Whole { source: name, epoch: self.epoch, explanation: &explanation };
+            let whole = Whole { source: name, epoch, explanation: &explanation };
             return print(&json(&whole)?);
         }
         let what = match (self.cell.is_some(), self.joint) {
@@ -116,7 +134,7 @@ impl Explain {
             (false, Some(_)) => show::What::Joint,
             (false, None) => show::What::All,
         };
-        print(&show::text(&name, self.epoch, found.first_ns, &explanation, what))
+        print(&show::text(&name, epoch, found.first_ns, &explanation, what))
     }
 
     /// The cell and the joint must be the skin's.

@@ -1,114 +1,147 @@
 //! `skinbus fit`.
 
-mod text;
+mod skin;
+mod skin_text;
+mod traffic;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use analysis::fit::{self, BusFit, COMPUTATION_NS, rates};
 use clap::Args;
 use protocol::can::Format;
-use protocol::skin::{Bus, Skin};
-use protocol::usage::{Failure, print};
+use protocol::usage::Failure;
 use protocol::wire_time::{BitRates, bit_rate};
+use trace::capture::{Format as CaptureFormat, Reader};
 
-use super::arguments::{FORMATS, one_of};
-use super::output::note;
-use super::print::{json, list};
+use super::arguments::{BusKinds, FORMATS, one_of, seconds};
+use super::input::{is_file, read_skin};
+use super::print::list;
 
-/// Compute whether a skin fits on real buses: load, time from joints to the last answer, cells and buses
+/// Compute whether a skin, or the traffic of a capture or a live bus, fits on real buses
 ///
-/// The worst case: all frames are taken as long as bit stuffing can make them, all cells as answering, and the bus as
-/// free of errors. Heartbeats count; commands and what only a bench sends do not. For the load of a run see `skinbus
-/// shadow`. Default rates: those of the description where it has them for every bus, else a table over common ones.
-/// docs/reference/bus-timing.md describes the computation.
+/// Of a skin the worst case: load, time from joints to the last answer, cells and buses, with all frames as long as bit
+/// stuffing can make them, all cells answering, and no errors. Heartbeats count; commands and what only a bench sends do
+/// not. Default rates: those of the description where it has them for every bus, else a table over common ones.
+///
+/// Of a capture (a candump log or an MCAP recording, of any CAN bus), or of live buses until Ctrl-C, what became of each
+/// frame on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted. A frame's time stamp
+/// counts as the time at which it was to be sent. Bench-only frames are left out, start-up is reported separately, and the
+/// worst case is added when the skin is known. docs/reference/bus-timing.md explains both.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus fit gateway/examples/ur5-253.toml
   skinbus fit gateway/examples/ur5-253.toml --nominal 1M --data 5M
-  skinbus skin generate --cells 253 --buses 3 > three.toml; skinbus fit three.toml --nominal 500k --format classic")]
+  skinbus skin generate --buses 3 | skinbus fit - --nominal 500k --format classic
+  skinbus fit run.mcap run-*.mcap
+  skinbus fit run.mcap --rates vcan0=1M/8M --rates vcan1=500k
+  skinbus fit run.log --skin skin.toml --json | jq -c 'select(.end_s and .end_s - .time > 0.016)'
+  skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct Fit {
-    /// The skin's description
-    #[arg(value_name = "SKIN")]
-    file: PathBuf,
-    /// Bits in a second while identifiers are compared, as 1000000, 500k or 1M: of all buses
+    /// A skin's description; a candump log or MCAP recording, all parts of a split recording in any order; or buses; - for
+    /// standard input
+    #[arg(value_name = "SKIN|FILE|BUS", required = true)]
+    sources: Vec<PathBuf>,
+    /// The bit rate of identifiers, and of all of classic frames: bit/s, as 1000000, 500k or 1M
     #[arg(long, value_name = "RATE", value_parser = bit_rate)]
     nominal: Option<u32>,
-    /// Bits in a second of the data of CAN FD frames
-    #[arg(long, value_name = "RATE", value_parser = bit_rate, requires = "nominal")]
+    /// The bit rate of the data of CAN FD frames that switch
+    #[arg(long, value_name = "RATE", value_parser = bit_rate)]
     data: Option<u32>,
-    /// A table over common bit rates, whatever the description has
+    /// A skin: a table over common bit rates, whatever the description has
     #[arg(long, conflicts_with = "nominal")]
     table: bool,
-    /// The frame format of packets on all buses, whatever the description has
+    /// A skin: the frame format of packets on all buses, whatever the description has
     #[arg(long, value_parser = one_of(FORMATS))]
     format: Option<Format>,
-    /// The longest that a cell takes from joints to its answer, in µs [the paper's cell: 68.5]
+    /// A skin: the longest that a cell takes from joints to its answer, in µs [the paper's cell: 68.5]
     #[arg(long, value_name = "US", value_parser = computation)]
     computation: Option<u64>,
-    /// Everything as JSON
+    /// Traffic: other bit rates of one bus, as often as there are buses: can0=500k/2M, can1=1M
+    #[arg(long, value_name = "BUS=RATES", value_parser = rates_of_bus)]
+    rates: Vec<(String, BitRates)>,
+    /// Traffic: the skin's description, for bit rates and the worst case; else the one attached to the recording
+    #[arg(long, value_name = "SKIN")]
+    skin: Option<PathBuf>,
+    /// Traffic: count bench-only frames too: stimuli, sync and report with their answers, simulated wires
     #[arg(long)]
+    bench_traffic: bool,
+    /// Traffic: the share of bits that arrive damaged, 0 to 0.01 [default: 0]: each costs an error frame, and its frame is
+    /// sent again
+    #[arg(long, value_name = "SHARE", allow_negative_numbers = true)]
+    ber: Option<f64>,
+    /// Traffic: what damaged bits are drawn from [default: 1]: the same seed, the same bits
+    #[arg(long, value_name = "N", requires = "ber")]
+    seed: Option<u64>,
+    /// Live buses: end after this time
+    #[arg(long, value_name = "TIME", value_parser = seconds, allow_negative_numbers = true)]
+    duration: Option<f64>,
+    /// One JSON object; of traffic one a frame instead of tables, in the order of the file
+    ///
+    /// Keys of a frame: time, start_s, end_s (s on the clock of the capture), bus, id (as candump prints it), nominal_bits and
+    /// data_bits (stuff bits and intermission included). What is left out has null bits and null times; what never went out
+    /// has null times.
+    #[arg(long, short)]
     json: bool,
+    #[command(flatten)]
+    kinds: BusKinds,
 }
 
 impl Fit {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let skin = Skin::read(&self.file).map_err(Failure::usage)?;
-        let computation_ns = self.computation.unwrap_or(COMPUTATION_NS);
-        let chosen = if self.table { None } else { self.rates(&skin)? };
-        let (buses, whole, rows) = match chosen {
-            None => (Vec::new(), None, fit::table(&skin, self.format, computation_ns)),
-            Some(chosen) => {
-                let buses = chosen.into_iter().enumerate();
-                let fit = |(index, (format, rates))| fit::bus(&skin, index, format, rates, computation_ns);
-                let buses: Vec<BusFit> = buses.filter_map(fit).collect();
-                let whole = fit::whole(&skin, &buses);
-                (buses, whole, Vec::new())
-            }
-        };
-        let is_partly_described = !rows.is_empty() && skin.buses.iter().any(|bus| bus.bitrate.is_some());
-        if is_partly_described && !self.table && !self.json {
-            let without = skin.buses.iter().filter(|bus| bus.bitrate.is_none()).map(|bus| &bus.name);
-            let (without, skin) = (list(without), &skin.name);
-            note(format_args!("no bitrate of {without}: these are common bit rates, not those of {skin}"));
+        let Some(skin) = self.skin_file()? else { return self.of_traffic() };
+        let of_traffic = [
+            ("--rates", !self.rates.is_empty()),
+            ("--skin", self.skin.is_some()),
+            ("--bench-traffic", self.bench_traffic),
+            ("--ber", self.ber.is_some()),
+            ("--duration", self.duration.is_some()),
+        ];
+        let file = skin.display();
+        if let Some((option, _)) = of_traffic.iter().find(|(_, given)| *given) {
+            return Err(Failure::usage(format!(
+                "{option} is for traffic, and {file} is a skin: leave it out"
+            )));
         }
-        print(&match self.json {
-            true => json(&fit::json(&skin, &buses, whole.as_ref(), &rows))?,
-            false => text::table(&skin, &rows) + &text::buses(&skin, &buses, whole.as_ref()),
-        })
+        if self.data.is_some() && self.nominal.is_none() {
+            return Err(Failure::usage("--data of a skin needs --nominal beside it"));
+        }
+        let skin = read_skin(skin)?;
+        self.of_skin(&skin)
     }
 
-    /// Format and rates of every bus; `None` when neither the command line nor the description has them for all.
-    fn rates(&self, skin: &Skin) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
-        let formats: Vec<_> = skin.buses.iter().map(|bus| self.format.unwrap_or(bus.format)).collect();
-        let Some(nominal) = self.nominal else {
-            let described = skin.buses.iter().zip(&formats).map(|(bus, &format)| described(bus, format));
-            return described.collect();
-        };
-        if self.data.is_some() && !formats.contains(&Format::Fd) {
-            return Err(Failure::usage(
-                "--data is for CAN FD, and here all buses are classic: leave it out, or add --format fd",
-            ));
-        }
-        let rates = |format| match (format, self.data) {
-            (Format::Classic, _) => BitRates::classic(nominal).map_err(Failure::usage),
-            (Format::Fd, Some(data)) => BitRates::new(nominal, data).map_err(Failure::usage),
-            (Format::Fd, None) => {
-                BitRates::classic(nominal).map_err(Failure::usage)?;
-                Err(Failure::usage(format!(
-                    "CAN FD needs a data bit rate: add --data, {nominal} to {}, or --format classic",
-                    BitRates::MAX_DATA
-                )))
+    /// The file of the skin, if that is what was named.
+    fn skin_file(&self) -> Result<Option<&Path>, Failure> {
+        let [source] = self.sources.as_slice() else { return Ok(None) };
+        let is_text = source.extension().is_some_and(|end| end == "toml");
+        let of_skin = [
+            ("--table", self.table),
+            ("--format", self.format.is_some()),
+            ("--computation", self.computation.is_some()),
+        ];
+        let given = of_skin.iter().find(|(_, given)| *given).map(|(option, _)| *option);
+        let is_skin = is_file(source) && (is_text || given.is_some() || !is_capture(source));
+        match given {
+            Some(option) if !is_skin => {
+                let names = list(self.sources.iter().map(|source| source.display()));
+                Err(Failure::usage(format!("{option} is for a skin, and {names} is none: leave it out")))
             }
-        };
-        formats.into_iter().map(|format| Ok((format, rates(format)?))).collect::<Result<_, _>>().map(Some)
+            _ => Ok(is_skin.then_some(source)),
+        }
     }
 }
 
-/// The rates of a bus in its description.
-fn described(bus: &Bus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
-    let rates = rates::described(bus, format).transpose();
-    let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;
-    Ok(rates.map(|rates| (format, rates)))
+/// Returns whether a file is a capture, or is none of its kind to be read as a skin either.
+fn is_capture(file: &Path) -> bool {
+    let Ok(mut reader) = Reader::open(file) else { return true };
+    reader.format() == CaptureFormat::Mcap || reader.has_frame().unwrap_or(true)
+}
+
+fn rates_of_bus(text: &str) -> Result<(String, BitRates), String> {
+    let (bus, rates) = text.split_once('=').unwrap_or_default();
+    if bus.is_empty() {
+        return Err("a bus and its bit rates are needed, as can0=1M/5M or can0=500k".to_owned());
+    }
+    let rates = rates.parse().map_err(|error| format!("{bus}: {error}"))?;
+    Ok((bus.to_owned(), rates))
 }
 
 /// µs, with up to three decimals, as ns.

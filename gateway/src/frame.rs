@@ -1,206 +1,130 @@
 //! `skinbus frame`: packets by hand.
 
+mod packets;
+mod sensing;
+
 use std::fmt::Write;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use bench::answers::Answers;
-use bench::listen::Listener;
-use bench::sensing;
-use clap::{Args, Subcommand};
-use model::decode::{Decoded, parameter, pick};
-use model::scenario::contact_words;
-use protocol::bus::{BusError, Choice};
+use bench::listen::{self, Listener};
+use bench::sensing as switching;
+use clap::Args;
+use model::decode::Decoded;
+use protocol::bus::{Bus, BusError, Choice, Kinds, Options};
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame as CanFrame};
-use protocol::fixed::{Q, Q1_14, Q5_10};
-use protocol::id::{CellId, Kind, Node};
-use protocol::message::{Answer, From, Joints, Message, Request, SensorPage, SkinSensors};
-use protocol::packet::Epoch;
-use protocol::parameters::MAX_JOINTS;
-use protocol::schema::packets;
+use protocol::id::CellId;
+use protocol::message::{Answer, Message};
+use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
 
-use super::ack;
-use super::arguments::{FORMATS, one_of};
+use super::arguments::{BusKinds, FORMATS, bus_of, one_of};
+use super::output;
 use super::print::list;
+use packets::{Addressee, What};
 
 /// Cells that are there send a heartbeat within this time, and answers.
 const ANSWER: Duration = Duration::from_secs(1);
 
 /// Print a frame for cansend, with the right CRC; or send it
 ///
-/// Prints one line for a CAN FD bus, two for a classic one. With --bus it is sent instead, also on an
-/// embedded bus, to which cansend cannot attach. Then what a configure asks for is waited for and printed, and exit
-/// code 1 says that no cell for which a stimulus or a configure is meant was heard, or that one refused.
+/// Prints one line for a CAN FD bus, two for a classic one. With --bus or --skin it is sent instead, also on an embedded bus,
+/// to which cansend cannot attach. Then what a configure asks for is waited for and printed, and exit code 1 says that no
+/// cell for which a stimulus or a configure is meant was heard, or that one refused.
 #[derive(Args, Debug)]
-#[command(after_help = "Examples, which press cell 12 with 3 N from the next joints on:
-  cansend vcan0 $(skinbus frame configure --node 12 --write mode 1)
-  cansend vcan0 $(skinbus frame stimulus --node 12 --force 3.0)
-  skinbus frame stimulus --node 12 --force 3.0 --bus vcan0")]
+#[command(mut_args(|arg| arg.global(true)), after_help = "Examples, of which the first three press cell 12 with 3 N from the next joints on:
+  cansend vcan0 $(skinbus frame configure --cell 12 --write mode 1)
+  cansend vcan0 $(skinbus frame stimulus --cell 12 --force 3.0)
+  skinbus frame stimulus --cell 12 --force 3.0 --bus vcan0
+  skinbus frame resume --skin skin.toml
+  skinbus frame sensing continuous 62.5 --bus vcan0")]
 pub(crate) struct Frame {
     #[command(subcommand)]
     what: What,
-    /// The frame format of the packet
-    #[arg(long, value_parser = one_of(FORMATS), default_value = "fd", global = true)]
-    format: Format,
-    /// Send it on this bus instead of printing it
-    #[arg(long, value_name = "NAME", global = true)]
-    bus: Option<String>,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto, global = true)]
-    bus_kind: Choice,
-}
-
-#[derive(Debug, Subcommand)]
-enum What {
-    /// Stop answering until a resume
-    #[command(after_help = "Example:\n  skinbus frame halt")]
-    Halt,
-    /// Leave the halted state
-    #[command(after_help = "Example:\n  skinbus frame resume")]
-    Resume,
-    /// Answer with a heartbeat when all that the last joints asked is done
-    #[command(after_help = "Example:\n  skinbus frame sync")]
-    Sync,
-    /// Answer with the pages of counters and sensors
-    #[command(after_help = "Example:\n  skinbus frame report")]
-    Report,
-    Joints(Positions),
-    Stimulus(Stimulus),
-    Configure(Configure),
-}
-
-/// The joint positions of an epoch
-#[derive(Args, Debug)]
-#[command(after_help = "Examples:
-  skinbus frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
-  skinbus frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
-struct Positions {
-    /// The number of this broadcast, 0 to 255; cells drop a repetition of the last one
-    #[arg(long, value_name = "E")]
-    epoch: u8,
+    /// The frame format of the packet; with --skin that of each bus, else fd
+    #[arg(long, value_parser = one_of(FORMATS))]
+    format: Option<Format>,
+    /// Send it on these buses instead of printing it
+    #[arg(long, value_name = "NAME", value_delimiter = ',')]
+    bus: Vec<String>,
+    /// Send it on all buses of this skin, or on those of them that --bus names
+    #[arg(long, value_name = "SKIN")]
+    skin: Option<PathBuf>,
     #[command(flatten)]
-    positions: Angles,
-}
-
-#[derive(Args, Debug)]
-#[group(required = true, multiple = false)]
-struct Angles {
-    /// One position for each joint of the chain, 1 to 14 of them, in rad; wrapped to a turn
-    #[arg(long, value_name = "RAD", num_args = 1.., allow_negative_numbers = true)]
-    rad: Option<Vec<String>>,
-    /// The same as words: -32768 to 32767 or 0x0 to 0xFFFF, in steps of a turn / 65536
-    #[arg(long, value_name = "WORD", num_args = 1.., allow_negative_numbers = true)]
-    words: Option<Vec<String>>,
-}
-
-/// A stimulus: the contact state of a cell in test mode
-///
-/// The cell must be in test mode: `skinbus frame configure --node N --write mode 1`. A stimulus takes effect with
-/// the next joints, and holds until another one replaces it; without --force the force is 0.
-#[derive(Args, Debug)]
-#[command(after_help = "Examples:
-  skinbus frame stimulus --node 12 --force 3.0
-  skinbus frame stimulus --node everyone --epoch 7 --force 0.5 --proximity 0.9
-  skinbus frame stimulus --node 12 --acceleration 0 0 1")]
-struct Stimulus {
-    /// The cell: a node id, or everyone
-    #[arg(long, value_name = "NODE")]
-    node: String,
-    /// The touch's force in N, shared by the three contact words
-    #[arg(long, value_name = "N", allow_negative_numbers = true)]
-    force: Option<String>,
-    /// 0, nothing near, to 1
-    #[arg(long, value_name = "P", allow_negative_numbers = true)]
-    proximity: Option<String>,
-    /// The two temperatures in degrees Celsius
-    #[arg(long, num_args = 2, value_names = ["T1", "T2"], allow_negative_numbers = true)]
-    temperature: Option<Vec<String>>,
-    /// The acceleration in g, instead of what touches the skin
-    #[arg(
-        long,
-        num_args = 3,
-        value_names = ["X", "Y", "Z"],
-        allow_negative_numbers = true,
-        conflicts_with_all = ["force", "proximity", "temperature"]
-    )]
-    acceleration: Option<Vec<String>>,
-    /// From the joints of this epoch on; else from the next joints on, whatever their epoch
-    #[arg(long, value_name = "E")]
-    epoch: Option<u8>,
-}
-
-/// Read or write a parameter of a cell
-///
-/// A parameter that is written by name takes values in their units:
-///
-///   mount JOINT JOINTS
-///   pose X Y Z NORMAL_X NORMAL_Y NORMAL_Z   (m, in the frame of the joint)
-///   contact ALPHA_C ALPHA_P CONTACT_THRESHOLD PROXIMITY_THRESHOLD FORCE_THRESHOLD   (N)
-///   timing PERIOD   (us)
-///   mode 0|1   (1 obeys stimuli)
-///   reply torque | sum SLOT DEEPEST 0|1   (us; 1 carries what rounding took away)
-///   sensing off | continuous PERIOD | event   (ms)
-///   events CONTACT PROXIMITY TEMPERATURE ACCELERATION HYSTERESIS   (N, °C, g; 0 to 1 of each)
-///   links_down none | 0+2   (ports that receive nothing, in test mode only)
-///   baseline off | hold|follow THRESHOLD HYSTERESIS RATE LIMIT SLOPE   (N; 0 to 1 of it; uN/s; N; N/°C)
-///   tare none | tared | forced   (forget the zero, find it unless touched, find it anyhow)
-///   row1 to row6  A D ALPHA THETA_OFFSET   (m, m, rad, rad)
-///   commit HASH   (hexadecimal)
-///
-/// By number it takes words as they are.
-#[derive(Args, Debug)]
-#[command(
-    verbatim_doc_comment,
-    after_help = "Examples:
-  skinbus frame configure --node 12 --read pose
-  skinbus frame configure --node 12 --write mode 1
-  skinbus frame configure --node everyone --write row2 -0.425 0 0 0
-  skinbus frame configure --node 12 --write 99 1 -1 0x7FFF"
-)]
-struct Configure {
-    /// The cell: a node id, or everyone
-    #[arg(long, value_name = "NODE")]
-    node: String,
-    #[command(flatten)]
-    request: Requested,
-    /// Copied into the answer
-    #[arg(long, value_name = "T", default_value_t = 0)]
-    tag: u8,
-}
-
-#[derive(Args, Debug)]
-#[group(required = true, multiple = false)]
-struct Requested {
-    /// Read a parameter, by name or number
-    #[arg(long, value_name = "PARAMETER")]
-    read: Option<String>,
-    /// Write a parameter, by name or number
-    #[arg(long, num_args = 1.., value_names = ["PARAMETER", "VALUE"], allow_negative_numbers = true)]
-    write: Option<Vec<String>>,
+    kinds: BusKinds,
 }
 
 impl Frame {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let message = self.what.message().map_err(Failure::usage)?;
-        match self.bus {
-            Some(name) => {
-                let (to, tag) = if let Message::Stimulus { to, .. } = message {
-                    (to, None)
-                } else if let Message::Configure { to, tag, .. } = message {
-                    (to, Some(tag))
-                } else {
-                    let bus = ack::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
-                    return ack::send(&bus, &message, self.format);
-                };
-                // Who hears nothing cannot know that nobody is there.
-                let bus = sensing::open(&name, self.bus_kind, self.format).map_err(Failure::usage)?;
-                ack::send(&bus, &message, self.format)?;
-                let only = if let Node::Cell(cell) = to { Some(cell) } else { None };
-                let answers = wait(Listener::new(bus, Some(self.format)), only, tag).map_err(Failure::run)?;
-                verdict(&answers, only, tag, (&name, self.format))
-            }
-            None => print(&text(&message, self.format)),
+        let (targets, kinds) = self.targets()?;
+        if targets.is_empty() {
+            return print(&text(&message, self.format.unwrap_or(Format::Fd)));
         }
+        // All are opened before anything is sent.
+        let open = |(name, format): &(String, Format)| {
+            self.open(name, kinds.of(name), *format).map_err(Failure::usage)
+        };
+        let buses = targets.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+        let done =
+            buses.into_iter().zip(&targets).map(|(bus, (_, format))| self.send(bus, *format, &message));
+        let failures: Vec<_> = done.filter_map(Result::err).collect();
+        let mut failures = failures.into_iter();
+        failures.next().map_or(Ok(()), |first| Err(failures.fold(first, Failure::and)))
+    }
+
+    /// The buses on which it is sent, with their formats, and their kinds; none prints it.
+    fn targets(&self) -> Result<(Vec<(String, Format)>, Kinds), Failure> {
+        let format = |of_skin: Format| self.format.unwrap_or(of_skin);
+        let mut targets: Vec<_> = match &self.skin {
+            Some(path) => {
+                let skin = Skin::read(path).map_err(Failure::usage)?;
+                let file = path.display().to_string();
+                self.bus.iter().try_for_each(|name| bus_of(&skin, &file, name).map(drop))?;
+                let buses = skin.buses.into_iter().map(|bus| (bus.name, format(bus.format)));
+                buses.filter(|(name, _)| self.bus.is_empty() || self.bus.contains(name)).collect()
+            }
+            None => self.bus.iter().map(|name| (name.clone(), format(Format::Fd))).collect(),
+        };
+        let names = list(targets.iter().map(|(name, _)| name));
+        let kinds = self.kinds.of(targets.iter().map(|(name, _)| name.as_str()))?;
+        if let Some(bus) = self.what.to().and_then(|to| to.bus.as_ref()).filter(|_| !targets.is_empty()) {
+            targets.retain(|(name, _)| name == bus);
+            if targets.is_empty() {
+                return Err(Failure::usage(format!("--cell {bus}:...: it is sent on {names} alone")));
+            }
+        }
+        Ok((targets, kinds))
+    }
+
+    /// Opens a bus to send on it; what cells answer is received where it is waited for.
+    fn open(&self, name: &str, kind: Choice, format: Format) -> Result<Bus, BusError> {
+        match self.what.to() {
+            // A send-only socket cannot tell whether a cell is there.
+            Some(_) => switching::open(name, kind, format),
+            None => {
+                let nothing = Options { filters: Vec::new(), ..Options::default() };
+                listen::open(name, kind, Some(format), nothing)
+            }
+        }
+    }
+
+    /// Sends it on a bus, and waits for what it makes cells answer.
+    fn send(&self, bus: Bus, format: Format, message: &Message) -> Result<(), Failure> {
+        let (name, only) = (bus.name().to_owned(), self.what.to().and_then(Addressee::cell));
+        if let What::Sensing(switch) = &self.what {
+            return switch.send(bus, format);
+        }
+        listen::send(&bus, message, format).map_err(Failure::run)?;
+        output::note(format_args!("sent on {name} ({})", bus.kind()));
+        let tag = match message {
+            Message::Stimulus { .. } => None,
+            Message::Configure { tag, .. } => Some(*tag),
+            _ => return Ok(()),
+        };
+        let answers = wait(Listener::new(bus, Some(format)), only, tag).map_err(Failure::run)?;
+        verdict(&answers, only, tag, (&name, format))
     }
 }
 
@@ -265,194 +189,4 @@ fn text(message: &Message, format: Format) -> String {
         writeln!(text, "{frame}").expect("a string takes whatever is written");
     }
     text
-}
-
-impl What {
-    fn message(&self) -> Result<Message, String> {
-        match self {
-            Self::Halt => Ok(Message::Halt),
-            Self::Resume => Ok(Message::Resume),
-            Self::Sync => Ok(Message::Sync),
-            Self::Report => Ok(Message::Report),
-            Self::Joints(joints) => joints.message(),
-            Self::Stimulus(stimulus) => stimulus.message(),
-            Self::Configure(configure) => configure.message(),
-        }
-    }
-}
-
-impl Positions {
-    fn message(&self) -> Result<Message, String> {
-        let Angles { rad, words } = &self.positions;
-        let (name, texts, read): (_, _, fn(&str) -> _) = match (rad, words) {
-            (Some(rad), _) => ("--rad", rad, parameter::angle),
-            (None, words) => ("--words", words.as_ref().ok_or("--rad or --words is needed")?, parameter::raw),
-        };
-        if texts.len() > MAX_JOINTS {
-            let got = texts.len();
-            return Err(format!("{name} has {got} positions: a chain has at most {MAX_JOINTS} joints"));
-        }
-        let mut positions = [Q1_14::ZERO; MAX_JOINTS];
-        for (position, text) in positions.iter_mut().zip(texts) {
-            *position = Q1_14::from_bits(value(name, text, read)?);
-        }
-        let in_use = u8::try_from(texts.len()).map_err(|error| error.to_string())?;
-        Ok(Message::Joints { epoch: Epoch(self.epoch), joints: Joints { positions, in_use } })
-    }
-}
-
-impl Stimulus {
-    fn message(&self) -> Result<Message, String> {
-        let page = match &self.acceleration {
-            Some(texts) => SensorPage::Acceleration(several("--acceleration", "acceleration_g", texts)?),
-            None => SensorPage::Skin(SkinSensors {
-                contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), contact)?,
-                proximity: self
-                    .proximity
-                    .as_deref()
-                    .map_or(Ok(Q1_14::ZERO), |text| contact_state("--proximity", "proximity", text))?,
-                temperature: several(
-                    "--temperature",
-                    "temperature_c",
-                    self.temperature.as_deref().unwrap_or_default(),
-                )?,
-            }),
-        };
-        let from = self.epoch.map_or(From::Next, |epoch| From::Epoch(Epoch(epoch)));
-        Ok(Message::Stimulus { to: addressee(&self.node)?, from, page })
-    }
-}
-
-impl Configure {
-    fn message(&self) -> Result<Message, String> {
-        let wrong = |error: parameter::ParameterTextError| error.to_string();
-        let request = match (&self.request.read, self.request.write.as_deref()) {
-            (Some(name), _) => Request::Read { number: parameter::number(name).map_err(wrong)? },
-            (None, Some([name, values @ ..])) => {
-                let (number, words) = parameter::write(name, values).map_err(wrong)?;
-                Request::Write { number, words }
-            }
-            (None, None | Some([])) => return Err("--read or --write is needed".to_owned()),
-        };
-        Ok(Message::Configure { to: addressee(&self.node)?, tag: self.tag, request })
-    }
-}
-
-/// A value of an option; the error names the option, the value, and what is allowed.
-fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, String> {
-    read(text).map_err(|allowed| format!("{option} {text}: {allowed}"))
-}
-
-/// A value of a field of the sensors.
-fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
-    let layouts =
-        packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts);
-    let field = layouts.flat_map(|layout| &layout.fields).find(|field| field.name == name);
-    let field = field.ok_or_else(|| format!("{option}: cells measure no {name}"))?;
-    let word = value(option, text, |text| parameter::real(text).and_then(|_| parameter::read(field, text)))?;
-    Ok(Q::from_bits(word))
-}
-
-/// So many numbers, or zeros when none were given.
-fn several<const F: u32, const N: usize>(
-    option: &str,
-    name: &str,
-    texts: &[String],
-) -> Result<[Q<F>; N], String> {
-    let mut all = [Q::ZERO; N];
-    for (one, text) in all.iter_mut().zip(texts) {
-        *one = contact_state(option, name, text)?;
-    }
-    Ok(all)
-}
-
-/// The three contact words of a force.
-fn contact(text: &str) -> Result<[Q5_10; 3], String> {
-    let force = value("--force", text, parameter::real)?;
-    let words = contact_words(force);
-    let sum: f64 = words.into_iter().map(Q::to_f64).sum();
-    if (sum - force).abs() > 1.0 / 1_024.0 {
-        let [min, max] = [Q5_10::MIN, Q5_10::MAX].map(|word| 3.0 * word.to_f64());
-        return Err(format!("--force {text}: three contact words hold {min} to {max:.3} N"));
-    }
-    Ok(words)
-}
-
-fn addressee(text: &str) -> Result<Node, String> {
-    match pick::node(text) {
-        Ok(node @ (Node::Cell(_) | Node::Everyone)) => Ok(node),
-        Ok(Node::Gateway) | Err(_) => {
-            Err(format!("--node {text}: a node id, 1 to 254, or everyone is possible"))
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use clap::Parser;
-
-    #[derive(Parser)]
-    struct Line {
-        #[command(flatten)]
-        frame: Frame,
-    }
-
-    fn message(line: &str) -> Result<Message, String> {
-        let words = std::iter::once("frame").chain(line.split(' '));
-        Line::try_parse_from(words).unwrap_or_else(|error| panic!("{error}")).frame.what.message()
-    }
-
-    fn says(line: &str) -> String {
-        message(line).unwrap_err()
-    }
-
-    #[test]
-    fn what_cannot_be_is_said_with_what_can() {
-        assert_eq!(says("joints --epoch 7 --rad 0 x"), "--rad x: it must be a number");
-        assert_eq!(
-            says("joints --epoch 7 --words 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15"),
-            "--words has 15 positions: a chain has at most 14 joints"
-        );
-        assert_eq!(
-            says("stimulus --node 12 --force 96"),
-            "--force 96: three contact words hold -96 to 95.997 N"
-        );
-        assert_eq!(says("stimulus --node 12 --force nan"), "--force nan: it must be a number");
-        assert_eq!(says("stimulus --node 12 --proximity -0.1"), "--proximity -0.1: proximity is 0 to 1");
-        assert_eq!(
-            says("stimulus --node 12 --temperature 20 512"),
-            "--temperature 512: it must be in [-512, 512)"
-        );
-        let node = "a node id, 1 to 254, or everyone is possible";
-        for wrong in ["0", "255", "gateway", "-1", "x"] {
-            assert_eq!(says(&format!("stimulus --node={wrong}")), format!("--node {wrong}: {node}"));
-        }
-        assert_eq!(says("configure --node 12 --write mode 2"), "mode = 2: 0 measures, 1 obeys stimuli");
-    }
-
-    #[test]
-    fn a_force_is_shared_and_adds_up_to_its_nearest_word() {
-        for (force, steps) in
-            [("3.0", 3_072), ("-96", -98_304), ("95.997", 98_301), ("0.0005", 1), ("1", 1_024)]
-        {
-            let Ok(Message::Stimulus { page: SensorPage::Skin(skin), from: From::Next, to: Node::Everyone }) =
-                message(&format!("stimulus --node everyone --force {force}"))
-            else {
-                panic!("{force}");
-            };
-            assert_eq!(
-                skin.contact.map(|word| i32::from(word.to_bits())).iter().sum::<i32>(),
-                steps,
-                "{force}"
-            );
-        }
-    }
-
-    #[test]
-    fn radians_are_wrapped_and_words_are_taken_as_they_are() {
-        let rad = message("joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 6.283185307179586").unwrap();
-        let words = message("joints --epoch 7 --words 0 0xCF1C 10430 -14603 0xc008 0").unwrap();
-        assert_eq!(rad, words);
-    }
 }

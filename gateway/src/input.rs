@@ -40,7 +40,11 @@ pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
     let is_path = name.contains('/') || Path::new(name).extension().is_some();
     let is_absent = matches!(
         error,
-        BusError::Name(_) | BusError::NotServed { .. } | BusError::NoInterface(_) | BusError::NoSocketCan(_)
+        BusError::Name(_)
+            | BusError::NotServed { .. }
+            | BusError::Absent { .. }
+            | BusError::NoInterface(_)
+            | BusError::NoSocketCan(_)
     );
     if is_path && is_absent {
         return Failure::usage(format!(
@@ -325,6 +329,16 @@ impl ReceiveEnd {
             ));
         }
         missing.into()
+    }
+}
+
+/// Waits until a frame comes on one of these buses, at most so long.
+pub(crate) fn wait(receive_ends: &[ReceiveEnd], timeout: Duration) -> Result<(), Failure> {
+    let mut fds: Vec<_> =
+        receive_ends.iter().map(|receive_end| PollFd::new(receive_end.bus(), PollFlags::IN)).collect();
+    match poll(&mut fds, Timespec::try_from(timeout).ok().as_ref()) {
+        Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
+        Err(errno) => Err(Failure::run(io::Error::from(errno))),
     }
 }
 

@@ -1,26 +1,28 @@
-//! `skinbus`: the bench's command line. A module a command, each a thin layer over the crates below; errors are one line, exit codes are 0 (done),
-//! 1 (failed, or different), 2 (wrong use or configuration) and 3 (the robot was halted at the end).
+//! `skinbus`: the bench's command line. A module a command, each a thin layer over the crates below; errors are one line, exit codes
+//! are 0 (done), 1 (failed, or different), 2 (wrong use or configuration) and 3 (the robot was halted at the end).
 
 #![allow(
     rustdoc::broken_intra_doc_links,
     reason = "help is written for a terminal: [events] is a table of a skin"
 )]
 
-mod ack;
 mod arguments;
 mod buses;
 mod calibrate;
 mod cells;
+mod check;
 mod columns;
 mod commission;
+mod completions;
 mod conformance;
 mod convert;
-mod dbc;
 mod dump;
 mod experiment;
 mod explain;
 mod fit;
+mod former;
 mod frame;
+mod groups;
 mod input;
 mod output;
 mod print;
@@ -29,28 +31,20 @@ mod replay;
 mod report;
 mod robot_file;
 mod run;
-mod scenario;
-mod sensing;
-mod shadow;
 mod skin;
 mod surface;
-mod torque;
 mod view;
 mod visuals;
 
 use std::process::ExitCode;
 
 use clap::error::{ContextKind, ContextValue, ErrorKind};
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use protocol::usage::{Failure, end, one_line};
 
-/// Bridges a robot skin's bus to a control loop.
+/// A test bench for robot skin on CAN: runs cells, bridges their bus to a control loop, records, replays
 #[derive(Debug, Parser)]
-#[command(
-    name = "skinbus",
-    version,
-    after_help = "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.\n\nExample:\n  skinbus demo"
-)]
+#[command(name = "skinbus", version, disable_help_subcommand = true)]
 struct Arguments {
     #[command(subcommand)]
     command: Command,
@@ -60,27 +54,24 @@ struct Arguments {
 enum Command {
     Demo(run::Demo),
     Run(run::Run),
-    Recover(recover::Recover),
+    View(view::View),
     Dump(dump::Dump),
+    Explain(explain::Explain),
+    Report(report::Report),
+    Cells(cells::Cells),
     Convert(convert::Convert),
     Replay(replay::Replay),
-    Report(report::Report),
-    Frame(frame::Frame),
+    Recover(recover::Recover),
+    Fit(fit::Fit),
     Commission(commission::Commission),
     Calibrate(calibrate::Calibrate),
     Conformance(conformance::Conformance),
-    Cells(cells::Cells),
-    Ack(ack::Ack),
-    Sensing(sensing::Sensing),
+    Frame(frame::Frame),
     Skin(skin::Skin),
-    Scenario(scenario::Scenario),
-    Torque(torque::Torque),
-    View(view::View),
-    Dbc(dbc::Dbc),
-    Explain(explain::Explain),
-    Shadow(shadow::ShadowCommand),
-    Fit(fit::Fit),
+    Check(check::Check),
     Experiment(experiment::Experiment),
+    Completions(completions::Completions),
+    Man(completions::Man),
 }
 
 impl Command {
@@ -88,33 +79,36 @@ impl Command {
         match self {
             Self::Demo(command) => command.run(),
             Self::Run(command) => command.run(),
-            Self::Recover(command) => command.run(),
+            Self::View(command) => command.run(),
             Self::Dump(command) => command.run(),
+            Self::Explain(command) => command.run(),
+            Self::Report(command) => command.run(),
+            Self::Cells(command) => command.run(),
             Self::Convert(command) => command.run(),
             Self::Replay(command) => command.run(),
-            Self::Report(command) => command.run(),
-            Self::Frame(command) => command.run(),
+            Self::Recover(command) => command.run(),
+            Self::Fit(command) => command.run(),
             Self::Commission(command) => command.run(),
             Self::Calibrate(command) => command.run(),
             Self::Conformance(command) => command.run(),
-            Self::Cells(command) => command.run(),
-            Self::Ack(command) => command.run(),
-            Self::Sensing(command) => command.run(),
+            Self::Frame(command) => command.run(),
             Self::Skin(command) => command.run(),
-            Self::Scenario(command) => command.run(),
-            Self::Torque(command) => command.run(),
-            Self::View(command) => command.run(),
-            Self::Dbc(command) => command.run(),
-            Self::Explain(command) => command.run(),
-            Self::Shadow(command) => command.run(),
-            Self::Fit(command) => command.run(),
+            Self::Check(command) => command.run(),
             Self::Experiment(command) => command.run(),
+            Self::Completions(command) => command.run(program()),
+            Self::Man(command) => command.run(program()),
         }
     }
 }
 
+/// The command line, with its commands in groups.
+fn program() -> clap::Command {
+    groups::grouped(Arguments::command())
+}
+
 fn main() -> ExitCode {
-    let done = match Arguments::try_parse() {
+    let parsed = program().try_get_matches().and_then(|matches| Arguments::from_arg_matches(&matches));
+    let done = match parsed {
         Ok(arguments) => arguments.command.run(),
         // Requested help and version are printed as they are.
         Err(requested) if !requested.use_stderr() => requested.exit(),
@@ -124,23 +118,29 @@ fn main() -> ExitCode {
     end("skinbus", done)
 }
 
-/// What clap says, in one line; where its guess would mislead, what there is instead.
+/// clap's message in one line; where its guess would mislead, a better one.
 fn refusal(wrong: &clap::Error) -> String {
-    let said = one_line(&wrong.render().to_string());
     let text = |kind| match wrong.get(kind) {
         Some(ContextValue::String(text)) => Some(text.as_str()),
         _ => None,
     };
-    let first = std::env::args_os().nth(1).unwrap_or_default();
-    if let Some(name) = text(ContextKind::InvalidSubcommand).filter(|name| first == *name) {
-        let arguments = Arguments::command();
-        let names = print::list(arguments.get_subcommands().map(clap::Command::get_name));
-        return format!("there is no command {name}; there are {names}");
+    let words: Vec<_> = std::env::args_os().skip(1).map(|word| word.to_string_lossy().into_owned()).collect();
+    let first = words.first().map(String::as_str).unwrap_or_default();
+    if let Some(name) = text(ContextKind::InvalidSubcommand) {
+        if let Some(now) = former::command(&words, name) {
+            return now;
+        }
+        if first == name {
+            return groups::unknown(&program(), name);
+        }
     }
     match text(ContextKind::InvalidArg) {
         Some(file) if first == "run" && file.ends_with(".toml") => {
             format!("{file} comes after the skin: a scenario is given by --scenario {file}")
         }
-        _ => said,
+        Some(option) => {
+            former::option(&words, option).unwrap_or_else(|| one_line(&wrong.render().to_string()))
+        }
+        None => one_line(&wrong.render().to_string()),
     }
 }

@@ -6,27 +6,27 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use protocol::usage::{Failure, say};
-use trace::files::{WholeFile, check, folder_of};
+use protocol::usage::{Failure, print, say, say_lines, written};
+use trace::files::{STANDARD_OUTPUT, WholeFile, check, folder_of};
 
 /// Whether files that exist may be overwritten.
 #[derive(Args, Clone, Copy, Debug)]
-pub(crate) struct Force {
+pub(crate) struct Overwrite {
     /// Overwrite files that exist
     #[arg(long)]
-    pub(crate) force: bool,
+    pub(crate) overwrite: bool,
 }
 
-impl Force {
+impl Overwrite {
     /// Begins a file that an option names, so that what makes that impossible is known before there is anything to
     /// write.
     pub(crate) fn create(self, option: &str, path: &Path) -> Result<(WholeFile, File), Failure> {
-        WholeFile::create(path, self.force).map_err(|error| refused(option, path, &error))
+        WholeFile::create(path, self.overwrite).map_err(|error| refused(option, path, &error))
     }
 
     /// Sees that a file may be written, long before it is.
     pub(crate) fn check(self, option: &str, path: &Path) -> Result<(), Failure> {
-        check(path, self.force).map_err(|error| refused(option, path, &error))
+        check(path, self.overwrite).map_err(|error| refused(option, path, &error))
     }
 
     /// Writes a whole file that an option names, or leaves what was there.
@@ -36,8 +36,28 @@ impl Force {
     }
 }
 
+/// Returns true for the name of standard output, `-`.
+pub(crate) fn is_standard_output(path: &Path) -> bool {
+    path == Path::new(STANDARD_OUTPUT)
+}
+
+/// Prints a table: on standard error when one of these files is standard output, which then carries nothing else.
+pub(crate) fn print_beside<'a>(
+    files: impl IntoIterator<Item = Option<&'a Path>>,
+    text: &str,
+) -> Result<(), Failure> {
+    if files.into_iter().flatten().any(is_standard_output) {
+        say_lines(text);
+        return Ok(());
+    }
+    print(text)
+}
+
 /// Writes all of a file that was begun.
 pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str) -> Result<(), Failure> {
+    if is_standard_output(whole.path()) {
+        return written(file.write_all(text.as_bytes()));
+    }
     let name = named(option, whole.path());
     let written = file.write_all(text.as_bytes()).and_then(|()| whole.finish());
     written.map_err(|error: io::Error| Failure::run(format!("{name}: {error}")))
@@ -52,7 +72,7 @@ fn named(option: &str, path: &Path) -> String {
     format!("{option} {}", path.display()).trim_start().to_owned()
 }
 
-/// Sees that each file that is written, by its option, is a file of its own, and none that the command reads: `--force`
+/// Sees that each file that is written, by its option, is a file of its own, and none that the command reads: `--overwrite`
 /// does not mean that one.
 pub(crate) fn apart<'a>(
     written: impl IntoIterator<Item = (&'a str, Option<&'a Path>)>,
@@ -60,7 +80,7 @@ pub(crate) fn apart<'a>(
 ) -> Result<(), Failure> {
     // Two names may be one terminal.
     let is_stream = |path: &Path| fs::metadata(path).is_ok_and(|about| !about.is_file() && !about.is_dir());
-    let read: Vec<_> = read.into_iter().map(place).collect();
+    let read: Vec<_> = read.into_iter().filter(|path| !is_standard_output(path)).map(place).collect();
     let mut before = Vec::new();
     for (option, path) in written {
         let Some(path) = path.filter(|path| !is_stream(path)) else { continue };

@@ -4,11 +4,11 @@ use std::path::PathBuf;
 
 use clap::Args;
 use protocol::input;
-use protocol::usage::{Failure, print, shown};
+use protocol::usage::{Failure, shown};
 use trace::recording::recover::RecoverError;
 use trace::recording::{names, repair};
 
-use super::output::{Force, apart};
+use super::output::{Overwrite, apart, print_beside};
 
 /// Make a recording whole that ends in the middle
 ///
@@ -21,10 +21,10 @@ pub(crate) struct Recover {
     /// The recording: an MCAP file of any program
     file: PathBuf,
     /// The new file; else FILE-recovered.mcap
-    #[arg(short, long, value_name = "OUT")]
+    #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
 }
 
 impl Recover {
@@ -37,7 +37,7 @@ impl Recover {
         let output = self.output.unwrap_or_else(|| names::recovered(&names::goal_of(&self.file)));
         let out = output.display();
         apart([("-o", Some(output.as_path()))], [self.file.as_path()])?;
-        self.force.check("-o", &output)?;
+        self.overwrite.check("-o", &output)?;
         let failure = |error| {
             if let RecoverError::Write(error) = error {
                 return Failure::run(format!("-o {out}: {error}"));
@@ -45,7 +45,7 @@ impl Recover {
             Failure::run(format!("{name}: {error}"))
         };
         let (recovered, bytes) =
-            repair::copy_unless_sound(&file, &output, self.force.force).map_err(failure)?;
+            repair::copy_unless_sound(&file, &output, self.overwrite.overwrite).map_err(failure)?;
         let line = match bytes {
             None if recovered.is_sound() => {
                 format!("{name} is whole, there is nothing to recover: {} messages", recovered.messages)
@@ -56,6 +56,6 @@ impl Recover {
         if recovered.is_little() {
             return Err(Failure::run(format!("more is lost of {name} than came back: {line}")));
         }
-        print(&format!("{}\n", shown(&line)))
+        print_beside([Some(output.as_path())], &format!("{}\n", shown(&line)))
     }
 }

@@ -1,6 +1,5 @@
 //! `skinbus replay`.
 
-use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -11,17 +10,20 @@ use bench::replay::report::{Expect, Summary};
 use bench::replay::survey::Part;
 use bench::replay::{Options, ReplayError, Spawn, replay};
 use clap::Args;
-use model::decode::pick::{self, Pick, Selector};
-use protocol::id::Node;
-use protocol::usage::{Failure, print};
+use protocol::usage::Failure;
 
-use super::arguments::{BusKinds, Programs, Word, nanos, one_of};
-use super::output::{self, Force, apart, note};
+use super::arguments::{BusKinds, Processes, Word, nanos, of_environment, one_of};
+use super::output::{self, Overwrite, apart, print_beside};
 use super::print::{Rows, count, json, list, or, quantiles};
-use super::view::{Page, PageOptions};
 
 /// Bytes for frames that wait: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
+
+/// How long before a frame is due the sender spins instead of sleeping.
+const SPIN: Duration = Duration::from_micros(100);
+
+/// Milliseconds for which room on a full bus is waited for before a frame is refused.
+const SEND_TIMEOUT_MS: u32 = 100;
 
 /// Send a capture on a bus, and compare the answers of the cells with the recorded ones
 ///
@@ -31,14 +33,14 @@ const RECEIVE_BUFFER: u32 = 8 << 20;
 /// so; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(mut_args(|arg| match arg.get_id().as_str() {
-    "cells_per_process" | "cell_node" | "vcan_setup" => arg.requires("spawn"),
+    "cells_per_process" => arg.requires("spawn"),
     _ => arg,
 }))]
 #[command(after_help = "Examples:
   skinbus replay run.log --only inputs --speed 0.5
   skinbus replay run.mcap --expect --spawn --lockstep
   skinbus replay run.mcap run-*.mcap --expect --spawn --lockstep
-  skinbus replay foreign.log --map can0=vcan0 --max --loop 10")]
+  skinbus replay foreign.log --map can0=vcan0 --speed max --loop 10")]
 pub(crate) struct Replay {
     /// A candump log or an MCAP recording; all parts of a split recording are one, in any order
     #[arg(required = true, value_name = "FILE")]
@@ -50,19 +52,13 @@ pub(crate) struct Replay {
     /// Do it N times; 0 is until Ctrl-C
     #[arg(long = "loop", value_name = "N", default_value_t = 1)]
     passes: u32,
-    /// So many times as fast, 0.1 to 100
+    /// So many times as fast, 0.1 to 100; or max, as fast as the bus takes it, whatever the times
     #[arg(long, value_name = "X", default_value = "1", value_parser = speed, allow_negative_numbers = true)]
-    speed: f64,
-    /// As fast as the bus takes it, whatever the times
-    #[arg(long, conflicts_with = "speed")]
-    max: bool,
-    /// Spin so many microseconds before a frame is due instead of sleeping; 0 is never
-    #[arg(long, value_name = "US", default_value_t = 100, value_parser = clap::value_parser!(u32).range(..=100_000))]
-    spin: u32,
+    speed: Pace,
     /// Send the next joints only when every cell has answered: the same on any machine, however slow
     #[arg(long)]
     lockstep: bool,
-    /// Compare the answers with the recorded ones; with --max in lockstep
+    /// Compare the answers with the recorded ones; with --speed max in lockstep
     #[arg(long)]
     expect: bool,
     /// Take torques for equal whose words differ by at most so many steps of 1/4096 Nm; they are counted
@@ -71,25 +67,19 @@ pub(crate) struct Replay {
     /// Start the cells, as processes, and end them afterwards
     #[arg(long)]
     spawn: bool,
-    /// The skin of the cells that are started, and of the page; else the recording's own
-    #[arg(long, value_name = "FILE")]
+    /// The skin of the cells that are started; else the recording's own
+    #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
     #[command(flatten)]
-    programs: Programs,
+    processes: Processes,
     /// Let cells that measure obey stimuli while the replay lasts, and measure again afterwards
     #[arg(long)]
     test_mode: bool,
-    /// Milliseconds to wait for room on a full bus before a frame is refused
-    #[arg(long, value_name = "MS", default_value_t = 100, value_parser = clap::value_parser!(u32).range(1..=60_000))]
-    send_timeout: u32,
-    /// End before anything is sent when a line of a log cannot be read
-    #[arg(long)]
-    strict: bool,
     /// Write the figures of the end as JSON; docs/reference/replay.md explains its keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
     #[command(flatten)]
     shown: Shown,
 }
@@ -98,17 +88,11 @@ pub(crate) struct Replay {
 #[derive(Args, Debug)]
 struct Shown {
     /// Print the figures as JSON instead of the table
-    #[arg(long)]
+    #[arg(long, short)]
     json: bool,
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
-    /// Show the skin live in a browser while it lasts: a page is served at this address or any free port of this machine;
-    /// docs/how-to/view.md
-    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true, conflicts_with = "map")]
-    view: Option<Option<SocketAddr>>,
-    #[command(flatten)]
-    page: PageOptions,
 }
 
 /// Which frames of the capture, and where they go.
@@ -124,13 +108,6 @@ struct Frames {
     /// else all are sent
     #[arg(long, value_parser = one_of(ONLY))]
     only: Option<Only>,
-    /// Only these kinds: command, sum, torque, sensors, network, configure, configured, stimulus; also halt,
-    /// joints, sync, resume, report alone, wire, and foreign
-    #[arg(long, value_name = "KIND", value_delimiter = ',', conflicts_with = "expect")]
-    kind: Vec<Selector>,
-    /// Only packets from or to these: a node id, gateway, everyone
-    #[arg(long, value_name = "NODE", value_delimiter = ',', value_parser = pick::node, conflicts_with = "expect")]
-    node: Vec<Node>,
     /// Begin so many seconds after the first frame; with inputs only, in the state that was latched there
     #[arg(long, value_name = "S", default_value = "0", value_parser = nanos, allow_negative_numbers = true)]
     from: u64,
@@ -152,10 +129,11 @@ fn route(text: &str) -> Result<(String, String), String> {
     }
 }
 
-fn speed(text: &str) -> Result<f64, String> {
+fn speed(text: &str) -> Result<Pace, String> {
     match text.parse::<f64>() {
-        Ok(speed) if (0.1..=100.0).contains(&speed) => Ok(speed),
-        _ => Err("a number from 0.1 to 100".to_owned()),
+        _ if text == "max" => Ok(Pace::Max),
+        Ok(speed) if (0.1..=100.0).contains(&speed) => Ok(Pace::Timed(speed)),
+        _ => Err("a number from 0.1 to 100, or max".to_owned()),
     }
 }
 
@@ -165,34 +143,23 @@ impl Replay {
         let read = self.files.iter().chain(&self.skin).map(PathBuf::as_path);
         apart([("--summary", self.summary.as_deref())], read)?;
         // Before the replay, so that a file that cannot be written is reported first.
-        let file = self.summary.as_ref().map(|path| self.force.create("--summary", path)).transpose()?;
-        let page = |listen| {
-            Page::of_replay(&self.files, self.skin.as_deref(), &options.kinds, listen, &self.shown.page)
-        };
-        // Its pipes stay open until the end.
-        let mut page = self.shown.view.map(page).transpose()?;
+        let file = self.summary.as_ref().map(|path| self.overwrite.create("--summary", path)).transpose()?;
         let failure = |error: ReplayError| Failure::with_code(error.exit_code(), error);
         let summary = replay(&options).map_err(failure)?;
-        if let Some(status) = page.as_mut().and_then(|(page, _lines)| page.ended()) {
-            note(format_args!(
-                "--view: the process that served the page ended before the replay did ({status})"
-            ));
-        }
         let json = json(&summary)?;
         let write = |(whole, file)| output::finish("--summary", whole, file, &json);
         let written = file.map_or(Ok(()), write);
-        print(&if self.shown.json { json } else { table(&summary) }).and(written)?;
+        let shown = if self.shown.json { json } else { table(&summary) };
+        print_beside([self.summary.as_deref()], &shown).and(written)?;
         summary.verdict(self.shown.quiet).map_or(Ok(()), |why| Err(Failure::run(why)))
     }
 
     fn options(&self) -> Result<Options, Failure> {
         let answered = [("--expect", self.expect), ("--lockstep", self.lockstep), ("--spawn", self.spawn)];
         let needs = answered.into_iter().find_map(|(name, given)| given.then_some(name));
-        if let Some(skin) = self.skin.as_ref().filter(|_| !self.spawn && self.shown.view.is_none()) {
-            return Err(Failure::usage(format!(
-                "--skin {} is of the cells that --spawn starts, and of the page of --view: add one of the two",
-                skin.display()
-            )));
+        if let Some(skin) = self.skin.as_ref().filter(|_| !self.spawn) {
+            let skin = skin.display();
+            return Err(Failure::usage(format!("--skin {skin} is of the cells that --spawn starts: add it")));
         }
         let only = match (self.frames.only, needs) {
             (Some(Only::Replies | Only::All), Some(name)) => {
@@ -204,33 +171,26 @@ impl Replay {
             (None, Some(_)) => Only::Inputs,
             (only, _) => only.unwrap_or(Only::All),
         };
+        let timeout_ms = of_environment("SKINBUS_SEND_TIMEOUT_MS", 1..=60_000)?;
         Ok(Options {
             files: self.files.clone(),
             kinds: self.kinds.of_any()?,
             only,
-            pick: Pick {
-                kinds: self.frames.kind.clone(),
-                nodes: self.frames.node.clone(),
-                ..Pick::default()
-            },
             buses: self.frames.bus.clone(),
             map: self.frames.map.clone(),
             part: Part { from: self.frames.from, to: self.frames.to },
             passes: (self.passes > 0).then_some(self.passes),
-            pace: if self.max { Pace::Max } else { Pace::Timed(self.speed) },
-            spin: Duration::from_micros(self.spin.into()),
-            lockstep: self.lockstep || (self.expect && self.max),
+            pace: self.speed,
+            spin: SPIN,
+            lockstep: self.lockstep || (self.expect && matches!(self.speed, Pace::Max)),
             expect: self.expect.then_some(self.tolerance),
             spawn: self.spawn.then(|| Spawn {
                 skin: self.skin.clone(),
-                cells_per_process: self.programs.cells_per_process.into(),
-                cell_node: self.programs.cell_node.clone(),
+                cells_per_process: self.processes.cells_per_process.into(),
             }),
-            vcan_setup: self.programs.vcan_setup.clone(),
             test_mode: self.test_mode,
-            timeout: Duration::from_millis(self.send_timeout.into()),
+            timeout: Duration::from_millis(timeout_ms.unwrap_or(SEND_TIMEOUT_MS).into()),
             receive_buffer: RECEIVE_BUFFER as usize,
-            strict: self.strict,
             quiet: self.shown.quiet,
         })
     }

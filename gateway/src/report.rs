@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use analysis::report::run::{self, ReportError};
 use analysis::report::{figure::Page, page, svg};
 use clap::Args;
-use protocol::usage::{Failure, command_line, print, shown};
+use protocol::usage::{Failure, command_line, shown};
 use protocol::wire_time::bit_rate;
 
-use super::output::{Force, apart, note};
+use super::output::{Overwrite, apart, note, print_beside};
 
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
@@ -20,14 +20,14 @@ use super::output::{Force, apart, note};
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus report run.mcap -o run.html
-  skinbus report run.mcap --svg figures --force
+  skinbus report run.mcap --svg figures --overwrite
   skinbus report run.mcap run-*.mcap -o all.html")]
 pub(crate) struct Report {
     /// The recording of a run: what `skinbus run SKIN --record FILE` wrote; all parts of a split one in any order
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// The page; else the recording's name with .html
-    #[arg(short, long, value_name = "OUT")]
+    #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Also each figure as an SVG file, in this folder, which is made if it is not there
     #[arg(long, value_name = "DIR")]
@@ -39,7 +39,7 @@ pub(crate) struct Report {
     #[arg(long, value_name = "RATE", value_parser = bit_rate)]
     data: Option<u32>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
 }
 
 impl Report {
@@ -65,7 +65,7 @@ impl Report {
             }
         }
         let made = self.svg.as_deref().map(make).transpose()?.unwrap_or(false);
-        if let Err(failure) = write(&files, self.force) {
+        if let Err(failure) = write(&files, self.overwrite) {
             if let Some(folder) = self.svg.filter(|_| made) {
                 // Only if nothing is in it.
                 let _ = fs::remove_dir(folder);
@@ -79,7 +79,7 @@ impl Report {
         let beside =
             self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
         let said = format!("{}: {figures} figures{beside}", output.display());
-        print(&format!("{}\n", shown(&said)))?;
+        print_beside([Some(output.as_path())], &format!("{}\n", shown(&said)))?;
         match report.missing.filter(|_| report.is_damaged) {
             Some(missing) => Err(Failure::run(format!("{}: {missing}", report.name))),
             None => Ok(()),
@@ -89,7 +89,7 @@ impl Report {
     /// What is there is not overwritten unless that is asked for.
     fn is_free(&self, path: &Path, option: &str) -> Result<(), Failure> {
         apart([(option, Some(path))], self.files.iter().map(PathBuf::as_path))?;
-        self.force.check(option, path)
+        self.overwrite.check(option, path)
     }
 }
 
@@ -124,13 +124,13 @@ fn make(folder: &Path) -> Result<bool, Failure> {
 }
 
 /// Writes all of them, each beside the option that is for it, or none: each gets its name when all are whole.
-fn write(files: &[(&str, PathBuf, String)], force: Force) -> Result<(), Failure> {
+fn write(files: &[(&str, PathBuf, String)], overwrite: Overwrite) -> Result<(), Failure> {
     let failed = |option: &str, path: &Path, error: io::Error| {
         Failure::run(format!("{option} {}: {error}", path.display()))
     };
     let mut whole = Vec::with_capacity(files.len());
     for (option, path, text) in files {
-        let (begun, mut file) = force.create(option, path)?;
+        let (begun, mut file) = overwrite.create(option, path)?;
         file.write_all(text.as_bytes()).map_err(|error| failed(option, path, error))?;
         whole.push((option, path, begun));
     }

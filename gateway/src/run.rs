@@ -2,7 +2,6 @@
 
 mod show;
 
-use std::net::SocketAddr;
 use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -19,12 +18,12 @@ use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds};
 use protocol::document;
 use protocol::skin::Skin;
 use protocol::time::Span;
-use protocol::usage::{Failure, command_line, print, quoted_os};
+use protocol::usage::{Failure, command_line, quoted_os};
 use trace::recording::series::{Attached, Split};
 
-use super::arguments::{BusKinds, Named, Programs, bus_names, cell, seconds, time};
+use super::arguments::{BusKinds, Named, Processes, bus_names, cell, of_environment, seconds, time};
 use super::buses;
-use super::output::{self, Force, apart, note};
+use super::output::{self, Overwrite, apart, note, print_beside};
 use super::print::json;
 use super::robot_file::{RobotOfSkin, urdf_of};
 use super::view::{Page, PageOptions};
@@ -48,15 +47,13 @@ struct Common {
     /// Write the figures of the end as JSON, also when the run fails; docs/reference/summary.md explains its keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
-    #[command(flatten)]
-    programs: Programs,
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
-    /// Show the skin live in a browser: a page is served until the run ends, at this address or any free port of this
-    /// machine; docs/how-to/view.md. Without --duration the run then ends with Ctrl-C
-    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true)]
-    view: Option<Option<SocketAddr>>,
+    /// Show the skin live in a browser: a page is served until the run ends; docs/how-to/view.md. Without --duration the run
+    /// then ends with Ctrl-C
+    #[arg(long)]
+    view: bool,
     #[command(flatten)]
     page: PageOptions,
     #[command(flatten)]
@@ -76,11 +73,8 @@ struct Recording {
     /// Record everything as MCAP: frames, joints, torques, touches, timing; docs/reference/recording.md has the topics
     #[arg(long, value_name = "FILE.mcap")]
     record: Option<PathBuf>,
-    /// Begin another file (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given twice
-    #[arg(long, value_name = "SIZE|TIME", requires = "record", value_parser = limit)]
-    record_split: Vec<Limit>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
 }
 
 /// When another file of a recording is begun.
@@ -107,9 +101,9 @@ fn limit(text: &str) -> Result<Limit, String> {
 
 impl Recording {
     /// What is recorded where; the files go with it as they are.
-    fn options(&self, candump: Option<Candump>, files: Files) -> record::Options {
+    fn options(&self, candump: Option<Candump>, files: Files, limits: &[Limit]) -> record::Options {
         let mut split = Split::default();
-        for &limit in &self.record_split {
+        for &limit in limits {
             match limit {
                 Limit::Bytes(bytes) => split.bytes = bytes,
                 Limit::Age(age) => split.age = age,
@@ -127,7 +121,7 @@ impl Recording {
             let command_line = command_line();
             record::Mcap { path, split, attachments, robot: files.robot.robot, command_line }
         });
-        record::Options { candump, mcap, force: self.force.force }
+        record::Options { candump, mcap, force: self.overwrite.overwrite }
     }
 }
 
@@ -137,16 +131,18 @@ impl Recording {
 /// directory, so any number of demonstrations and runs go on side by side. It prints the command that shows the frames on
 /// its bus, and where it records them as candump text. Exit codes are those of `skinbus run`.
 #[derive(Args, Debug)]
-#[command(after_help = "Example:\n  skinbus demo --duration 5")]
+#[command(
+    after_help = "Example:\n  skinbus demo --duration 5",
+    mut_arg("bus_kind", |arg| arg.help("socketcan or embedded; auto is SocketCAN if there is an interface vcan0 [default: embedded]"))
+)]
 pub(crate) struct Demo {
     #[command(flatten)]
     common: Common,
     /// Where the frames are recorded; else skinbus-demo.log, or skinbus-demo-1.log, ... where that exists
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
-    /// embedded, socketcan, or auto for SocketCAN where the kernel has it
-    #[arg(long, value_name = "KIND", default_value_t = Choice::Only(BusKind::Embedded))]
-    bus_kind: Choice,
+    #[command(flatten)]
+    kinds: BusKinds,
 }
 
 /// Run a bench: cells, buses, the control loop
@@ -169,6 +165,11 @@ pub(crate) struct Run {
     scenario: Option<PathBuf>,
     #[command(flatten)]
     common: Common,
+    /// Begin another recording (FILE-1.mcap, ...) at this size or age: 500MB, 2GiB, 90s, 10min; may be given twice
+    #[arg(long, value_name = "SIZE|TIME", requires = "record", value_parser = limit)]
+    record_split: Vec<Limit>,
+    #[command(flatten)]
+    processes: Processes,
     /// Write all frames as candump text: a log that can be followed while it grows
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
@@ -177,10 +178,6 @@ pub(crate) struct Run {
     /// Start no cells: they are on the bus already, or are real
     #[arg(long)]
     no_spawn: bool,
-    /// Ask for so many bytes for frames that wait unread in the gateway's socket of each bus, about 1 KiB a
-    /// frame; the kernel grants the double, or less to those who may not have it
-    #[arg(long, value_name = "BYTES", default_value_t = GATEWAY_RECEIVE_BUFFER, value_parser = clap::value_parser!(u32).range(..=1 << 30))]
-    receive_buffer: u32,
     /// Let cells keep their parameters in files of this directory
     #[arg(long, value_name = "DIR")]
     flash: Option<PathBuf>,
@@ -200,10 +197,16 @@ impl Demo {
         let mut scenario =
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
         // Whoever opens the page late sees the arm move, too.
-        scenario.touches_repeat = self.common.view.map(|_| scenario.duration);
+        scenario.touches_repeat = self.common.view.then_some(scenario.duration);
         let mut options = self.common.options(skin_file, skin, scenario);
-        options.kinds = Kinds::all(self.bus_kind);
-        let kind = self.bus_kind.resolve();
+        let per_process = of_environment("SKINBUS_CELLS_PER_PROCESS", 1..=254)?;
+        options.cells_per_process = per_process.unwrap_or(1) as usize;
+        options.kinds = self
+            .kinds
+            .or(Choice::Only(BusKind::Embedded))?
+            .only(bus_names(&options.skin))
+            .map_err(Failure::usage)?;
+        let kind = options.kinds.of("vcan0").resolve("vcan0");
         let given = std::env::var_os("SKINBUS_DIR").filter(|given| !given.is_empty()).map(PathBuf::from);
         let own = given.is_none() && kind == BusKind::Embedded;
         let buses = own.then(|| buses::directory("demo")).transpose()?;
@@ -221,9 +224,9 @@ impl Demo {
             None => RobotOfSkin::default(),
         };
         let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), robot };
-        options.record = recording.options(candump, files);
-        let page = view.map(|listen| Page::of(&options, listen, &page)).transpose()?;
-        bench(&options, summary.as_deref(), recording.force, &[], page)
+        options.record = recording.options(candump, files, &[]);
+        let page = view.then(|| Page::of(&options, &page)).transpose()?;
+        bench(&options, summary.as_deref(), recording.overwrite, &[], page)
     }
 }
 
@@ -261,13 +264,16 @@ impl Run {
         options.kinds = self.kinds.of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
         let files = Files { skin: skin_text, scenario: scenario_text, robot };
-        options.record = recording.options(candump, files);
+        options.record = recording.options(candump, files, &self.record_split);
         options.spawn = !self.no_spawn;
         options.flash = self.flash;
         options.emulated = emulated(self.firmware, &self.emulate, &options.skin)?;
-        options.receive_buffer = self.receive_buffer as usize;
-        let page = view.map(|listen| Page::of(&options, listen, &page)).transpose()?;
-        bench(&options, summary.as_deref(), recording.force, &read, page)
+        // The kernel grants the double, or less to those who may not have it.
+        let bytes = of_environment("SKINBUS_RECEIVE_BUFFER", 0..=1 << 30)?;
+        options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER) as usize;
+        options.cells_per_process = self.processes.cells_per_process.into();
+        let page = view.then(|| Page::of(&options, &page)).transpose()?;
+        bench(&options, summary.as_deref(), recording.overwrite, &read, page)
     }
 }
 
@@ -288,7 +294,7 @@ fn emulated(firmware: Option<PathBuf>, named: &[Named], skin: &Skin) -> Result<O
 impl Common {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 1e13: checked")]
     fn options(&self, skin_file: PathBuf, skin: Skin, mut scenario: Scenario) -> Options {
-        let until_stopped = self.view.map(|_| UNTIL_STOPPED);
+        let until_stopped = self.view.then_some(UNTIL_STOPPED);
         if let Some(seconds) = self.duration.or(until_stopped) {
             scenario.duration = Span((seconds * 1e6) as u64);
         }
@@ -300,10 +306,8 @@ impl Common {
             directory: None,
             spawn: true,
             emulated: None,
-            cells_per_process: self.programs.cells_per_process.into(),
+            cells_per_process: 1,
             flash: None,
-            cell_node: self.programs.cell_node.clone(),
-            vcan_setup: self.programs.vcan_setup.clone(),
             receive_buffer: GATEWAY_RECEIVE_BUFFER as usize,
             record: record::Options::default(),
             quiet: self.quiet,
@@ -316,7 +320,7 @@ impl Common {
 fn bench(
     options: &Options,
     summary_file: Option<&Path>,
-    force: Force,
+    overwrite: Overwrite,
     read: &[PathBuf],
     page: Option<(Page, Lines)>,
 ) -> Result<(), Failure> {
@@ -327,7 +331,7 @@ fn bench(
     ];
     apart(written, read.iter().map(PathBuf::as_path))?;
     // Before the run, so that a file that cannot be written is reported first.
-    let summary = summary_file.map(|path| force.create("--summary", path)).transpose()?;
+    let summary = summary_file.map(|path| overwrite.create("--summary", path)).transpose()?;
     // A panic is reported in the summary too.
     let (page, lines) = page.unzip();
     let ended = panic::catch_unwind(AssertUnwindSafe(|| run::run(options, lines)));
@@ -342,7 +346,9 @@ fn bench(
     if let Some(panic) = panicked {
         panic::resume_unwind(panic);
     }
-    let printed = if ended.control.ticks > 0 { print(&show::rows(&ended).text()) } else { Ok(()) };
+    let files = written.map(|(_, path)| path);
+    let printed =
+        if ended.control.ticks > 0 { print_beside(files, &show::rows(&ended).text()) } else { Ok(()) };
     // The last line is the failure's own; each of them is one line.
     let mut lines = ended.complaints(options.quiet);
     let lost: Vec<_> = unwritten.into_iter().chain(printed.err()).collect();

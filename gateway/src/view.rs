@@ -4,32 +4,31 @@ mod address;
 mod token;
 
 use std::collections::BTreeMap;
-use std::ffi::{OsStr, OsString};
+use std::ffi::OsString;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::net::UnixStream;
 use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus};
+use std::process::{Child, Command};
 
 use bench::remote::Lines;
 use bench::run;
 use clap::Args;
 use cover::mesh::{Triangle, simplify};
-use protocol::bus::Kinds;
 use protocol::skin::Skin;
 use protocol::usage::Failure;
 use robots::Isometry3;
 use trace::capture::{CaptureError, Format, Reader};
+use view::Shell;
 use view::play::{self, play};
 use view::player::PlayError;
 use view::serve::{Options, ServeError, serve};
 use view::server::{Access, url};
-use view::{Shell, Token};
 
 use super::arguments::{BusKinds, bus_names, bus_of, nanos};
-use super::input::{no_frame, read_skin, remark_another, skin_for, skin_of, stopped};
+use super::input::{no_frame, read_skin, remark_another, skin_of, stopped};
 use super::output::note;
 use super::surface::{Placed, Surface};
 use super::visuals::Packages;
@@ -72,10 +71,6 @@ pub(crate) struct View {
     /// The address of the page; port 0 is any that is free
     #[arg(long, value_name = "ADDRESS:PORT", default_value_t = LISTEN)]
     listen: SocketAddr,
-    /// The token in the page's address, at least 16 letters or digits; every user of this machine can read it on the command
-    /// line, so --token-file is better
-    #[arg(long, value_name = "TOKEN", value_parser = Token::parse, conflicts_with = "token_file")]
-    token: Option<Token>,
     /// Take the token in the page's address from this file; else from the variable SKINBUS_TOKEN, else it is random
     #[arg(long, value_name = "FILE")]
     token_file: Option<PathBuf>,
@@ -93,18 +88,18 @@ pub(crate) struct View {
     /// over the socket at standard output, end with it
     #[arg(long, hide = true)]
     of_run: bool,
-    /// Listen to the buses of a recording's skin, to which it is replayed
-    #[arg(long, hide = true)]
-    replayed: bool,
     #[command(flatten)]
     packages: Packages,
     #[command(flatten)]
     kinds: BusKinds,
 }
 
-/// The options of a run's page, and of a replay's.
+/// The options of a run's page.
 #[derive(Args, Debug)]
 pub(crate) struct PageOptions {
+    /// The address of the page; else any free port of this machine
+    #[arg(long, value_name = "ADDRESS:PORT", requires = "view")]
+    listen: Option<SocketAddr>,
     /// Write the page's address to this file as well, for scripts: only you can read it, and it goes with the page; - is
     /// standard output
     #[arg(long, value_name = "FILE", requires = "view")]
@@ -124,22 +119,13 @@ struct Served {
 
 impl View {
     pub(crate) fn run(self) -> Result<(), Failure> {
-        let is_recording = !self.replayed && self.is_recording()?;
+        let is_recording = self.is_recording()?;
         let may_act = !self.read_only && !is_recording;
         let (listener, token) = if self.of_run {
             (listener_of_run().map_err(|error| failed(&error))?, token::chosen(None)?)
         } else {
             let listen = self.listen;
-            let token = match &self.token {
-                Some(token) => {
-                    let instead = "--token-file FILE, or the variable SKINBUS_TOKEN, keeps it to you";
-                    note(format_args!(
-                        "--token: every user of this machine can read it while this runs; {instead}"
-                    ));
-                    Some(token.clone())
-                }
-                None => token::chosen(self.token_file.as_deref())?,
-            };
+            let token = token::chosen(self.token_file.as_deref())?;
             let bound = TcpListener::bind(listen);
             let listener = bound.map_err(|error| Failure::usage(format!("--listen {listen}: {error}")))?;
             (listener, token::needed(token, may_act, listen)?)
@@ -155,7 +141,6 @@ impl View {
     /// The skin of buses.
     fn live(self, served: Served) -> Result<(), Failure> {
         let (skin, surface) = match self.sources.as_slice() {
-            _ if self.replayed => self.recorded_skin()?,
             [one, ..] if !one.exists() => self.on_buses()?,
             [one] if self.skin.is_none() && self.at.is_none() => self.read(one)?,
             [one] => {
@@ -306,63 +291,22 @@ pub(crate) struct Page {
     _address_file: Option<AddressFile>,
 }
 
-/// A page's subject, and whether the page can act on it.
-struct Shown<'a> {
-    words: Vec<&'a OsStr>,
-    skin: &'a Skin,
-    kinds: &'a Kinds,
-    directory: Option<&'a Path>,
-    may_act: bool,
-}
-
 impl Page {
     /// Serves the page of a run, whose buses open later; and where it sends what pages want of the run.
-    pub(crate) fn of(
-        run: &run::Options,
-        listen: Option<SocketAddr>,
-        options: &PageOptions,
-    ) -> Result<(Self, Lines), Failure> {
+    pub(crate) fn of(run: &run::Options, options: &PageOptions) -> Result<(Self, Lines), Failure> {
         let run::Options { skin_file, skin, kinds, directory, .. } = run;
-        let words = vec![skin_file.as_os_str()];
-        Self::start(
-            Shown { words, skin, kinds, directory: directory.as_deref(), may_act: true },
-            listen,
-            options,
-        )
-    }
-
-    /// Serves the page of a replay, which cannot be commanded.
-    pub(crate) fn of_replay(
-        files: &[PathBuf],
-        skin: Option<&Path>,
-        kinds: &Kinds,
-        listen: Option<SocketAddr>,
-        options: &PageOptions,
-    ) -> Result<(Self, Lines), Failure> {
-        let known = skin_for(files, skin)?;
-        let given = skin.into_iter().flat_map(|path| [OsStr::new("--skin"), path.as_os_str()]);
-        let words = ["--replayed", "--read-only"].map(OsStr::new).into_iter().chain(given);
-        let words = words.chain(files.iter().map(|file| file.as_os_str())).collect();
-        Self::start(Shown { words, skin: &known, kinds, directory: None, may_act: false }, listen, options)
-    }
-
-    fn start(
-        shown: Shown<'_>,
-        listen: Option<SocketAddr>,
-        options: &PageOptions,
-    ) -> Result<(Self, Lines), Failure> {
         let program = std::env::current_exe().map_err(|error| failed(&error))?;
         let mut command = Command::new(program);
-        command.args(["view", "--wait", "--of-run"]).args(shown.words);
-        for bus in &shown.skin.buses {
-            let kind = shown.kinds.of(&bus.name).resolve();
+        command.args(["view", "--wait", "--of-run"]).arg(skin_file);
+        for bus in &skin.buses {
+            let kind = kinds.of(&bus.name).resolve(&bus.name);
             command.arg("--bus-kind").arg(OsString::from(format!("{}={kind}", bus.name)));
         }
-        if let Some(directory) = shown.directory {
+        if let Some(directory) = directory {
             command.env("SKINBUS_DIR", directory);
         }
-        let listen = listen.unwrap_or(LISTEN);
-        let token = token::needed(token::chosen(options.token_file.as_deref())?, shown.may_act, listen)?;
+        let listen = options.listen.unwrap_or(LISTEN);
+        let token = token::needed(token::chosen(options.token_file.as_deref())?, true, listen)?;
         // In its environment only this user can read it, on its command line everybody.
         match &token {
             Some(token) => command.env(token::VARIABLE, token.as_str()),
@@ -370,7 +314,7 @@ impl Page {
         };
         let listener = TcpListener::bind(listen).map_err(|error| {
             Failure::usage(format!(
-                "--view={listen}: {error}; name another port, or --view alone for a free one"
+                "--listen {listen}: {error}; name another port, or leave it out for a free one"
             ))
         })?;
         let address = listener.local_addr().map_err(|error| failed(&error))?;
@@ -385,11 +329,6 @@ impl Page {
         let process = command.spawn().map_err(|error| failed(&error))?;
         say(Some(url));
         Ok((Self { process, _address_file: address_file }, lines))
-    }
-
-    /// How its process has ended, if it has.
-    pub(crate) fn ended(&mut self) -> Option<ExitStatus> {
-        self.process.try_wait().ok().flatten()
     }
 }
 

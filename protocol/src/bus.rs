@@ -1,4 +1,4 @@
-//! Opening a bus: SocketCAN, or the embedded bus where the kernel has none, behind one type.
+//! Opening a bus: SocketCAN or the embedded bus, behind one type.
 //!
 //! ```no_run
 //! use protocol::bus::{Bus, Choice, Filter, Inbox, Options};
@@ -51,7 +51,7 @@ pub mod netlink;
 pub use error::{BusError, SendError};
 pub use filter::Filter;
 pub use inbox::{Inbox, Received};
-pub use kernel::{GATEWAY_RECEIVE_BUFFER, set_receive_buffer};
+pub use kernel::{GATEWAY_RECEIVE_BUFFER, has_socketcan, set_receive_buffer};
 pub use kinds::{BusKind, Choice, Kinds, KindsError, OneKind, UnknownKind};
 
 /// How a bus is opened.
@@ -130,8 +130,13 @@ impl Bus {
     pub fn open(name: &str, choice: Choice, options: &Options) -> Result<Self, BusError> {
         check_name(name)?;
         check_count(name, &options.filters)?;
-        let kind = choice.resolve();
-        let (socket, receive_buffer) = kind.carrier().open(name, options)?;
+        let kind = choice.resolve(name);
+        let (socket, receive_buffer) = match (kind.carrier().open(name, options), choice) {
+            (Err(BusError::NotServed { name, directory }), Choice::Auto) => {
+                return Err(BusError::Absent { name, directory });
+            }
+            (opened, _) => opened?,
+        };
         let Options { fd, send_timeout, .. } = *options;
         Ok(Self {
             name: name.to_owned(),

@@ -3,17 +3,24 @@
 
 use std::fs::{self, File, FileType, OpenOptions};
 use std::io::{self, Read};
+use std::os::fd::AsFd;
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
 use std::path::Path;
 
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 
-/// Opens a regular file for reading, or one of this program's own descriptors (`/dev/stdin`, and `<(...)` of a shell),
+/// The name of standard input; a file of this name is `./-`.
+pub const STANDARD_INPUT: &str = "-";
+
+/// Opens a regular file for reading, or one of this program's own descriptors (`-`, `/dev/stdin`, and `<(...)` of a shell),
 /// whatever that is. Does not wait.
 ///
 /// # Errors
 /// When it is a folder, a named pipe, a socket or a device, or cannot be opened.
 pub fn open(path: &Path) -> io::Result<File> {
+    if path == Path::new(STANDARD_INPUT) {
+        return Ok(io::stdin().as_fd().try_clone_to_owned()?.into());
+    }
     let flags = (OFlags::NONBLOCK | OFlags::NOCTTY).bits().cast_signed();
     // A socket cannot be opened at all, and the error says only that there is no such device.
     let is_socket = fs::metadata(path).is_ok_and(|about| about.file_type().is_socket());

@@ -71,6 +71,11 @@ pub fn say(line: &str) {
     let _ = Stoppable::new(io::stderr()).write_all(format!("{}\n", shown(line)).as_bytes());
 }
 
+/// Writes lines to standard error in one piece, as [`shown_lines`]. When that is closed, there is no reader.
+pub fn say_lines(text: &str) {
+    let _ = Stoppable::new(io::stderr()).write_all(shown_lines(text).as_bytes());
+}
+
 /// Writes a text to standard output; to a terminal as [`shown_lines`].
 ///
 /// # Errors

@@ -108,6 +108,7 @@ pub fn assess(facts: &Facts) -> Vec<Finding> {
         BusKind::SocketCan => {}
         BusKind::Embedded => {
             findings.push(facts.embedded());
+            findings.extend(facts.buses.iter().filter_map(|bus| facts.absent(bus)));
             findings.extend(facts.buses.iter().flat_map(|bus| facts.traffic(bus, "the embedded bus")));
         }
     }
@@ -118,12 +119,17 @@ pub fn assess(facts: &Facts) -> Vec<Finding> {
 impl Facts {
     /// The kind of bus that a bench would use.
     #[must_use]
-    pub const fn bus_kind(&self) -> BusKind {
+    pub fn bus_kind(&self) -> BusKind {
         match self.choice {
             Choice::Only(kind) => kind,
-            Choice::Auto if self.kernel.has_can => BusKind::SocketCan,
+            Choice::Auto if self.kernel.has_can && self.has_interface() => BusKind::SocketCan,
             Choice::Auto => BusKind::Embedded,
         }
+    }
+
+    /// Returns whether a named bus is an interface, or none was named.
+    fn has_interface(&self) -> bool {
+        self.buses.is_empty() || self.buses.iter().any(|bus| bus.interface.is_some())
     }
 
     /// A command of this program, as root.
@@ -176,7 +182,7 @@ impl Facts {
         let (all, count) = (nodes(&heard.cells), heard.cells.len());
         let gateway = heard.gateway.then(|| {
             Finding::fault(format!("another gateway sends joints on {on}"))
-                .hint("pgrep -a gateway  # and stop it, or take another bus")
+                .hint("pgrep -a skinbus  # and stop it, or take another bus")
         });
         let absent = || {
             let missing = |cells: &BTreeSet<_>| cells.difference(&heard.cells).copied().collect();
@@ -270,9 +276,11 @@ impl Facts {
         match (self.no_spawn, there) {
             (true, _) => None,
             (false, true) => Some(Finding::ok("cell-node is beside vcan-setup")),
-            (false, false) => Some(Finding::fault(absent).hint(
-                "cargo build --release  # in the project's folder; or name it with skinbus run --cell-node",
-            )),
+            (false, false) => {
+                Some(Finding::fault(absent).hint(
+                    "cargo build --release  # in the project's folder; or name it in SKINBUS_CELL_NODE",
+                ))
+            }
         }
     }
 }

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-use protocol::bus::{BusKind, Choice};
+use protocol::bus::has_socketcan;
 
 /// Where a module of the kernel is.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -45,7 +45,7 @@ impl Kernel {
         let release = uname.release().to_string_lossy().into_owned();
         let lists = Lists::read(&release);
         // Asking for such a socket makes the kernel load the module if it has it.
-        let has_can = Choice::Auto.resolve() == BusKind::SocketCan;
+        let has_can = has_socketcan();
         let loaded = |name: &str| Path::new("/sys/module").join(name).exists();
         let os_release = fs::read_to_string("/etc/os-release").unwrap_or_default();
         Self {

@@ -28,11 +28,10 @@ const LISTEN: Duration = Duration::from_millis(600);
 /// Looks at everything that a bench on these buses would meet.
 #[must_use]
 pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Interface]) -> Facts {
-    let kind = choice.resolve();
     for bus in &mut buses {
         bus.interface = present.iter().find(|interface| interface.name == bus.target.name).cloned();
     }
-    let all_heard = listen_to_all(&buses, kind);
+    let all_heard = listen_to_all(&buses, choice);
     for (bus, heard) in buses.iter_mut().zip(all_heard) {
         if let Some(heard) = heard {
             bus.heard = heard;
@@ -48,7 +47,7 @@ pub fn facts(mut buses: Vec<Bus>, choice: Choice, no_spawn: bool, present: &[Int
         backlog: fs::read_to_string("/proc/sys/net/core/netdev_max_backlog")
             .ok()
             .and_then(|text| text.trim().parse().ok()),
-        cell_node: beside("cell-node"),
+        cell_node: cell_node(),
         embedded: embedded(),
         buses,
         present: present.iter().filter(|interface| interface.is_can()).cloned().collect(),
@@ -60,13 +59,18 @@ fn usable(target: &Target, interface: &Interface) -> bool {
 }
 
 /// Listens on all buses at once that can be opened.
-fn listen_to_all(buses: &[Bus], kind: BusKind) -> Vec<Option<Result<Option<Heard>, String>>> {
+fn listen_to_all(buses: &[Bus], choice: Choice) -> Vec<Option<Result<Option<Heard>, String>>> {
+    let kind_of = |bus: &Bus| match (choice, &bus.interface) {
+        (Choice::Only(kind), _) => kind,
+        (Choice::Auto, Some(_)) => BusKind::SocketCan,
+        (Choice::Auto, None) => BusKind::Embedded,
+    };
     let is_open = |bus: &&Bus| {
-        kind == BusKind::Embedded || bus.interface.as_ref().is_some_and(|it| usable(&bus.target, it))
+        kind_of(bus) == BusKind::Embedded || bus.interface.as_ref().is_some_and(|it| usable(&bus.target, it))
     };
     thread::scope(|scope| {
         let begin = |bus: &'_ Bus| {
-            let target = bus.target.clone();
+            let (target, kind) = (bus.target.clone(), kind_of(bus));
             is_open(&bus).then(|| thread::Builder::new().spawn_scoped(scope, move || listen(&target, kind)))
         };
         let begun: Vec<_> = buses.iter().map(begin).collect();
@@ -146,10 +150,14 @@ pub fn is_admin() -> bool {
     capabilities(None).is_ok_and(|sets| sets.effective.contains(CapabilitySet::NET_ADMIN))
 }
 
-/// A program of this project, which should be beside this one.
-fn beside(name: &str) -> Program {
+/// The cells' program, which should be beside this one where `SKINBUS_CELL_NODE` does not name it.
+fn cell_node() -> Program {
+    if let Some(path) = std::env::var_os("SKINBUS_CELL_NODE").filter(|path| !path.is_empty()) {
+        let path = PathBuf::from(path);
+        return Program { there: path.is_file(), path };
+    }
     let own = std::env::current_exe().ok();
-    let path = own.as_deref().and_then(Path::parent).unwrap_or_else(|| Path::new(".")).join(name);
+    let path = own.as_deref().and_then(Path::parent).unwrap_or_else(|| Path::new(".")).join("cell-node");
     Program { there: path.is_file(), path }
 }
 

@@ -165,7 +165,9 @@ impl<W: Write> Show<W> {
     fn show(&mut self, record: &Record<'_>, decoded: &Decoded, units: Units) -> io::Result<()> {
         let nanos = record.time.nanos;
         let first = *self.first.get_or_insert(nanos);
-        if !self.pick.takes(first, nanos, &record.frame, decoded) || self.contact && !decoded.is_contact() {
+        if !self.pick.takes(first, nanos, record.interface, &record.frame, decoded)
+            || self.contact && !decoded.is_contact()
+        {
             return Ok(());
         }
         let said = decoded.in_units(units);
@@ -261,7 +263,7 @@ mod tests {
 
     /// What is written of a frame on this bus.
     fn line(bus: &str, how: How) -> String {
-        let pick = Pick { kinds: Vec::new(), nodes: Vec::new(), from: None, to: None };
+        let pick = Pick::default();
         let mut show = Show::new(Vec::new(), None, pick, false, how, 1);
         let frame = candump::parse_frame("123#00").unwrap();
         let time = Timestamp::six_digits(1_000_000_000);

@@ -20,7 +20,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use trace::files::write_whole;
 
-use crate::arguments::Programs;
+use crate::arguments::Processes;
 use crate::buses;
 
 /// Where benches are run, and with what.
@@ -28,7 +28,7 @@ use crate::buses;
 pub(super) struct Benches {
     /// For their skins, scenarios, recordings and summaries.
     pub(super) folder: PathBuf,
-    pub(super) programs: Programs,
+    pub(super) processes: Processes,
     /// Set when it has to end.
     pub(super) stop: Arc<AtomicBool>,
 }
@@ -60,7 +60,7 @@ impl Benches {
         let text = arm::skin(reply, effort);
         let texts = [text.as_str(), arm::scenario(effort)];
         let buses = buses::directory("experiment")?;
-        let ended = self.perform(&what, &files, texts, self.programs.cells_per_process, buses.path())?;
+        let ended = self.perform(&what, &files, texts, self.processes.cells_per_process, buses.path())?;
         if !ended.status.success() {
             return Err(failed(&what, &last_words(&ended)));
         }
@@ -115,15 +115,8 @@ impl Benches {
         command.arg("run").arg(&files.skin).arg("--scenario").arg(&files.scenario);
         command.arg("--summary").arg(&files.summary).args(["--bus-kind", "embedded", "--quiet"]);
         command.arg("--cells-per-process").arg(cells_per_process.to_string());
-        let Programs { cells_per_process: _, cell_node, vcan_setup } = &self.programs;
-        for (option, path) in [
-            ("--record", files.recording.as_ref()),
-            ("--cell-node", cell_node.as_ref()),
-            ("--vcan-setup", vcan_setup.as_ref()),
-        ] {
-            if let Some(path) = path {
-                command.arg(option).arg(path);
-            }
+        if let Some(path) = &files.recording {
+            command.arg("--record").arg(path);
         }
         command.env("SKINBUS_DIR", buses).stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped());
         self.wait(command).map_err(|error| at(what, &own, &error))

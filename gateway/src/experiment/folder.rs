@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use protocol::usage::Failure;
 use trace::files::{rename, sync_folder, write_whole};
 
-use crate::output::Force;
+use crate::output::Overwrite;
 
 /// A folder for results of experiments. What is written stands in a hidden folder in it until [`Folder::finish`]; if that
 /// never comes, nothing of it stays.
@@ -17,13 +17,13 @@ pub(super) struct Folder {
     inside: PathBuf,
     /// Whether it was made for this.
     made: bool,
-    force: Force,
+    overwrite: Overwrite,
 }
 
 impl Folder {
     /// Makes it where there is none, and makes sure that it can be written. One in which there is something is taken
-    /// with `force` only.
-    pub(super) fn create(path: &Path, force: Force) -> Result<Self, Failure> {
+    /// with `overwrite` only.
+    pub(super) fn create(path: &Path, overwrite: Overwrite) -> Result<Self, Failure> {
         let wrong = |error: &dyn std::fmt::Display| {
             Failure::run(format!("-o {}: {error}; name a folder that can be written", path.display()))
         };
@@ -33,14 +33,14 @@ impl Folder {
         }
         fs::create_dir_all(path).map_err(|error| wrong(&error))?;
         let taken = fs::read_dir(path).map_err(|error| wrong(&error))?.next().is_some();
-        if taken && !force.force {
+        if taken && !overwrite.overwrite {
             let path = path.display();
             return Err(Failure::usage(format!(
-                "-o {path}: there is something in it: name another folder, or overwrite files in it with --force"
+                "-o {path}: there is something in it: name another folder, or overwrite files in it with --overwrite"
             )));
         }
         let inside = path.join(format!(".experiment.{}.part", std::process::id()));
-        let folder = Self { path: path.to_owned(), inside, made, force };
+        let folder = Self { path: path.to_owned(), inside, made, overwrite };
         fs::create_dir(&folder.inside).map_err(|error| wrong(&error))?;
         Ok(folder)
     }
@@ -55,7 +55,7 @@ impl Folder {
         write_whole(&self.inside.join(name), text, false).map_err(|error| self.failed(name, &error))
     }
 
-    /// Gives all files their names, in the order of these; files of the same names are replaced with `force` only.
+    /// Gives all files their names, in the order of these; files of the same names are replaced with `overwrite` only.
     pub(super) fn finish(self) -> Result<(), Failure> {
         self.publish()
     }
@@ -67,7 +67,7 @@ impl Folder {
             listed.map_err(|error| self.failed("", &error))?.iter().map(fs::DirEntry::file_name).collect();
         names.sort();
         for name in names {
-            rename(&self.inside.join(&name), &self.path.join(&name), self.force.force)
+            rename(&self.inside.join(&name), &self.path.join(&name), self.overwrite.overwrite)
                 .map_err(|error| self.failed(&name.to_string_lossy(), &error))?;
         }
         sync_folder(&self.inside);
@@ -108,13 +108,13 @@ mod tests {
     fn what_is_not_finished_leaves_nothing_and_what_is_replaces_what_was_there() {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("deep/er");
-        let [kept, forced] = [false, true].map(|force| Force { force });
+        let [kept, forced] = [false, true].map(|overwrite| Overwrite { overwrite });
         let folder = Folder::create(&path, kept).unwrap();
         folder.write("report.html", "half").unwrap();
         drop(folder);
         assert!(!path.exists());
-        for (force, text) in [(kept, "first"), (forced, "second")] {
-            let folder = Folder::create(&path, force).unwrap();
+        for (overwrite, text) in [(kept, "first"), (forced, "second")] {
+            let folder = Folder::create(&path, overwrite).unwrap();
             folder.write("report.html", text).unwrap();
             folder.finish().unwrap();
             assert_eq!(fs::read_to_string(path.join("report.html")).unwrap(), text);
@@ -133,7 +133,7 @@ mod tests {
         let place = tempfile::tempdir().unwrap();
         let path = place.path().join("out");
         fs::create_dir_all(path.join("report.html")).unwrap();
-        let folder = Folder::create(&path, Force { force: true }).unwrap();
+        let folder = Folder::create(&path, Overwrite { overwrite: true }).unwrap();
         folder.write("results.json", "{}").unwrap();
         folder.publish().unwrap();
         folder.write("report.html", "page").unwrap();
@@ -148,7 +148,7 @@ mod tests {
         let path = place.path().join("file");
         fs::write(&path, "mine").unwrap();
         for path in [path.clone(), path.join("below")] {
-            let error = Folder::create(&path, Force { force: true }).unwrap_err();
+            let error = Folder::create(&path, Overwrite { overwrite: true }).unwrap_err();
             assert!(format!("{error:?}").contains("name a folder"), "{error:?}");
         }
         assert_eq!(fs::read_to_string(&path).unwrap(), "mine");

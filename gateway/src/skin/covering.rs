@@ -15,7 +15,7 @@ use super::super::visuals::{Packages, Visuals};
 #[derive(Args, Debug)]
 pub(super) struct Covering {
     /// Cover these links with cells, on the meshes and shapes of their visuals; the other links are in the way
-    #[arg(long, value_name = "LINK,..", value_delimiter = ',', value_parser = link, conflicts_with = "cells")]
+    #[arg(long, value_name = "LINK,..", value_delimiter = ',', value_parser = link, conflicts_with = "places")]
     pub(super) cover: Vec<String>,
     /// From one cell's middle to the next one's in m, 0.001 to 1
     #[arg(long, value_name = "M", requires = "cover", default_value_t = 0.028, value_parser = pitch, allow_negative_numbers = true)]

@@ -9,7 +9,7 @@ use protocol::usage::{Failure, print};
 use robots::{CellOnLink, Chain, Import as Described, ImportError, JointKind};
 
 use super::super::columns::{Columns, Table};
-use super::super::output::{Force, apart, note};
+use super::super::output::{Overwrite, apart, is_standard_output, note};
 use super::super::print::{count, list};
 use super::super::robot_file::{path_from, read_urdf};
 use super::covering::{self, Covered, Covering};
@@ -28,7 +28,7 @@ if it is to be given, its bus and its node id:
   link5,0.05,0,-0.1,1,0,0,vcan0,1
 
 Examples:
-  skinbus skin import panda.urdf --tip hand --cells cells.csv -o panda.toml
+  skinbus skin import panda.urdf --tip hand --places cells.csv -o panda.toml
   skinbus skin import panda.urdf --tip hand --cover link5,link6 -o panda.toml
   skinbus skin import two-arms.urdf --tip left_hand --tip right_hand -o both.toml
   skinbus run panda.toml --duration 10"
@@ -45,14 +45,14 @@ pub(super) struct Import {
     root: Option<String>,
     /// Where the cells sit
     #[arg(long, value_name = "CELLS.csv")]
-    cells: Option<PathBuf>,
+    places: Option<PathBuf>,
     #[command(flatten)]
     covering: Covering,
     /// The file to write, whole or not at all; else standard output
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
 }
 
 /// What stands in a line of the file of cells.
@@ -61,13 +61,9 @@ const COLUMNS: Columns =
 
 impl Import {
     pub(super) fn run(self) -> Result<(), Failure> {
-        let read = [Some(self.urdf.as_path()), self.cells.as_deref()].into_iter().flatten();
+        let read = [Some(self.urdf.as_path()), self.places.as_deref()].into_iter().flatten();
         apart([("-o", self.output.as_deref())], read)?;
         let file = self.urdf.display().to_string();
-        if self.urdf == Path::new("-") && !self.urdf.exists() {
-            let why = "the description is a file; of a pipe, name /dev/stdin";
-            return Err(Failure::usage(format!("{file}: {why}")));
-        }
         let (urdf, _) = read_urdf(&self.urdf).map_err(Failure::usage)?;
         let chain = |tip: &String| urdf.chain(self.root.as_deref(), tip).map_err(Failure::usage);
         let chains = self.tip.iter().map(chain).collect::<Result<Vec<_>, _>>()?;
@@ -76,13 +72,16 @@ impl Import {
         {
             return Err(Failure::usage(format!("--tip {}: this tip is named twice", twice.1)));
         }
-        let Covered { cells, figures } = match &self.cells {
+        let Covered { cells, figures } = match &self.places {
             Some(path) => Covered { cells: cells(path)?, figures: Vec::new() },
             None if self.covering.cover.is_empty() => Covered { cells: Vec::new(), figures: Vec::new() },
             None => self.covering.cells(&urdf, &self.urdf, &chains)?,
         };
         let command = self.command();
-        let path = self.output.as_deref().and_then(|output| path_from(output, &self.urdf));
+        // A skin cannot name what was read from a pipe.
+        let is_named = |path: &&Path| !is_standard_output(path) && self.urdf.is_file();
+        let output = self.output.as_deref().filter(is_named);
+        let path = output.and_then(|output| path_from(output, &self.urdf));
         let import = Described {
             name: if urdf.name.is_empty() { "robot" } else { &urdf.name },
             command: &command,
@@ -90,13 +89,13 @@ impl Import {
             chains: &chains,
             cells: &cells,
         };
-        let wrong = |error: ImportError| match &self.cells {
+        let wrong = |error: ImportError| match &self.places {
             Some(path) if error.is_of_cells() => Failure::usage(format!("{}: {error}", path.display())),
             Some(_) | None => Failure::usage(format!("{file}: {error}")),
         };
         let skin = import.toml().map_err(wrong)?;
         match &self.output {
-            Some(path) => self.force.write("-o", path, &skin)?,
+            Some(path) => self.overwrite.write("-o", path, &skin)?,
             None => print(&skin)?,
         }
         for chain in &chains {
@@ -121,8 +120,8 @@ impl Import {
         if let Some(root) = &self.root {
             command += &format!(" --root {root}");
         }
-        if let Some(cells) = &self.cells {
-            command += &format!(" --cells {}", name(cells));
+        if let Some(places) = &self.places {
+            command += &format!(" --places {}", name(places));
         }
         command += &self.covering.words();
         command.replace(['\n', '\r'], " ")

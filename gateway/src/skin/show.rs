@@ -10,7 +10,7 @@ use protocol::usage::{Failure, print};
 use robots::{Isometry3, Row, frames, pose_of};
 use view::Scene;
 
-use super::super::output::{Force, apart};
+use super::super::output::{Overwrite, apart};
 use super::super::print::words;
 use super::super::robot_file::urdf_of;
 use super::super::surface::{Placed, Surface};
@@ -32,10 +32,10 @@ pub(super) struct Show {
     #[command(flatten)]
     packages: Packages,
     /// The file to write, whole or not at all; else standard output
-    #[arg(long, short, value_name = "FILE.html")]
+    #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
 }
 
 impl Show {
@@ -45,11 +45,11 @@ impl Show {
         let read = [Some(self.file.as_path()), urdf.as_deref()].into_iter().flatten();
         apart([("-o", self.output.as_deref())], read)?;
         if let Some(path) = &self.output {
-            self.force.check("-o", path)?;
+            self.overwrite.check("-o", path)?;
         }
         let page = page(&drawing(&self.file, &skin, &self.packages));
         match &self.output {
-            Some(path) => self.force.write("-o", path, &page),
+            Some(path) => self.overwrite.write("-o", path, &page),
             None => print(&page),
         }
     }

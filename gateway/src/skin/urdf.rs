@@ -7,7 +7,7 @@ use protocol::skin::Skin;
 use protocol::usage::{Failure, print};
 use robots::written;
 
-use super::super::output::{Force, apart};
+use super::super::output::{Overwrite, apart};
 
 /// Describe a skin's robot as a URDF: its chains, row by row
 ///
@@ -21,10 +21,10 @@ pub(super) struct Urdf {
     #[arg(value_name = "SKIN")]
     file: PathBuf,
     /// The file to write, whole or not at all; else standard output
-    #[arg(long, short, value_name = "FILE.urdf")]
+    #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
 }
 
 impl Urdf {
@@ -33,7 +33,7 @@ impl Urdf {
         apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
         let text = written(&skin).xml;
         match &self.output {
-            Some(path) => self.force.write("-o", path, &text),
+            Some(path) => self.overwrite.write("-o", path, &text),
             None => print(&text),
         }
     }

@@ -69,7 +69,7 @@ fn a_log_is_shown_as_it_is_with_its_meaning_beside_it() {
         let raw: Vec<&str> = shown.lines().map(|line| line.split_once('\t').unwrap().0).collect();
         assert_eq!(raw, frames, "{name}");
     }
-    let shown = output(gateway(&format!("dump {} --max 5", golden("document.log"))));
+    let shown = output(gateway(&format!("dump {} -n 5", golden("document.log"))));
     let expected = "(1700000000.001000) vcan0 20C##5001000F80100000000000000070175D6\t\
                     ok      torque 12 epoch 7: 1.0000 -0.5000 0.0002 0.0000 0.0000 0.0000 Nm";
     assert_eq!((shown.lines().count(), shown.lines().next()), (5, Some(expected)));
@@ -97,17 +97,17 @@ fn filters_pick_by_kind_node_and_time() {
         "ok      torque 12 epoch 8: 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 Nm",
     ];
     assert_eq!(dump("--kind torque"), torques);
-    assert_eq!(dump("--kind torque --max 1"), torques[..1]);
-    assert_eq!(dump("--kind sync,report --node gateway"), ["ok      sync", "ok      report"]);
-    assert_eq!(dump("--kind torque --node 13"), [""; 0]);
-    assert_eq!(dump("--node 12,gateway").len(), dump("").len());
+    assert_eq!(dump("--kind torque -n 1"), torques[..1]);
+    assert_eq!(dump("--kind sync,report --cell gateway"), ["ok      sync", "ok      report"]);
+    assert_eq!(dump("--kind torque --cell 13"), [""; 0]);
+    assert_eq!(dump("--cell 12,gateway").len(), dump("").len());
     // Frames come 1 ms apart.
     assert_eq!(dump("--from 0.002 --to 0.005"), dump("")[2..5]);
-    let classic = output(gateway(&format!("dump {} --from 0.0005 --max 2", golden("classic.log"))));
+    let classic = output(gateway(&format!("dump {} --from 0.0005 -n 2", golden("classic.log"))));
     let pair =
         ["segment joints", "ok      joints epoch 255: -3.1416 3.1415 -0.0001 0.0001 1.5708 -1.5708 rad"];
     assert_eq!(decoded(&classic), pair);
-    let only_fd = output(gateway(&format!("dump {} --format fd --max 1", golden("classic.log"))));
+    let only_fd = output(gateway(&format!("dump {} --format fd -n 1", golden("classic.log"))));
     assert_eq!(decoded(&only_fd), ["foreign no packet: 8 data bytes, not 16"]);
 }
 
@@ -161,20 +161,20 @@ fn frames_are_those_of_the_document() {
         ("resume".to_owned(), None),
         ("joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0".to_owned(), None),
         ("joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0".to_owned(), None),
-        ("configure --node 12 --write mount 2 6".to_owned(), Some(1)),
-        (format!("configure --node 12 --write pose {pose}"), Some(2)),
-        ("configure --node 12 --write contact 1 0 0.1 0.05 0.1".to_owned(), Some(3)),
-        ("configure --node 12 --write timing 16000".to_owned(), Some(4)),
-        (format!("configure --node 12 --write row1 0 0.089159 {half_pi} 0"), Some(5)),
-        ("configure --node 12 --write row2 -0.425 0 0 0".to_owned(), Some(6)),
-        ("configure --node 12 --write row3 -0.39225 0 0 0".to_owned(), Some(7)),
-        (format!("configure --node 12 --write row4 0 0.10915 {half_pi} 0"), Some(8)),
-        (format!("configure --node 12 --write row5 0 0.09465 -{half_pi} 0"), Some(9)),
-        ("configure --node 12 --write row6 0 0.0823 0 0".to_owned(), Some(10)),
-        ("configure --node 12 --write commit 266D".to_owned(), Some(11)),
-        ("configure --node 12 --write mode 1".to_owned(), Some(12)),
-        ("stimulus --node 12 --force 3.0".to_owned(), None),
-        ("stimulus --node 12".to_owned(), None),
+        ("configure --cell 12 --write mount 2 6".to_owned(), Some(1)),
+        (format!("configure --cell 12 --write pose {pose}"), Some(2)),
+        ("configure --cell 12 --write contact 1 0 0.1 0.05 0.1".to_owned(), Some(3)),
+        ("configure --cell 12 --write timing 16000".to_owned(), Some(4)),
+        (format!("configure --cell 12 --write row1 0 0.089159 {half_pi} 0"), Some(5)),
+        ("configure --cell 12 --write row2 -0.425 0 0 0".to_owned(), Some(6)),
+        ("configure --cell 12 --write row3 -0.39225 0 0 0".to_owned(), Some(7)),
+        (format!("configure --cell 12 --write row4 0 0.10915 {half_pi} 0"), Some(8)),
+        (format!("configure --cell 12 --write row5 0 0.09465 -{half_pi} 0"), Some(9)),
+        ("configure --cell 12 --write row6 0 0.0823 0 0".to_owned(), Some(10)),
+        ("configure --cell 12 --write commit 266D".to_owned(), Some(11)),
+        ("configure --cell 12 --write mode 1".to_owned(), Some(12)),
+        ("stimulus --cell 12 --force 3.0".to_owned(), None),
+        ("stimulus --cell 12".to_owned(), None),
     ] {
         let tag = tag.map(|tag| format!(" --tag {tag}")).unwrap_or_default();
         let line = output(gateway(&format!("frame {arguments}{tag}")));
@@ -183,7 +183,7 @@ fn frames_are_those_of_the_document() {
         assert!(there, "{arguments}: {line}is not in the document");
     }
     // The document writes these with the very flags.
-    let line = output(gateway("frame stimulus --node 12 --force 3.0"));
+    let line = output(gateway("frame stimulus --cell 12 --force 3.0"));
     assert!(DOCUMENT.contains(&format!("cansend vcan0 {}", line.trim_end())), "{line}");
 }
 
@@ -192,16 +192,16 @@ fn frames_mean_what_was_requested() {
     for (arguments, meaning) in [
         ("report", "report"),
         (
-            "stimulus --node everyone --epoch 7 --force 1 --proximity 0.5 --temperature 25 -40",
+            "stimulus --cell everyone --epoch 7 --force 1 --proximity 0.5 --temperature 25 -40",
             "stimulus everyone from epoch 7 on: force 1.000 N (0.334 0.333 0.333), proximity 0.5000, temperature 25.00 -40.00 °C",
         ),
         (
-            "stimulus --node 254 --acceleration 0 -1 0.5",
+            "stimulus --cell 254 --acceleration 0 -1 0.5",
             "stimulus 254 from the next joints on: acceleration 0.0000 -1.0000 0.5000 g",
         ),
-        ("configure --node everyone --read identity --tag 255", "configure everyone tag 255: read identity"),
+        ("configure --cell everyone --read identity --tag 255", "configure everyone tag 255: read identity"),
         (
-            "configure --node 1 --write 99 1 -1 0x7FFF",
+            "configure --cell 1 --write 99 1 -1 0x7FFF",
             "configure 1 tag 0: write parameter 99: words 1 -1 32767 0 0 0",
         ),
     ] {
@@ -240,24 +240,31 @@ fn packet(frames: &[Frame], format: Format) -> Packet {
 #[test]
 fn wrong_use_is_one_line_and_exit_code_2() {
     for (arguments, expected) in [
-        ("frame stimulus --node 300", "--node 300: a node id, 1 to 254, or everyone is possible"),
-        ("frame stimulus --node 12 --force 100", "--force 100: three contact words hold -96 to 95.997 N"),
-        ("frame stimulus", "the following required arguments were not provided: --node <NODE>; try '--help'"),
+        (
+            "frame stimulus --cell 300",
+            "invalid value '300' for '--cell <[BUS:]NODE>': a node id, 1 to 254, BUS:NODE, or everyone is possible; \
+             try '--help'",
+        ),
+        ("frame stimulus --cell 12 --force 100", "--force 100: three contact words hold -96 to 95.997 N"),
+        (
+            "frame stimulus",
+            "the following required arguments were not provided: --cell <[BUS:]NODE>; try '--help'",
+        ),
         (
             "frame joints --epoch 256 --rad 0",
             "invalid value '256' for '--epoch <E>': 256 is not in 0..=255; try '--help'",
         ),
-        ("frame configure --node 12 --write mode 2", "mode = 2: 0 measures, 1 obeys stimuli"),
+        ("frame configure --cell 12 --write mode 2", "mode = 2: 0 measures, 1 obeys stimuli"),
         (
             "dump run.log --from -1",
             "invalid value '-1' for '--from <S>': a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h); try '--help'",
         ),
-        ("dump / ", "/ is a directory: name a candump log or a bus"),
+        ("dump / ", "/ is a directory: name a candump log or buses"),
         (
             "skin generate --cells 255",
             "255 cells do not fit on one bus: a bus has 254 node ids; use --buses 2",
         ),
-        ("skin check /nowhere.toml", "/nowhere.toml: No such file or directory (os error 2)"),
+        ("check /nowhere.toml", "/nowhere.toml: No such file or directory (os error 2)"),
         (
             "run skin.toml scenario.toml",
             "scenario.toml comes after the skin: a scenario is given by --scenario scenario.toml",
@@ -284,8 +291,8 @@ fn wrong_use_is_one_line_and_exit_code_2() {
 #[test]
 fn the_example_is_what_the_command_in_its_header_prints() {
     let example = include_str!("../../examples/ur5-253.toml");
-    let command = example.lines().next().unwrap().strip_prefix("# gateway ").unwrap();
-    assert!(output(gateway(command)) == example, "generate it with gateway {command}");
+    let command = example.lines().next().unwrap().strip_prefix("# skinbus ").unwrap();
+    assert!(output(gateway(command)) == example, "generate it with skinbus {command}");
 }
 
 #[test]
@@ -301,7 +308,7 @@ fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
     let why = "No such file or directory (os error 2); name a file in a folder that can be written";
     assert_eq!(refusal(&format!("{generate} {nowhere}"), 2), format!("skinbus: {nowhere}: {why}"));
 
-    let shown = output(gateway(&format!("skin check {}", file.display())));
+    let shown = output(gateway(&format!("check {}", file.display())));
     let (hash, lines): (Vec<_>, Vec<_>) = shown.lines().partition(|line| line.starts_with("hash: "));
     let expected = [
         "ur5-3: 3 cells, 2 buses",
@@ -313,14 +320,14 @@ fn a_generated_skin_is_a_whole_file_and_checked_in_a_few_lines() {
     assert_eq!((hash.len(), lines), (1, expected.to_vec()));
 
     let skin = protocol::skin::Skin::read(&file).unwrap();
-    let shown = output(gateway(&format!("skin check --cells {}", file.display())));
+    let shown = output(gateway(&format!("check --list {}", file.display())));
     let hash = skin.parameters(&skin.cells[2]).hash();
     let ([x, y, z], line) = (skin.cells[2].position, shown.lines().last().unwrap());
     assert!(line.starts_with(&format!("vcan1 1 joint 3 at {x} {y} {z} m normal ")), "{line}");
     assert!(line.ends_with(&format!(" ports - - - - root serial 200001 hash {hash:04X}")), "{line}");
-    assert_eq!(output(gateway(&format!("skin check --node 2 {}", file.display()))).lines().count(), 1);
-    let said = refusal(&format!("skin check --node 9 {}", file.display()), 2);
-    assert!(said.ends_with("has no such cell on vcan0, vcan1; --cells lists all"), "{said}");
+    assert_eq!(output(gateway(&format!("check --cell 2 {}", file.display()))).lines().count(), 1);
+    let said = refusal(&format!("check --cell 9 {}", file.display()), 2);
+    assert!(said.ends_with("has no such cell on vcan0, vcan1; --list lists all"), "{said}");
 }
 
 #[test]
@@ -332,7 +339,7 @@ fn a_check_shows_bit_rates_and_cells_at_one_place() {
     let last = &text[text.rfind("[[cell]]").unwrap()..];
     let another = last.replace("node = 1", "node = 7").replace("serial = 200001", "serial = 200007");
     std::fs::write(&file, format!("{text}\n{another}")).unwrap();
-    let shown = output(gateway(&format!("skin check {}", file.display())));
+    let shown = output(gateway(&format!("check {}", file.display())));
     assert!(shown.contains("bus vcan0 (fd, 500000 bit/s, torque): 2 cells"), "{shown}");
     assert!(shown.contains("remark: cells 1 on vcan1 and 7 on vcan1 sit at one place"), "{shown}");
 }
@@ -343,7 +350,7 @@ fn checked(scenario: &str, options: &str) -> Output {
     let [skin, file] = ["skin.toml", "s.toml"].map(|name| directory.path().join(name));
     output(gateway(&format!("skin generate --cells 3 -o {}", skin.display())));
     std::fs::write(&file, scenario).unwrap();
-    let line = format!("scenario check s.toml --skin skin.toml {options}");
+    let line = format!("check s.toml --skin skin.toml {options}");
     gateway(&line).current_dir(directory.path()).output().unwrap()
 }
 
@@ -426,7 +433,7 @@ fn a_check_refuses_what_a_recorded_run_would_refuse() {
         [("/dev/zero", "it is a device"), ("nothing.urdf", "No such file"), ("empty.urdf", "empty.urdf")]
     {
         std::fs::write(&skin, with(urdf)).unwrap();
-        let said = refusal(&format!("skin check {}", skin.display()), 2);
+        let said = refusal(&format!("check {}", skin.display()), 2);
         assert!(said.starts_with("skinbus: robot.urdf: ") && said.contains(why), "{said}");
     }
 }
@@ -443,17 +450,20 @@ fn every_command_has_help_with_an_example() {
         "frame joints",
         "frame stimulus",
         "frame configure",
-        "ack",
+        "frame sensing",
         "skin generate",
-        "skin check",
+        "skin dbc",
+        "check",
         "skin import",
         "skin show",
-        "torque",
-        "scenario check",
+        "explain",
+        "fit",
+        "completions",
+        "man",
     ] {
         let help = output(gateway(&format!("{command} --help")));
         assert!(
-            help.contains("Example") && help.contains(&format!("  gateway {command}")),
+            help.contains("Example") && help.contains(&format!("  skinbus {command}")),
             "{command}: {help}"
         );
     }
@@ -469,9 +479,9 @@ fn what_is_no_file_or_too_long_is_not_read() {
     let too_long = "it is longer than 16777216 bytes, the most that are read";
     for (file, why) in [("/dev/zero", "it is a device, a file is needed"), (long, too_long)] {
         for command in [
-            format!("skin check {file}"),
+            format!("check {file}"),
             format!("skin import {file} --tip hand"),
-            format!("skin import {urdf} --tip hand --cells {file}"),
+            format!("skin import {urdf} --tip hand --places {file}"),
         ] {
             let said = refusal(&command, 2);
             assert!(said.contains(&format!("{file}: {why}")), "{said}");

@@ -236,15 +236,15 @@ fn an_output_that_exists_is_left_alone_unless_it_is_to_be_overwritten() {
     let folder = Folder::new(&[("run.log", LOG.as_bytes()), ("run.mcap", b"precious")]);
     assert_eq!(
         folder.refuses("convert run.log run.mcap", 2),
-        "skinbus: run.mcap: it exists: name another file, or overwrite it with --force"
+        "skinbus: run.mcap: it exists: name another file, or overwrite it with --overwrite"
     );
     assert_eq!(
-        folder.refuses("convert run.log . --force", 2),
+        folder.refuses("convert run.log . --overwrite", 2),
         "skinbus: .: a name that ends in .mcap is a recording, in .log or .txt a candump log, in .csv its torques, and - is \
          standard output"
     );
-    folder.says("convert run.log run.mcap --force", 0);
-    folder.says("convert run.mcap run.log --force", 0);
+    folder.says("convert run.log run.mcap --overwrite", 0);
+    folder.says("convert run.mcap run.log --overwrite", 0);
     assert_eq!(folder.text("run.log"), LOG);
 }
 

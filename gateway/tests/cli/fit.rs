@@ -96,8 +96,15 @@ fn what_can_does_not_allow_is_refused_in_one_line() {
     ] {
         assert_eq!(refusal(&format!("fit {skin} {arguments}")), format!("skinbus: {said}"));
     }
-    for arguments in ["--data 5M", "--nominal fast --data 5M", "--table --nominal 1M", "--computation nan"] {
+    for arguments in ["--nominal fast --data 5M", "--table --nominal 1M", "--computation nan"] {
         assert!(refusal(&format!("fit {skin} {arguments}")).ends_with("try '--help'"));
     }
+    let alone = refusal(&format!("fit {skin} --data 5M"));
+    assert_eq!(alone, "skinbus: --data of a skin needs --nominal beside it");
     assert!(refusal("fit nothing.toml").contains("nothing.toml"));
+    for option in ["--rates vcan0=1M/5M", "--skin x.toml", "--bench-traffic", "--ber 0.001", "--duration 3"] {
+        let (name, file) = (option.split(' ').next().unwrap(), skin);
+        let expected = format!("skinbus: {name} is for traffic, and {file} is a skin: leave it out");
+        assert_eq!(refusal(&format!("fit {skin} {option}")), expected);
+    }
 }

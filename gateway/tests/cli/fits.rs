@@ -66,7 +66,7 @@ impl Files {
     }
 
     fn report(&self, options: &str) -> String {
-        self.gateway(&format!("report run.mcap --force{options}"));
+        self.gateway(&format!("report run.mcap --overwrite{options}"));
         text(&self.path("run.html"))
     }
 }
@@ -129,15 +129,15 @@ fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
     assert_eq!(worst, ["118.9 %: does not fit: bandwidth", "all 253 cells answer"]);
     assert_eq!(row(&fit, "buses needed"), ["3: nodes", "bandwidth 2, deadline 2, nodes 3"]);
 
-    let shadow = files.gateway("shadow run.mcap");
+    let shadow = files.gateway("fit run.mcap");
     assert_eq!(row(&shadow, "worst case"), worst);
     let run = row(&shadow, "this run");
     let (load, verdict) = run[0].split_once(": ").unwrap();
     assert_eq!((verdict, run[1]), ("in time, but 254 nodes", "at most 120 of 253 cells answered"));
     assert_eq!(row(&shadow, "most in any second")[0], load);
-    let of_log = files.gateway("shadow run.log --skin skin.toml");
+    let of_log = files.gateway("fit run.log --skin skin.toml");
     assert_eq!((row(&of_log, "worst case"), row(&of_log, "this run")), (worst, run));
-    let unknown = files.gateway("shadow run.log --nominal 1M --data 5M");
+    let unknown = files.gateway("fit run.log --nominal 1M --data 5M");
     assert_eq!(row(&unknown, "worst case")[0], "?");
     assert_eq!(row(&unknown, "this run"), [run[0], "at most 120 of 253 cells seen answered"]);
 
@@ -184,7 +184,7 @@ fn four_commands_give_the_same_figures_for_one_skin_in_the_same_words() {
 #[test]
 fn stimuli_and_start_up_are_no_load_of_operation() {
     let files = Files::new("");
-    let shadow = files.gateway("shadow run.mcap");
+    let shadow = files.gateway("fit run.mcap");
     assert_eq!(row(&shadow, "left out: bench traffic"), ["15000 frames", "15000 stimuli"]);
     let percent = |text: &str| text.split(' ').next().unwrap().parse::<f64>().unwrap();
     let average = percent(row(&shadow, "average load")[0]);
@@ -198,11 +198,11 @@ fn stimuli_and_start_up_are_no_load_of_operation() {
     let without: String = log.split_inclusive('\n').filter(|line| !line.contains(" 7")).collect();
     assert!(without.len() < log.len() * 3 / 5);
     fs::write(files.path("less.log"), without).unwrap();
-    let [log, less] = ["run.log", "less.log"].map(|name| files.gateway(&format!("shadow {name}")));
+    let [log, less] = ["run.log", "less.log"].map(|name| files.gateway(&format!("fit {name}")));
     for name in ["average load", "most in any second", "no pause for 16 ms", "all frames", "torque"] {
         assert_eq!(row(&log, name), row(&less, name), "{name}");
     }
-    let all = files.gateway("shadow run.mcap --bench-traffic");
+    let all = files.gateway("fit run.mcap --bench-traffic");
     assert_eq!(row(&all, "counted: bench traffic")[0], "15000 frames");
     assert!(percent(row(&all, "average load")[0]) > average + 40.0, "{all}");
 }

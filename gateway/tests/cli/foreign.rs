@@ -261,7 +261,7 @@ fn dump_shows_a_foreign_log_as_foreign_in_its_order() {
         assert!(shown.lines().all(|line| line.split('\t').nth(1).unwrap().starts_with("foreign ")));
     }
     let kinds = "command,sum,torque,sensors,network,configure,configured,stimulus,wire,damaged";
-    for pick in [format!("--kind {kinds}"), "--node gateway,everyone,1,12".to_owned(), "--contact".to_owned()]
+    for pick in [format!("--kind {kinds}"), "--cell gateway,everyone,1,12".to_owned(), "--contact".to_owned()]
     {
         assert_eq!(gateway(folder, &format!("dump car.log {pick}")), "", "{pick}");
     }
@@ -303,6 +303,6 @@ fn a_classic_capture_comes_back_in_its_order_with_each_segment() {
         shown.lines().map(|line| line.split('\t').nth(1).unwrap().split(' ').next().unwrap()).collect();
     assert_eq!(verdicts, ["segment", "ok"].repeat(frames.len() / 2));
     assert_eq!(gateway(folder, "dump ours.log --kind foreign"), "");
-    let torques = gateway(folder, "dump ours.log --node 3 --max 5");
+    let torques = gateway(folder, "dump ours.log --cell 3 -n 5");
     assert_eq!(torques.lines().count(), 5, "--max counts what is shown");
 }

@@ -1,4 +1,4 @@
-//! `skinbus dbc`, `skinbus explain`, and the parts of `skinbus dump` that are not lines, as processes.
+//! `skinbus skin dbc`, `skinbus explain`, and the parts of `skinbus dump` that are not lines, as processes.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::path::Path;
@@ -44,17 +44,17 @@ fn skins() -> TempDir {
 fn a_dbc_goes_to_standard_output_or_into_a_file_that_is_not_there_yet() {
     let folder = skins();
     let folder = folder.path();
-    let text = output(folder, "dbc one.toml");
+    let text = output(folder, "skin dbc one.toml");
     assert!(text.starts_with("VERSION \"1\"\n") && text.contains("\nBO_ 515 torque_3: 16 cell_3\n"));
-    assert_eq!(output(folder, "dbc one.toml -o one.dbc"), "");
+    assert_eq!(output(folder, "skin dbc one.toml -o one.dbc"), "");
     let written = || std::fs::read_to_string(folder.join("one.dbc")).unwrap();
     assert_eq!(written(), text);
-    let said = refusal(folder, "dbc classic.toml --joined -o one.dbc", 2);
-    assert_eq!(said, "skinbus: -o one.dbc: it exists: name another file, or overwrite it with --force");
+    let said = refusal(folder, "skin dbc classic.toml --joined -o one.dbc", 2);
+    assert_eq!(said, "skinbus: -o one.dbc: it exists: name another file, or overwrite it with --overwrite");
     assert_eq!(written(), text);
-    output(folder, "dbc classic.toml --joined -o one.dbc --force");
+    output(folder, "skin dbc classic.toml --joined -o one.dbc --overwrite");
     assert!(written().contains("Classic: a packet travels in frames of up to 8 bytes under one identifier"));
-    let said = refusal(folder, "dbc one.toml -o nowhere/one.dbc", 2);
+    let said = refusal(folder, "skin dbc one.toml -o nowhere/one.dbc", 2);
     assert!(said.starts_with("skinbus: -o nowhere/one.dbc: "), "{said}");
     assert!(said.ends_with("; name a file in a folder that can be written"), "{said}");
 }
@@ -64,7 +64,7 @@ fn a_recording_without_a_skin_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("run.log"), "(1.000000) vcan0 123#00\n").unwrap();
     assert!(gateway(folder.path(), "convert run.log run.mcap").status.success());
-    let said = refusal(folder.path(), "dbc run.mcap", 2);
+    let said = refusal(folder.path(), "skin dbc run.mcap", 2);
     assert_eq!(said, "skinbus: run.mcap has no skin in it: name the skin's own file");
 }
 
@@ -72,14 +72,14 @@ fn a_recording_without_a_skin_is_refused() {
 fn of_several_buses_one_is_chosen() {
     let folder = skins();
     let folder = folder.path();
-    let said = refusal(folder, "dbc two.toml", 2);
+    let said = refusal(folder, "skin dbc two.toml", 2);
     let expected =
         "skinbus: two.toml has 2 buses, and a DBC describes one: add --bus with one of vcan0, vcan1";
     assert_eq!(said, expected);
-    let said = refusal(folder, "dbc two.toml --bus can7", 2);
+    let said = refusal(folder, "skin dbc two.toml --bus can7", 2);
     assert_eq!(said, "skinbus: two.toml has no bus \"can7\"; its buses are vcan0, vcan1");
     for bus in ["vcan0", "vcan1"] {
-        let text = output(folder, &format!("dbc two.toml --bus {bus}"));
+        let text = output(folder, &format!("skin dbc two.toml --bus {bus}"));
         assert!(text.contains(&format!("BA_ \"DBName\" \"{bus}\";")), "{text}");
     }
 }
@@ -88,12 +88,12 @@ fn of_several_buses_one_is_chosen() {
 fn a_classic_bus_is_described_only_as_joined_packets() {
     let folder = skins();
     let folder = folder.path();
-    let said = refusal(folder, "dbc classic.toml", 2);
+    let said = refusal(folder, "skin dbc classic.toml", 2);
     let expected = "skinbus: bus vcan0 is classic: a packet is several frames under one identifier, which a \
                     DBC cannot tell apart; --joined describes their bytes joined, for a program that joins them \
                     first";
     assert_eq!(said, expected);
-    let said = refusal(folder, "dbc one.toml --joined", 2);
+    let said = refusal(folder, "skin dbc one.toml --joined", 2);
     assert_eq!(said, "skinbus: --joined is for classic buses; on vcan0 a packet is one FD frame");
 }
 
@@ -169,10 +169,11 @@ fn with_strict_the_first_line_that_cannot_be_read_is_the_end() {
     let folder = folder.path();
     let log = "(1.000000) vcan0 002##50000000000000000000000000000632A\n(1.000000) vcan0 12#11\n(1.0) x\n";
     std::fs::write(folder.join("odd.log"), log).unwrap();
-    let Output { status, stdout, stderr } = gateway(folder, "dump odd.log --strict");
-    let said = "skinbus: odd.log:2: column 18: an identifier of 3 or 8 hexadecimal digits\n";
-    assert_eq!((status.code(), std::str::from_utf8(&stderr)), (Some(1), Ok(said)));
-    assert_eq!(std::str::from_utf8(&stdout).unwrap().lines().count(), 1);
+    let Output { status, stderr, .. } = gateway(folder, "convert odd.log even.log --strict");
+    let said = "skinbus: odd.log:2: column 18: an identifier of 3 or 8 hexadecimal digits";
+    assert_eq!(status.code(), Some(1));
+    assert!(std::str::from_utf8(&stderr).unwrap().starts_with(said), "{stderr:?}");
+    assert!(!folder.join("even.log").exists());
     let Output { status, stdout, .. } = gateway(folder, "dump odd.log");
     assert_eq!((status.code(), std::str::from_utf8(&stdout).unwrap().lines().count()), (Some(0), 1));
 }
@@ -317,7 +318,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain run.log --skin skin.toml --epoch 7 --cell 300",
             2,
-            "invalid value '300' for '--cell <CELL>': \"300\" is no node id: 1 to 254 are; try '--help'",
+            "invalid value '300' for '--cell <[BUS:]NODE>': \"300\" is no node id: 1 to 254 are; try '--help'",
         ),
         (
             "explain empty.log --skin skin.toml --epoch 7",
@@ -333,7 +334,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain run.log --skin skin.toml --epoch 256",
             2,
-            "invalid value '256' for '--epoch <N>': 256 is not in 0..=255; try '--help'",
+            "invalid value '256' for '--epoch <E>': 256 is not in 0..=255; try '--help'",
         ),
     ] {
         assert_eq!(refusal(folder, arguments, code), format!("skinbus: {expected}"), "{arguments}");

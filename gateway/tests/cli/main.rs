@@ -12,5 +12,6 @@ mod recordings;
 mod recover;
 mod report;
 mod shadow;
+mod shell;
 mod stops;
 mod torques;

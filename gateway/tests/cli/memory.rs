@@ -36,24 +36,24 @@ fn files_of_people_cost_at_most_what_the_documents_say() {
     let skin = bounded(folder.path(), "skin generate --cells 10000 --buses 40");
     assert!(skin.status.success(), "{}", String::from_utf8_lossy(&skin.stderr));
     fs::write(folder.path().join("skin.toml"), skin.stdout).unwrap();
-    let checked = bounded(folder.path(), "skin check skin.toml");
+    let checked = bounded(folder.path(), "check skin.toml");
     assert!(checked.status.success(), "{}", String::from_utf8_lossy(&checked.stderr));
 
     for (name, text) in hostile() {
         write(name, &text);
-        for line in [format!("skin check {name}"), format!("scenario check {name} --skin skin.toml")] {
+        for line in [format!("check {name}"), format!("check {name} --skin skin.toml")] {
             let ended = bounded(folder.path(), &line);
             let said = String::from_utf8_lossy(&ended.stderr);
             assert_eq!(ended.status.code(), Some(2), "{line}: {said}");
             assert_eq!(said.lines().count(), 1, "{line}: {said}");
         }
         write(name, &text.repeat(5));
-        let ended = bounded(folder.path(), &format!("skin check {name}"));
+        let ended = bounded(folder.path(), &format!("check {name}"));
         let said = String::from_utf8_lossy(&ended.stderr);
         assert_eq!(ended.status.code(), Some(2), "{name}: {said}");
         assert!(said.contains("at most 500000 are read"), "{name}: {said}");
     }
     write("long.toml", &"# \n".repeat(6 << 20));
-    let said = bounded(folder.path(), "skin check long.toml").stderr;
+    let said = bounded(folder.path(), "check long.toml").stderr;
     assert!(String::from_utf8_lossy(&said).contains("longer than 16777216 bytes"), "{said:?}");
 }

@@ -29,13 +29,13 @@ const COMMANDS: &[&str] = &[
     "dump FILE --stats",
     "dump FILE --json --contact",
     "convert FILE - --direction",
-    "report FILE -o OUT.html --force",
-    "shadow FILE",
-    "shadow FILE --json --ber 0.0001",
+    "report FILE -o OUT.html --overwrite",
+    "fit FILE",
+    "fit FILE --json --ber 0.0001",
     "explain FILE --epoch 7",
     "explain FILE --epoch 2 --skin skin.toml",
     "replay FILE --bus-kind embedded --expect",
-    "recover FILE -o OUT.mcap --force",
+    "recover FILE -o OUT.mcap --overwrite",
 ];
 
 /// Runs a command without a terminal and with few addresses; what became of it, and what it said.
@@ -123,7 +123,7 @@ fn a_report_finds_the_skin_behind_the_messages() {
     let folder = tempfile::tempdir().unwrap();
     for (name, seed) in seeds::all(&seeds::skin()) {
         fs::write(folder.path().join("m.mcap"), seed).unwrap();
-        let (status, said) = run(folder.path(), "report m.mcap --force");
+        let (status, said) = run(folder.path(), "report m.mcap --overwrite");
         let of_a_run = !["converted", "another bridge's"].contains(&name);
         assert_eq!(status.success(), of_a_run, "{name}: {said}");
     }

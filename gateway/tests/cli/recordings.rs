@@ -87,7 +87,7 @@ fn another_skin_than_the_recorded_one_is_remarked() {
     let attached = &reader.extras().attachments;
     let (_, own) = attached.iter().find(|(name, _)| name == SKIN).unwrap();
     let own = String::from_utf8(own.clone()).unwrap();
-    for command in ["dump fd.mcap --brief", "explain fd.mcap --epoch 9", "shadow fd.mcap"] {
+    for command in ["dump fd.mcap --brief", "explain fd.mcap --epoch 9", "fit fd.mcap"] {
         let same = said(&own, command);
         assert!(!same.contains("is not the skin"), "{command}: {same}");
         let moved = own.replacen("position = [", "position = [0.001, ", 1);

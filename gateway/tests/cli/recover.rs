@@ -435,13 +435,13 @@ fn the_command_says_what_it_did_and_overwrites_nothing() {
             && said.contains(" 20 of 100 messages"),
         "{said}"
     );
-    let exists = "skinbus: -o there.mcap: it exists: name another file, or overwrite it with --force";
+    let exists = "skinbus: -o there.mcap: it exists: name another file, or overwrite it with --overwrite";
     assert_eq!(says("recover run.mcap.part -o there.mcap", 2), exists);
     assert_eq!(fs::read_to_string(path("there.mcap")).unwrap(), "somebody's");
-    says("recover run.mcap.part -o there.mcap --force", 0);
+    says("recover run.mcap.part -o there.mcap --overwrite", 0);
     assert_eq!(messages(&fs::read(path("there.mcap")).unwrap()).len(), 40);
     let itself = "skinbus: -o whole.mcap is a file that this command reads: name another file";
-    assert_eq!(says("recover whole.mcap -o whole.mcap --force", 2), itself);
+    assert_eq!(says("recover whole.mcap -o whole.mcap --overwrite", 2), itself);
     assert!(
         says("recover a.zip", 1)
             .starts_with("skinbus: a.zip: it is no MCAP file: it begins with 50 4b 03 04")

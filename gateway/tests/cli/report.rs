@@ -78,9 +78,9 @@ fn what_would_be_overwritten_or_is_no_bit_rate_is_refused_before_anything_is_rea
     let recording = concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/recordings/fd.mcap");
     fs::copy(recording, folder.path().join("run.mcap")).unwrap();
     fs::write(folder.path().join("run.html"), "mine").unwrap();
-    let exists = "-o run.html: it exists: name another file, or overwrite it with --force";
+    let exists = "-o run.html: it exists: name another file, or overwrite it with --overwrite";
     assert_eq!(refuses(&folder, "run.mcap", 2), exists);
-    let itself = refuses(&folder, "run.mcap -o run.mcap --force", 2);
+    let itself = refuses(&folder, "run.mcap -o run.mcap --overwrite", 2);
     assert_eq!(itself, "-o run.mcap is a file that this command reads: name another file");
     let rate = refuses(&folder, "run.mcap -o new.html --nominal fast", 2);
     assert!(rate.contains("--nominal") && rate.contains("not a bit rate"), "{rate}");

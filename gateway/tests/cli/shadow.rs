@@ -1,4 +1,4 @@
-//! `skinbus shadow` as a process: whole, cut-off, empty and foreign recordings, and what it refuses.
+//! `skinbus fit` as a process: whole, cut-off, empty and foreign recordings, and what it refuses.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
 use std::fmt::Write as _;
@@ -39,7 +39,7 @@ fn objects(text: &str) -> Vec<Value> {
 fn each_frame_is_an_object_with_the_bits_and_times_of_a_bus() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("run.log"), log()).unwrap();
-    let (code, text, said) = gateway(folder.path(), "shadow run.log --json --rates can1=500k/2M");
+    let (code, text, said) = gateway(folder.path(), "fit run.log --json --rates can1=500k/2M");
     assert_eq!((code, said.as_str()), (Some(0), ""));
     let objects = objects(&text);
     assert_eq!(objects.len(), 3_000);
@@ -66,7 +66,7 @@ fn each_frame_is_an_object_with_the_bits_and_times_of_a_bus() {
 fn every_line_that_a_capture_can_have_is_taken() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("corpus.log"), CORPUS).unwrap();
-    let (code, text, _) = gateway(folder.path(), "shadow corpus.log --json");
+    let (code, text, _) = gateway(folder.path(), "fit corpus.log --json");
     let frames = CORPUS.split(|&byte| byte == b'\n').filter(|line| {
         std::str::from_utf8(line).is_ok_and(|line| matches!(candump::parse(line), Ok(Line::Frame(_))))
     });
@@ -80,7 +80,7 @@ fn a_recording_that_was_truncated_is_looked_at_as_far_as_it_goes() {
     assert_eq!(gateway(folder.path(), "convert run.log run.mcap").0, Some(0));
     let whole = fs::read(folder.path().join("run.mcap")).unwrap();
     fs::write(folder.path().join("cut.mcap"), &whole[..whole.len() - 3_000]).unwrap();
-    let (code, text, said) = gateway(folder.path(), "shadow cut.mcap");
+    let (code, text, said) = gateway(folder.path(), "fit cut.mcap");
     assert_eq!((code, said.matches('\n').count()), (Some(0), 1), "{said}");
     assert!(
         said.starts_with("cut.mcap: it has no end: after ") && text.contains("can0 at 1M/5M"),
@@ -89,7 +89,7 @@ fn a_recording_that_was_truncated_is_looked_at_as_far_as_it_goes() {
     // In the middle of a line.
     let log = log();
     fs::write(folder.path().join("cut.log"), &log[..log.len() - 40]).unwrap();
-    let (code, text, said) = gateway(folder.path(), "shadow cut.log");
+    let (code, text, said) = gateway(folder.path(), "fit cut.log");
     assert_eq!(code, Some(0));
     assert!(
         said.ends_with("cut.log: 1 of 3000 lines could not be read\n") && text.contains("2999 frames"),
@@ -107,22 +107,18 @@ fn what_has_no_frame_and_what_is_no_capture_is_said_in_one_line() {
     }
     fs::write(folder.path().join("run.log"), log()).unwrap();
     for (arguments, code, begin) in [
-        ("shadow empty.log", 1, "skinbus: empty.log: it is empty: there is no frame in it"),
-        ("shadow notes.txt", 1, "skinbus: notes.txt: there is no frame in 1 line; what candump prints"),
-        ("shadow x.zip", 2, "skinbus: x.zip is "),
-        ("shadow .", 2, "skinbus: . is a directory"),
-        ("shadow nowhere", 2, "skinbus: there is no file nowhere, and as a bus: "),
-        ("shadow run.log notes.txt", 2, "skinbus: notes.txt has no frame in it: name captures alone"),
-        (
-            "shadow run.log vcan0",
-            2,
-            "skinbus: run.log, vcan0: one file, the parts of one recording, or buses",
-        ),
-        ("shadow run.log --duration 3", 2, "skinbus: --duration is for live buses"),
-        ("shadow run.log --nominal 2M", 2, "skinbus: nominal bit rate 2000000 bit/s: CAN allows"),
-        ("shadow run.log --data 9M", 2, "skinbus: data bit rate 9000000 bit/s: CAN FD allows"),
-        ("shadow run.log --rates can0=1M/9M", 2, "skinbus: invalid value 'can0=1M/9M'"),
-        ("shadow run.log --ber 2", 2, "skinbus: --ber: bit-error rate 2: 0 to 0.01"),
+        ("fit empty.log", 1, "skinbus: empty.log: it is empty: there is no frame in it"),
+        ("fit notes.txt", 1, "skinbus: notes.txt: there is no frame in 1 line; what candump prints"),
+        ("fit x.zip", 2, "skinbus: x.zip is "),
+        ("fit .", 2, "skinbus: . is a directory"),
+        ("fit nowhere", 2, "skinbus: there is no file nowhere, and as a bus: "),
+        ("fit run.log notes.txt", 2, "skinbus: notes.txt has no frame in it: name captures alone"),
+        ("fit run.log vcan0", 2, "skinbus: run.log, vcan0: one file, the parts of one recording, or buses"),
+        ("fit run.log --duration 3", 2, "skinbus: --duration is for live buses"),
+        ("fit run.log --nominal 2M", 2, "skinbus: nominal bit rate 2000000 bit/s: CAN allows"),
+        ("fit run.log --data 9M", 2, "skinbus: data bit rate 9000000 bit/s: CAN FD allows"),
+        ("fit run.log --rates can0=1M/9M", 2, "skinbus: invalid value 'can0=1M/9M'"),
+        ("fit run.log --ber 2", 2, "skinbus: --ber: bit-error rate 2: 0 to 0.01"),
     ] {
         let (got, text, said) = gateway(folder.path(), arguments);
         assert_eq!(
@@ -139,7 +135,7 @@ fn a_time_at_the_end_of_all_clocks_is_a_time_like_others() {
     let folder = tempfile::tempdir().unwrap();
     let log = "(18446744073.709551) vcan0 001##500000000000000000000000000000006\n";
     fs::write(folder.path().join("late.log"), log.repeat(3)).unwrap();
-    for line in ["shadow late.log", "shadow late.log --json", "shadow late.log --ber 0.01"] {
+    for line in ["fit late.log", "fit late.log --json", "fit late.log --ber 0.01"] {
         let (code, out, said) = gateway(folder.path(), line);
         let one = "late.log: all 3 frames of vcan0 have the time 18446744073.709551000: rates, gaps and loads mean nothing\n";
         assert_eq!((code, said.as_str()), (Some(0), one), "{line}");

@@ -79,21 +79,21 @@ fn a_named_pipe_is_refused_in_one_line() {
         "dump fifo",
         "convert fifo out.mcap",
         "report fifo -o out.html",
-        "shadow fifo",
+        "fit fifo",
         "explain fifo --epoch 1 --skin skin.toml",
         "explain run.log --epoch 1 --skin fifo",
         "replay run.log --bus-kind embedded --spawn --skin fifo",
         "recover fifo -o out.mcap",
         "fit fifo",
-        "dbc fifo",
-        "skin check fifo",
+        "skin dbc fifo",
+        "check fifo",
         "cells vcan0 --skin fifo",
         "commission fifo",
         "run fifo",
         "run skin.toml --scenario fifo",
         "replay fifo --bus-kind embedded",
         "explain fifo --epoch 1",
-        "torque skin.toml --batch fifo",
+        "explain skin.toml --batch fifo",
         "run skin.toml --firmware fifo --emulate 1",
         "skin import fifo --tip tool",
         "view fifo",
@@ -116,11 +116,11 @@ fn a_signal_ends_a_command_that_waits_for_a_pipe() {
         "dump /dev/stdin",
         "convert - out.mcap",
         "report /dev/stdin -o out.html",
-        "shadow - --skin skin.toml",
+        "fit - --skin skin.toml",
         "explain run.log --epoch 1 --skin /dev/stdin",
         "recover /dev/stdin -o out.mcap",
         "fit /dev/stdin",
-        "skin check /dev/stdin",
+        "check /dev/stdin",
         "run skin.toml --scenario /dev/stdin",
     ];
     for line in lines {
@@ -140,7 +140,7 @@ fn a_signal_ends_a_command_that_waits_for_a_pipe() {
 #[test]
 fn a_signal_ends_a_command_whose_reader_takes_nothing() {
     let folder = place();
-    for line in ["dump run.log", "dump run.log --json", "convert run.log -", "shadow run.log --json"] {
+    for line in ["dump run.log", "dump run.log --json", "convert run.log -", "fit run.log --json"] {
         for signal in [Signal::INT, Signal::TERM] {
             let (mut reader, writer) = std::io::pipe().unwrap();
             let mut child =

@@ -118,7 +118,7 @@ fn rows_are_what_explain_says_of_their_epochs_in_recordings_logs_and_parts() {
         (parts, "", 150),
         ("split-1.mcap", "", 0),
     ] {
-        let last = said(&folder, &format!("convert {capture} out.csv --force{skin}"), 0);
+        let last = said(&folder, &format!("convert {capture} out.csv --overwrite{skin}"), 0);
         let rows = rows(&folder, "out.csv");
         assert!(last.ends_with(&format!(" -> out.csv: {} epochs", rows.len())), "{last}");
         assert!(rows.len() == epochs || epochs == 0 && !rows.is_empty(), "{capture}: {}", rows.len());
@@ -175,7 +175,7 @@ fn what_has_no_torques_is_refused_in_one_line_and_nothing_is_written() {
         (
             "fd.mcap mine.csv",
             2,
-            "skinbus: mine.csv: it exists: name another file, or overwrite it with --force",
+            "skinbus: mine.csv: it exists: name another file, or overwrite it with --overwrite",
         ),
         (
             "fd.mcap fd.csv/out.csv",

@@ -78,6 +78,17 @@ pub enum BusError {
         /// Where its socket would be.
         directory: PathBuf,
     },
+    /// There is neither an interface nor an embedded bus of this name, and either would do.
+    #[error(
+        "there is no interface {name}, and no embedded bus of this name is served in {}: make the interface with \
+         `vcan-setup up {name}`, or serve the bus with `vcan-setup serve {name}`", directory.display()
+    )]
+    Absent {
+        /// The bus.
+        name: String,
+        /// Where its socket would be.
+        directory: PathBuf,
+    },
     /// The directory of embedded buses is not as private as it must be.
     #[error(transparent)]
     Directory(#[from] DirectoryError),
@@ -163,6 +174,7 @@ impl BusError {
         matches!(
             self,
             Self::NotServed { .. }
+                | Self::Absent { .. }
                 | Self::NoAnswer { .. }
                 | Self::TurnedAway(_)
                 | Self::NoInterface(_)

@@ -19,9 +19,15 @@ const FD_MTU: u32 = 72;
 /// answer a report at once.
 pub const GATEWAY_RECEIVE_BUFFER: u32 = 8 << 20;
 
-/// Whether the kernel has `CAN_RAW` sockets: anything but "no such protocol" counts as yes.
-pub(super) fn has_socketcan() -> bool {
+/// Returns whether the kernel has `CAN_RAW` sockets: anything but "no such protocol" counts as yes.
+#[must_use]
+pub fn has_socketcan() -> bool {
     !matches!(probe(), Err(Errno::AFNOSUPPORT | Errno::PROTONOSUPPORT))
+}
+
+/// Returns whether there is an interface of this name, CAN or not; anything but "no such device" counts as yes.
+pub(super) fn has_interface(name: &str) -> bool {
+    !Link::named(name).is_err_and(|error| matches!(error.raw_os_error(), Some(libc::ENODEV | libc::ENXIO)))
 }
 
 fn probe() -> Result<OwnedFd, Errno> {

@@ -88,7 +88,7 @@ impl fmt::Display for BusKind {
 /// Which kind of bus is requested.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, PartialEq)]
 pub enum Choice {
-    /// SocketCAN where the kernel has it, else the embedded bus.
+    /// SocketCAN if there is an interface of the bus's name, else the embedded bus.
     #[default]
     Auto,
     /// This one and no other.
@@ -96,15 +96,12 @@ pub enum Choice {
 }
 
 impl Choice {
-    /// The kind that this choice comes to on this machine.
-    ///
-    /// A kernel with `CAN_RAW` sockets means SocketCAN, also when the interface is missing: that is an error
-    /// with a hint, never a silent change of bus.
+    /// The kind that this choice comes to for the bus of this name on this machine, now.
     #[must_use]
-    pub fn resolve(self) -> BusKind {
+    pub fn resolve(self, name: &str) -> BusKind {
         match self {
             Self::Only(kind) => kind,
-            Self::Auto if super::kernel::has_socketcan() => BusKind::SocketCan,
+            Self::Auto if super::kernel::has_interface(name) => BusKind::SocketCan,
             Self::Auto => BusKind::Embedded,
         }
     }

@@ -22,9 +22,24 @@ fn a_bus_that_nobody_serves_says_how_to_serve_it() {
 }
 
 #[test]
+fn a_bus_of_either_kind_that_is_absent_names_both_ways() {
+    let options = Options { directory: Some("/nowhere/skinbus".into()), ..Options::default() };
+    let error = Bus::open("nosuchcan0", Choice::Auto, &options).unwrap_err();
+    let expected = "there is no interface nosuchcan0, and no embedded bus of this name is served in /nowhere/skinbus: make \
+                    the interface with `vcan-setup up nosuchcan0`, or serve the bus with `vcan-setup serve nosuchcan0`";
+    assert_eq!(error.to_string(), expected);
+    assert!(error.may_open_later());
+    // An interface of the name is taken, and not passed by, whatever its sort.
+    assert_eq!(
+        [Choice::Auto.resolve("lo"), Choice::Auto.resolve("nosuchcan0")],
+        [BusKind::SocketCan, BusKind::Embedded]
+    );
+}
+
+#[test]
 fn a_kernel_without_can_says_so_and_one_with_it_names_the_missing_interface() {
     let error = Bus::open("nosuchcan0", Choice::Only(BusKind::SocketCan), &Options::default()).unwrap_err();
-    if kernel::has_socketcan() {
+    if has_socketcan() {
         let expected = "there is no interface nosuchcan0: make it with `vcan-setup up nosuchcan0`, or plug \
                         it in if it is hardware";
         assert_eq!(error.to_string(), expected);

@@ -94,10 +94,15 @@ impl Place {
         self.command_of(&program(name), words)
     }
 
-    /// The same of any program.
+    /// The same of any program. Words such as `SKINBUS_TOKEN=x` go to its environment.
     pub fn command_of(&self, program: &Path, words: &str) -> Command {
         let mut command = Command::new(program);
-        command.args(words.split(' ').filter(|word| !word.is_empty()));
+        for word in words.split(' ').filter(|word| !word.is_empty()) {
+            match word.split_once('=').filter(|(name, _)| name.starts_with("SKINBUS_")) {
+                Some((name, value)) => command.env(name, value),
+                None => command.arg(word),
+            };
+        }
         command.current_dir(self.directory.path()).env("SKINBUS_DIR", self.buses()).env("NO_COLOR", "1");
         command
     }
@@ -112,7 +117,7 @@ impl Place {
             "skinbus",
             &format!(
                 "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} \
-                 --candump run.log --force --summary run.json {more}",
+                 --candump run.log --overwrite --summary run.json {more}",
                 self.kind
             ),
         )

@@ -122,7 +122,7 @@ impl Place {
         let kind = self.kind();
         self.start(
             "skinbus",
-            &format!("replay {file} --bus-kind {kind} --summary replay.json --force {more}"),
+            &format!("replay {file} --bus-kind {kind} --summary replay.json --overwrite {more}"),
         )
     }
 

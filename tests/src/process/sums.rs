@@ -67,7 +67,7 @@ pub fn wired(place: &Place, format: Format, neighbors: impl Fn(u8) -> [u8; 4]) {
 pub fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
     let words = format!(
         "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} --summary run.json \
-         --force {more}",
+         --overwrite {more}",
         place.kind()
     );
     place.start("skinbus", &words)

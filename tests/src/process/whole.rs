@@ -53,7 +53,7 @@ pub fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summary {
     }
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     let run =
-        "run skin.toml --scenario scenario.toml --bus-kind socketcan --quiet --summary run.json --force";
+        "run skin.toml --scenario scenario.toml --bus-kind socketcan --quiet --summary run.json --overwrite";
     let bench = Running::start(place.command_of(&place.path("skinbus"), run));
     let ended = bench.end_after(Duration::from_secs(SECONDS.into()) + Duration::from_secs(60)).well();
     eprintln!("{}", ended.stdout);

@@ -96,7 +96,8 @@ impl Alone {
             let mut bytes = [0; 4096];
             let Ok(count) = self.line.read(&mut bytes) else { continue };
             for line in bytes[..count].iter().filter_map(|&byte| self.decoder.push(byte)) {
-                let Line::Frame(frame) = line else { panic!("{line:?}") };
+                // A reset ends a line in its middle.
+                let Line::Frame(frame) = line else { continue };
                 self.came.push_back(Message::decode(&Packet::from_fd(&frame).unwrap()).unwrap());
             }
         }

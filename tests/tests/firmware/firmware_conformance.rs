@@ -55,10 +55,10 @@ fn conforms(format: Format) {
     let line = place.path("line");
     let slcan = place.start("vcan-setup", &format!("slcan vcan0 unix:{},cell=12 --wait", line.display()));
     place.test_client_of(format).waits_for("a heartbeat of the cell", |_| true);
-    let words = format!("conformance --bus vcan0 --bus-kind embedded --node 12 --format {}", format.name());
+    let words = format!("conformance --bus vcan0 --bus-kind embedded --cell 12 --format {}", format.name());
     let failed = |only: &[&str]| -> Vec<String> {
         let mut command = place.command("skinbus", &words);
-        command.args(["--restart", "sh restart.sh", "--force"]).args(only);
+        command.args(["--restart", "sh restart.sh", "--overwrite"]).args(only);
         let ended = Running::start(command).end_after(Duration::from_secs(120));
         assert!(ended.stdout.contains(" passed, "), "{ended:#?}");
         let all: Vec<_> =
@@ -68,7 +68,7 @@ fn conforms(format: Format) {
     // A busy machine may stop the emulator where the documents allow a cell some milliseconds, and what a killed one has
     // sent may still be on its way: a requirement has to be met in one of a few attempts.
     for requirement in failed(&[]) {
-        let meets = || failed(&["--only", &requirement]).is_empty();
+        let meets = || failed(&["--requirement", &requirement]).is_empty();
         assert!((0..5).any(|_| meets()), "{requirement}, six times");
     }
     drop((slcan, server));

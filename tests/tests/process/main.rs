@@ -6,7 +6,6 @@ mod process_buses;
 mod process_calibrate;
 mod process_captures;
 mod process_chains;
-mod process_command_line;
 mod process_commission;
 mod process_conformance;
 mod process_end;

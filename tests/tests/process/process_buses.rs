@@ -105,7 +105,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
     // What the cells answer now was lost with the bus then, and is no difference.
     for capture in ["run.mcap", "run.log"] {
-        place.start("skinbus", &format!("convert {capture} notes.log --force")).end().well();
+        place.start("skinbus", &format!("convert {capture} notes.log --overwrite")).end().well();
         let lines = place.read("notes.log");
         assert_eq!(
             lines.lines().filter(|line| *line == "# the bus 'vcan1' was lost").count(),
@@ -158,13 +158,13 @@ fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() 
     }
     // The robot is halted and resumed while the bus does not receive it.
     place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
-    bench.hears("the robot is halted: somebody sent a halt frame; `skinbus ack vcan0 --bus-kind embedded`");
+    bench.hears("the robot is halted: somebody sent a halt frame; `skinbus frame resume --bus vcan0 --bus-kind embedded`");
     let second = serve(&place, "vcan1");
     bench.hears("vcan1 works again");
     (1..=4).for_each(|cell| bench.tells_on("vcan1", cell, "come back"));
     let [_, vcan1, _] = test_clients(&place);
     vcan1.waits_for_halted_cells(1..=4);
-    place.start("skinbus", "ack vcan2 --bus-kind embedded").end().well();
+    place.start("skinbus", "frame resume --bus vcan2 --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     assert_eq!(bench.cells(), cells, "no cell was restarted");
@@ -195,7 +195,7 @@ fn cells_that_were_away_receive_a_missed_resume_and_a_missed_touch() {
     first.signal(Signal::KILL);
     first.end();
     bench.hears(LOST);
-    place.start("skinbus", "ack vcan0 --bus-kind embedded").end().well();
+    place.start("skinbus", "frame resume --bus vcan0 --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     // More than the two seconds after which the cells that are away are touched.
     TestClient::on(&place, "vcan2", Format::Fd).waits_for_joints(150);
@@ -239,7 +239,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted_until_it_is_back() {
     bench.hears("the robot is halted: too many bad cycles in a row: the torque is not valid");
     let second = serve(&place, "vcan1");
     bench.hears("vcan1 works again");
-    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     ended_well(&place, bench, Some(second), 1);

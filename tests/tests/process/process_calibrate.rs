@@ -11,7 +11,7 @@ const START: [&str; 2] = ["--start", "0 -1.2 1.0 -1.4 -1.57 0"];
 
 /// Exit code, result unless it was refused, and standard error.
 fn calibrate(place: &Place, words: &str) -> (Option<i32>, Option<Value>, String) {
-    let mut command = place.command("skinbus", &format!("calibrate skin.toml --json --force {words}"));
+    let mut command = place.command("skinbus", &format!("calibrate skin.toml --json --overwrite {words}"));
     let output = command.args(START).output().unwrap();
     let said = String::from_utf8(output.stderr).unwrap();
     let found = (!output.stdout.is_empty())
@@ -25,13 +25,13 @@ fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
     place.skin(6);
     let live = "--duration 24s --quiet --bus-kind embedded --record run.mcap -o found.toml --page found.html";
     let (_, found, said) = calibrate(&place, live);
-    let (code, again, repeated) = calibrate(&place, "--from run.mcap -o again.toml");
+    let (code, again, repeated) = calibrate(&place, "--recording run.mcap -o again.toml");
     assert_eq!(found, again, "{said}");
     let exists = |name: &str| place.path(name).exists();
     // The same cells under the description of others.
     let skin = place.read("skin.toml");
     place.write("skin.toml", &skin.replace("serial = 100001", "serial = 7"));
-    let (refused, nothing, why) = calibrate(&place, "--from run.mcap -o other.toml");
+    let (refused, nothing, why) = calibrate(&place, "--recording run.mcap -o other.toml");
     assert_eq!((refused, nothing), (Some(2), None), "{why}");
     assert!(why.contains("was recorded with another skin: serial numbers 100002, recorded 100001"), "{why}");
     assert!(!exists("other.toml"));
@@ -81,6 +81,6 @@ fn what_cannot_be_calibrated_is_refused_in_one_line() {
         "skinbus: sheet.toml:1:11: noise_g = 3: 0 to 1 are possible\n"
     );
     place.write("empty.log", "(1.000000) vcan0 080##1\n");
-    let said = refused("--from empty.log");
+    let said = refused("--recording empty.log");
     assert!(said.contains("no cell of the skin sent an acceleration; record a bus with"), "{said}");
 }

@@ -43,7 +43,7 @@ fn robot(file: &str, tips: &str, cells: &str) -> Place {
     let place = Place::new();
     fs::copy(example(file), place.path(file)).unwrap();
     place.write("cells.csv", &format!("{HEAD}\n{cells}"));
-    run(&place, &format!("skin import {file} {tips} --cells cells.csv -o skin.toml"));
+    run(&place, &format!("skin import {file} {tips} --places cells.csv -o skin.toml"));
     place.scenario(PRESS);
     place
 }
@@ -187,7 +187,7 @@ fn a_report_names_the_torque_format_that_would_have_fitted() {
     ));
     let report = || {
         place.bench(1.5, "--record run.mcap").end().well();
-        run(&place, "report run.mcap -o run.html --force");
+        run(&place, "report run.mcap -o run.html --overwrite");
         place.read("run.html").split_whitespace().collect::<Vec<_>>().join(" ")
     };
     let page = report();

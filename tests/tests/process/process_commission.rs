@@ -313,7 +313,7 @@ fn a_list_is_redrawn_while_it_is_watched() {
     let workshop = Workshop::new(&skin(3));
     let watched = workshop
         .place
-        .start("skinbus", "cells vcan0 --bus-kind embedded --watch --json --for 2.2")
+        .start("skinbus", "cells vcan0 --bus-kind embedded --watch --json --duration 2.2")
         .end()
         .well();
     let lines: Vec<Value> = watched.stdout.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
@@ -406,7 +406,7 @@ fn what_cannot_be_done_is_one_line() {
     bus.prints("serving ");
     let line = said("commission skin.toml --quiet", 1);
     assert_eq!(line, "skinbus: no cells are on vcan0: start them, or switch them on, and run this again");
-    let line = said("cells vcan0 --for 0.4", 1);
+    let line = said("cells vcan0 --duration 0.4", 1);
     assert!(line.starts_with("skinbus: no cell sent anything on vcan0 for 0.4 s: "), "{line}");
 
     place.write("other.toml", &skin(4).replace("serial = 1000", "serial = 2000"));

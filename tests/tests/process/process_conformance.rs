@@ -51,13 +51,13 @@ impl Cell {
     /// Waits until it answers.
     fn settles(&self) {
         until("the cell", || {
-            let words = format!("frame configure --node 5 --read identity {}", self.bus());
+            let words = format!("frame configure --cell 5 --read identity {}", self.bus());
             self.place.start("skinbus", &words).end().code().filter(|code| *code == 0)
         });
     }
 
     fn conformance(&self, more: &str) -> Running {
-        let words = format!("conformance --bus vcan0 --bus-kind embedded --node 5 {more}");
+        let words = format!("conformance --bus vcan0 --bus-kind embedded --cell 5 {more}");
         self.place.start("skinbus", &words)
     }
 
@@ -74,7 +74,7 @@ impl Cell {
     /// What it has in use.
     fn has(&self) -> Vec<String> {
         let read = |parameter: &&str| {
-            let words = format!("frame configure --node 5 --read {parameter} {}", self.bus());
+            let words = format!("frame configure --cell 5 --read {parameter} {}", self.bus());
             self.place.start("skinbus", &words).end().well().stdout
         };
         ["mount", "pose", "contact", "timing", "mode", "events", "16", "21"].iter().map(read).collect()
@@ -106,8 +106,11 @@ fn passes(format: Format) {
         all.filter(|it| it["verdict"] == "failed" && !timed(it["id"].as_str().unwrap())).cloned().collect()
     };
     for requirement in failed(&whole) {
-        let alone =
-            format!("--restart {} --json --only {}", restart.display(), requirement["id"].as_str().unwrap());
+        let alone = format!(
+            "--restart {} --json --requirement {}",
+            restart.display(),
+            requirement["id"].as_str().unwrap()
+        );
         let meets = || {
             let ended = cell.conformance(&alone).end_after(Duration::from_secs(90));
             serde_json::from_str(&ended.stdout).is_ok_and(|whole: Value| failed(&whole).is_empty())
@@ -194,9 +197,13 @@ fn a_cell_that_dies_is_said_and_its_file_is_kept() {
 fn what_cannot_be_tested_is_refused_in_a_line() {
     let cell = Cell::new(Format::Fd);
     let refusals = [
-        ("--only CONFI", 2, "--only CONFI: no requirement has this id; CONF-7 and CONF are examples"),
+        (
+            "--requirement CONFI",
+            2,
+            "--requirement CONFI: no requirement has this id; CONF-7 and CONF are examples",
+        ),
         ("--format classic", 1, "cell 5 sends fd frames on vcan0, not classic: say --format fd"),
-        ("--restart false --only CLAIM", 1, "the command of --restart failed: exit status: 1"),
+        ("--restart false --requirement CLAIM", 1, "the command of --restart failed: exit status: 1"),
     ];
     for (words, code, line) in refusals {
         let ended = cell.conformance(words).end();
@@ -204,7 +211,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
         assert_eq!(ended.stderr, format!("skinbus: {line}\n"));
     }
     let of = |node: u8| {
-        let words = format!("conformance --bus vcan0 --bus-kind embedded --node {node} --only J");
+        let words = format!("conformance --bus vcan0 --bus-kind embedded --cell {node} --requirement J");
         cell.place.start("skinbus", &words).end()
     };
     assert_eq!(
@@ -223,7 +230,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
         "skinbus: other cells are on vcan0: 3; joints and halts of the test reach them too: take them away, or say \
          --others-will-stop"
     );
-    let tolerated = cell.conformance("--others-will-stop --only CMD").end().well();
+    let tolerated = cell.conformance("--others-will-stop --requirement CMD").end().well();
     assert!(tolerated.stdout.contains("4 passed, 0 failed"), "{tolerated:#?}");
     drop(other);
 }
@@ -240,7 +247,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     let cell = Cell::new(Format::Fd);
     let before = cell.has();
     let client = cell.place.test_client();
-    let test = cell.conformance("--only CMD");
+    let test = cell.conformance("--requirement CMD");
     for _ in 0..40 {
         client.sends(&twin());
         std::thread::sleep(Duration::from_millis(20));
@@ -260,7 +267,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
         "skinbus: 003##500000000000000000000000000004782 was sent by somebody else: stop the gateway that is on this bus\n"
     );
     assert_eq!(cell.has(), before);
-    let test = cell.conformance("--only CMD");
+    let test = cell.conformance("--requirement CMD");
     for _ in 0..20 {
         client.sends(&Message::Resume);
         std::thread::sleep(Duration::from_millis(20));
@@ -273,7 +280,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
 fn other_cells_that_send_much_do_not_matter_if_they_are_tolerated() {
     let cell = Cell::new(Format::Fd);
     let client = cell.place.test_client();
-    let test = cell.conformance("--only CMD,STIM,CONF --others-will-stop");
+    let test = cell.conformance("--requirement CMD,STIM,CONF --others-will-stop");
     let from = protocol::id::CellId::new(9).unwrap();
     let torque = protocol::packet::Words::zeros(protocol::packet::Length::Six);
     let flood = Message::Torque { from, epoch: Epoch(1), torque };

@@ -100,7 +100,7 @@ fn a_failed_or_interrupted_experiment_leaves_nothing() {
         ("experiment fig11 -o results", 2, "there is no experiment of this name"),
         ("experiment fig9 --quick -o file", 1, "it is a file; name a folder that can be written"),
         (
-            "experiment fig7 --quick -o results --cell-node nowhere/cell-node",
+            "experiment fig7 --quick -o results SKINBUS_CELL_NODE=nowhere/cell-node",
             1,
             "the bench of the moving arm (single)",
         ),

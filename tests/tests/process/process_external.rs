@@ -72,13 +72,13 @@ fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_
     first.signal(Signal::KILL);
     assert_eq!(first.end().signal(), Some(9));
     bench.hears(&format!(
-        "the robot is halted: too many bad cycles in a row: {NOBODY}; `skinbus ack vcan0 --bus-kind embedded`"
+        "the robot is halted: too many bad cycles in a row: {NOBODY}; `skinbus frame resume --bus vcan0 --bus-kind embedded`"
     ));
     // A hello does not resume the robot; a person has to do that.
     let second = python(&place);
     second.prints("HALTED");
     assert!(!bench.stderr().contains("goes on"), "{}", bench.stderr());
-    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     place.test_client().waits_for_motion();
     bench.signal(Signal::TERM);

@@ -205,7 +205,7 @@ fn a_second_gateway_ends_with_one_line_and_the_first_goes_on_undisturbed() {
     place.pressed();
     let bench = place.running_bench(60.0, "");
     let second = "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 1 --summary second.json \
-                  --candump second.log --force --quiet";
+                  --candump second.log --overwrite --quiet";
     for more in ["", " --no-spawn"] {
         let ended = place.start("skinbus", &format!("{second}{more}")).end();
         let said = "skinbus: another gateway is on vcan0: stop one of the two, or set SKINBUS_DIR to \
@@ -370,9 +370,9 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
     let sent = place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     assert_eq!(sent.stderr, "sent on vcan0 (embedded)\n");
     bench.hears(
-        "the robot is halted: somebody sent a halt frame; `skinbus ack vcan0 --bus-kind embedded` resumes it",
+        "the robot is halted: somebody sent a halt frame; `skinbus frame resume --bus vcan0 --bus-kind embedded` resumes it",
     );
-    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     let test_client = place.test_client();
     test_client.waits_for("a torque", torque_of(1));
@@ -439,7 +439,7 @@ fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
     test_client.waits_for("cell 3 that has its node id", settled);
     test_client.waits_for("another halt", |message| *message == Message::Halt);
     test_client.waits_for("a cell 3 that is halted", says(State::HALTED));
-    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
     test_client.waits_for("its torque", torque_of(3));
     bench.signal(Signal::TERM);
     bench.end().well();

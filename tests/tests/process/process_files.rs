@@ -1,5 +1,5 @@
 //! Files that commands write: a log can be read while it grows, a summary is there after every end, and nothing is
-//! overwritten without --force.
+//! overwritten without --overwrite.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -97,12 +97,12 @@ fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
         }
         assert!(Log::read(&place.read(name), Format::Fd).frames.len() >= seen);
     };
-    for (name, force) in [("new.log", ""), ("run.log", "--force")] {
+    for (name, force) in [("new.log", ""), ("run.log", "--overwrite")] {
         let words = format!("{RUN} --duration 60 --summary {name}.json --candump {name} {force}");
         let bench = place.start("skinbus", &words);
         bench.hears_the_loop();
         follow(name);
-        let options = ["", "--force"];
+        let options = ["", "--overwrite"];
         for option in options {
             let words = format!("run skin.toml --bus-kind embedded --candump {name} {option}");
             let why = "another run is writing it: name another file, or wait for that run's end";
@@ -132,7 +132,7 @@ const WRITERS: [(&str, &str, &str); 13] = [
     ("-o ", "recover in.mcap -o NAME", "new.mcap"),
     ("-o ", "report in.mcap -o NAME", "new.html"),
     ("-o ", "skin generate --cells 3 -o NAME", "new.toml"),
-    ("-o ", "dbc skin.toml -o NAME", "new.dbc"),
+    ("-o ", "skin dbc skin.toml -o NAME", "new.dbc"),
     ("--node-ids ", "commission skin.toml --bus-kind embedded --node-ids NAME", "new.toml"),
 ];
 
@@ -146,7 +146,7 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
     for (option, words, name) in WRITERS {
         let path = place.path(name);
         for (make, why) in [
-            ("file", "exists: name another file, or overwrite it with --force"),
+            ("file", "exists: name another file, or overwrite it with --overwrite"),
             ("link", "name another one"),
             ("dangling", "name another one"),
             ("directory", "name a file in a folder that can be written"),
@@ -158,7 +158,7 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
                 _ => fs::create_dir(&path).unwrap(),
             }
             let before = place.files();
-            let options = ["", " --force"];
+            let options = ["", " --overwrite"];
             for overwrite in options {
                 if make == "file" && !overwrite.is_empty() {
                     continue;
@@ -189,7 +189,7 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
     let said = place.start("skinbus", "experiment fig10 --quick -o results").end();
     assert_eq!(
         said.refusal(2),
-        "skinbus: -o results: there is something in it: name another folder, or overwrite files in it with --force"
+        "skinbus: -o results: there is something in it: name another folder, or overwrite files in it with --overwrite"
     );
     assert_eq!(names(&place.path("results")), ["notes.txt"]);
 }
@@ -240,9 +240,9 @@ fn no_command_overwrites_what_it_reads_even_with_force() {
         ("", "convert in.log".to_owned(), "in.log"),
         ("-o ", "recover in.mcap -o".to_owned(), "in.mcap"),
         ("-o ", "report in.mcap -o".to_owned(), "in.mcap"),
-        ("-o ", "dbc skin.toml -o".to_owned(), "skin.toml"),
+        ("-o ", "skin dbc skin.toml -o".to_owned(), "skin.toml"),
     ] {
-        let ended = place.start("skinbus", &format!("{words} {name} --force")).end();
+        let ended = place.start("skinbus", &format!("{words} {name} --overwrite")).end();
         let why = "is a file that this command reads: name another file";
         assert_eq!(ended.refusal(2), format!("skinbus: {option}{name} {why}"), "{words}");
     }
@@ -288,7 +288,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     let place = Place::new();
     place.pressed();
     // Before its loop begins.
-    let ended = place.bench(1.0, "--cell-node /bin/true").end();
+    let ended = place.bench(1.0, "SKINBUS_CELL_NODE=/bin/true").end();
     assert_eq!(failed(&place, &ended).number("/loop/ticks"), 0);
 
     // While it runs: another gateway.
@@ -311,7 +311,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
 
     // Its log breaks off, and it goes on to its end.
     let mut command = place.command_of(Path::new("/bin/sh"), "");
-    let run = format!("{RUN} --duration 2 --candump run.log --summary run.json --force");
+    let run = format!("{RUN} --duration 2 --candump run.log --summary run.json --overwrite");
     command.args(["-c", &format!("ulimit -f 64; exec {} {run}", process::program("skinbus").display())]);
     let ended = Running::start(command).end();
     let summary = failed(&place, &ended);
@@ -335,7 +335,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
 fn any_number_of_demonstrations_go_on_side_by_side() {
     let place = Place::new();
     let run = |quiet: &str| {
-        let words = format!("demo --duration 60 --cells-per-process 64 {quiet}");
+        let words = format!("demo --duration 60 SKINBUS_CELLS_PER_PROCESS=64 {quiet}");
         let mut command = place.command("skinbus", &words);
         command.env_remove("SKINBUS_DIR").env("TMPDIR", place.path(""));
         Running::start(command)
@@ -347,8 +347,8 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
         let said = demo.stderr();
         // The printed command shows its frames.
         let line = said.lines().find_map(|line| line.strip_prefix("its frames in words: ")).unwrap();
-        let (directory, dump) = line.strip_prefix("SKINBUS_DIR=").unwrap().split_once(" gateway ").unwrap();
-        let mut dump = place.command("skinbus", &format!("{dump} --kind torque --max 3"));
+        let (directory, dump) = line.strip_prefix("SKINBUS_DIR=").unwrap().split_once(" skinbus ").unwrap();
+        let mut dump = place.command("skinbus", &format!("{dump} --kind torque -n 3"));
         dump.env("SKINBUS_DIR", directory);
         let dumped = Running::start(dump).end().well();
         assert_eq!(dumped.stdout.lines().count(), 3, "{dumped:#?}");
@@ -389,6 +389,6 @@ fn a_skin_that_a_test_makes_is_one_that_generate_makes() {
     let place = Place::new();
     place.start("skinbus", "skin generate --cells 8 -o skin.toml").end().well();
     assert_eq!(place.read("skin.toml"), skin(8));
-    place.start("skinbus", "skin generate --cells 9 -o skin.toml --force").end().well();
+    place.start("skinbus", "skin generate --cells 9 -o skin.toml --overwrite").end().well();
     assert_eq!(place.read("skin.toml"), skin(9));
 }

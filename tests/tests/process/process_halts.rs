@@ -153,7 +153,7 @@ fn a_resumed_halt_is_reported_and_the_run_succeeds() {
     test_client.waits_for_epoch(10);
     place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     bench.hears("the robot is halted: somebody sent a halt frame");
-    place.start("skinbus", "ack skin.toml --bus-kind embedded").end().well();
+    place.start("skinbus", "frame resume --skin skin.toml --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
     bench.signal(Signal::TERM);
     let ended = bench.end().well();

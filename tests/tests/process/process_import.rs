@@ -92,9 +92,9 @@ fn each_example_becomes_a_skin() {
     ] {
         fs::copy(example(file), place.path(file)).unwrap();
         let tips_words = tips.iter().map(|tip| format!(" --tip {tip}")).collect::<String>();
-        let ended = run(&place, &format!("skin import {file}{tips_words} -o skin.toml --force")).well();
+        let ended = run(&place, &format!("skin import {file}{tips_words} -o skin.toml --overwrite")).well();
         assert_eq!(ended.stderr.lines().count(), tips.len(), "a line for each chain: {}", ended.stderr);
-        let said = run(&place, "skin check skin.toml").well().stdout;
+        let said = run(&place, "check skin.toml").well().stdout;
         assert!(said.contains(&format!("{joints} joints")), "{file}: {said}");
         let skin = read(&place, "skin.toml");
         assert_eq!((skin.cells.len(), skin.robot.chains.len()), (tips.len(), tips.len()), "{file}");
@@ -110,7 +110,7 @@ fn links_are_covered_and_the_skin_runs() {
         let line = said.stderr.lines().find(|line| line.starts_with(link)).unwrap();
         assert!(line.contains(" cells, ") && line.contains(" % of ") && line.contains(" mm from "), "{line}");
     }
-    run(&place, "skin check skin.toml").well();
+    run(&place, "check skin.toml").well();
     let skin = read(&place, "skin.toml");
     assert!(skin.cells.len() > 100 && skin.buses.len() >= 2, "{} cells", skin.cells.len());
     for (index, bus) in skin.buses.iter().enumerate() {
@@ -260,7 +260,7 @@ fn what_cannot_be_covered_is_said_in_a_line() {
         (cover("fore", "--keep-out fore:1,0,0,0,1,1"), "six lengths in m"),
         (cover("fore", "--keep-out upper:0,0,0,1,1,1"), "upper is not covered: the covered links are fore"),
         (cover("fore", "--package arm_parts"), "NAME=DIR"),
-        (cover("fore", "--cells cells.csv"), "cannot be used with"),
+        (cover("fore", "--places cells.csv"), "cannot be used with"),
     ] {
         refused(&place, &words, expected);
     }
@@ -289,7 +289,8 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
         place.write("arm.urdf", text);
         refused(&place, &format!("skin import arm.urdf {words}"), expected);
     }
-    refused(&place, "skin import - --tip a", "-: the description is a file; of a pipe, name /dev/stdin");
+    // Standard input.
+    refused(&place, "skin import - --tip a", "-: the file is empty");
     refused(&place, "skin import nowhere.urdf --tip a", "nowhere.urdf: No such file");
     let head = "link,px,py,pz,nx,ny,nz";
     for (text, expected) in [
@@ -326,7 +327,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
         ),
     ] {
         place.write("cells.csv", &text);
-        refused(&place, "skin import arm.urdf --tip bare --cells cells.csv", expected);
+        refused(&place, "skin import arm.urdf --tip bare --places cells.csv", expected);
     }
 }
 
@@ -347,7 +348,7 @@ fn a_robot_has_at_most_32_joints() {
     }
     place.write("arms.urdf", &format!("<robot name=\"arms\">{inner}</robot>"));
     place.write("cells.csv", "link,px,py,pz,nx,ny,nz\na12,0,0,0,0,0,1\nb12,0,0,0,0,0,1\n");
-    for cells in ["", " --cells cells.csv"] {
+    for cells in ["", " --places cells.csv"] {
         refused(
             &place,
             &format!("skin import arms.urdf --tip a12 --tip b12 --tip c12{cells}"),
@@ -403,9 +404,9 @@ fn each_covered_link_has_a_cell() {
 fn torques_of_a_force_are_computed_in_both_ways() {
     let place = arm();
     place.write("cells.csv", "link,px,py,pz,nx,ny,nz\nupper,0,0,0.3,1,0,0\nfore,0.2,0,0.1,0,0,1\n");
-    run(&place, "skin import arm.urdf --tip bare --cells cells.csv -o skin.toml").well();
+    run(&place, "skin import arm.urdf --tip bare --places cells.csv -o skin.toml").well();
     place.write("rows.csv", "cell,force_n,q\nvcan0:1,10,0 0.5\n2,10,0 0.5\n1,10,1.5707963267948966 0.5\n");
-    let said = run(&place, "torque skin.toml --batch rows.csv --json").well().stdout;
+    let said = run(&place, "explain skin.toml --batch rows.csv --json").well().stdout;
     let rows: Vec<Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let numbers = |row: &Value, key: &str| {
         row[key].as_array().unwrap().iter().map(|it| it.as_f64().unwrap()).collect::<Vec<_>>()
@@ -426,7 +427,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
             assert!((fixed - central).abs() < 0.01 && (fixed - central - difference).abs() < 1e-12, "{row}");
         }
     }
-    let mut single = place.command("skinbus", "torque skin.toml --json --cell vcan0:1 --force 10 --joints");
+    let mut single = place.command("skinbus", "explain skin.toml --json --cell vcan0:1 --force 10 --joints");
     single.arg("0 0.5");
     let out = single.output().unwrap();
     assert!(out.status.success());
@@ -451,7 +452,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
             "cells.csv: line 1: the first line must be the header cell,force_n,q, and it is \"link,",
         ),
     ] {
-        refused(&place, &format!("torque skin.toml {words}"), expected);
+        refused(&place, &format!("explain skin.toml {words}"), expected);
     }
     for (text, expected) in [
         ("cell,force_n,q\n", "there is no row in it"),
@@ -480,20 +481,20 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         ),
     ] {
         place.write("rows.csv", text);
-        refused(&place, "torque skin.toml --batch rows.csv", expected);
+        refused(&place, "explain skin.toml --batch rows.csv", expected);
     }
 
     // The ends of what is possible.
     place.write("rows.csv", "# ends\ncell,force_n,q\n1,0,-6.28 0.5\n1,95.9970703125,2 6.28\n");
-    run(&place, "torque skin.toml --batch rows.csv").well();
+    run(&place, "explain skin.toml --batch rows.csv").well();
     let endless = ARM.replacen("revolute", "continuous", 1).replacen("revolute", "prismatic", 1);
     place.write("arm.urdf", &endless.replace("\"0.5\" upper=\"1.5\"", "\"0\" upper=\"0.5\""));
-    run(&place, "skin import arm.urdf --tip bare -o skin.toml --force").well();
-    run(&place, "torque skin.toml --cell 1 --force 1 --joints -3.14159,0.5").well();
+    run(&place, "skin import arm.urdf --tip bare -o skin.toml --overwrite").well();
+    run(&place, "explain skin.toml --cell 1 --force 1 --joints -3.14159,0.5").well();
     for (joints, expected) in [
         ("-6.3,0", "position -6.3 rad: shoulder takes -6.2832 to 6.2832 rad"),
         ("0,0.6", "position 0.6 m: elbow takes 0.0000 to 0.5000 m"),
     ] {
-        refused(&place, &format!("torque skin.toml --cell 1 --force 1 --joints {joints}"), expected);
+        refused(&place, &format!("explain skin.toml --cell 1 --force 1 --joints {joints}"), expected);
     }
 }

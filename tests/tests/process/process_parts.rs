@@ -37,7 +37,7 @@ fn all_come_back(place: &Place, min: u64) {
     place.is_left_clean();
     let parts = parts(place);
     assert!(parts.len() >= 4, "{parts:?}");
-    let route = "--expect --spawn --max --quiet --cells-per-process 8";
+    let route = "--expect --spawn --speed max --quiet --cells-per-process 8";
     let mut equal = 0;
     for part in &parts {
         let (ended, replayed) = place.replayed(part, route);
@@ -141,7 +141,7 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     assert_eq!(all["source"], "run.mcap to run-3.mcap (4 parts)");
     let ended = place.start("skinbus", &format!("convert {parts} all.log --plain")).end().well();
     assert!(ended.stderr.contains(&format!("{one_by_one} frames")), "{ended:#?}");
-    place.start("skinbus", &format!("shadow {parts}")).end().well();
+    place.start("skinbus", &format!("fit {parts}")).end().well();
 
     // No packet of the part before counts as lost in this one.
     let summary = place.summary();
@@ -172,7 +172,7 @@ fn files_that_are_not_the_parts_of_one_recording_are_named() {
     let line = refused("run.mcap run-1.mcap run.log");
     assert_eq!(line, "skinbus: run.mcap is a part of a recording, and run.log is none: name the parts alone");
     let line = refused("run.mcap nothing.mcap");
-    assert!(line.starts_with("skinbus: there is no file nothing.mcap: "), "{line}");
+    assert!(line.starts_with("skinbus: there is no file nothing.mcap, and run.mcap is one: "), "{line}");
     fs::rename(place.path("run.mcap"), place.path("run-recovered.mcap")).unwrap();
     place.bench(0.1, "--record other.mcap").end().well();
     let line = refused("other.mcap run-1.mcap");
@@ -202,9 +202,9 @@ fn parts_of_a_killed_run_come_back_recovered_or_as_they_are() {
     let left: Vec<_> = left.collect();
     let last = left.iter().filter(|name| name.ends_with(".part")).max();
     let last = last.unwrap_or_else(|| panic!("{left:?}"));
-    let route = "--expect --spawn --max --quiet";
+    let route = "--expect --spawn --speed max --quiet";
     let whole = parts(&place).join(" ");
-    let (ended, replayed) = place.replayed(&format!("{whole} {last}"), "--expect --spawn --max");
+    let (ended, replayed) = place.replayed(&format!("{whole} {last}"), "--expect --spawn --speed max");
     let as_it_is = replayed.all_came_back(&ended);
     assert!(ended.stderr.contains("it has no end"), "{ended:#?}");
     place.start("skinbus", &format!("recover {last} -o z-recovered.mcap")).end().well();

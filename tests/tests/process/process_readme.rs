@@ -151,8 +151,8 @@ fn failing_and_unknown_commands_fail_here() {
     for commands in [
         vec![version],
         vec!["cargo build"],
-        vec![build, path, "skinbus skin check nothing.toml", version],
-        vec![build, path, "skinbus skin check nothing.toml & sleep 0", version],
+        vec![build, path, "skinbus check nothing.toml", version],
+        vec![build, path, "skinbus check nothing.toml & sleep 0", version],
         vec![build, path, "nothing.toml & sleep 0"],
         vec![build, path, "tests/nothing"],
         vec![build, path, "sudo vcan-setup status"],

@@ -153,7 +153,7 @@ fn two_buses_of_classic_frames_have_a_topic_each() {
         let log: Vec<_> = log.lines().filter(|line| line.split(' ').nth(1) == Some(bus)).collect();
         assert!(!log.is_empty() && log == lines, "{bus}");
     }
-    let described = place.start("skinbus", "dbc run.mcap --bus vcan1 --joined").end().well();
+    let described = place.start("skinbus", "skin dbc run.mcap --bus vcan1 --joined").end().well();
     assert_eq!(
         described.stdout,
         dbc::dbc(&Skin::parse("skin.toml", &skin_of(8, 2, Format::Classic)).unwrap(), 1)
@@ -216,7 +216,7 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     let said = refused("--record old.mcap");
     assert_eq!(
         said,
-        "skinbus: --record old.mcap: it exists: name another file, or overwrite it with --force"
+        "skinbus: --record old.mcap: it exists: name another file, or overwrite it with --overwrite"
     );
     place.write("late-1.mcap", "somebody's");
     assert!(refused("--record late.mcap").contains("late-1.mcap exists"));
@@ -224,7 +224,7 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
     let said = refused("--candump old.log");
     assert_eq!(
         said,
-        "skinbus: --candump old.log: it exists: name another file, or overwrite it with --force"
+        "skinbus: --candump old.log: it exists: name another file, or overwrite it with --overwrite"
     );
     assert_eq!(refused("--record run.log"), "skinbus: --record run.log: a recording's name ends in .mcap");
     fs::create_dir(place.path("dir.mcap")).unwrap();
@@ -238,7 +238,7 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
             .contains("--summary and --record name the same file")
     );
     // One that cannot begin for another reason leaves nothing.
-    assert!(refused("--record run.mcap --cell-node /nowhere").contains("/nowhere"));
+    assert!(refused("--record run.mcap SKINBUS_CELL_NODE=/nowhere").contains("/nowhere"));
     assert_eq!(
         place.files(),
         ["dir.mcap", "late-1.mcap", "old.log", "old.mcap", "scenario.toml", "skin.toml"]

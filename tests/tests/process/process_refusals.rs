@@ -7,7 +7,7 @@ use skinbus_tests::process;
 use std::os::unix::net::UnixDatagram;
 
 use process::{PRESSED, Place, skin};
-use protocol::bus::{BusKind, Choice};
+use protocol::bus::has_socketcan;
 
 /// The message of a refused command; checks that it leaves nothing.
 fn refusal(place: &Place, program: &str, words: &str, code: i32) -> String {
@@ -121,14 +121,14 @@ fn files_that_are_not_there_are_named() {
         ("run skin.toml --scenario nowhere.toml", "nowhere.toml: No such file or directory (os error 2)"),
         ("run .", ".: it is a folder, a file is needed"),
         (
-            "run skin.toml --cell-node /nowhere",
-            "cell-node is not at /nowhere: build it with `cargo build --release`, or name its path with \
-             --cell-node",
+            "run skin.toml SKINBUS_CELL_NODE=/nowhere",
+            "cell-node is not at /nowhere: build it with `cargo build --release`, or name its path in \
+             SKINBUS_CELL_NODE",
         ),
         (
-            "run skin.toml --vcan-setup /nowhere",
-            "vcan-setup is not at /nowhere: build it with `cargo build --release`, or name its path with \
-             --vcan-setup",
+            "run skin.toml SKINBUS_VCAN_SETUP=/nowhere",
+            "vcan-setup is not at /nowhere: build it with `cargo build --release`, or name its path in \
+             SKINBUS_VCAN_SETUP",
         ),
     ] {
         let said = refusal(&place, "skinbus", &format!("{words} --bus-kind embedded --candump run.log"), 2);
@@ -142,12 +142,20 @@ fn files_that_are_not_there_are_named() {
 fn a_file_that_is_no_program_is_named() {
     let place = Place::new();
     place.pressed();
-    let said =
-        refusal(&place, "skinbus", "run skin.toml --cell-node skin.toml --bus-kind embedded --quiet", 2);
+    let said = refusal(
+        &place,
+        "skinbus",
+        "run skin.toml SKINBUS_CELL_NODE=skin.toml --bus-kind embedded --quiet",
+        2,
+    );
     assert_eq!(said, "skinbus: ./skin.toml does not start: Permission denied (os error 13)");
     // One that starts and is no cell.
-    let said =
-        refusal(&place, "skinbus", "run skin.toml --cell-node /bin/true --bus-kind embedded --quiet", 1);
+    let said = refusal(
+        &place,
+        "skinbus",
+        "run skin.toml SKINBUS_CELL_NODE=/bin/true --bus-kind embedded --quiet",
+        1,
+    );
     assert!(
         said.ends_with(" on vcan0 ended while starting (exit status: 0); see the message above"),
         "{said}"
@@ -184,8 +192,8 @@ fn a_run_that_fails_to_start_leaves_old_recordings_and_has_a_summary() {
     place.pressed();
     place.write("run.log", "of yesterday\n");
     place.write("run.json", "{}\n");
-    let run = "run skin.toml --bus-kind embedded --candump run.log --summary run.json --cell-node /bin/true \
-               --quiet --force --record run.mcap";
+    let run = "run skin.toml --bus-kind embedded --candump run.log --summary run.json SKINBUS_CELL_NODE=/bin/true \
+               --quiet --overwrite --record run.mcap";
     place.write("run.mcap", "of yesterday\n");
     refusal(&place, "skinbus", run, 1);
     assert_eq!(place.read("run.mcap"), "of yesterday\n");
@@ -197,11 +205,11 @@ fn a_run_that_fails_to_start_leaves_old_recordings_and_has_a_summary() {
 fn a_bus_that_does_not_exist_is_named_with_its_hint() {
     let place = Place::new();
     place.write("skin.toml", &skin(3).replace("\"vcan0\"", "\"nosuch0\""));
-    let expected = match Choice::Auto.resolve() {
-        BusKind::SocketCan => {
+    let expected = match has_socketcan() {
+        true => {
             "there is no interface nosuch0: make it with `vcan-setup up nosuch0`, or plug it in if it is hardware"
         }
-        BusKind::Embedded => {
+        false => {
             "nosuch0: this kernel has no SocketCAN; load it with `modprobe can_raw`, or use the embedded bus \
              (--bus-kind embedded)"
         }

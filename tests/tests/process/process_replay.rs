@@ -23,16 +23,18 @@ fn a_run_comes_back_bit_for_bit_at_its_own_times_in_lockstep_and_as_fast_as_it_c
     let place = Place::new();
     place.records(8);
     let mut counts = Vec::new();
-    for route in ["", "--spin 0", "--lockstep --speed 4", "--max", "--max --cells-per-process 8", "--max"] {
+    for route in
+        ["", "--lockstep --speed 4", "--speed max", "--speed max --cells-per-process 8", "--speed max"]
+    {
         let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
         place.is_left_clean();
-        let count = if route.contains("--max") || route.contains("--lockstep") {
+        let count = if route.contains("--speed max") || route.contains("--lockstep") {
             replayed.all_came_back(&ended)
         } else {
             replayed.all_came_back_in_time(&ended)
         };
         counts.push(count);
-        let timed = !route.contains("--max") && !route.contains("--lockstep");
+        let timed = !route.contains("--speed max") && !route.contains("--lockstep");
         assert_eq!(!replayed.0["late_us"].is_null(), timed);
         assert_eq!(ended.stdout.contains("lateness"), timed, "{}", ended.stdout);
         assert_eq!(replayed.number("/refused") + replayed.number("/lost"), 0);
@@ -68,7 +70,7 @@ fn a_recording_brings_its_own_skin() {
         let skin = if file == "run.log" { " --skin again.toml" } else { "" };
         place.skin(5);
         fs::rename(place.path("skin.toml"), place.path("again.toml")).unwrap();
-        let (ended, replayed) = place.replayed(file, &format!("--expect --spawn --max{skin}"));
+        let (ended, replayed) = place.replayed(file, &format!("--expect --spawn --speed max{skin}"));
         counts.push((replayed.all_came_back(&ended), replayed.number("/sent")));
         place.is_left_clean();
     }
@@ -82,9 +84,9 @@ fn the_second_file_of_a_recording_begins_with_what_was_latched() {
     place.skin(5);
     place.scenario(process::PRESSED);
     place.bench(2.5, "--record run.mcap --record-split 1s").end().well();
-    let (ended, first) = place.replayed("run.mcap", &format!("{FRESH} --max"));
+    let (ended, first) = place.replayed("run.mcap", &format!("{FRESH} --speed max"));
     let first = first.all_came_back(&ended);
-    let (ended, second) = place.replayed("run-1.mcap", &format!("{FRESH} --max"));
+    let (ended, second) = place.replayed("run-1.mcap", &format!("{FRESH} --speed max"));
     // It was pressed in the first file, and is in contact in the second.
     let second = second.all_came_back(&ended);
     assert!(first > 30 && second > 30, "{first} and {second}");
@@ -97,7 +99,7 @@ fn two_buses_of_classic_frames_come_back_too() {
     place.write("skin.toml", &skin_of(9, 2, Format::Classic));
     place.scenario(process::PRESSED);
     place.bench(2.0, "").end().well();
-    for route in ["--max", "--lockstep --from 1"] {
+    for route in ["--speed max", "--lockstep --from 1"] {
         let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
         assert!(replayed.all_came_back(&ended) > 100, "{:#}", replayed.0);
         assert_eq!(replayed.0["buses"].as_array().unwrap().len(), 2);
@@ -110,18 +112,19 @@ fn two_buses_of_classic_frames_come_back_too() {
 fn from_the_middle_on_the_torques_are_the_same() {
     let place = Place::new();
     place.records(8);
-    let (ended, all) = place.replayed("run.log", &format!("{FRESH} --max"));
+    let (ended, all) = place.replayed("run.log", &format!("{FRESH} --speed max"));
     let all = all.all_came_back(&ended);
     let mut before = all;
     // The second one begins while the cells are halted, the last one after cell 4 was configured again.
     for from in ["1.1", "2.1", "2.6", "3.2"] {
-        let (ended, part) = place.replayed("run.log", &format!("{FRESH} --max --from {from}"));
+        let (ended, part) = place.replayed("run.log", &format!("{FRESH} --speed max --from {from}"));
         let count = part.all_came_back(&ended);
         assert!(count > 0 && count < before, "{count} of {before} from {from} on");
         before = count;
     }
-    let (ended, thrice) = place.replayed("run.log", &format!("{FRESH} --max --from 2.6 --to 3.1 --loop 3"));
-    let (again, once) = place.replayed("run.log", &format!("{FRESH} --max --from 2.6 --to 3.1"));
+    let (ended, thrice) =
+        place.replayed("run.log", &format!("{FRESH} --speed max --from 2.6 --to 3.1 --loop 3"));
+    let (again, once) = place.replayed("run.log", &format!("{FRESH} --speed max --from 2.6 --to 3.1"));
     assert_eq!(thrice.all_came_back(&ended), 3 * once.all_came_back(&again));
     place.is_left_clean();
 }
@@ -146,11 +149,11 @@ fn cells_with_another_history_answer_as_they_did_then() {
         test_client.sends(&Message::Halt);
         // The configuration was changed in the middle of the run, and a restart from there has it again.
         let part = if round == 0 { "--to 1.2" } else { "--from 2" };
-        let (ended, replayed) = place.replayed("run.log", &format!("--expect --max {part}"));
+        let (ended, replayed) = place.replayed("run.log", &format!("--expect --speed max {part}"));
         assert!(replayed.all_came_back(&ended) > 50, "{:#}", replayed.0);
     }
     // Now cell 4 has another configuration than at the beginning.
-    let ended = place.replay("run.log", "--expect --max --quiet").end();
+    let ended = place.replay("run.log", "--expect --speed max --quiet").end();
     let line = ended.refusal(1);
     assert!(line.contains("cells have another configuration than in the recording: 4 (recorded "), "{line}");
 }
@@ -201,7 +204,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     let log = place.read("run.log");
     let wrong = changed(&log, 30, |message| is_torque(message, 2), |words| words[1] += 3);
     place.write("wrong.log", &wrong);
-    let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --max"));
+    let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --speed max"));
     place.is_left_clean();
     assert_eq!((ended.code(), &replayed.replies()[1..]), (Some(1), &[1, 0, 0][..]), "{:#}", replayed.0);
     assert!(
@@ -217,7 +220,8 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
 
     // Within a tolerance it is equal, and counted.
     for (steps, code, replies) in [("2", 1, [1, 0]), ("3", 0, [0, 1])] {
-        let (ended, replayed) = place.replayed("wrong.log", &format!("{FRESH} --max --tolerance {steps}"));
+        let (ended, replayed) =
+            place.replayed("wrong.log", &format!("{FRESH} --speed max --tolerance {steps}"));
         let [equal, different, missing, extra] = replayed.replies();
         let tolerated = replayed.number("/expect/tolerated");
         assert_eq!((ended.code(), missing, extra), (Some(code), 0, 0), "{:#}", replayed.0);
@@ -243,14 +247,14 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
         it && beats.replace(beats.get() + 1) >= 8
     };
     place.write("gone.log", &without(&gone, |message| silent(message) || heartbeat(message)));
-    let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --max"));
+    let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --speed max"));
     let [_, different, missing, extra] = replayed.replies();
     // Without counters a reply that a busy machine kept from the recording is extra, too.
     assert!(ended.code() == Some(1) && (different, missing) == (0, 0) && extra >= 1, "{:#}", replayed.0);
     assert_eq!(replayed.text("/expect/first/how"), "extra");
     // With them it is known that it is the recording's fault.
     place.write("gone.log", &gone);
-    let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --max"));
+    let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --speed max"));
     replayed.all_came_back(&ended);
     // A busy machine during the recording is another reason, and the two cannot be distinguished.
     let lacking = ["unrecorded", "untaken"].map(|why| replayed.number(&format!("/expect/lacking/{why}")));
@@ -329,7 +333,7 @@ fn a_foreign_capture_goes_to_another_bus_as_it_is() {
     place.write("foreign.log", log);
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");
-    let dump = place.start("skinbus", "dump vcan0 --bus-kind embedded --max 4");
+    let dump = place.start("skinbus", "dump vcan0 --bus-kind embedded -n 4");
     dump.hears("vcan0 is embedded");
     let (ended, replayed) = place.replayed("foreign.log", "--map can7=vcan0 --map can8=vcan0");
     ended.well();
@@ -364,7 +368,7 @@ fn a_cell_that_measures_obeys_for_the_replay_with_test_mode() {
     let said = "skinbus: cells measure and do not obey stimuli, as they did in the recording: 3; --test-mode lets them \
                 obey while the replay lasts";
     assert_eq!(ended.refusal(1), said);
-    let (ended, replayed) = place.replayed("run.log", "--expect --max --to 1 --test-mode");
+    let (ended, replayed) = place.replayed("run.log", "--expect --speed max --to 1 --test-mode");
     assert!(replayed.all_came_back(&ended) > 50);
     test_client.sends(&mode(2, Request::Read { number }));
     test_client.waits_for("a cell that measures again", answers(2, 0));
@@ -379,7 +383,7 @@ fn two_hundred_and_fifty_three_fresh_cells_answer_as_the_others_did_twice() {
     place.bench(4.0, "").end().well();
     place.is_left_clean();
     let mut counts = Vec::new();
-    for route in ["--lockstep", "--max"] {
+    for route in ["--lockstep", "--speed max"] {
         let replay = place.replay("run.log", &format!("{FRESH} {route}"));
         let ended = replay.end_after(Duration::from_secs(120));
         let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());

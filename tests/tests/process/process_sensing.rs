@@ -38,11 +38,19 @@ fn ends(bench: Running) {
 
 /// What a command in this place prints, when it does what it should.
 fn switches(place: &Place, words: &str) -> String {
-    place.start("skinbus", &format!("sensing vcan0 {words} --bus-kind embedded")).end().well().stdout
+    place
+        .start("skinbus", &format!("frame sensing {words} --bus vcan0 --bus-kind embedded"))
+        .end()
+        .well()
+        .stdout
 }
 
 fn refusal(place: &Place, words: &str, code: i32) -> String {
-    place.start("skinbus", &format!("sensing {words} --bus-kind embedded")).end().refusal(code).to_owned()
+    place
+        .start("skinbus", &format!("frame sensing {words} --bus vcan0 --bus-kind embedded"))
+        .end()
+        .refusal(code)
+        .to_owned()
 }
 
 #[test]
@@ -77,7 +85,7 @@ fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
                 if from.get() == cell && contact(skin) > 0)
         });
     };
-    assert_eq!(switches(&place, "event --node 3"), "cell 3 on vcan0 (embedded): event\n");
+    assert_eq!(switches(&place, "event --cell 3"), "cell 3 on vcan0 (embedded): event\n");
     tells(3);
     let all = "8 cells on vcan0 (embedded): continuous, every 20 ms\n";
     assert_eq!(switches(&place, "continuous 50"), all);
@@ -85,7 +93,7 @@ fn a_running_bench_is_switched_from_a_shell_for_one_cell_and_for_all() {
     assert_eq!(switches(&place, "off"), "8 cells on vcan0 (embedded): off\n");
 
     let why = "skinbus: no cell 99 answers on vcan0: start it, or name the bus' format with --format classic";
-    assert_eq!(refusal(&place, "vcan0 event --node 99", 1), why);
+    assert_eq!(refusal(&place, "event --cell 99", 1), why);
     ends(bench);
     place.is_left_clean();
     let summary = place.summary();
@@ -182,18 +190,15 @@ fn accelerometers_of_a_robot_at_rest_show_gravity_in_the_frames_of_their_cells()
 fn an_invalid_request_is_refused_in_one_line() {
     let place = Place::new();
     assert_eq!(
-        refusal(&place, "vcan0 continuous", 2),
+        refusal(&place, "continuous", 2),
         "skinbus: continuous needs a rate, such as `continuous 62.5`"
     );
+    assert_eq!(refusal(&place, "event 10", 2), "skinbus: HZ = 10: only continuous has a rate; leave it out");
     assert_eq!(
-        refusal(&place, "vcan0 event 10", 2),
-        "skinbus: HZ = 10: only continuous has a rate; leave it out"
-    );
-    assert_eq!(
-        refusal(&place, "vcan0 continuous 60", 2),
+        refusal(&place, "continuous 60", 2),
         "skinbus: HZ = 60: its period must be a whole number of ms; the nearest are 58.8235 and 62.5000 Hz"
     );
-    let nowhere = refusal(&place, "vcan0 event", 2);
+    let nowhere = refusal(&place, "event", 2);
     assert!(nowhere.starts_with("skinbus: ") && nowhere.contains("vcan0"), "{nowhere}");
 }
 
@@ -249,6 +254,15 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     drop((cells, server, test_client));
 }
 
+/// Ends threads that pass frames on, also when the test fails.
+struct Stops<'a>(&'a AtomicBool);
+
+impl Drop for Stops<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+}
+
 /// Passes frames on until it is stopped, as `change` makes them.
 fn pass_on(from: &Bus, to: &Bus, stop: &AtomicBool, mut change: impl FnMut(&Frame) -> Frame) {
     let mut inbox = Inbox::new();
@@ -279,6 +293,7 @@ fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_t
     });
     let stop = AtomicBool::new(false);
     std::thread::scope(|scope| {
+        let stops = Stops(&stop);
         scope.spawn(|| pass_on(&bench, &far, &stop, |frame| *frame));
         scope.spawn(|| {
             let mut first = None;
@@ -292,7 +307,7 @@ fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_t
         });
         place.test_client().waits_for_settled_cells(8);
         let ended = place.bench(6.0, "--no-spawn --record run.mcap").end().well();
-        stop.store(true, Ordering::Relaxed);
+        drop(stops);
         assert!(ended.stdout.contains("stuck: cell 5"), "{}", ended.stdout);
     });
     drop((cells, servers));

@@ -205,10 +205,11 @@ fn a_page_at_an_address_that_is_taken_is_refused_before_the_run() {
     place.skin(4);
     let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
     let address = taken.local_addr().unwrap();
-    let words = format!("run skin.toml --bus-kind embedded --duration 1 --candump run.log --view={address}");
+    let words =
+        format!("run skin.toml --bus-kind embedded --duration 1 --candump run.log --view --listen {address}");
     let refused = place.start("skinbus", &words).end();
     let said = refused.refusal(2);
-    assert!(said.starts_with(&format!("skinbus: --view={address}: Address already in use")), "{said}");
+    assert!(said.starts_with(&format!("skinbus: --listen {address}: Address already in use")), "{said}");
     assert_eq!(place.files(), ["skin.toml"], "nothing was done");
 }
 

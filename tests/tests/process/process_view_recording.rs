@@ -185,21 +185,3 @@ fn pages_play_and_nothing_they_send_ends_it() {
     page.say(r#"{"do":"seek","at_s":0.25}"#);
     page.hears("the last position", |said| said["playback"]["at_s"] == 0.25);
 }
-
-#[test]
-fn a_replay_has_a_page_which_ends_with_it() {
-    let place = Place::new();
-    let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings");
-    std::fs::copy(from.join("fd.mcap"), place.path("fd.mcap")).unwrap();
-    let replay = place.replay("fd.mcap", "--spawn --lockstep --loop 0 --view");
-    let mut page = Page::new(&address(&replay));
-    assert_eq!(page.scene["may_press"], false);
-    page.sees("a cell that answers", |snapshot| snapshot.cells.iter().any(|(status, ..)| *status == 2));
-    page.sees("a torque", |snapshot| snapshot.joints.iter().any(|joint| joint[1] != 0.0));
-    assert_eq!(page.hears("words", |_| true)["playback"], Value::Null);
-    replay.signal(rustix::process::Signal::INT);
-    replay.end();
-    place.is_left_clean();
-    let ended = place.start("skinbus", "replay fd.mcap --view --map vcan0=vcan1").end();
-    assert!(ended.refusal(2).contains("cannot be used with"), "{ended:?}");
-}

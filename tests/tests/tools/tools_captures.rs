@@ -220,7 +220,7 @@ fn tshark_reads_our_log() {
 fn cantools_decodes_our_log_by_our_dbc() {
     let place = Place::new();
     fs::write(place.path("skin.toml"), place.gateway("skin generate --cells 12")).unwrap();
-    fs::write(place.path("skin.dbc"), place.gateway("dbc skin.toml")).unwrap();
+    fs::write(place.path("skin.dbc"), place.gateway("skin dbc skin.toml")).unwrap();
     let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join("../protocol/tests/golden/document.log");
     fs::copy(golden, place.path("golden.log")).unwrap();
     place.gateway("convert golden.log run.mcap");

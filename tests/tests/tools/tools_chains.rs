@@ -63,7 +63,8 @@ fn import(place: &Place, rows: &[Vec<&str>], torque_format: &str) -> PathBuf {
     }
     place.write("cells.csv", &cells);
     let urdf = robots().join(rows[0][1]);
-    let words = format!("skin import {} --tip {} --cells cells.csv -o skin.toml", urdf.display(), rows[0][3]);
+    let words =
+        format!("skin import {} --tip {} --places cells.csv -o skin.toml", urdf.display(), rows[0][3]);
     place.start("skinbus", &words).end().well();
     let name = "name = \"vcan0\"\n";
     let skin = place.read("skin.toml");
@@ -82,7 +83,7 @@ fn check_calculator(robot: &str) {
         writeln!(batch, "{node},{},{}", row[11], row[13]).unwrap();
     }
     place.write("rows.csv", &batch);
-    let said = place.start("skinbus", "torque skin.toml --batch rows.csv --json").end().well().stdout;
+    let said = place.start("skinbus", "explain skin.toml --batch rows.csv --json").end().well().stdout;
     let answers: Vec<Value> = said.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     assert_eq!(answers.len(), rows.len());
     let (mut central_off, mut fixed_off) = (0.0_f64, Vec::new());

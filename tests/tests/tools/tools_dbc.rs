@@ -1,4 +1,4 @@
-//! `skinbus dbc` beside cantools, which decodes and encodes the golden frames by it.
+//! `skinbus skin dbc` beside cantools, which decodes and encodes the golden frames by it.
 //!
 //! `tests/tools/install` makes the tools ready; `tests/run` does that, and then runs this.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]

@@ -64,7 +64,7 @@ fn goes_on_when_reported(place: &Place, bench: &Running, cells: &[(Pid, String)]
         matches!(message, Message::Network { from: Node::Cell(_), page: NetworkPage::Heartbeat(heartbeat), .. }
             if heartbeat.state.has(State::HALTED))
     });
-    place.start("skinbus", "ack vcan0 --bus-kind socketcan").end().well();
+    place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end().well();
     bench.hears("the robot goes on");
     all_answer(place);
     assert_eq!(bench.cells(), cells, "no cell was restarted");
@@ -111,12 +111,12 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
     let cells = bench.cells();
     vcan0.down();
     bench.hears(DOWN);
-    let hint = "`skinbus ack vcan0 --bus-kind socketcan` resumes it";
+    let hint = "`skinbus frame resume --bus vcan0 --bus-kind socketcan` resumes it";
     bench.hears(&format!("the robot is halted: too many bad cycles in a row: {INVALID}; {hint}"));
     for cell in 1..=6 {
         bench.tells(cell, "fallen silent");
     }
-    let refused = place.start("skinbus", "ack vcan0 --bus-kind socketcan").end();
+    let refused = place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end();
     let said = refused.refusal(2);
     assert!(said.starts_with(&format!("skinbus: there is no file vcan0, and as a bus: {DOWN}")), "{said}");
     vcan0.up();
@@ -165,7 +165,7 @@ fn cells_alone_outlive_a_bus_that_goes_down() {
         vcan0.up();
         place.test_client().waits_for_settled_cells(CELLS);
         let test_client = place.test_client();
-        cansend(&place, "stimulus --node 2 --force 3");
+        cansend(&place, "stimulus --cell 2 --force 3");
         cansend(&place, &format!("joints --epoch {epoch} --rad 0 -1.2 1.0 -1.4 -1.57 0"));
         test_client.waits_for("a torque", torque_of(2));
     }
@@ -312,7 +312,7 @@ fn a_second_gateway_is_refused_and_the_first_is_undisturbed() {
     let place = prepare();
     let bench = place.running_bench(60.0, "");
     all_answer(&place);
-    let second = "run skin.toml --scenario scenario.toml --duration 1 --summary second.json --candump second.log --force --quiet";
+    let second = "run skin.toml --scenario scenario.toml --duration 1 --summary second.json --candump second.log --overwrite --quiet";
     for more in ["", " --no-spawn"] {
         let ended = place.start("skinbus", &format!("{second}{more}")).end();
         let said = "skinbus: another gateway is on vcan0: stop one of the two, or give this one another bus";
@@ -344,7 +344,7 @@ fn of_two_gateways_that_start_at_the_same_time_at_most_one_goes_on() {
         });
         let run = |name: &str| {
             let words = format!(
-                "run skin.toml --scenario scenario.toml --duration 2 --quiet --summary {name}.json --force {more}"
+                "run skin.toml --scenario scenario.toml --duration 2 --quiet --summary {name}.json --overwrite {more}"
             );
             place.start("skinbus", &words)
         };

@@ -185,7 +185,7 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     place.scenario(PRESSED);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     let backlog = backlog_drops();
-    let bench = place.running_bench(4.0, &format!("--record run.mcap --receive-buffer {SMALL}"));
+    let bench = place.running_bench(4.0, &format!("--record run.mcap SKINBUS_RECEIVE_BUFFER={SMALL}"));
     place.test_client().waits_for_epoch(10);
     bench.signal(Signal::STOP);
     until("a gateway that is stopped", || is_stopped(bench.pid()).then_some(()));

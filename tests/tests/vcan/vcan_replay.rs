@@ -33,7 +33,7 @@ fn a_run_on_vcan_comes_back_bit_for_bit() {
     says_everything(&place.test_client(), &place.path("skin.toml"));
     bench.end().well();
     let mut counts = Vec::new();
-    for route in ["--lockstep", "--max", "--max", ""] {
+    for route in ["--lockstep", "--speed max", "--speed max", ""] {
         let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
         eprintln!("{}", ended.stdout);
         counts.push(match route {
@@ -54,7 +54,7 @@ fn two_hundred_and_fifty_three_fresh_cells_on_vcan_answer_as_the_others_did_twic
     place.bench(4.0, "--cells-per-process 16").end_after(Duration::from_secs(60)).well();
     let mut counts = Vec::new();
     for _ in 0..2 {
-        let replay = place.replay("run.log", &format!("{FRESH} --max --cells-per-process 16"));
+        let replay = place.replay("run.log", &format!("{FRESH} --speed max --cells-per-process 16"));
         let ended = replay.end_after(Duration::from_secs(120));
         eprintln!("{}{}", ended.stdout, ended.stderr);
         let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
@@ -97,7 +97,7 @@ fn a_transmit_queue_without_room_refuses_and_is_waited_for() {
     place.write("some.log", "(1.000000) vcan0 123#00\n(1.001000) vcan0 123#01\n(3.000000) vcan0 123#02\n");
     let vcan0 = Vcan0;
     vcan0.fill();
-    let replay = place.replay("some.log", "--send-timeout 50");
+    let replay = place.replay("some.log", "SKINBUS_SEND_TIMEOUT_MS=50");
     // Until the second frame has timed out, which the third one reports.
     replay.hears("vcan0 is socketcan");
     std::thread::sleep(Duration::from_millis(1_000));

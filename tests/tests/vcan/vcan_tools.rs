@@ -81,13 +81,13 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
     place.scenario(ALONE);
     let bench = place.running_bench(60.0, "");
     let test_client = place.test_client();
-    cansend(&place, "stimulus --node 2 --force 3");
+    cansend(&place, "stimulus --cell 2 --force 3");
     let (answers, pressed) = (Cell::new(0), torque_of(2, true));
     test_client.waits_for("twenty torques of cell 2", |message| {
         answers.set(answers.get() + u32::from(pressed(message)));
         answers.get() == 20
     });
-    cansend(&place, "stimulus --node 2");
+    cansend(&place, "stimulus --cell 2");
     test_client.waits_for("the end of the contact", torque_of(2, false));
     let joints = Cell::new(0);
     test_client.waits_for("joints after that", |message| {
@@ -144,7 +144,7 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
     test_client.waits_for("a torque", torque_of(1, true));
     cansend(&place, "halt");
     bench.hears(
-        "the robot is halted: somebody sent a halt frame; `skinbus ack vcan0 --bus-kind socketcan` resumes it",
+        "the robot is halted: somebody sent a halt frame; `skinbus frame resume --bus vcan0 --bus-kind socketcan` resumes it",
     );
     let test_client = place.test_client();
     let joints = Cell::new(0);
@@ -152,7 +152,7 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
         joints.set(joints.get() + u32::from(matches!(message, Message::Joints { .. })));
         joints.get() == 10
     });
-    place.start("skinbus", "ack vcan0 --bus-kind socketcan").end().well();
+    place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end().well();
     bench.hears("the robot goes on");
     let test_client = place.test_client();
     for cell in 1..=4 {

@@ -3,7 +3,7 @@
 use std::ffi::OsString;
 
 use clap::Args;
-use protocol::bus::{BusKind, Choice};
+use protocol::bus::{BusKind, Choice, has_socketcan};
 use protocol::usage::{Failure, print};
 use serde::Serialize;
 use vcan_setup::doctor::{Bus, Facts, Finding, Level, assess, would_run};
@@ -26,7 +26,7 @@ pub(crate) struct Doctor {
     /// Names of buses, or skins: what ends in .toml or holds a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
     #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
     bus_kind: Choice,
     /// The cells are on the bus already, or are real: as with `skinbus run --no-spawn`
@@ -40,11 +40,12 @@ pub(crate) struct Doctor {
 impl Doctor {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let mut buses = named(&self.what, Bus::of_skin, Bus::named)?;
-        let present = match (query(), self.bus_kind.resolve()) {
+        let present = match (query(), self.bus_kind) {
             (Ok((_, present)), _) => present,
             // Which needs none of them.
-            (Err(_), BusKind::Embedded) => Vec::new(),
-            (Err(failure), BusKind::SocketCan) => return Err(failure),
+            (Err(_), Choice::Only(BusKind::Embedded)) => Vec::new(),
+            (Err(_), Choice::Auto) if !has_socketcan() => Vec::new(),
+            (Err(failure), _) => return Err(failure),
         };
         for Bus { target, .. } in buses.iter_mut().filter(|bus| bus.cells.is_none()) {
             target.take_format_of_hardware(&present);

@@ -38,7 +38,7 @@ pub(crate) struct Link {
     /// This host's name among the others; else the machine's
     #[arg(long, value_name = "NAME")]
     host: Option<String>,
-    /// socketcan or embedded; else SocketCAN where the kernel has CAN, the embedded bus where not
+    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
     #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
     bus_kind: Choice,
     /// Print what has become of the frames as JSON

@@ -1,5 +1,6 @@
 //! What is wrong with interfaces, and how to fix it.
 
+use protocol::bus::Choice;
 use protocol::can::Format;
 
 use super::{Bus, Facts, Finding, User, would_run};
@@ -60,9 +61,35 @@ impl Facts {
         })
     }
 
+    /// What a bus without an interface comes to where either kind of bus would do.
+    pub(super) fn absent(&self, bus: &Bus) -> Option<Finding> {
+        if self.choice != Choice::Auto || !self.kernel.has_can {
+            return None;
+        }
+        let (name, up) = (&bus.target.name, self.up(&bus.target));
+        let is_served = !matches!(bus.heard, Ok(None));
+        Some(match (self.no_spawn, is_served) {
+            (false, _) => Finding::note(format!(
+                "there is no interface {name}: a run that starts its cells makes an embedded bus; for SocketCAN:"
+            ))
+            .hint(up),
+            (true, true) => Finding::ok(format!("there is no interface {name}, and an embedded bus is served")),
+            (true, false) => Finding::fault(format!(
+                "there is no interface {name}, and no embedded bus of this name is served"
+            ))
+            .hint(up)
+            .hint(format!("{} serve {name} &", self.program)),
+        })
+    }
+
     pub(super) fn interface(&self, bus: &Bus) -> Vec<Finding> {
         let name = &bus.target.name;
         let Some(interface) = &bus.interface else {
+            if let Some(finding) = self.absent(bus) {
+                let mut findings = vec![finding];
+                findings.extend(self.traffic(bus, "the embedded bus"));
+                return findings;
+            }
             let (text, up) = (format!("there is no interface {name}"), self.up(&bus.target));
             return vec![if bus.target.hardware().is_some() {
                 Finding::fault(text + ", and the skin gives it a bitrate, so it is hardware")

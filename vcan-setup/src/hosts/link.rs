@@ -103,7 +103,7 @@ impl Link {
     pub fn open(settings: Settings) -> Result<Self, LinkError> {
         let own = key(FRAMES, &settings.bus, &settings.host)?;
         let config = config(&settings)?;
-        let kind = settings.choice.resolve();
+        let kind = settings.choice.resolve(&settings.bus);
         let listener = listen(&settings.bus, kind, settings.directory.as_deref()).map_err(|error| {
             if error.kind() == io::ErrorKind::AddrInUse {
                 LinkError::Twice(settings.bus.clone())

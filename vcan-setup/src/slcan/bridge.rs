@@ -72,7 +72,7 @@ impl Bridge {
     /// # Errors
     /// When the bus or a line cannot be opened.
     pub fn open(settings: Settings, lines: Vec<LineOptions>) -> Result<Self, BridgeError> {
-        let kind = settings.choice.resolve();
+        let kind = settings.choice.resolve(&settings.bus);
         let mut participants: Vec<Participant> = Vec::new();
         for line in lines {
             let name = line.address.to_string();

@@ -55,7 +55,6 @@ use crate::run::realtime::idle_lateness;
 use crate::setup::names;
 use crate::signals::caught;
 use model::decode::BUSES;
-use model::decode::pick::Pick;
 use trace::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
 
 /// The period of wake-ups for which lateness is measured, in ns.
@@ -70,8 +69,6 @@ pub struct Spawn {
     pub skin: Option<PathBuf>,
     /// At most so many in a process.
     pub cells_per_process: usize,
-    /// Their program, when it is not beside this one.
-    pub cell_node: Option<PathBuf>,
 }
 
 /// What a replay needs to know.
@@ -83,8 +80,6 @@ pub struct Options {
     pub kinds: Kinds,
     /// Whose frames are sent.
     pub only: Only,
-    /// Which kinds, to and from whom; its times are not looked at.
-    pub pick: Pick,
     /// The capture's buses whose frames are sent; all when empty.
     pub buses: Vec<String>,
     /// Which bus of the capture goes to which one now.
@@ -103,16 +98,12 @@ pub struct Options {
     pub expect: Option<u16>,
     /// Cells to start.
     pub spawn: Option<Spawn>,
-    /// The embedded bus' program, when it is not beside this one.
-    pub vcan_setup: Option<PathBuf>,
     /// Whether cells that measure are put into test mode.
     pub test_mode: bool,
     /// How long a full bus is waited for.
     pub timeout: Duration,
     /// Bytes that may wait in the socket of a bus, as the kernel counts them.
     pub receive_buffer: usize,
-    /// Whether a line that cannot be read ends it before it begins.
-    pub strict: bool,
     /// Whether progress is hidden.
     pub quiet: bool,
 }
@@ -186,9 +177,6 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
                 NoteKind::Dropped(frames) => survey.dropped = survey.dropped.saturating_add(frames),
                 NoteKind::Unreadable(why) => {
                     let line = format!("{name}:{}: {why}", note.line);
-                    if options.strict {
-                        return Err(ReplayError::Line(line));
-                    }
                     unreadable += 1;
                     if unreadable <= NAMED_LINES {
                         progress.note(&line);

@@ -18,7 +18,6 @@ use protocol::time::Micros;
 use super::comparator::Comparator;
 use super::survey::{Survey, is_input, is_joints};
 use model::decode::Decoded;
-use model::decode::pick::Pick;
 use model::decode::settle::Settler;
 use trace::order::{Order, Ordered};
 
@@ -44,8 +43,6 @@ pub enum Only {
 pub struct Selection {
     /// The filter by sender.
     pub only: Only,
-    /// Which kinds, to and from whom. Times are the survey's.
-    pub pick: Pick,
     /// By the capture's buses: where a bus' frames go, if they go anywhere.
     pub bus_links: Vec<Option<usize>>,
     /// Whether packets are read: joints are numbered, and replies handed on.
@@ -262,7 +259,7 @@ impl<'a> ReplayPlan<'a> {
 
     /// Why a frame of the part is not sent.
     fn unwanted(&self, bus: usize, frame: &Frame, decoded: &Decoded) -> Option<&'static str> {
-        let picked = self.bus_link(bus).is_some() && self.selection.pick.takes(0, 0, frame, decoded);
+        let picked = self.bus_link(bus).is_some();
         if frame.is_error() {
             return Some(reason::ERROR);
         }

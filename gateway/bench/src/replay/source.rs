@@ -27,7 +27,7 @@ pub(super) fn read(
 ) -> Result<PlanSummary, CaptureError> {
     let Checks { options, survey, routes, .. } = &shared_state.checks;
     let (bus_links, hears) = (routes.bus_links.clone(), options.hears());
-    let selection = Selection { only: options.only, pick: options.pick.clone(), bus_links, reads: hears };
+    let selection = Selection { only: options.only, bus_links, reads: hears };
     let mut source = Source { shared_state, replay_plan: ReplayPlan::new(survey, &selection), queue };
     let mut pass = 0_u32;
     while options.passes.is_none_or(|passes| pass < passes) && !source.is_over() {

@@ -18,7 +18,7 @@ use super::{Options, ReplayError, Spawn};
 use crate::listen::{self, Listener};
 use crate::run::launch::{LISTEN, Plan, Processes, in_memory, program};
 use crate::run::roots::{ReceiveFilter, Roots};
-use crate::run::served::{ServedBus, open_or_serve};
+use crate::run::served::{Absent, ServedBus, open_or_serve};
 use crate::setup::names;
 use model::decode::Decoded;
 use trace::capture::{Extras, SKIN};
@@ -187,9 +187,7 @@ pub(super) fn open(
             ..BusOptions::default()
         };
         let (bus, of_ours) = match skin_override {
-            Some(_) => {
-                open_or_serve(name, options.kinds.of(name), &bus_options, options.vcan_setup.as_deref())?
-            }
+            Some(_) => open_or_serve(name, options.kinds.of(name), &bus_options, Absent::Made)?,
             None => (Bus::open(name, options.kinds.of(name), &bus_options)?, None),
         };
         // On a real bus the wires are real.
@@ -254,7 +252,7 @@ impl Buses {
         self.processes = Processes::new()?;
         self.processes.start(&Plan {
             directory: None,
-            program: &program("cell-node", spawn.cell_node.as_deref())?,
+            program: &program("cell-node")?,
             skin_file: &skin_override.file,
             skin: &skin_override.skin,
             kinds: &kinds,

@@ -38,7 +38,7 @@ impl Bench<'_> {
             if self.served.len() < self.bus_links.len() {
                 self.find_alone(listened)?;
             }
-            let program = program("cell-node", options.cell_node.as_deref())?;
+            let program = program("cell-node")?;
             self.processes.start(&Plan {
                 program: &program,
                 skin_file: &options.skin_file,
@@ -168,7 +168,7 @@ impl Bench<'_> {
             ("do not answer, the run goes on without them", silent),
             ("have no parameters, the run goes on without them", unconfigured),
             (
-                "measure, the scenario does not press them (`skinbus frame configure --node N --write mode 1` puts one \
+                "measure, the scenario does not press them (`skinbus frame configure --cell N --write mode 1` puts one \
                  into test mode)",
                 measuring,
             ),

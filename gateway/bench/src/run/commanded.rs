@@ -298,7 +298,7 @@ fn commands(links: &[BusLink], bus: usize) -> u64 {
 
 /// Serves an embedded bus.
 pub(super) fn serve(options: &Options, bus: &str) -> Result<ServedBus, LaunchError> {
-    let program = program("vcan-setup", options.vcan_setup.as_deref())?;
+    let program = program("vcan-setup")?;
     ServedBus::start(&program, bus, options.directory.as_deref())
 }
 

@@ -33,7 +33,7 @@ impl Bench<'_> {
         if !unclear.is_empty() && !self.options.quiet {
             say(&format!(
                 "the contact of these cells is not known, their torques are not compared: {unclear}; they have taken \
-                 stimuli before this run (`skinbus frame configure --node N --write mode 1` clears one)"
+                 stimuli before this run (`skinbus frame configure --cell N --write mode 1` clears one)"
             ));
         }
         Ok(())

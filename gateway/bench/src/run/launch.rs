@@ -41,7 +41,10 @@ const TIMEOUT: Duration = Duration::from_secs(2);
 #[non_exhaustive]
 pub enum LaunchError {
     /// There is no such program.
-    #[error("{name} is not at {path}: build it with `cargo build --release`, or name its path with --{name}")]
+    #[error(
+        "{name} is not at {path}: build it with `cargo build --release`, or name its path in {}",
+        variable(name)
+    )]
     Missing {
         /// The program.
         name: &'static str,
@@ -95,13 +98,20 @@ pub fn allow_files(buses: usize, clients: usize) -> Result<(), LaunchError> {
         .map_err(|_| LaunchError::Files { limit, needed })
 }
 
-/// Where a program of this project is: named by the user, or beside this one.
+/// The environment variable that has the path of a program of this project.
+fn variable(name: &str) -> String {
+    format!("SKINBUS_{}", name.to_ascii_uppercase().replace('-', "_"))
+}
+
+/// The path of a program of this project: from the environment (`SKINBUS_CELL_NODE`, `SKINBUS_VCAN_SETUP`), else beside this
+/// one.
 ///
 /// # Errors
 /// When it is not there.
-pub fn program(name: &'static str, given: Option<&Path>) -> Result<PathBuf, LaunchError> {
+pub fn program(name: &'static str) -> Result<PathBuf, LaunchError> {
+    let given = std::env::var_os(variable(name)).filter(|path| !path.is_empty()).map(PathBuf::from);
     let beside = || std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(name)));
-    let path = given.map(Path::to_owned).or_else(beside).unwrap_or_else(|| PathBuf::from(name));
+    let path = given.or_else(beside).unwrap_or_else(|| PathBuf::from(name));
     // A bare name would be searched in PATH, and not here.
     let path = if path.components().count() == 1 { Path::new(".").join(path) } else { path };
     if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }

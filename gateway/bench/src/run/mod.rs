@@ -75,10 +75,6 @@ pub struct Options {
     pub cells_per_process: usize,
     /// Where cells keep their parameters, if they do.
     pub flash: Option<PathBuf>,
-    /// The cells' program, when it is not beside this one.
-    pub cell_node: Option<PathBuf>,
-    /// The embedded bus' program, when it is not beside this one.
-    pub vcan_setup: Option<PathBuf>,
     /// Bytes that may wait in the gateway's socket of a bus, as the kernel counts them: about 1 KiB a frame.
     pub receive_buffer: usize,
     /// What is recorded where.

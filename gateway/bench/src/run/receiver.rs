@@ -330,6 +330,7 @@ const fn is_absent(error: &BusError) -> bool {
             | BusError::Down { .. }
             | BusError::Gone { .. }
             | BusError::NotServed { .. }
+            | BusError::Absent { .. }
             | BusError::Closed { .. }
             | BusError::HungUp { .. }
     )

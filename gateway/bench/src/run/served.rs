@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 
-use protocol::bus::{Bus, BusError, Choice, Options};
+use protocol::bus::{Bus, BusError, BusKind, Choice, Options};
 
 use super::RunError;
 use super::launch::{LaunchError, apart, end, program, spawn};
@@ -77,7 +77,17 @@ impl ServedBus {
 /// A bus to be opened: its name, its kind, and how.
 pub type Target<'a> = (&'a str, Choice, Options);
 
-/// Opens a bus; an embedded one without a server is served, by `vcan_setup` if that is named.
+/// Whether a bus may be made that is on this machine neither as an interface nor as an embedded bus, where either would do
+/// ([`Choice::Auto`]).
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Absent {
+    /// An embedded bus is made: all cells are started here.
+    Made,
+    /// An error: an empty bus would not be the one that cells are on.
+    Refused,
+}
+
+/// Opens a bus; an embedded one without a server is served.
 ///
 /// # Errors
 /// When it does not open, or is not served.
@@ -85,9 +95,9 @@ pub fn open_or_serve(
     name: &str,
     kind: Choice,
     target: &Options,
-    vcan_setup: Option<&Path>,
+    absent: Absent,
 ) -> Result<(Bus, Option<ServedBus>), RunError> {
-    let (opened, mut served) = open_or_serve_all(&[(name, kind, target.clone())], vcan_setup)?;
+    let (opened, mut served) = open_or_serve_all(&[(name, kind, target.clone())], absent)?;
     let bus = opened.into_iter().next().ok_or_else(|| BusError::Name(name.to_owned()))?;
     Ok((bus, served.pop()))
 }
@@ -98,13 +108,16 @@ pub fn open_or_serve(
 /// When one does not open, or is not served.
 pub fn open_or_serve_all(
     buses: &[Target<'_>],
-    vcan_setup: Option<&Path>,
+    absent: Absent,
 ) -> Result<(Vec<Bus>, Vec<ServedBus>), RunError> {
     let mut begun = Vec::with_capacity(buses.len());
     for (name, kind, target) in buses {
-        begun.push(match Bus::open(name, *kind, target) {
-            Err(BusError::NotServed { .. }) => {
-                let program = program("vcan-setup", vcan_setup)?;
+        let opened = Bus::open(name, *kind, target);
+        let is_served = matches!(opened, Err(BusError::NotServed { .. }))
+            || (absent == Absent::Made && matches!(opened, Err(BusError::Absent { .. })));
+        begun.push(match opened {
+            Err(_) if is_served => {
+                let program = program("vcan-setup")?;
                 Err(ServedBus::begin(&program, name, target.directory.as_deref())
                     .map(|served| (program, served))?)
             }
@@ -112,13 +125,14 @@ pub fn open_or_serve_all(
         });
     }
     let (mut opened, mut all_served) = (Vec::with_capacity(buses.len()), Vec::new());
-    for ((name, kind, target), begun) in buses.iter().zip(begun) {
+    for ((name, _, target), begun) in buses.iter().zip(begun) {
         opened.push(match begun {
             Ok(bus) => bus,
             Err((program, mut served)) => {
                 served.wait(&program)?;
                 all_served.push(served);
-                Bus::open(name, *kind, target)?
+                // Not by the choice: an interface of this name may have come meanwhile.
+                Bus::open(name, Choice::Only(BusKind::Embedded), target)?
             }
         });
     }

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use hdrhistogram::Histogram;
-use protocol::bus::{Bus, BusKind, Filter, Options as BusOptions};
+use protocol::bus::{Bus, BusKind, Choice, Filter, Options as BusOptions};
 use protocol::can::Format;
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
@@ -24,7 +24,7 @@ use super::link::{Link, ReceiveEnd, Slot};
 use super::network::Network;
 use super::receiver::{BusEvent, Receiver, look_at};
 use super::roots::{ReceiveFilter, Roots};
-use super::served::{ServedBus, Target, open_or_serve, open_or_serve_all};
+use super::served::{Absent, ServedBus, Target, open_or_serve, open_or_serve_all};
 use super::{Options, RunError, realtime};
 use crate::emulate::{self, Emulation, Emulator};
 use crate::record::feed::{self, Feed, Outlet};
@@ -85,7 +85,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
         target_of(options, bus, receive_filter.filters)
     });
     let targets: Vec<_> = targets.collect();
-    let (opened, own) = open_or_serve_all(&targets, options.vcan_setup.as_deref())?;
+    let (opened, own) = open_or_serve_all(&targets, absent(options))?;
     served.extend(own);
     let opened = skin.buses.iter().zip(targets).zip(opened);
     let opened = opened.map(|((bus, (.., target)), opened)| linked(options, bus, target, opened));
@@ -134,7 +134,7 @@ pub(super) fn start(options: &Options) -> Result<Bench<'_>, RunError> {
 /// Checks for what a description allows and this program cannot do, and for what is missing.
 fn refuse(options: &Options) -> Result<Option<Emulator<'_>>, RunError> {
     if options.spawn {
-        program("cell-node", options.cell_node.as_deref())?;
+        program("cell-node")?;
     }
     if let Some(flash) = options.flash.as_ref().filter(|flash| !flash.is_dir()) {
         return Err(RunError::NoFlash(flash.clone()));
@@ -162,7 +162,7 @@ fn emulate(
         let target =
             BusOptions { filters: Vec::new(), directory: directory.clone(), ..BusOptions::default() };
         let target = BusOptions { fd: bus.format == Format::Fd, ..target };
-        let (_, own) = open_or_serve(&bus.name, kinds.of(&bus.name), &target, options.vcan_setup.as_deref())?;
+        let (_, own) = open_or_serve(&bus.name, kinds.of(&bus.name), &target, absent(options))?;
         served.extend(own);
     }
     let bench = emulate::Bench { skin, kinds, directory: directory.as_deref(), flash: flash.as_deref() };
@@ -172,6 +172,11 @@ fn emulate(
         say(&said);
     }
     Ok(emulation)
+}
+
+/// Emulated cells are on a bus that others may look at, and cells that are there already are on a bus that is there.
+const fn absent(options: &Options) -> Absent {
+    if options.spawn && options.emulated.is_none() { Absent::Made } else { Absent::Refused }
 }
 
 /// How a bus is to be opened.
@@ -203,7 +208,11 @@ fn linked(
     if !options.quiet {
         let (kind, bytes) = (bus.kind(), bus.receive_buffer());
         let less = if bytes < options.receive_buffer { LIMITED } else { "" };
-        say(&format!("{name} is {kind}, with a receive buffer of {} KiB{less}", bytes / 1_024));
+        let why = match (options.kinds.of(name), kind) {
+            (Choice::Auto, BusKind::Embedded) => format!(" (there is no interface {name})"),
+            _ => String::new(),
+        };
+        say(&format!("{name} is {kind}{why}, with a receive buffer of {} KiB{less}", bytes / 1_024));
     }
     let (_, receive_end, slot) = Link::new(bus, target);
     Ok((receive_end, slot))

@@ -193,7 +193,7 @@ impl Bench<'_> {
                 let (bus, kind) = bus_link.map_or(("BUS", BusKind::SocketCan), |bus_link| {
                     (bus_link.link.name.as_str(), bus_link.link.kind)
                 });
-                let hint = format!("`skinbus ack {bus} --bus-kind {kind}` resumes it");
+                let hint = format!("`skinbus frame resume --bus {bus} --bus-kind {kind}` resumes it");
                 progress.note(&format!("the robot is halted: {why}; {hint}"));
             }
             (true, None) => progress.note("the robot goes on"),

@@ -2,7 +2,7 @@
 
 use core::str::FromStr;
 
-use protocol::can::Frame;
+use protocol::can::{EXTENDED_MASK, Frame, STANDARD_MASK};
 use protocol::id::{CellId, Command, Id, Kind, Node};
 use protocol::packet::data_id;
 use thiserror::Error;
@@ -66,31 +66,110 @@ pub fn node(word: &str) -> Result<Node, String> {
     }
 }
 
+/// A node, on one bus or on any.
+#[derive(Clone, Debug, Eq, PartialEq)]
+pub struct Party {
+    /// The bus; `None` is any.
+    pub bus: Option<String>,
+    /// The node there.
+    pub node: Node,
+}
+
+impl FromStr for Party {
+    type Err = String;
+
+    /// Parses `NODE` or `BUS:NODE`; as a node `gateway`, `everyone`, or a node id.
+    fn from_str(word: &str) -> Result<Self, String> {
+        let (bus, name) = match word.rsplit_once(':') {
+            Some((bus, name)) => (Some(bus.to_owned()), name),
+            None => (None, word),
+        };
+        Ok(Self { bus, node: node(name)? })
+    }
+}
+
+/// Identifiers, by the bits that matter: `ID` alone or `ID:MASK`, in hexadecimal as candump prints them.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct IdMask {
+    id: u32,
+    mask: u32,
+    is_extended: bool,
+}
+
+impl IdMask {
+    /// Returns whether a frame's identifier is one of these; 11-bit and 29-bit identifiers are never the same.
+    #[must_use]
+    pub fn takes(&self, frame: &Frame) -> bool {
+        frame.is_extended() == self.is_extended
+            && !frame.is_error()
+            && (frame.id() & EXTENDED_MASK ^ self.id) & self.mask == 0
+    }
+}
+
+impl FromStr for IdMask {
+    type Err = String;
+
+    /// Parses an identifier, 11 bits of up to 3 hexadecimal digits or 29 bits of 8, and its mask.
+    fn from_str(word: &str) -> Result<Self, String> {
+        let allowed = || {
+            format!(
+                "{word:?}: an identifier of up to 3 hexadecimal digits (11 bits) or of 8 (29 bits), or ID:MASK, is needed"
+            )
+        };
+        let number = |digits: &str| {
+            let digits = digits.strip_prefix("0x").unwrap_or(digits);
+            let is_extended = digits.len() == 8;
+            let longest = if is_extended { EXTENDED_MASK } else { STANDARD_MASK };
+            let value = u32::from_str_radix(digits, 16).ok().filter(|value| *value <= longest)?;
+            (!digits.starts_with('+') && (is_extended || digits.len() <= 3)).then_some((
+                value,
+                is_extended,
+                longest,
+            ))
+        };
+        let (id, mask) = word.split_once(':').map_or((word, None), |(id, mask)| (id, Some(mask)));
+        let (id, is_extended, all) = number(id).ok_or_else(allowed)?;
+        let mask = match mask {
+            None => all,
+            Some(mask) => number(mask).filter(|(mask, ..)| *mask <= all).ok_or_else(allowed)?.0,
+        };
+        Ok(Self { id, mask, is_extended })
+    }
+}
+
 /// What is shown; everything by default.
 #[derive(Clone, Debug, Default)]
 pub struct Pick {
     /// Any of these; all when empty.
     pub kinds: Vec<Selector>,
     /// Any of these, as sender or addressee; all when empty. Commands are the gateway's.
-    pub nodes: Vec<Node>,
-    /// From so many nanoseconds after the first frame on.
+    pub parties: Vec<Party>,
+    /// Frames of these buses; of all when empty.
+    pub buses: Vec<String>,
+    /// Frames with any of these identifiers; with all when empty.
+    pub ids: Vec<IdMask>,
+    /// From so many nanoseconds after the origin of times on.
     pub from: Option<u64>,
-    /// Up to, and without, so many nanoseconds after the first frame.
+    /// Up to, and without, so many nanoseconds after the origin of times.
     pub to: Option<u64>,
 }
 
 impl Pick {
-    /// Whether a frame is shown that came at `nanos` and is this, when the first one came at `first`.
+    /// Returns whether a frame on a bus is shown that came at `nanos` and is this, when times count from `origin`.
     #[must_use]
-    pub fn takes(&self, first: u64, nanos: u64, frame: &Frame, decoded: &Decoded) -> bool {
+    pub fn takes(&self, origin: u64, nanos: u64, bus: &str, frame: &Frame, decoded: &Decoded) -> bool {
         let is_foreign = matches!(decoded, Decoded::Foreign(_));
         let id = data_id(frame).ok().filter(|_| !is_foreign);
-        self.takes_time(first, nanos) && self.takes_kind(id, decoded) && self.takes_node(id)
+        self.takes_time(origin, nanos)
+            && (self.buses.is_empty() || self.buses.iter().any(|it| it == bus))
+            && (self.ids.is_empty() || self.ids.iter().any(|it| it.takes(frame)))
+            && self.takes_kind(id, decoded)
+            && self.takes_party(id, bus)
     }
 
-    fn takes_time(&self, first: u64, nanos: u64) -> bool {
-        let after_from = self.from.is_none_or(|from| nanos >= first.saturating_add(from));
-        let before_to = self.to.is_none_or(|to| nanos < first.saturating_add(to));
+    fn takes_time(&self, origin: u64, nanos: u64) -> bool {
+        let after_from = self.from.is_none_or(|from| nanos >= origin.saturating_add(from));
+        let before_to = self.to.is_none_or(|to| nanos < origin.saturating_add(to));
         after_from && before_to
     }
 
@@ -106,7 +185,7 @@ impl Pick {
             })
     }
 
-    fn takes_node(&self, id: Option<Id>) -> bool {
+    fn takes_party(&self, id: Option<Id>, bus: &str) -> bool {
         let node = id.map(|id| match id.kind {
             Kind::Command => Node::Gateway,
             Kind::Sum
@@ -117,7 +196,8 @@ impl Pick {
             | Kind::Configured
             | Kind::Stimulus => Node::from_byte(id.node),
         });
-        self.nodes.is_empty() || node.is_some_and(|node| self.nodes.contains(&node))
+        let is = |party: &Party| Some(party.node) == node && party.bus.as_ref().is_none_or(|it| it == bus);
+        self.parties.is_empty() || self.parties.iter().any(is)
     }
 }
 
@@ -138,7 +218,7 @@ mod tests {
     }
 
     fn takes(pick: &Pick, frame: &Frame) -> bool {
-        pick.takes(0, 0, frame, &Decoder::new(None).decode(Micros(0), "can0", frame))
+        pick.takes(0, 0, "can0", frame, &Decoder::new(None).decode(Micros(0), "can0", frame))
     }
 
     #[test]
@@ -147,7 +227,7 @@ mod tests {
         let taken = |kinds: &[&str], nodes: &[&str]| -> Vec<u32> {
             let pick = Pick {
                 kinds: kinds.iter().map(|word| word.parse().unwrap()).collect(),
-                nodes: nodes.iter().map(|word| node(word).unwrap()).collect(),
+                parties: nodes.iter().map(|word| word.parse().unwrap()).collect(),
                 ..Pick::default()
             };
             ids.into_iter().filter(|&id| takes(&pick, &frame(id))).collect()
@@ -158,6 +238,8 @@ mod tests {
         assert_eq!(taken(&[], &["12"]), [0x20C, 0x50C]);
         assert_eq!(taken(&["configure"], &["12", "everyone"]), [0x50C, 0x5FF]);
         assert_eq!(taken(&[], &["gateway"]), [0x000, 0x001, 0x400]);
+        assert_eq!(taken(&[], &["can0:12", "can1:255"]), [0x20C, 0x50C]);
+        assert_eq!(taken(&[], &["can1:12"]), [0_u32; 0]);
         assert_eq!(taken(&["damaged"], &[]), [0_u32; 0]);
         let wire = wire::LinkId { wire: 3, back: true }.frame(wire::PortMessage::Join);
         let kinds = ["wire", "foreign", "command"];
@@ -173,12 +255,12 @@ mod tests {
         let mut decoder = Decoder::new(None);
         let mut taken = |frame: &Frame| {
             let decoded = decoder.decode(Micros(0), "can0", frame);
-            ["torque", "foreign", "damaged"].map(|kind| of(kind).takes(0, 0, frame, &decoded))
+            ["torque", "foreign", "damaged"].map(|kind| of(kind).takes(0, 0, "can0", frame, &decoded))
         };
         assert_eq!(taken(&wrong), [false, true, false]);
         assert_eq!([0, 1].map(|_| taken(&frame(0x20C))), [[true, false, false]; 2]);
         assert_eq!(taken(&wrong), [true, true, true]);
-        let cell = Pick { nodes: vec![node("12").unwrap()], ..Pick::default() };
+        let cell = Pick { parties: vec!["12".parse().unwrap()], ..Pick::default() };
         assert!(!takes(&cell, &wrong), "nothing is known of another bus");
     }
 
@@ -186,9 +268,35 @@ mod tests {
     fn times_count_from_the_first_frame_and_leave_out_the_end() {
         let pick = Pick { from: Some(10), to: Some(20), ..Pick::default() };
         let taken: Vec<u64> = (95..=125)
-            .filter(|&at| pick.takes(100, at, &frame(1), &Decoded::Foreign(Foreign::Remote)))
+            .filter(|&at| pick.takes(100, at, "can0", &frame(1), &Decoded::Foreign(Foreign::Remote)))
             .collect();
         assert_eq!(taken, (110..120).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn identifiers_are_compared_by_the_bits_of_the_mask() {
+        let ids = [0x000, 0x001, 0x20C, 0x50C, 0x5FF, 0x1234 | EXTENDED, 0x20C | EXTENDED];
+        let taken = |words: &[&str]| -> Vec<u32> {
+            let pick =
+                Pick { ids: words.iter().map(|word| word.parse().unwrap()).collect(), ..Pick::default() };
+            ids.into_iter().filter(|&id| takes(&pick, &frame(id))).collect()
+        };
+        assert_eq!(taken(&["0x20C"]), [0x20C]);
+        assert_eq!(taken(&["20c:7FF", "1"]), [0x001, 0x20C]);
+        assert_eq!(taken(&["0x200:0x700"]), [0x20C]);
+        assert_eq!(taken(&["500:700"]), [0x50C, 0x5FF]);
+        assert_eq!(taken(&["0:0"]), [0x000, 0x001, 0x20C, 0x50C, 0x5FF]);
+        assert_eq!(taken(&["0000020C"]), [0x20C | EXTENDED]);
+        assert_eq!(taken(&["00000000:00000000"]), [0x1234 | EXTENDED, 0x20C | EXTENDED]);
+        for wrong in
+            ["", "x", "800", "2000", "20C:800", "20C:", ":7FF", "+20", "FFFFFFFF", "20C:7FF:1", "123456789"]
+        {
+            let said = wrong.parse::<IdMask>().unwrap_err();
+            assert!(
+                said.contains("3 hexadecimal digits (11 bits) or of 8 (29 bits), or ID:MASK"),
+                "{wrong}: {said}"
+            );
+        }
     }
 
     #[test]

@@ -135,10 +135,7 @@ fn a_declared_encoding_is_read() {
     let latin =
         |text: &str| text.chars().map(|letter| u8::try_from(u32::from(letter)).unwrap()).collect::<Vec<_>>();
     let mut expected = read(&declared("UTF-8"));
-    for bytes in [
-        latin(&declared("ISO-8859-1")),
-        latin(&declared("windows-1252")),
-    ] {
+    for bytes in [latin(&declared("ISO-8859-1")), latin(&declared("windows-1252"))] {
         let decoded = text("t.urdf", &bytes).unwrap();
         assert_eq!(decoded, declared("UTF-8"), "the declaration is of the text, too");
         expected.file = "t.urdf".to_owned();
@@ -153,7 +150,8 @@ fn a_declared_encoding_is_read() {
 
 #[test]
 fn utf_16_is_refused_as_by_ros_with_a_command_that_mends_it() {
-    let declared = wrap(ARM).replace("<?xml version=\"1.0\"?>", "<?xml version=\"1.0\" encoding=\"UTF-16\"?>");
+    let declared =
+        wrap(ARM).replace("<?xml version=\"1.0\"?>", "<?xml version=\"1.0\" encoding=\"UTF-16\"?>");
     for (mark, name) in [("\u{feff}", "utf-16"), ("", "utf-16le")] {
         let wide: Vec<_> = format!("{mark}{declared}").encode_utf16().flat_map(u16::to_le_bytes).collect();
         assert_eq!(

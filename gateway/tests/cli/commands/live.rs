@@ -120,10 +120,10 @@ impl Drop for Over<'_> {
 #[test]
 fn what_is_sent_on_an_embedded_bus_is_shown() {
     let bench = Bench::new();
-    let dump = bench.dump("--max 4 --kind stimulus,command");
-    bench.beside(Format::Fd, || bench.send("frame stimulus --node 12 --force 3.0 --bus vcan0"));
+    let dump = bench.dump("-n 4 --kind stimulus,command");
+    bench.beside(Format::Fd, || bench.send("frame stimulus --cell 12 --force 3.0 --bus vcan0"));
     bench.send("frame sync --bus vcan0 --format classic");
-    bench.send("ack vcan0");
+    bench.send("frame resume --bus vcan0");
     let Output { status, stdout, stderr } = dump.wait_with_output().unwrap();
     let skin = "force 3.000 N (1.000 1.000 1.000), proximity 0.0000, temperature 0.00 0.00 °C";
     let expected = [
@@ -152,14 +152,14 @@ fn a_cell_that_is_requested_answers_and_one_that_is_not_there_is_missed() {
     for format in [Format::Fd, Format::Classic] {
         let with = format!("--bus vcan0 --format {}", format.name());
         bench.beside(format, || {
-            let read = says(&format!("frame configure --node 12 --read mount --tag 7 {with}"));
+            let read = says(&format!("frame configure --cell 12 --read mount --tag 7 {with}"));
             assert_eq!((read.0, read.2.as_str()), (Some(0), ""));
             assert!(read.1.starts_with("configured 12 tag 7: has mount: joint 2 of 6") && read.1.lines().count() == 1, "{read:?}");
-            let all = says(&format!("frame configure --node everyone --read mount {with}"));
+            let all = says(&format!("frame configure --cell everyone --read mount {with}"));
             assert_eq!((all.0, all.1.lines().count()), (Some(0), 1), "{all:?}");
-            let refused = says(&format!("frame configure --node 12 --write mode 1 {with}"));
+            let refused = says(&format!("frame configure --cell 12 --write mode 1 {with}"));
             assert!(refused.0 == Some(1) && refused.2.starts_with("skinbus: configured 12 tag 0: "), "{refused:?}");
-            let nobody = says(&format!("frame stimulus --node 250 {with}"));
+            let nobody = says(&format!("frame stimulus --cell 250 {with}"));
             assert_eq!((nobody.0, nobody.1.as_str()), (Some(1), ""));
             let expected = format!(
                 "skinbus: no cell 250 was heard on vcan0 for 1 s: `skinbus cells vcan0` lists who is there; the bus' \
@@ -226,7 +226,7 @@ fn a_foreign_classic_frame_is_shown_though_nothing_comes_after_it() {
 fn cells_on_a_foreign_bus_reports_that_frames_came_and_none_of_a_cell() {
     let bench = Bench::new();
     let bus = bench.open();
-    let mut command = bench.gateway("cells vcan0 --for 1");
+    let mut command = bench.gateway("cells vcan0 --duration 1");
     let mut child = command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let mut sent = 0_u64;
     while child.try_wait().unwrap().is_none() {
@@ -271,7 +271,7 @@ fn a_live_bus_is_counted_until_the_end_that_was_requested_or_a_signal() {
         let report: serde_json::Value = serde_json::from_slice(&stdout).unwrap();
         (report["format"].clone(), report["frames"].clone())
     };
-    let child = bench.dump("--stats --json --max 2");
+    let child = bench.dump("--stats --json -n 2");
     (0..2).for_each(|_| bench.send("frame sync --bus vcan0"));
     assert_eq!(counted(child), ("live".into(), 2.into()));
 
@@ -336,7 +336,7 @@ fn a_skin_tells_ack_its_buses_and_formats() {
     let skin = bench.parent.path().join("skin.toml");
     output(gateway(&format!("skin generate --cells 3 --format classic -o {}", skin.display())));
     let bus = bench.open();
-    bench.send(&format!("ack {}", skin.display()));
+    bench.send(&format!("frame resume --skin {}", skin.display()));
     let mut inbox = Inbox::new();
     let mut frames = Vec::new();
     while frames.len() < 2 {

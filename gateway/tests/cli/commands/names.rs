@@ -19,29 +19,31 @@ use super::{golden, output, text};
 /// is a blank in a word. A command with several rows has one for each file that it takes.
 const COMMANDS: &[(&str, i32, &[&str])] = &[
     ("dump @c.log", 0, &[]),
-    ("dump @run.mcap --skin @skin.toml --max 3", 0, &[]),
+    ("dump @run.mcap --skin @skin.toml -n 3", 0, &[]),
     ("convert @c.log @new.mcap", 0, &["new.mcap"]),
     ("convert @run.mcap @new.log", 0, &["new.log"]),
     ("recover @torn.mcap -o @whole.mcap", 0, &["whole.mcap"]),
     ("explain @run.mcap --epoch 3", 0, &[]),
     ("report @run.mcap", 0, &["run.html"]),
     ("report @run.mcap -o @page.html --svg @figures", 0, &["page.html", "figures"]),
-    ("dbc @skin.toml -o @skin.dbc", 0, &["skin.dbc"]),
-    ("shadow @c.log --nominal 1M --data 5M", 0, &[]),
+    ("skin dbc @skin.toml -o @skin.dbc", 0, &["skin.dbc"]),
+    ("fit @c.log --nominal 1M --data 5M", 0, &[]),
     ("fit @skin.toml", 0, &[]),
-    ("skin check @skin.toml", 0, &[]),
+    ("check @skin.toml", 0, &[]),
+    ("completions bash", 0, &[]),
+    ("man @pages", 2, &[]),
     ("skin show @skin.toml -o @skin.html", 0, &["skin.html"]),
     ("skin urdf @skin.toml -o @skin.urdf", 0, &["skin.urdf"]),
     ("skin generate --cells 8 -o @other.toml", 0, &["other.toml"]),
     ("skin import @arm.urdf --tip hand -o @arm.toml", 0, &["arm.toml"]),
-    ("scenario check @scenario.toml --skin @skin.toml", 0, &[]),
-    ("torque @skin.toml --cell 1 --joints 0~0~0~0~0~0 --force 5", 0, &[]),
-    ("torque @skin.toml --batch @rows.csv", 2, &[]),
+    ("check @scenario.toml --skin @skin.toml", 0, &[]),
+    ("explain @skin.toml --cell 1 --joints 0~0~0~0~0~0 --force 5", 0, &[]),
+    ("explain @skin.toml --batch @rows.csv", 2, &[]),
     ("experiment fig9 --quick -q -o @results", 0, &["results"]),
     // Without a bus they come as far as their files.
     ("calibrate @skin.toml --dry-run", 0, &[]),
-    ("calibrate @skin.toml --from @run.mcap -o @found.toml --page @found.html", 2, &[]),
-    ("calibrate @skin.toml --from @run.mcap --data-sheet @sheet.toml", 2, &[]),
+    ("calibrate @skin.toml --recording @run.mcap -o @found.toml --page @found.html", 2, &[]),
+    ("calibrate @skin.toml --recording @run.mcap --data-sheet @sheet.toml", 2, &[]),
     ("view @nothing.mcap", 2, &[]),
     ("replay @run.mcap --skin @skin.toml --summary @summary.json", 2, &[]),
     (
@@ -51,10 +53,10 @@ const COMMANDS: &[(&str, i32, &[&str])] = &[
     ),
     ("demo --duration 1 --candump @demo.log --record @demo.mcap --summary @demo.json", 2, &[]),
     ("commission @skin.toml --node-ids @ids.toml", 2, &[]),
-    ("conformance --bus vcan0 --bus-kind embedded --node 3 --save @saved.json --junit @cell.xml", 2, &[]),
-    ("conformance --bus vcan0 --bus-kind embedded --node 3 --restore @saved.json", 2, &[]),
+    ("conformance --bus vcan0 --bus-kind embedded --cell 3 --save @saved.json --junit @cell.xml", 2, &[]),
+    ("conformance --bus vcan0 --bus-kind embedded --cell 3 --restore @saved.json", 2, &[]),
     ("cells vcan0 --bus-kind embedded --skin @skin.toml", 2, &[]),
-    ("ack @skin.toml --bus-kind embedded", 2, &[]),
+    ("frame resume --skin @skin.toml --bus-kind embedded", 2, &[]),
 ];
 
 /// Commands that take no file.
@@ -62,9 +64,12 @@ const WITHOUT: &[&str] = &["frame", "sensing", "help"];
 
 /// Names of the commands in a help text.
 fn commands(help: &str) -> Vec<String> {
-    let listed =
-        help.lines().skip_while(|line| *line != "Commands:").skip(1).take_while(|line| !line.is_empty());
-    let named = listed.filter(|line| line.starts_with("  ") && !line.starts_with("   "));
+    // The program's own are in groups, up to its options.
+    let is_end = |line: &&str| !line.starts_with("Options:");
+    let listed = help.lines().skip_while(|line| !line.starts_with("Usage:")).take_while(is_end);
+    let is_of_arguments = help.contains("\nArguments:\n");
+    let named =
+        listed.filter(|_| !is_of_arguments).filter(|line| line.starts_with("  ") && !line.starts_with("   "));
     named.filter_map(|line| Some(line.split_whitespace().next()?.to_owned())).collect()
 }
 
@@ -201,9 +206,9 @@ fn without_threads_no_command_panics() {
     for words in [
         "dump @c.log",
         "convert @c.log @new.mcap",
-        "report @run.mcap --force",
+        "report @run.mcap --overwrite",
         "calibrate @skin.toml --dry-run",
-        "calibrate @skin.toml --from @run.mcap",
+        "calibrate @skin.toml --recording @run.mcap",
         "view @run.mcap --listen 127.0.0.1:0",
         "experiment list",
     ] {

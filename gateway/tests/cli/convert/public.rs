@@ -89,7 +89,7 @@ fn an_identifier_that_does_not_fit_is_named_and_no_frame() {
 #[test]
 fn topics_with_one_frame_id_are_two_buses() {
     let folder = folder(&["two_buses_one_frame_id.mcap"]);
-    let (code, out, said) = run(&folder, "shadow two_buses_one_frame_id.mcap --nominal 500k");
+    let (code, out, said) = run(&folder, "fit two_buses_one_frame_id.mcap --nominal 500k");
     assert_eq!(code, Some(0), "{said}");
     assert!(said.contains("topics have frames of one frame_id: each topic is a bus of its own"), "{said}");
     for (bus, load) in [("/can0/from_can_bus", "97.8 %: fits"), ("/can1/from_can_bus", "97.0 %: fits")] {
@@ -124,7 +124,7 @@ fn times_that_are_none_get_a_remark_and_no_verdict() {
         ),
         ("none.txt", "rates, gaps and loads mean nothing"),
     ] {
-        let (code, out, said) = run(&folder, &format!("shadow {name} --nominal 500k"));
+        let (code, out, said) = run(&folder, &format!("fit {name} --nominal 500k"));
         assert!(code == Some(0) && said.contains(remark), "{said}");
         assert!(!out.contains('%') && !out.contains("fit"), "{out}");
         let (_, out, said) = run(&folder, &format!("dump --stats {name}"));
@@ -158,9 +158,7 @@ fn no_control_of_a_foreign_name_comes_out() {
     let folder = folder(&["names_with_escapes.mcap"]);
     let is_plain =
         |text: &str| !text.chars().any(|letter| letter.is_control() && !matches!(letter, '\n' | '\t'));
-    for command in
-        ["dump", "dump --brief", "dump --stats", "dump --json", "convert", "shadow", "shadow --json"]
-    {
+    for command in ["dump", "dump --brief", "dump --stats", "dump --json", "convert", "fit", "fit --json"] {
         let to = if command == "convert" { " -" } else { "" };
         let (code, out, said) = run(&folder, &format!("{command} names_with_escapes.mcap{to}"));
         assert!(code == Some(0) && is_plain(&out) && is_plain(&said), "{command}: {out:?} {said:?}");
@@ -250,7 +248,7 @@ fn texts_of_other_programs_are_named_with_what_to_do() {
         let name = file.strip_prefix("kinds/").unwrap();
         let begin = format!("skinbus: {name} is {what}, and no candump log or MCAP recording: ");
         for command in
-            ["dump NAME", "convert NAME -", "convert NAME out.log", "shadow NAME", "view NAME", "dbc NAME"]
+            ["dump NAME", "convert NAME -", "convert NAME out.log", "fit NAME", "view NAME", "skin dbc NAME"]
         {
             let said = folder.refuses(&command.replace("NAME", name), 2);
             assert!(said.starts_with(&begin) && said.contains(hint), "{command}: {said}");
@@ -270,7 +268,7 @@ fn a_capture_is_shown_and_another_text_is_named_as_dump_names_it() {
         "view words.txt",
         "view words.txt --skin skin.toml",
         "view words.txt --at 1",
-        "dbc words.txt",
+        "skin dbc words.txt",
     ] {
         let said = folder.refuses(command, 1);
         assert!(
@@ -283,7 +281,7 @@ fn a_capture_is_shown_and_another_text_is_named_as_dump_names_it() {
     );
     assert!(
         folder
-            .refuses("dbc late.log", 2)
+            .refuses("skin dbc late.log", 2)
             .ends_with("late.log is a capture (candump log), and a skin is needed")
     );
     let mut view = folder.gateway("view late.log --skin skin.toml").stderr(Stdio::piped()).spawn().unwrap();

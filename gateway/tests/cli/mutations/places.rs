@@ -330,7 +330,7 @@ fn is_given(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<u
         let refuses = code == Some(1) && !stderr.is_empty();
         assert!(code == Some(0) || refuses, "{what}: gateway {line}: {code:?}: {stderr}");
     };
-    for line in ["convert m.mcap - --direction", "shadow m.mcap --json", "dump m.mcap --stats --json"] {
+    for line in ["convert m.mcap - --direction", "fit m.mcap --json", "dump m.mcap --stats --json"] {
         let (code, lines, stderr) = run(folder, line);
         said(line, code, &stderr);
         if code != Some(0) {
@@ -342,7 +342,7 @@ fn is_given(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<u
                 let (smallest, most) = (lines.len().min(whole.len()), intact);
                 assert!(smallest >= most, "{what}: {line}: {smallest} entries of {intact}: {stderr}");
             }
-            Some("shadow") => {
+            Some("fit") => {
                 assert!(lines.len() >= frames, "{what}: {line}: {} of {frames}: {stderr}", lines.len())
             }
             _ => {
@@ -356,7 +356,7 @@ fn is_given(folder: &Path, seed: &Seed, what: &str, file: &[u8], place: &Range<u
     let (code, _, stderr) = run(folder, line);
     said(line, code, &stderr);
     let is_bare = seed.parts.iter().any(|part| part.code == op::MESSAGE);
-    for line in ["explain m.mcap --epoch 3 --skin skin.toml --json", "report m.mcap -o r.html --force"] {
+    for line in ["explain m.mcap --epoch 3 --skin skin.toml --json", "report m.mcap -o r.html --overwrite"] {
         let whole = run(folder, &line.replace("m.mcap", "seed.mcap"));
         let (code, lines, stderr) = run(folder, line);
         match (whole.0, code) {

@@ -13,15 +13,15 @@ use std::sync::atomic::AtomicBool;
 
 pub use log::LogFile;
 pub use protocol::input::folder_of;
+pub use target::{STANDARD_OUTPUT, check, check_regular, rename, suffixed, sync_folder, with_hint};
 use target::{Target, open_stream, or_exists, part_of};
-pub use target::{check, check_regular, rename, suffixed, sync_folder, with_hint};
 pub(crate) use target::{hold, identity, is_still, link, nameless, open_unfollowed, write_patiently};
 
 /// A file that has a name only when it is whole. Until then it has none at all, and so is gone with a
 /// program that is killed; where the file system has no such files it is called `.NAME.PID.part`, and a run
 /// that does not come to its end takes it away. Once it has its name, it outlives a loss of power.
 ///
-/// What is there and is no regular file (a FIFO, a terminal, `/dev/stdout`) is written to as it is.
+/// What is there and is no regular file (a FIFO, a terminal, `/dev/stdout`), and `-`, standard output, are written to as they are.
 #[derive(Debug)]
 pub struct WholeFile {
     path: PathBuf,

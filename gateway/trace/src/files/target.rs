@@ -19,6 +19,9 @@ use rustix::io::Errno;
 /// Between two looks whether somebody reads a FIFO.
 const LOOK: Duration = Duration::from_millis(20);
 
+/// The name of standard output; a file of this name is `./-`.
+pub const STANDARD_OUTPUT: &str = "-";
+
 /// What stands under a name.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Target {
@@ -26,7 +29,7 @@ pub(super) enum Target {
     New,
     /// A regular file, which is to be overwritten.
     Old,
-    /// A FIFO, a terminal, `/dev/stdout`: written to as it is.
+    /// A FIFO, a terminal, `/dev/stdout`, `-`: written to as it is.
     Stream,
 }
 
@@ -34,6 +37,9 @@ impl Target {
     /// Looks at a name. A regular file is overwritten only with `force`; a symlink to one, or to nothing, is never
     /// followed.
     pub(super) fn of(path: &Path, force: bool) -> io::Result<Self> {
+        if path == Path::new(STANDARD_OUTPUT) {
+            return Ok(Self::Stream);
+        }
         let kind = match fs::symlink_metadata(path) {
             Ok(about) => about.file_type(),
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
@@ -85,7 +91,7 @@ fn no_regular_file() -> io::Error {
 
 /// The refusal of a name that is taken.
 pub(super) fn exists() -> io::Error {
-    let why = "it exists: name another file, or overwrite it with --force";
+    let why = "it exists: name another file, or overwrite it with --overwrite";
     io::Error::new(io::ErrorKind::AlreadyExists, why)
 }
 
@@ -100,7 +106,8 @@ fn is_stream(kind: FileType) -> bool {
 
 /// Opens what is written to as it is. A FIFO is waited for until somebody reads it, or until `stopped`.
 pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File> {
-    let own: Option<OwnedFd> = match own_descriptor(path) {
+    let descriptor = if path == Path::new(STANDARD_OUTPUT) { Some(1) } else { own_descriptor(path) };
+    let own: Option<OwnedFd> = match descriptor {
         Some(1) => Some(io::stdout().as_fd().try_clone_to_owned()?),
         Some(2) => Some(io::stderr().as_fd().try_clone_to_owned()?),
         _ => None,

@@ -50,7 +50,7 @@ fn what_is_there_is_not_overwritten_and_no_symlink_is_followed_to_a_file() {
     fs::create_dir(&directory).unwrap();
     let _socket = std::os::unix::net::UnixListener::bind(&socket).unwrap();
     let before = names(folder.path());
-    let exists = "it exists: name another file, or overwrite it with --force";
+    let exists = "it exists: name another file, or overwrite it with --overwrite";
     assert_eq!(refusals(&file, false), [exists; 2]);
     for force in [false, true] {
         for path in [&link, &dangling] {

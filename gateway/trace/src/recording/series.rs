@@ -196,7 +196,8 @@ impl<T> Series<T> {
     pub fn claim(path: &Path, force: bool, split: Split) -> io::Result<Self> {
         let stale = names::series(path);
         if let Some(there) = stale.first().filter(|_| !force) {
-            let why = format!("{} exists: name another file, or overwrite it with --force", there.display());
+            let why =
+                format!("{} exists: name another file, or overwrite it with --overwrite", there.display());
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, why));
         }
         Ok(Self {

@@ -9,7 +9,7 @@
 //!
 //! Replies, losses and errors are not in a recording as numbers; the frames are. They go through the same
 //! [`Table`](model::table::Table) that the gateway had, and so come to the same accounts. The load of a
-//! real bus is that of `skinbus shadow` for the same recording.
+//! real bus is that of `skinbus fit` for the same recording.
 
 mod bus_figures;
 mod moments;

@@ -70,7 +70,7 @@ fn share_of(
     capture.iter().for_each(|it| survey.take(&record(it)));
     survey.finish();
     let bus_links = vec![Some(0), Some(1)];
-    let mut chosen = Selection { only: Only::All, pick: Pick::default(), bus_links, reads: true };
+    let mut chosen = Selection { only: Only::All, bus_links, reads: true };
     selection(&mut chosen);
     let names = ["a", "b"].map(|name| (name.to_owned(), BTreeMap::new()));
     let mut comparator = Comparator::new(names, 0, Some(0));
@@ -150,7 +150,7 @@ fn foreign_frames_are_neither_inputs_nor_replies_whatever_their_identifiers_are(
 fn wire_messages_are_never_sent() {
     let survey = Survey::new(Part::default());
     for only in [Only::All, Only::Inputs, Only::Replies] {
-        let selection = Selection { only, pick: Pick::default(), bus_links: vec![Some(0)], reads: true };
+        let selection = Selection { only, bus_links: vec![Some(0)], reads: true };
         let replay_plan = ReplayPlan::new(&survey, &selection);
         let frame = wire::LinkId { wire: 9, back: false }.frame(wire::PortMessage::Join);
         assert_eq!(replay_plan.unwanted(0, &frame, &decoded(&frame)), Some(reason::WIRE));

@@ -1,4 +1,4 @@
-//! `skinbus dbc`.
+//! `skinbus skin dbc`.
 
 use std::path::PathBuf;
 
@@ -7,10 +7,10 @@ use clap::Args;
 use protocol::can::Format;
 use protocol::usage::{Failure, print};
 
-use super::arguments::bus_names;
-use super::input::skin_in;
-use super::output::{Force, apart};
-use super::print::list;
+use crate::arguments::bus_names;
+use crate::input::skin_in;
+use crate::output::{Overwrite, apart};
+use crate::print::list;
 
 /// Describe a bus in a DBC file, for cantools, SavvyCAN and others
 ///
@@ -19,11 +19,11 @@ use super::print::list;
 /// from bus to bus, so there is one file for each. Of a recording, that is the bus that it was recorded on.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  skinbus dbc gateway/examples/ur5-253.toml -o skin.dbc
-  skinbus dbc skin.toml --bus can1 > can1.dbc
-  skinbus dbc run.mcap -o run.dbc
+  skinbus skin dbc gateway/examples/ur5-253.toml -o skin.dbc
+  skinbus skin dbc skin.toml --bus can1 > can1.dbc
+  skinbus skin dbc run.mcap -o run.dbc
   candump -L vcan0 | python3 -m cantools decode -s skin.dbc")]
-pub(crate) struct Dbc {
+pub(super) struct Dbc {
     /// The skin's description, or a recording of a run, which has it in it
     #[arg(value_name = "SKIN|MCAP")]
     file: PathBuf,
@@ -37,11 +37,11 @@ pub(crate) struct Dbc {
     #[arg(long, short, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    force: Force,
+    overwrite: Overwrite,
 }
 
 impl Dbc {
-    pub(crate) fn run(self) -> Result<(), Failure> {
+    pub(super) fn run(self) -> Result<(), Failure> {
         let file = self.file.display();
         apart([("-o", self.output.as_deref())], [self.file.as_path()])?;
         let skin = skin_in(&self.file)?;
@@ -78,7 +78,7 @@ impl Dbc {
         }
         let text = dbc(&skin, bus);
         match self.output {
-            Some(path) => self.force.write("-o", &path, &text),
+            Some(path) => self.overwrite.write("-o", &path, &text),
             None => print(&text),
         }
     }

@@ -1,9 +1,9 @@
-//! `skinbus torque`.
+//! The torques of a force on a cell, both ways: `skinbus explain SKIN --force`.
 
 use core::f64::consts::TAU;
 use std::path::{Path, PathBuf};
 
-use clap::{ArgGroup, Args};
+use clap::Args;
 use model::central::Central;
 use model::scenario::MAX_FORCE_N;
 use protocol::document;
@@ -14,9 +14,10 @@ use protocol::usage::{Failure, print};
 use reference::Reference;
 use serde::Serialize;
 
-use super::arguments::{Named, cell};
-use super::columns::{Columns, Table};
-use super::print::{count, json_line, table};
+use crate::arguments::{Named, cell};
+use crate::columns::{Columns, Table};
+use crate::input::skin_in;
+use crate::print::{count, json_line, table};
 
 /// Bytes of a file of rows.
 const BATCH: u64 = 256 << 20;
@@ -24,39 +25,18 @@ const BATCH: u64 = 256 << 20;
 /// What stands in a line of it.
 const COLUMNS: Columns = Columns { needed: &["cell", "force_n", "q"], optional: &[] };
 
-/// Compute the torques of a force on a cell: centrally, and as the cell's fixed-point code does
-///
-/// The central computation is that of the run's comparison, in double precision with the numbers of the skin's file. The
-/// cell's is the code that a cell runs, on the words of its parameters and of the joints' positions. Positions of sliding
-/// joints are within their limits, angles within a turn each way or their limits, if those are wider.
+/// A force on a cell, or rows of them.
 #[derive(Args, Debug)]
-#[command(group = ArgGroup::new("what").required(true).args(["cell", "batch"]),
-    after_help = "ROWS.csv has a line for each row, positions with spaces between them:
-  cell,force_n,q
-  vcan0:12,2.5,0 -1.2 1.0 -1.4 -1.57 0
-
-Examples:
-  skinbus torque skin.toml --cell 12 --force 2.5 --joints \"0 -1.2 1.0 -1.4 -1.57 0\"
-  skinbus torque skin.toml --batch rows.csv --json > torques.jsonl")]
-pub(crate) struct Torque {
-    /// The skin's description
-    #[arg(value_name = "SKIN")]
-    file: PathBuf,
-    /// The cell: its node id, or BUS:NODE
-    #[arg(long, value_name = "CELL", value_parser = cell, requires_all = ["force", "joints"])]
-    cell: Option<Named>,
-    /// The force against its outward normal in N, 0 to 95.997: the range of three contact words
-    #[arg(long, value_name = "N", requires = "cell", allow_negative_numbers = true)]
+pub(super) struct Given {
+    /// Compute the torques of a force against the cell's outward normal in N, 0 to 95.997: the range of three contact words
+    #[arg(long, value_name = "N", requires_all = ["cell", "joints"], conflicts_with_all = ["epoch", "skin"], allow_negative_numbers = true)]
     force: Option<f64>,
     /// The positions of its chain's joints, rad or m, with spaces between them
-    #[arg(long, value_name = "POSITIONS", requires = "cell", allow_hyphen_values = true)]
+    #[arg(long, value_name = "POSITIONS", requires = "force", allow_hyphen_values = true)]
     joints: Option<String>,
-    /// Many rows from a file
-    #[arg(long, value_name = "ROWS.csv")]
+    /// Compute the torques of many rows from a file
+    #[arg(long, value_name = "ROWS.csv", conflicts_with_all = ["force", "cell", "epoch", "skin"])]
     batch: Option<PathBuf>,
-    /// One JSON object a row
-    #[arg(long)]
-    json: bool,
 }
 
 /// What comes out, in Nm, of prismatic joints in N.
@@ -72,20 +52,29 @@ struct Row {
     saturated: bool,
 }
 
-impl Torque {
-    pub(crate) fn run(self) -> Result<(), Failure> {
-        let skin = Skin::read(&self.file).map_err(Failure::usage)?;
+impl Given {
+    /// Computes the torques for a skin, or for the one in a recording, and prints them.
+    pub(super) fn compute(
+        &self,
+        files: &[PathBuf],
+        cell: Option<&Named>,
+        as_json: bool,
+    ) -> Result<(), Failure> {
+        let [file] = files else {
+            return Err(Failure::usage("--force and --batch are for one skin: name one file"));
+        };
+        let skin = skin_in(file)?;
         let calculator = Calculator::new(&skin);
-        let rows = match (&self.cell, &self.batch) {
-            (Some(cell), _) => {
+        let rows = match (cell, &self.batch) {
+            (_, Some(path)) => calculator.batch(path)?,
+            (Some(cell), None) => {
                 let (force, joints) =
                     (self.force.unwrap_or_default(), self.joints.as_deref().unwrap_or_default());
                 vec![calculator.row(cell, "--cell", force, joints).map_err(Failure::usage)?]
             }
-            (None, Some(path)) => calculator.batch(path)?,
             (None, None) => Vec::new(),
         };
-        if self.json {
+        if as_json {
             return rows.iter().try_for_each(|row| print(&json_line(row)?));
         }
         rows.iter().try_for_each(|row| print(&row.text()))

@@ -1,68 +1,27 @@
-//! `skinbus scenario check`.
+//! What `skinbus check` prints of a scenario.
 
-use std::path::PathBuf;
+use std::path::Path;
 
 use bench::run::RunError;
 use bench::run::launch::groups;
-use clap::{Args, Subcommand};
 use model::scenario::{BusFault, FaultKind, ForceErrors, MotionKind, Scenario as Description, SensorFault};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
-use protocol::usage::{Failure, print, shown};
+use protocol::usage::{Failure, shown};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 
-use super::print::{count, decimals, json as pretty, list, or, table, words};
+use crate::print::{count, decimals, json as pretty, list, or, table, words};
 
-/// Check the descriptions of runs
-#[derive(Args, Debug)]
-pub(crate) struct Scenario {
-    #[command(subcommand)]
-    command: Command,
-}
-
-#[derive(Debug, Subcommand)]
-enum Command {
-    Check(Check),
-}
-
-/// Check a scenario's description for a skin, and say what it will do
+/// Checks a scenario that a file describes for a skin, and says what it will do.
 ///
-/// Lists in the order of time who is touched with what force, what breaks, and what the gateway computes. Exit code 2,
-/// and one line with the line and column, the key, the value and what is allowed, when something is wrong.
-#[derive(Args, Debug)]
-#[command(after_help = "Examples:
-  skinbus scenario check gateway/examples/demo.toml --skin gateway/examples/ur5-253.toml
-  skinbus scenario check scenario.toml --skin skin.toml --json | jq '.events[] | select(.what == \"touch\")'")]
-struct Check {
-    /// The scenario's description
-    file: PathBuf,
-    /// The description of the skin that it is for
-    #[arg(long, value_name = "FILE")]
-    skin: PathBuf,
-    /// One JSON object; numbers have the names of the file's keys
-    #[arg(long)]
-    json: bool,
-}
-
-impl Scenario {
-    pub(crate) fn run(self) -> Result<(), Failure> {
-        let Command::Check(command) = self.command;
-        command.run()
-    }
-}
-
-impl Check {
-    fn run(self) -> Result<(), Failure> {
-        let skin = Skin::read(&self.skin).map_err(Failure::usage)?;
-        let scenario = Description::read(&self.file, &skin).map_err(Failure::usage)?;
-        let plan = Plan::of(&scenario, &skin);
-        print(&if self.json { pretty(&plan)? } else { plan.text(&self.file.display().to_string()) })?;
-        if let Some(error) = RunError::bus_fault(&scenario, &skin) {
-            return Err(Failure::usage(error));
-        }
-        Ok(())
-    }
+/// Returns also why a run would refuse it, if it would: a bench in virtual time may not.
+pub(super) fn plan(file: &Path, skin: &Skin, as_json: bool) -> Result<(String, Option<Failure>), Failure> {
+    let scenario = Description::read(file, skin).map_err(Failure::usage)?;
+    let refused = RunError::bus_fault(&scenario, skin).map(Failure::usage);
+    let plan = Plan::of(&scenario, skin);
+    let text = if as_json { pretty(&plan)? } else { plan.text(&file.display().to_string()) };
+    Ok((text, refused))
 }
 
 /// What a scenario does.

@@ -1,0 +1,114 @@
+//! `skinbus check`.
+
+mod scenario;
+mod skin;
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use protocol::document;
+use protocol::skin::Skin;
+use protocol::usage::{Failure, print};
+
+use self::skin::Listed;
+use super::arguments::{Named, cell};
+
+/// Check skins and scenarios, and say what they describe
+///
+/// Of a skin its URDF is read too, and it is summarised in a few lines. Of a scenario it lists in the order of time who is
+/// touched with what force, what breaks, and what the gateway computes. Exit code 2, and one line with the line and column,
+/// the key, the value and what is allowed, when something is wrong.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  skinbus check gateway/examples/ur5-253.toml gateway/examples/demo.toml
+  skinbus check scenario.toml --skin skin.toml --json | jq '.events[] | select(.what == \"touch\")'
+  skinbus check skin.toml --cell vcan0:12")]
+pub(crate) struct Check {
+    /// Skins and scenarios; - for standard input
+    #[arg(value_name = "FILE", required = true)]
+    files: Vec<PathBuf>,
+    /// The skin that scenarios are for; else the one among the files
+    #[arg(long, value_name = "SKIN")]
+    skin: Option<PathBuf>,
+    /// Also list the cells of skins, one a line: where each sits in the frame of its joint, whom its ports lead to, and the
+    /// configuration hash that its heartbeats carry
+    #[arg(long)]
+    list: bool,
+    /// List this cell alone
+    #[arg(long, value_name = "[BUS:]NODE", value_parser = cell, conflicts_with = "list")]
+    cell: Option<Named>,
+    /// One JSON object for each file; numbers have the names of the files' keys
+    #[arg(long, short)]
+    json: bool,
+}
+
+/// What a file describes.
+enum Described {
+    Skin(Box<Skin>),
+    Scenario,
+}
+
+impl Check {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let has_skin = self.skin.is_some() || self.files.len() > 1;
+        let described = self.files.iter().map(|file| Ok((file, described(file, has_skin)?)));
+        let described = described.collect::<Result<Vec<_>, Failure>>()?;
+        let named = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
+        let mut skins = described.iter().filter_map(|(_, described)| match described {
+            Described::Skin(skin) => Some(&**skin),
+            Described::Scenario => None,
+        });
+        let beside = (skins.next(), skins.next());
+        let listed = match &self.cell {
+            Some(cell) => Listed::Only(cell),
+            None if self.list => Listed::All,
+            None => Listed::None,
+        };
+        let (mut text, mut refused) = (String::new(), None);
+        for (file, described) in &described {
+            text += &match described {
+                Described::Skin(skin) => skin::summary(file, skin, listed, self.json)?,
+                Described::Scenario => {
+                    let skin = match (&named, beside) {
+                        (Some(skin), _) | (None, (Some(skin), None)) => skin,
+                        (None, (None, _)) => return Err(ambiguous(file, "no skin is")),
+                        (None, (Some(_), Some(_))) => return Err(ambiguous(file, "several skins are")),
+                    };
+                    let (text, refusal) = scenario::plan(file, skin, self.json)?;
+                    refused = refused.or(refusal);
+                    text
+                }
+            };
+        }
+        print(&text)?;
+        refused.map_or(Ok(()), Err)
+    }
+}
+
+fn ambiguous(file: &Path, found: &str) -> Failure {
+    let file = file.display();
+    Failure::usage(format!(
+        "{file} is a scenario, and {found} among the files: name the skin that it is for with --skin"
+    ))
+}
+
+/// Reads a skin, or finds that a file is a scenario: by its tables, which the two have not in common; of a file with none of
+/// them, a scenario where `has_skin`, a skin where not.
+fn described(file: &Path, has_skin: bool) -> Result<Described, Failure> {
+    const OF_SKINS: [&str; 8] =
+        ["robot", "chain", "bus", "cell", "timing", "controller", "contact", "safety"];
+    const OF_SCENARIOS: [&str; 5] = ["motion", "mode", "touch", "fault", "sensors"];
+    let text = document::text(file).map_err(Failure::usage)?;
+    let has = |names: &[&str]| {
+        let tables = text.lines().filter_map(|line| line.trim_start().strip_prefix('['));
+        let name = |line: &str| {
+            line.trim_start_matches([' ', '[']).split([']', '.', ' ']).next().unwrap_or_default().to_owned()
+        };
+        tables.map(name).any(|name| names.contains(&name.as_str()))
+    };
+    if !has(&OF_SKINS) && (has(&OF_SCENARIOS) || has_skin) {
+        return Ok(Described::Scenario);
+    }
+    let skin = Skin::parse(&file.display().to_string(), &text).map_err(Failure::usage)?;
+    Ok(Described::Skin(Box::new(skin)))
+}

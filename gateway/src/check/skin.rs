@@ -1,0 +1,220 @@
+//! What `skinbus check` prints of a skin.
+
+use std::collections::hash_map::Entry;
+use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
+
+use protocol::fixed::TorqueFormat;
+use protocol::packet::crc16;
+use protocol::skin::{Cell, ControllerKind, Reply, Skin};
+use protocol::usage::{Failure, shown};
+use serde_json::{Value, json};
+
+use crate::arguments::{Named, bus_names};
+use crate::print::{count, list, or, words};
+use crate::robot_file::{RobotOfSkin, urdf_of};
+
+/// The cells that are listed beside the summary.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Listed<'a> {
+    None,
+    All,
+    /// This one instead of the summary.
+    Only(&'a Named),
+}
+
+/// Checks a skin that a file describes and its URDF, as a run that records does, and summarises it.
+pub(super) fn summary(
+    file: &Path,
+    skin: &Skin,
+    listed: Listed<'_>,
+    as_json: bool,
+) -> Result<String, Failure> {
+    if let Some(urdf) = &skin.robot.urdf {
+        RobotOfSkin::read(skin, Some(&urdf_of(file, urdf)))?;
+    }
+    let is_listed = |cell: &&Cell| match listed {
+        Listed::None => false,
+        Listed::All => true,
+        Listed::Only(Named { bus, node }) => {
+            cell.node == *node && bus.as_deref().is_none_or(|bus| bus == bus_name(skin, cell))
+        }
+    };
+    let cells: Vec<_> = skin.cells.iter().filter(is_listed).collect();
+    if let Listed::Only(named) = listed
+        && cells.is_empty()
+    {
+        let (file, buses) = (file.display(), list(bus_names(skin)));
+        return Err(Failure::usage(format!(
+            "--cell {named}: {file} has no such cell on {buses}; --list lists all"
+        )));
+    }
+    if as_json {
+        return crate::print::json(&values(file, skin, &cells));
+    }
+    let lines: String = cells.iter().map(|cell| line(skin, cell)).collect();
+    Ok(if let Listed::Only(_) = listed { lines } else { describe(skin) + &lines })
+}
+
+fn describe(skin: &Skin) -> String {
+    let Skin { name, robot, timing, events: _, buses, controller, safety: _, cells } = skin;
+    let controller = match &controller.kind {
+        ControllerKind::Kinesthetic { .. } => "kinesthetic controller".to_owned(),
+        ControllerKind::External { socket, .. } => format!("external controller at {socket}"),
+    };
+    let every = cells.first().map(|cell| format!(" (every {} us)", skin.parameters(cell).period_us));
+    let (name, robot_name) = (shown(name), shown(&robot.name));
+    let mut text = format!(
+        "{name}: {}, {}\nrobot: {}, {}\ntiming: control loop {} Hz, joints {} Hz{}, {controller}\n",
+        count(cells.len(), "cell"),
+        count(buses.len(), "bus"),
+        robot_name,
+        count(robot.joints.len(), "joint"),
+        timing.control_hz,
+        timing.broadcast_hz(),
+        or(every, ""),
+    );
+    for chain in
+        robot.chains.iter().filter(|chain| robot.chains.len() > 1 || chain.rows.len() > chain.joints.len())
+    {
+        let names =
+            words(chain.joints.iter().filter_map(|joint| robot.joints.get(*joint)).map(|joint| &joint.name));
+        let (joints, rows) = (count(chain.joints.len(), "joint"), count(chain.rows.len(), "row"));
+        text += &format!("chain {}: {joints} in {rows}: {}\n", shown(&chain.name), shown(&names));
+    }
+    for (index, bus) in buses.iter().enumerate() {
+        let format = bus.format.name();
+        let reply = match bus.reply {
+            Reply::Torque => "torque".to_owned(),
+            Reply::Sum { slot_us, carry: true } => format!("sum, slots of {slot_us} us"),
+            Reply::Sum { slot_us, carry: false } => format!("sum without carry, slots of {slot_us} us"),
+        };
+        let mut by_joint = BTreeMap::<_, usize>::new();
+        for cell in skin.cells_of(index) {
+            *by_joint.entry(cell.joint).or_default() += 1;
+        }
+        let cells = count(by_joint.values().sum::<usize>(), "cell");
+        let parts = list(by_joint.iter().map(|(joint, cells)| format!("{cells} on joint {joint}")));
+        let roots: Vec<_> = skin.cells_of(index).filter(|cell| cell.root).map(|cell| cell.node).collect();
+        let roots = match roots.as_slice() {
+            [] => "no root".to_owned(),
+            [root] => format!("root {root}"),
+            roots => format!("roots {}", words(roots)),
+        };
+        let rates = bus.bitrate.map(|nominal| match bus.data_bitrate {
+            Some(data) => format!(", {nominal} and {data} bit/s"),
+            None => format!(", {nominal} bit/s"),
+        });
+        let rates = or(rates, "");
+        let chain = if robot.chains.len() > 1 {
+            format!(", chain {}", skin.chain(index).name)
+        } else {
+            String::new()
+        };
+        let torques = match bus.torque_format {
+            TorqueFormat::Q3_12 => String::new(),
+            format @ (TorqueFormat::Q5_10 | TorqueFormat::Q7_8) => format!(", torques in {}", format.name()),
+        };
+        text += &format!(
+            "bus {} ({format}{rates}{chain}, {reply}{torques}): {cells}: {parts}; {roots}\n",
+            bus.name
+        );
+    }
+    for [first, second] in at_one_place(skin) {
+        let name = |cell: &Cell| format!("{} on {}", cell.node, bus_name(skin, cell));
+        text += &format!("remark: cells {} and {} sit at one place\n", name(first), name(second));
+    }
+    text + &format!("hash: {:04X} over the parameters of all cells; --list lists each cell's\n", hash(skin))
+}
+
+/// Cells that sit where a cell before them sits.
+fn at_one_place(skin: &Skin) -> Vec<[&Cell; 2]> {
+    let mut known = HashMap::new();
+    let place = |cell: &Cell| {
+        (
+            skin.buses.get(cell.bus).map(|bus| bus.chain),
+            cell.row,
+            cell.position.map(|metres| (metres + 0.0).to_bits()),
+        )
+    };
+    let pair = |cell| match known.entry(place(cell)) {
+        Entry::Occupied(first) => Some([*first.get(), cell]),
+        Entry::Vacant(free) => {
+            free.insert(cell);
+            None
+        }
+    };
+    skin.cells.iter().filter_map(pair).collect()
+}
+
+fn bus_name<'a>(skin: &'a Skin, cell: &Cell) -> &'a str {
+    skin.buses.get(cell.bus).map_or("", |bus| bus.name.as_str())
+}
+
+/// A cell in a line.
+fn line(skin: &Skin, cell: &Cell) -> String {
+    let on_bus = bus_name(skin, cell);
+    let Cell { node, serial, joint, row, position, normal, neighbors, root, .. } = cell;
+    let (position, ports) = (words(position), words(neighbors.map(|port| or(port, "-"))));
+    let normal = words(rounded(normal));
+    let root = if *root { " root" } else { "" };
+    let row = Some(*row).filter(|row| skin.chain(cell.bus).row_of(*joint) != Some(*row));
+    let row = or(row.map(|row| format!(" row {row}")), "");
+    let hash = skin.parameters(cell).hash();
+    format!(
+        "{on_bus} {node} joint {joint}{row} at {position} m normal {normal} ports {ports}{root} serial {serial} hash {hash:04X}\n"
+    )
+}
+
+/// A unit vector with the four decimals that can be measured: one from a quaternion has more.
+fn rounded(normal: &[f64; 3]) -> [f64; 3] {
+    normal.map(|part| (part * 1e4).round() / 1e4 + 0.0)
+}
+
+/// The hash over the parameters of all cells.
+fn hash(skin: &Skin) -> u16 {
+    let images: Vec<u8> = skin.cells.iter().flat_map(|cell| skin.parameters(cell).image()).collect();
+    crc16(&images)
+}
+
+/// The skin as JSON.
+fn values(file: &Path, skin: &Skin, cells: &[&Cell]) -> Value {
+    let buses = skin.buses.iter().enumerate().map(|(index, bus)| {
+        let roots = skin.cells_of(index).filter(|cell| cell.root).map(|cell| cell.node.get());
+        json!({
+            "name": bus.name,
+            "format": bus.format.name(),
+            "reply": if bus.reply == Reply::Torque { "torque" } else { "sum" },
+            "bitrate": bus.bitrate,
+            "data_bitrate": bus.data_bitrate,
+            "cells": skin.cells_of(index).count(),
+            "roots": roots.collect::<Vec<_>>(),
+        })
+    });
+    let cells = cells.iter().map(|cell| {
+        json!({
+            "bus": bus_name(skin, cell),
+            "node": cell.node.get(),
+            "joint": cell.joint,
+            "position_m": cell.position,
+            "normal": rounded(&cell.normal),
+            "neighbors": cell.neighbors.map(|port| port.map(protocol::id::CellId::get)),
+            "root": cell.root,
+            "serial": cell.serial,
+            "hash": format!("{:04X}", skin.parameters(cell).hash()),
+        })
+    });
+    json!({
+        "file": file.display().to_string(),
+        "kind": "skin",
+        "name": skin.name,
+        "robot": skin.robot.name,
+        "joints": skin.robot.joints.iter().map(|joint| &joint.name).collect::<Vec<_>>(),
+        "control_hz": skin.timing.control_hz,
+        "broadcast_hz": skin.timing.broadcast_hz(),
+        "cell_count": skin.cells.len(),
+        "buses": buses.collect::<Vec<_>>(),
+        "hash": format!("{:04X}", hash(skin)),
+        "cells": cells.collect::<Vec<_>>(),
+    })
+}

@@ -1,0 +1,75 @@
+//! `skinbus completions` and `skinbus man`.
+
+use std::io;
+use std::path::PathBuf;
+
+use clap::{Args, Command};
+use clap_complete::Shell;
+use protocol::usage::{Failure, draw, written};
+
+use super::output::{Overwrite, is_standard_output, note};
+
+/// Print completions for a shell
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  skinbus completions bash > ~/.local/share/bash-completion/completions/skinbus
+  skinbus completions zsh > ~/.zfunc/_skinbus
+  skinbus completions fish > ~/.config/fish/completions/skinbus.fish")]
+pub(crate) struct Completions {
+    /// The shell
+    shell: Shell,
+}
+
+impl Completions {
+    pub(crate) fn run(self, mut program: Command) -> Result<(), Failure> {
+        let mut script = Vec::new();
+        clap_complete::generate(self.shell, &mut program, "skinbus", &mut script);
+        draw(&String::from_utf8_lossy(&script))
+    }
+}
+
+/// Write man pages: skinbus.1, and one for each command
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  skinbus man ~/.local/share/man/man1
+  skinbus man - | man -l -")]
+pub(crate) struct Man {
+    /// The folder, which has to exist; - for skinbus.1 on standard output
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+    #[command(flatten)]
+    overwrite: Overwrite,
+}
+
+impl Man {
+    pub(crate) fn run(self, mut program: Command) -> Result<(), Failure> {
+        if is_standard_output(&self.folder) {
+            return written(clap_mangen::Man::new(program).render(&mut io::stdout()));
+        }
+        if !self.folder.is_dir() {
+            let folder = self.folder.display();
+            return Err(Failure::usage(format!("{folder}: there is no such folder; make it first")));
+        }
+        program.build();
+        let mut pages = Vec::new();
+        pages_of(&program, &mut pages)?;
+        for (name, _) in &pages {
+            self.overwrite.check("", &self.folder.join(name))?;
+        }
+        for (name, text) in &pages {
+            self.overwrite.write("", &self.folder.join(name), text)?;
+        }
+        note(format_args!("{} man pages in {}", pages.len(), self.folder.display()));
+        Ok(())
+    }
+}
+
+/// Adds the page of a command and those of its subcommands: `skinbus-skin-import.1`.
+fn pages_of(command: &Command, pages: &mut Vec<(String, String)>) -> Result<(), Failure> {
+    let mut page = Vec::new();
+    clap_mangen::Man::new(command.clone()).render(&mut page).map_err(Failure::run)?;
+    let name = command.get_display_name().unwrap_or_else(|| command.get_name());
+    pages.push((format!("{name}.1"), String::from_utf8_lossy(&page).into_owned()));
+    let mut below = command.get_subcommands().filter(|it| it.get_name() != "help");
+    below.try_for_each(|it| pages_of(it, pages))
+}

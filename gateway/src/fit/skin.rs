@@ -1,0 +1,72 @@
+//! Whether a skin fits on real buses, in the worst case.
+
+use analysis::fit::{self, BusFit, COMPUTATION_NS, rates};
+use protocol::can::Format;
+use protocol::skin::{Bus, Skin};
+use protocol::usage::{Failure, print};
+use protocol::wire_time::BitRates;
+
+use super::{Fit, skin_text};
+use crate::output::note;
+use crate::print::{json, list};
+
+impl Fit {
+    /// Computes it for a skin, and prints it.
+    pub(super) fn of_skin(&self, skin: &Skin) -> Result<(), Failure> {
+        let computation_ns = self.computation.unwrap_or(COMPUTATION_NS);
+        let chosen = if self.table { None } else { self.rates(skin)? };
+        let (buses, whole, rows) = match chosen {
+            None => (Vec::new(), None, fit::table(skin, self.format, computation_ns)),
+            Some(chosen) => {
+                let buses = chosen.into_iter().enumerate();
+                let fit = |(index, (format, rates))| fit::bus(skin, index, format, rates, computation_ns);
+                let buses: Vec<BusFit> = buses.filter_map(fit).collect();
+                let whole = fit::whole(skin, &buses);
+                (buses, whole, Vec::new())
+            }
+        };
+        let is_partly_described = !rows.is_empty() && skin.buses.iter().any(|bus| bus.bitrate.is_some());
+        if is_partly_described && !self.table && !self.json {
+            let without = skin.buses.iter().filter(|bus| bus.bitrate.is_none()).map(|bus| &bus.name);
+            let (without, skin) = (list(without), &skin.name);
+            note(format_args!("no bitrate of {without}: these are common bit rates, not those of {skin}"));
+        }
+        print(&match self.json {
+            true => json(&fit::json(skin, &buses, whole.as_ref(), &rows))?,
+            false => skin_text::table(skin, &rows) + &skin_text::buses(skin, &buses, whole.as_ref()),
+        })
+    }
+
+    /// Format and rates of every bus; `None` when neither the command line nor the description has them for all.
+    fn rates(&self, skin: &Skin) -> Result<Option<Vec<(Format, BitRates)>>, Failure> {
+        let formats: Vec<_> = skin.buses.iter().map(|bus| self.format.unwrap_or(bus.format)).collect();
+        let Some(nominal) = self.nominal else {
+            let described = skin.buses.iter().zip(&formats).map(|(bus, &format)| described(bus, format));
+            return described.collect();
+        };
+        if self.data.is_some() && !formats.contains(&Format::Fd) {
+            return Err(Failure::usage(
+                "--data is for CAN FD, and here all buses are classic: leave it out, or add --format fd",
+            ));
+        }
+        let rates = |format| match (format, self.data) {
+            (Format::Classic, _) => BitRates::classic(nominal).map_err(Failure::usage),
+            (Format::Fd, Some(data)) => BitRates::new(nominal, data).map_err(Failure::usage),
+            (Format::Fd, None) => {
+                BitRates::classic(nominal).map_err(Failure::usage)?;
+                Err(Failure::usage(format!(
+                    "CAN FD needs a data bit rate: add --data, {nominal} to {}, or --format classic",
+                    BitRates::MAX_DATA
+                )))
+            }
+        };
+        formats.into_iter().map(|format| Ok((format, rates(format)?))).collect::<Result<_, _>>().map(Some)
+    }
+}
+
+/// The rates of a bus in its description.
+fn described(bus: &Bus, format: Format) -> Result<Option<(Format, BitRates)>, Failure> {
+    let rates = rates::described(bus, format).transpose();
+    let rates = rates.map_err(|error| Failure::usage(format!("bus {}: {error}", bus.name)))?;
+    Ok(rates.map(|rates| (format, rates)))
+}

@@ -1,0 +1,361 @@
+//! Packets by hand: what is asked for, as messages.
+
+use clap::{Args, Subcommand};
+use model::decode::parameter;
+use model::scenario::contact_words;
+use protocol::fixed::{Q, Q1_14, Q5_10};
+use protocol::id::{CellId, Kind, Node};
+use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
+use protocol::packet::Epoch;
+use protocol::parameters::MAX_JOINTS;
+use protocol::schema::packets;
+
+use super::sensing;
+use crate::arguments::node;
+
+/// Whom a packet is for.
+#[derive(Clone, Debug)]
+pub(super) struct Addressee {
+    pub(super) bus: Option<String>,
+    pub(super) node: Node,
+}
+
+impl Addressee {
+    /// The cell; `None` is every cell.
+    pub(super) const fn cell(&self) -> Option<CellId> {
+        if let Node::Cell(cell) = self.node { Some(cell) } else { None }
+    }
+}
+
+pub(super) fn addressee(text: &str) -> Result<Addressee, String> {
+    let (bus, name) = match text.rsplit_once(':') {
+        Some((bus, name)) => (Some(bus.to_owned()), name),
+        None => (None, text),
+    };
+    let found = if name == "everyone" { Ok(Node::Everyone) } else { node(name).map(Node::Cell) };
+    let node = found.map_err(|_| "a node id, 1 to 254, BUS:NODE, or everyone is possible".to_owned())?;
+    Ok(Addressee { bus, node })
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum What {
+    /// Stop answering until a resume
+    #[command(after_help = "Example:\n  skinbus frame halt")]
+    Halt,
+    /// Leave the halted state
+    #[command(after_help = "Example:\n  skinbus frame resume")]
+    Resume,
+    /// Answer with a heartbeat when all that the last joints asked is done
+    #[command(after_help = "Example:\n  skinbus frame sync")]
+    Sync,
+    /// Answer with the pages of counters and sensors
+    #[command(after_help = "Example:\n  skinbus frame report")]
+    Report,
+    Joints(Positions),
+    Stimulus(Stimulus),
+    Configure(Configure),
+    Sensing(sensing::Switch),
+}
+
+/// The joint positions of an epoch
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  skinbus frame joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 0
+  skinbus frame joints --epoch 7 --words 0 0xCF1C 0x28BE 0xC6F5 0xC008 0")]
+pub(super) struct Positions {
+    /// The number of this broadcast, 0 to 255; cells drop a repetition of the last one
+    #[arg(long, value_name = "E")]
+    epoch: u8,
+    #[command(flatten)]
+    positions: Angles,
+}
+
+#[derive(Args, Debug)]
+#[group(required = true, multiple = false)]
+struct Angles {
+    /// One position for each joint of the chain, 1 to 14 of them, in rad; wrapped to a turn
+    #[arg(long, value_name = "RAD", num_args = 1.., allow_negative_numbers = true)]
+    rad: Option<Vec<String>>,
+    /// The same as words: -32768 to 32767 or 0x0 to 0xFFFF, in steps of a turn / 65536
+    #[arg(long, value_name = "WORD", num_args = 1.., allow_negative_numbers = true)]
+    words: Option<Vec<String>>,
+}
+
+/// A stimulus: the contact state of a cell in test mode
+///
+/// The cell must be in test mode: `skinbus frame configure --cell N --write mode 1`. A stimulus takes effect with
+/// the next joints, and holds until another one replaces it; without --force the force is 0.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  skinbus frame stimulus --cell 12 --force 3.0
+  skinbus frame stimulus --cell everyone --epoch 7 --force 0.5 --proximity 0.9
+  skinbus frame stimulus --cell 12 --acceleration 0 0 1")]
+pub(super) struct Stimulus {
+    /// The cell, or everyone
+    #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
+    cell: Addressee,
+    /// The touch's force in N, shared by the three contact words
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    force: Option<String>,
+    /// 0, nothing near, to 1
+    #[arg(long, value_name = "P", allow_negative_numbers = true)]
+    proximity: Option<String>,
+    /// The two temperatures in degrees Celsius
+    #[arg(long, num_args = 2, value_names = ["T1", "T2"], allow_negative_numbers = true)]
+    temperature: Option<Vec<String>>,
+    /// The acceleration in g, instead of what touches the skin
+    #[arg(
+        long,
+        num_args = 3,
+        value_names = ["X", "Y", "Z"],
+        allow_negative_numbers = true,
+        conflicts_with_all = ["force", "proximity", "temperature"]
+    )]
+    acceleration: Option<Vec<String>>,
+    /// From the joints of this epoch on; else from the next joints on, whatever their epoch
+    #[arg(long, value_name = "E")]
+    epoch: Option<u8>,
+}
+
+/// Read or write a parameter of a cell
+///
+/// A parameter that is written by name takes values in their units:
+///
+///   mount JOINT JOINTS
+///   pose X Y Z NORMAL_X NORMAL_Y NORMAL_Z   (m, in the frame of the joint)
+///   contact ALPHA_C ALPHA_P CONTACT_THRESHOLD PROXIMITY_THRESHOLD FORCE_THRESHOLD   (N)
+///   timing PERIOD   (us)
+///   mode 0|1   (1 obeys stimuli)
+///   reply torque | sum SLOT DEEPEST 0|1   (us; 1 carries what rounding took away)
+///   sensing off | continuous PERIOD | event   (ms)
+///   events CONTACT PROXIMITY TEMPERATURE ACCELERATION HYSTERESIS   (N, °C, g; 0 to 1 of each)
+///   links_down none | 0+2   (ports that receive nothing, in test mode only)
+///   baseline off | hold|follow THRESHOLD HYSTERESIS RATE LIMIT SLOPE   (N; 0 to 1 of it; uN/s; N; N/°C)
+///   tare none | tared | forced   (forget the zero, find it unless touched, find it anyhow)
+///   row1 to row6  A D ALPHA THETA_OFFSET   (m, m, rad, rad)
+///   commit HASH   (hexadecimal)
+///
+/// By number it takes words as they are.
+#[derive(Args, Debug)]
+#[command(
+    verbatim_doc_comment,
+    after_help = "Examples:
+  skinbus frame configure --cell 12 --read pose
+  skinbus frame configure --cell 12 --write mode 1
+  skinbus frame configure --cell everyone --write row2 -0.425 0 0 0
+  skinbus frame configure --cell 12 --write 99 1 -1 0x7FFF"
+)]
+pub(super) struct Configure {
+    /// The cell, or everyone
+    #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
+    cell: Addressee,
+    #[command(flatten)]
+    request: Requested,
+    /// Copied into the answer
+    #[arg(long, value_name = "T", default_value_t = 0)]
+    tag: u8,
+}
+
+#[derive(Args, Debug)]
+#[group(required = true, multiple = false)]
+struct Requested {
+    /// Read a parameter, by name or number
+    #[arg(long, value_name = "PARAMETER")]
+    read: Option<String>,
+    /// Write a parameter, by name or number
+    #[arg(long, num_args = 1.., value_names = ["PARAMETER", "VALUE"], allow_negative_numbers = true)]
+    write: Option<Vec<String>>,
+}
+
+impl What {
+    pub(super) fn message(&self) -> Result<Message, String> {
+        match self {
+            Self::Halt => Ok(Message::Halt),
+            Self::Resume => Ok(Message::Resume),
+            Self::Sync => Ok(Message::Sync),
+            Self::Report => Ok(Message::Report),
+            Self::Joints(joints) => joints.message(),
+            Self::Stimulus(stimulus) => stimulus.message(),
+            Self::Configure(configure) => configure.message(),
+            Self::Sensing(switch) => switch.message(),
+        }
+    }
+
+    /// Whom it is for; `None` is whoever listens.
+    pub(super) const fn to(&self) -> Option<&Addressee> {
+        match self {
+            Self::Halt | Self::Resume | Self::Sync | Self::Report | Self::Joints(_) => None,
+            Self::Stimulus(Stimulus { cell, .. }) | Self::Configure(Configure { cell, .. }) => Some(cell),
+            Self::Sensing(switch) => Some(&switch.cell),
+        }
+    }
+}
+
+impl Positions {
+    fn message(&self) -> Result<Message, String> {
+        let Angles { rad, words } = &self.positions;
+        let (name, texts, read): (_, _, fn(&str) -> _) = match (rad, words) {
+            (Some(rad), _) => ("--rad", rad, parameter::angle),
+            (None, words) => ("--words", words.as_ref().ok_or("--rad or --words is needed")?, parameter::raw),
+        };
+        if texts.len() > MAX_JOINTS {
+            let got = texts.len();
+            return Err(format!("{name} has {got} positions: a chain has at most {MAX_JOINTS} joints"));
+        }
+        let mut positions = [Q1_14::ZERO; MAX_JOINTS];
+        for (position, text) in positions.iter_mut().zip(texts) {
+            *position = Q1_14::from_bits(value(name, text, read)?);
+        }
+        let in_use = u8::try_from(texts.len()).map_err(|error| error.to_string())?;
+        Ok(Message::Joints { epoch: Epoch(self.epoch), joints: Joints { positions, in_use } })
+    }
+}
+
+impl Stimulus {
+    fn message(&self) -> Result<Message, String> {
+        let page = match &self.acceleration {
+            Some(texts) => SensorPage::Acceleration(several("--acceleration", "acceleration_g", texts)?),
+            None => SensorPage::Skin(SkinSensors {
+                contact: self.force.as_deref().map_or(Ok([Q5_10::ZERO; 3]), contact)?,
+                proximity: self
+                    .proximity
+                    .as_deref()
+                    .map_or(Ok(Q1_14::ZERO), |text| contact_state("--proximity", "proximity", text))?,
+                temperature: several(
+                    "--temperature",
+                    "temperature_c",
+                    self.temperature.as_deref().unwrap_or_default(),
+                )?,
+            }),
+        };
+        let from = self.epoch.map_or(From::Next, |epoch| From::Epoch(Epoch(epoch)));
+        Ok(Message::Stimulus { to: self.cell.node, from, page })
+    }
+}
+
+impl Configure {
+    fn message(&self) -> Result<Message, String> {
+        let wrong = |error: parameter::ParameterTextError| error.to_string();
+        let request = match (&self.request.read, self.request.write.as_deref()) {
+            (Some(name), _) => Request::Read { number: parameter::number(name).map_err(wrong)? },
+            (None, Some([name, values @ ..])) => {
+                let (number, words) = parameter::write(name, values).map_err(wrong)?;
+                Request::Write { number, words }
+            }
+            (None, None | Some([])) => return Err("--read or --write is needed".to_owned()),
+        };
+        Ok(Message::Configure { to: self.cell.node, tag: self.tag, request })
+    }
+}
+
+/// A value of an option; the error names the option, the value, and what is allowed.
+fn value<T>(option: &str, text: &str, read: impl Fn(&str) -> Result<T, String>) -> Result<T, String> {
+    read(text).map_err(|allowed| format!("{option} {text}: {allowed}"))
+}
+
+/// A value of a field of the sensors.
+fn contact_state<const F: u32>(option: &str, name: &str, text: &str) -> Result<Q<F>, String> {
+    let layouts =
+        packets().iter().filter(|schema| schema.kind == Kind::Stimulus).flat_map(|schema| &schema.layouts);
+    let field = layouts.flat_map(|layout| &layout.fields).find(|field| field.name == name);
+    let field = field.ok_or_else(|| format!("{option}: cells measure no {name}"))?;
+    let word = value(option, text, |text| parameter::real(text).and_then(|_| parameter::read(field, text)))?;
+    Ok(Q::from_bits(word))
+}
+
+/// So many numbers, or zeros when none were given.
+fn several<const F: u32, const N: usize>(
+    option: &str,
+    name: &str,
+    texts: &[String],
+) -> Result<[Q<F>; N], String> {
+    let mut all = [Q::ZERO; N];
+    for (one, text) in all.iter_mut().zip(texts) {
+        *one = contact_state(option, name, text)?;
+    }
+    Ok(all)
+}
+
+/// The three contact words of a force.
+fn contact(text: &str) -> Result<[Q5_10; 3], String> {
+    let force = value("--force", text, parameter::real)?;
+    let words = contact_words(force);
+    let sum: f64 = words.into_iter().map(Q::to_f64).sum();
+    if (sum - force).abs() > 1.0 / 1_024.0 {
+        let [min, max] = [Q5_10::MIN, Q5_10::MAX].map(|word| 3.0 * word.to_f64());
+        return Err(format!("--force {text}: three contact words hold {min} to {max:.3} N"));
+    }
+    Ok(words)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(subcommand)]
+        what: What,
+    }
+
+    fn message(line: &str) -> Result<Message, String> {
+        let words = std::iter::once("frame").chain(line.split(' '));
+        Line::try_parse_from(words).unwrap_or_else(|error| panic!("{error}")).what.message()
+    }
+
+    fn says(line: &str) -> String {
+        message(line).unwrap_err()
+    }
+
+    #[test]
+    fn what_cannot_be_is_said_with_what_can() {
+        assert_eq!(says("joints --epoch 7 --rad 0 x"), "--rad x: it must be a number");
+        assert_eq!(
+            says("joints --epoch 7 --words 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15"),
+            "--words has 15 positions: a chain has at most 14 joints"
+        );
+        assert_eq!(
+            says("stimulus --cell 12 --force 96"),
+            "--force 96: three contact words hold -96 to 95.997 N"
+        );
+        assert_eq!(says("stimulus --cell 12 --force nan"), "--force nan: it must be a number");
+        assert_eq!(says("stimulus --cell 12 --proximity -0.1"), "--proximity -0.1: proximity is 0 to 1");
+        assert_eq!(
+            says("stimulus --cell 12 --temperature 20 512"),
+            "--temperature 512: it must be in [-512, 512)"
+        );
+        for wrong in ["0", "255", "gateway", "-1", "x", "vcan0:0", ""] {
+            assert_eq!(
+                addressee(wrong).unwrap_err(),
+                "a node id, 1 to 254, BUS:NODE, or everyone is possible"
+            );
+        }
+        assert_eq!(says("configure --cell 12 --write mode 2"), "mode = 2: 0 measures, 1 obeys stimuli");
+    }
+
+    #[test]
+    fn a_force_is_shared_and_adds_up_to_its_nearest_word() {
+        for (force, steps) in
+            [("3.0", 3_072), ("-96", -98_304), ("95.997", 98_301), ("0.0005", 1), ("1", 1_024)]
+        {
+            let Ok(Message::Stimulus { page: SensorPage::Skin(skin), from: From::Next, to: Node::Everyone }) =
+                message(&format!("stimulus --cell everyone --force {force}"))
+            else {
+                panic!("{force}");
+            };
+            assert_eq!(
+                skin.contact.map(|word| i32::from(word.to_bits())).iter().sum::<i32>(),
+                steps,
+                "{force}"
+            );
+        }
+    }
+
+    #[test]
+    fn radians_are_wrapped_and_words_are_taken_as_they_are() {
+        let rad = message("joints --epoch 7 --rad 0 -1.2 1.0 -1.4 -1.57 6.283185307179586").unwrap();
+        let words = message("joints --epoch 7 --words 0 0xCF1C 10430 -14603 0xc008 0").unwrap();
+        assert_eq!(rad, words);
+    }
+}

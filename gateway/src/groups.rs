@@ -1,0 +1,152 @@
+//! The commands in groups, as the help lists them.
+
+use std::fmt::Write;
+
+use clap::Command;
+
+/// The groups, and their commands in order.
+const GROUPS: [(&str, &[&str]); 7] = [
+    ("Run", &["demo", "run", "view"]),
+    ("Look", &["dump", "explain", "report", "cells"]),
+    ("Files", &["convert", "replay", "recover"]),
+    ("Size", &["fit"]),
+    ("Real cells", &["commission", "calibrate", "conformance", "frame"]),
+    ("Describe", &["skin", "check", "experiment"]),
+    ("Shell", &["completions", "man"]),
+];
+
+/// The rest of the help.
+const AFTER: &str =
+    "Embedded buses lie in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
+`skinbus COMMAND -h` has the options of a command, `--help` explains them.
+
+Examples:
+  skinbus demo
+  skinbus run skin.toml --scenario scenario.toml --record run.mcap";
+
+/// The program with its commands in groups instead of one list.
+pub(crate) fn grouped(program: Command) -> Command {
+    let help = format!(
+        "{{about-with-newline}}\n{{usage-heading}} {{usage}}\n{}\nOptions:\n{{options}}\n\n{AFTER}\n",
+        list(&program)
+    );
+    program.help_template(help)
+}
+
+fn list(program: &Command) -> String {
+    let mut text = String::new();
+    for (group, names) in GROUPS {
+        let _ = write!(text, "\n{group}:\n");
+        for command in names.iter().filter_map(|name| program.find_subcommand(name)) {
+            let about = command.get_about().map(ToString::to_string).unwrap_or_default();
+            let _ = writeln!(text, "  {:<12} {about}", command.get_name());
+        }
+    }
+    text
+}
+
+/// The refusal of a name that is no command: the one that was perhaps meant, else all of them.
+pub(crate) fn unknown(program: &Command, name: &str) -> String {
+    let names: Vec<_> = program.get_subcommands().map(Command::get_name).collect();
+    let likely = names.iter().map(|it| (strsim::jaro_winkler(name, it), it));
+    let best = likely.max_by(|one, other| one.0.total_cmp(&other.0)).filter(|(likeness, _)| *likeness > 0.75);
+    match best {
+        Some((_, best)) => format!("there is no command {name}; did you mean {best}?"),
+        None => format!("there is no command {name}; there are {}", crate::print::list(names)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::{BTreeMap, BTreeSet};
+
+    use clap::{Arg, CommandFactory};
+
+    use super::*;
+
+    fn program() -> Command {
+        let mut program = grouped(crate::Arguments::command());
+        program.build();
+        program
+    }
+
+    /// A command and those below it.
+    fn all<'a>(command: &'a Command, found: &mut Vec<&'a Command>) {
+        found.push(command);
+        command.get_subcommands().for_each(|it| all(it, found));
+    }
+
+    /// The visible options of a command, without help and version.
+    fn options(command: &Command) -> impl Iterator<Item = &Arg> {
+        let is_own = |arg: &&Arg| !matches!(arg.get_id().as_str(), "help" | "version");
+        command.get_arguments().filter(is_own).filter(|arg| !arg.is_hide_set() && !arg.is_positional())
+    }
+
+    #[test]
+    fn every_command_is_in_one_group() {
+        let grouped: Vec<_> = GROUPS.iter().flat_map(|(_, names)| names.iter().copied()).collect();
+        let program = program();
+        let there: BTreeSet<_> = program.get_subcommands().map(Command::get_name).collect();
+        assert_eq!(grouped.iter().copied().collect::<BTreeSet<_>>(), there);
+        assert!(grouped.len() <= 21 && grouped.len() == there.len(), "{}", grouped.len());
+        let help = program.clone().render_help().to_string();
+        assert!(help.contains("\nReal cells:\n  commission   Write a skin"), "{help}");
+    }
+
+    #[test]
+    fn there_are_at_most_210_options() {
+        // Not built: options for all commands below one stand once, where they are defined.
+        let program = crate::Arguments::command();
+        let mut commands = Vec::new();
+        all(&program, &mut commands);
+        let of_all: usize = commands.iter().map(|it| options(it).count()).sum();
+        assert!(
+            of_all <= 210,
+            "{of_all}: {:?}",
+            commands.iter().map(|it| (it.get_name(), options(it).count())).collect::<Vec<_>>()
+        );
+    }
+
+    #[test]
+    fn an_option_means_the_same_in_every_command() {
+        let program = program();
+        let mut commands = Vec::new();
+        all(&program, &mut commands);
+        let mut meanings = BTreeMap::<String, BTreeSet<String>>::new();
+        let mut shorts = BTreeMap::<char, BTreeSet<String>>::new();
+        for arg in commands.iter().flat_map(|it| options(it)) {
+            let long = arg.get_long().unwrap_or_default().to_owned();
+            let names = arg.get_value_names().unwrap_or_default();
+            let takes =
+                if arg.get_action().takes_values() { crate::print::words(names) } else { String::new() };
+            // A path is one, whatever it leads to.
+            let takes = if takes == "DIR" { "FILE".to_owned() } else { takes };
+            meanings.entry(long.clone()).or_default().insert(takes);
+            if let Some(short) = arg.get_short() {
+                shorts.entry(short).or_default().insert(long);
+            }
+        }
+        let several: Vec<_> = meanings.iter().filter(|(_, takes)| takes.len() > 1).collect();
+        assert_eq!(several, Vec::<(&String, &BTreeSet<String>)>::new());
+        let several: Vec<_> = shorts.iter().filter(|(_, longs)| longs.len() > 1).collect();
+        assert_eq!(several, Vec::<(&char, &BTreeSet<String>)>::new());
+        // In other words than `FILE`, what is overwritten and what a force is.
+        assert_eq!(meanings["overwrite"], BTreeSet::from([String::new()]));
+        assert_eq!(meanings["force"], BTreeSet::from(["N".to_owned()]));
+    }
+
+    #[test]
+    fn a_name_that_is_nearly_a_command_is_asked_about() {
+        let program = program();
+        assert_eq!(unknown(&program, "dmup"), "there is no command dmup; did you mean dump?");
+        assert_eq!(unknown(&program, "reply"), "there is no command reply; did you mean replay?");
+        assert!(
+            unknown(&program, "xyz").starts_with("there is no command xyz; there are demo, run, view, dump")
+        );
+    }
+
+    #[test]
+    fn the_command_line_is_sound() {
+        crate::Arguments::command().debug_assert();
+    }
+}
