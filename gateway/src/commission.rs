@@ -80,7 +80,7 @@ impl Commission {
         let benches = benches.map_err(Failure::usage)?;
         let began = Instant::now();
         let mut line = Line::new(self.quiet);
-        let done = commission(benches, &skin, wish, &stopped, |far| line.show(|| how_far(far)));
+        let done = commission(benches, &skin, wish, &stopped, |far| line.show(|_width| how_far(far)));
         line.clear();
         let interrupted = stopped.load(Ordering::Relaxed);
         check_begun(&file, &done, interrupted)?;

@@ -3,7 +3,7 @@
 mod show;
 mod table;
 
-use std::io::{self, BufWriter, IsTerminal, Write};
+use std::io::{self, BufWriter, Write};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -118,8 +118,7 @@ impl Dump {
         let is_capture = self.is_capture()?;
         let mut title = list(self.sources.iter().map(|source| source.display()));
         let out = io::stdout();
-        let no_color = std::env::var_os("NO_COLOR").is_some_and(|value| !value.is_empty());
-        let colour = out.is_terminal() && !no_color;
+        let colour = output::is_coloured(&out);
         let how = match (self.stats, self.json, self.brief) {
             (true, _, _) => How::Stats(Box::default()),
             (false, true, _) => How::Json,

@@ -2,11 +2,11 @@
 
 use std::fmt::Display;
 use std::fs::{self, File};
-use std::io::{self, Write};
+use std::io::{self, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use protocol::usage::{Failure, print, say, say_lines, written};
+use protocol::usage::{Failure, draw, print, say, say_lines, written};
 use trace::files::{STANDARD_OUTPUT, WholeFile, check, folder_of};
 
 /// Whether files that exist may be overwritten.
@@ -51,6 +51,18 @@ pub(crate) fn print_beside<'a>(
         return Ok(());
     }
     print(text)
+}
+
+/// Prints a table, in colours where standard output takes them; else as [`print_beside`].
+pub(crate) fn print_table<'a>(
+    files: impl IntoIterator<Item = Option<&'a Path>>,
+    text: impl FnOnce(bool) -> String,
+) -> Result<(), Failure> {
+    if !is_coloured(&io::stdout()) {
+        return print_beside(files, &text(false));
+    }
+    // A terminal is in place of a file too: its colours do no harm. Names in the text are escaped already.
+    draw(&text(true))
 }
 
 /// Writes all of a file that was begun.
@@ -103,6 +115,11 @@ pub(crate) fn apart<'a>(
 fn place(path: &Path) -> PathBuf {
     let inside = || Some(fs::canonicalize(folder_of(path)).ok()?.join(path.file_name()?));
     fs::canonicalize(path).ok().or_else(inside).unwrap_or_else(|| path.to_owned())
+}
+
+/// Returns true if what is written there may be coloured: on a terminal, unless NO_COLOR is set.
+pub(crate) fn is_coloured(out: &impl IsTerminal) -> bool {
+    out.is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty())
 }
 
 /// Prints a line on standard error; if that is closed, the line is dropped.

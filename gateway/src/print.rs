@@ -3,10 +3,16 @@
 use std::borrow::Cow;
 use std::fmt::Display;
 
-use comfy_table::{CellAlignment, ColumnConstraint, ContentArrangement, Table, Width, presets};
+use comfy_table::{Cell, CellAlignment, Color, ColumnConstraint, ContentArrangement, Table, Width, presets};
 use model::quantiles::Quantiles;
 use protocol::usage::{Failure, shown, shown_lines};
 use serde::Serialize;
+
+/// Colours of a terminal, and the end of them.
+pub(crate) const RED: &str = "\x1b[31m";
+pub(crate) const GREEN: &str = "\x1b[32m";
+pub(crate) const YELLOW: &str = "\x1b[33m";
+pub(crate) const PLAIN: &str = "\x1b[0m";
 
 /// A space before a name that stays when the name takes two lines.
 const INDENT: &str = "\u{a0}";
@@ -110,9 +116,8 @@ pub(crate) fn table<H: Into<String>>(
 
 /// The table as wide as the terminal, and not wider than is good to read.
 pub(crate) fn readable(mut table: Table) -> Table {
-    if table.width().is_none_or(|width| width > WIDTH) {
-        table.set_width(WIDTH);
-    }
+    let width = table.width().map_or(WIDTH, |width| width.min(WIDTH));
+    table.set_width(width);
     table
 }
 
@@ -146,7 +151,21 @@ pub(crate) struct Rows {
 impl Rows {
     /// A [`readable`] table with this head and no rows.
     pub(crate) fn new(name: impl Display, value: impl Display, beside: impl Display) -> Self {
-        let mut table = readable(table(line(name, value, beside), [], |_| false));
+        Self::in_columns(None, name, value, beside)
+    }
+
+    /// The same on a terminal of so many columns; of unknown width, as wide as the terminal is.
+    pub(crate) fn in_columns(
+        columns: Option<u16>,
+        name: impl Display,
+        value: impl Display,
+        beside: impl Display,
+    ) -> Self {
+        let mut table = table(line(name, value, beside), [], |_| false);
+        if let Some(columns) = columns {
+            table.set_width(columns);
+        }
+        let mut table = readable(table);
         let width = (table.width().unwrap_or(WIDTH) * 2 / 5).min(NAME);
         if let Some(names) = table.column_mut(0) {
             names.set_constraint(ColumnConstraint::ContentWidth);
@@ -163,6 +182,26 @@ impl Rows {
         self
     }
 
+    /// The same with colours, or without any.
+    pub(crate) fn coloured(mut self, is_coloured: bool) -> Self {
+        self.table.force_no_tty();
+        if is_coloured {
+            self.table.enforce_styling();
+        }
+        self
+    }
+
+    /// The columns that it may take.
+    pub(crate) fn columns(&self) -> usize {
+        self.table.width().unwrap_or(WIDTH).into()
+    }
+
+    /// The same with names in lines of at most so many letters.
+    pub(crate) const fn names_in(mut self, letters: usize) -> Self {
+        self.name_width = Some(letters);
+        self
+    }
+
     /// The table as it is printed.
     pub(crate) fn text(&self) -> String {
         format!("{}\n", self.table).replace(INDENT, " ")
@@ -175,6 +214,19 @@ impl Rows {
 
     pub(crate) fn row(&mut self, name: impl Display, value: impl Display, beside: impl Display) {
         self.section(format!("  {name}"), value, beside);
+    }
+
+    /// Adds a row whose last text is in a colour, where colours are [`Rows::coloured`].
+    pub(crate) fn row_in_colour(
+        &mut self,
+        name: impl Display,
+        value: impl Display,
+        beside: impl Display,
+        colour: Color,
+    ) {
+        let [name, value, beside] = line(format!("  {name}"), value, beside);
+        let name = Cell::new(folded(&name, self.name_width));
+        self.table.add_row([name, Cell::new(value), Cell::new(beside).fg(colour)]);
     }
 
     /// The same, whose last text is not broken.
@@ -197,6 +249,13 @@ impl Rows {
 /// A row's texts, [`shown`].
 fn line(name: impl Display, value: impl Display, beside: impl Display) -> [String; 3] {
     [name.to_string(), value.to_string(), beside.to_string()].map(|text| shown(&text).into_owned())
+}
+
+/// Breaks a text into lines of so many letters; all but the first, which begins with `begin`, are indented.
+pub(crate) fn hanging(begin: &str, text: &str, columns: usize) -> String {
+    let indent = begin.chars().count();
+    let lines = folded(&format!("{}{text}", " ".repeat(indent)), Some(columns)).replace(INDENT, " ");
+    format!("{begin}{}", lines.get(indent..).unwrap_or_default())
 }
 
 /// A name in lines of so many letters; all but the first are indented further. A longer word is broken.
@@ -233,6 +292,12 @@ fn folded(name: &str, width: Option<usize>) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_long_text_hangs_under_its_begin() {
+        assert_eq!(hanging("look at: ", "a few words of it", 20), "look at: a few words\n           of it");
+        assert_eq!(hanging("", "a few words", 80), "a few words");
+    }
 
     #[test]
     fn a_long_name_is_folded_between_words_and_keeps_its_indent() {

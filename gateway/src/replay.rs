@@ -10,11 +10,11 @@ use bench::replay::report::{Expect, Summary};
 use bench::replay::survey::Part;
 use bench::replay::{Options, ReplayError, Spawn, replay};
 use clap::Args;
-use protocol::usage::Failure;
+use protocol::usage::{Failure, shown, shown_lines};
 
 use super::arguments::{BusKinds, Processes, Word, nanos, of_environment, one_of};
-use super::output::{self, Overwrite, apart, print_beside};
-use super::print::{Rows, count, json, list, or, quantiles};
+use super::output::{self, Overwrite, apart, print_beside, print_table};
+use super::print::{GREEN, PLAIN, Rows, YELLOW, count, hanging, json, list, or, quantiles};
 
 /// Bytes for frames that wait: all cells may answer a report at once.
 const RECEIVE_BUFFER: u32 = 8 << 20;
@@ -149,8 +149,12 @@ impl Replay {
         let json = json(&summary)?;
         let write = |(whole, file)| output::finish("--summary", whole, file, &json);
         let written = file.map_or(Ok(()), write);
-        let shown = if self.shown.json { json } else { table(&summary) };
-        print_beside([self.summary.as_deref()], &shown).and(written)?;
+        let files = [self.summary.as_deref()];
+        let printed = match self.shown.json {
+            true => print_beside(files, &json),
+            false => print_table(files, |is_coloured| table(&summary, is_coloured)),
+        };
+        printed.and(written)?;
         summary.verdict(self.shown.quiet).map_or(Ok(()), |why| Err(Failure::run(why)))
     }
 
@@ -196,14 +200,25 @@ impl Replay {
     }
 }
 
-/// The table of the replay.
-fn table(summary: &Summary) -> String {
-    let ended = if summary.interrupted { "interrupted" } else { "done" };
+/// The result of the replay in one line, and its table.
+fn table(summary: &Summary, is_coloured: bool) -> String {
+    let ended = match (&summary.failure, summary.interrupted) {
+        (Some(_), _) => "failed",
+        (None, true) => "interrupted",
+        (None, false) => "done",
+    };
     let mut rows = Rows::new(&summary.file, format!("{:.1} s, {ended}", summary.duration_s), "");
+    let (is_well, first) = summary.first_line();
+    let first_line = hanging("", &shown(&first), rows.columns());
+    let first_line = match is_coloured {
+        true if is_well => format!("{GREEN}{first_line}{PLAIN}\n"),
+        true => format!("{YELLOW}{first_line}{PLAIN}\n"),
+        false => format!("{first_line}\n"),
+    };
     rows.section("frames", "", "");
     rows.row("sent", summary.sent, "");
-    rows.row("refused", summary.refused, "a bus stayed full");
-    rows.row("lost", summary.lost, "a bus was down");
+    rows.any("refused", summary.refused, "a bus stayed full");
+    rows.any("lost", summary.lost, "a bus was down");
     for (reason, count) in &summary.skipped {
         rows.row("not sent", count, reason);
     }
@@ -227,7 +242,7 @@ fn table(summary: &Summary) -> String {
         expectation(&mut rows, expect);
     }
     let first = summary.expect.as_ref().and_then(|expect| expect.first.as_ref());
-    rows.text() + &or(first.map(|first| format!("{}\n", first.text)), "")
+    first_line + &rows.text() + &or(first.map(|first| format!("{}\n", shown_lines(&first.text))), "")
 }
 
 fn expectation(rows: &mut Rows, expect: &Expect) {

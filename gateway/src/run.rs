@@ -23,10 +23,11 @@ use trace::recording::series::{Attached, Split};
 
 use super::arguments::{BusKinds, Named, Processes, bus_names, cell, of_environment, seconds, time};
 use super::buses;
-use super::output::{self, Overwrite, apart, note, print_beside};
+use super::output::{self, Overwrite, apart, note, print_table};
 use super::print::json;
 use super::robot_file::{RobotOfSkin, urdf_of};
 use super::view::{Page, PageOptions};
+use show::Look;
 
 /// The skin and the scenario of the demonstration.
 const SKIN: &str = include_str!("../examples/ur5-253.toml");
@@ -50,6 +51,9 @@ struct Common {
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
+    /// Print all rows of the table, also those of what is usual
+    #[arg(long, short)]
+    verbose: bool,
     /// Show the skin live in a browser: a page is served until the run ends; docs/how-to/view.md. Without --duration the run
     /// then ends with Ctrl-C
     #[arg(long)]
@@ -194,10 +198,8 @@ impl Demo {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let (_file, skin_file) = in_memory(SKIN.as_bytes()).map_err(Failure::run)?;
         let skin = Skin::parse("the demonstration's skin", SKIN).map_err(Failure::usage)?;
-        let mut scenario =
+        let scenario =
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
-        // Whoever opens the page late sees the arm move, too.
-        scenario.touches_repeat = self.common.view.then_some(scenario.duration);
         let mut options = self.common.options(skin_file, skin, scenario);
         let per_process = of_environment("SKINBUS_CELLS_PER_PROCESS", 1..=254)?;
         options.cells_per_process = per_process.unwrap_or(1) as usize;
@@ -215,7 +217,7 @@ impl Demo {
         let place = place.map(|path| format!("SKINBUS_DIR={} ", quoted_os(path.as_os_str())));
         let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
         options.announced.push(format!("its frames in words: {place}skinbus dump vcan0 --bus-kind {kind}"));
-        let Common { recording, summary, view, page, .. } = self.common;
+        let Common { recording, summary, verbose, view, page, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
@@ -226,7 +228,7 @@ impl Demo {
         let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), robot };
         options.record = recording.options(candump, files, &[]);
         let page = view.then(|| Page::of(&options, &page)).transpose()?;
-        bench(&options, summary.as_deref(), recording.overwrite, &[], page)
+        bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], page)
     }
 }
 
@@ -260,7 +262,7 @@ impl Run {
             note(format_args!("remark: {remark}"));
         }
         let mut options = self.common.options(skin_file, skin, scenario);
-        let Common { recording, summary, view, page, .. } = self.common;
+        let Common { recording, summary, verbose, view, page, .. } = self.common;
         options.kinds = self.kinds.of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
         let files = Files { skin: skin_text, scenario: scenario_text, robot };
@@ -273,7 +275,7 @@ impl Run {
         options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER) as usize;
         options.cells_per_process = self.processes.cells_per_process.into();
         let page = view.then(|| Page::of(&options, &page)).transpose()?;
-        bench(&options, summary.as_deref(), recording.overwrite, &read, page)
+        bench(&options, (summary.as_deref(), recording.overwrite), verbose, &read, page)
     }
 }
 
@@ -319,8 +321,8 @@ impl Common {
 
 fn bench(
     options: &Options,
-    summary_file: Option<&Path>,
-    overwrite: Overwrite,
+    (summary_file, overwrite): (Option<&Path>, Overwrite),
+    is_verbose: bool,
     read: &[PathBuf],
     page: Option<(Page, Lines)>,
 ) -> Result<(), Failure> {
@@ -347,8 +349,8 @@ fn bench(
         panic::resume_unwind(panic);
     }
     let files = written.map(|(_, path)| path);
-    let printed =
-        if ended.control.ticks > 0 { print_beside(files, &show::rows(&ended).text()) } else { Ok(()) };
+    let table = |is_coloured| show::text(&ended, Look { is_verbose, is_coloured, columns: None });
+    let printed = if ended.control.ticks > 0 { print_table(files, table) } else { Ok(()) };
     // The last line is the failure's own; each of them is one line.
     let mut lines = ended.complaints(options.quiet);
     let lost: Vec<_> = unwritten.into_iter().chain(printed.err()).collect();

@@ -11,18 +11,22 @@ use serde::Serialize;
 
 pub use self::cells::{CellSummary, RepliesSummary};
 pub use self::outcome::{CellError, ErrorCells, Halted, Outcome, TickBefore, cells_in_error, ranges};
+pub use self::verdict::{CELL_ERROR_NM, Verdict};
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Contributions, Event, Status, SumCounts, Table};
 pub use trace::recording::account::{Recording, Written};
 
 mod cells;
 mod outcome;
+mod verdict;
 
 /// A whole run.
 #[derive(Clone, Debug, Default, Serialize)]
 pub struct Summary {
     /// The skin's name.
     pub skin: String,
+    /// All is well, or what to look at.
+    pub verdict: Verdict,
     /// Each cell in it.
     pub cells: Vec<CellSummary>,
     /// How it ended.
@@ -84,7 +88,7 @@ impl Summary {
         Self::empty(skin).rated(Some(why))
     }
 
-    /// Sets the outcome from what else is known; `failure` is why it did not come to its end.
+    /// Sets the outcome and the verdict from what else is known; `failure` is why it did not come to its end.
     #[must_use]
     pub fn rated(mut self, failure: Option<String>) -> Self {
         // A lost bus may be why the robot was halted, and the halt is the more precise outcome.
@@ -98,6 +102,7 @@ impl Summary {
             None if self.interrupted => Outcome::Interrupted,
             None => Outcome::Done,
         };
+        self.verdict = Verdict::of(&self);
         self
     }
 
@@ -200,7 +205,7 @@ pub struct Memory {
 
 /// Packets from the cells: sent = delivered + rejected + unheard + lost, and lost = dropped + backlog + outage + hosts
 /// + unknown.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct UplinkSummary {
     /// Sent, by the cells' own count, as of their last heartbeats.
     pub sent: u64,
@@ -330,7 +335,7 @@ pub struct SensorsSummary {
 }
 
 /// One bus.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct BusSummary {
     /// Its name.
     pub name: String,

@@ -29,6 +29,9 @@ pub(super) fn plan(file: &Path, skin: &Skin, as_json: bool) -> Result<(String, O
 struct Plan {
     skin: String,
     duration_s: f64,
+    /// The period after which the touches begin again.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    touches_repeat_s: Option<f64>,
     seed: u64,
     motion: Motion,
     events: Vec<Event>,
@@ -114,11 +117,13 @@ impl Plan {
         if let Some(sheet) = scenario.sensors.acceleration {
             sensors.insert("acceleration".to_owned(), json!(sheet));
         }
-        Self { skin: skin.name.clone(), duration_s, seed, motion, events, sensors, remarks }
+        let touches_repeat_s = scenario.touches_repeat.map(Span::seconds);
+        let skin = skin.name.clone();
+        Self { skin, duration_s, touches_repeat_s, seed, motion, events, sensors, remarks }
     }
 
     fn text(&self, file: &str) -> String {
-        let Self { skin, duration_s, seed, motion, events, sensors, remarks } = self;
+        let Self { skin, duration_s, touches_repeat_s, seed, motion, events, sensors, remarks } = self;
         let moves = match motion.kind {
             "hold" => "the robot stays at",
             "sine" => "every joint swings about",
@@ -135,8 +140,9 @@ impl Plan {
         };
         let (file, skin) = (shown(file), shown(skin));
         let head = format!(
-            "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start}{how}\n{}",
+            "{file} on {skin}: {duration_s} s, {}, seed {seed}\nmotion: {moves} {start}{how}\n{}{}",
             count(events.len(), "event"),
+            or(touches_repeat_s.map(|period| format!("the touches repeat every {period} s\n")), ""),
             if sensors.is_empty() { String::new() } else { format!("sensors: {}\n", described(sensors)) }
         );
         let remarks: String = remarks.iter().map(|remark| format!("remark: {}\n", shown(remark))).collect();

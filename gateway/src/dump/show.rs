@@ -20,16 +20,12 @@ use protocol::time::Micros;
 use protocol::usage::shown;
 
 use crate::output::note;
-use crate::print::harmless;
+use crate::print::{GREEN, PLAIN, RED, YELLOW, harmless};
 
 /// Colours of a terminal.
 const DIM: &str = "\x1b[2m";
-const RED: &str = "\x1b[31m";
-const GREEN: &str = "\x1b[32m";
-const YELLOW: &str = "\x1b[33m";
 const MAGENTA: &str = "\x1b[35m";
 const CYAN: &str = "\x1b[36m";
-const PLAIN: &str = "\x1b[0m";
 
 /// How frames are shown.
 #[derive(Debug)]

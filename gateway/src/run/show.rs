@@ -1,43 +1,95 @@
-//! The table at the end of a run.
+//! The table at the end of a run: the verdict, and what is not usual; all of it if it is verbose.
 
 use std::cmp::Reverse;
 use std::fmt::Display;
 
 use analysis::paper;
-use bench::summary::{BusSummary, CellSummary, Halted, Outcome, Processor, Summary, ranges};
+use bench::summary::{BusSummary, CELL_ERROR_NM, CellSummary, Halted, Outcome, Processor, Summary, ranges};
+use comfy_table::Color;
 use model::table::Errors;
+use protocol::usage::shown;
 
-use crate::print::{Rows, count, list, or, quantiles, words};
+use crate::print::{GREEN, PLAIN, RED, Rows, YELLOW, count, hanging, list, or, quantiles, words};
 
 /// Halts that are listed one by one.
 const HALTS: usize = 10;
-
-/// Cells of a bus that are told one by one, because they stand out.
+/// Cells of a bus that are listed one by one, because they stand out.
 const CELLS: usize = 5;
-/// A mean error in Nm that rounding does not explain: four steps of a torque's word.
-const OFF_NM: f64 = 4.0 / 4096.0;
+/// Lines of the verdict, unless it is verbose.
+const LINES: usize = 6;
+/// Columns for which the names of rows are short enough.
+const NAME: usize = 24;
 
-/// The whole run.
-pub(super) fn rows(summary: &Summary) -> Rows {
+/// How a run is shown.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Look {
+    /// Also what is usual.
+    pub(super) is_verbose: bool,
+    /// In the colours of a terminal.
+    pub(super) is_coloured: bool,
+    /// The columns of the terminal; as many as it has, if that is not given.
+    pub(super) columns: Option<u16>,
+}
+
+/// Returns the verdict and the table of a run.
+pub(super) fn text(summary: &Summary, look: Look) -> String {
+    let rows = rows(summary, look);
+    verdict(summary, look, rows.columns()) + &rows.text()
+}
+
+fn verdict(summary: &Summary, look: Look, columns: usize) -> String {
+    let look_at = &summary.verdict.look_at;
+    let mut lines = Vec::new();
+    if summary.verdict.well {
+        let begin = match summary.outcome {
+            Outcome::Interrupted => "all well until it was interrupted: ",
+            _ => "all well: ",
+        };
+        lines.push(hanging("", &format!("{begin}{}", shown(&summary.sums_of_all())), columns));
+    }
+    let many = if look.is_verbose { look_at.len() } else { LINES };
+    let more = look_at.len().saturating_sub(many);
+    let more = (more > 0).then(|| format!("and {more} more, with --verbose"));
+    for (at, item) in look_at.iter().take(many).chain(&more).enumerate() {
+        let begin = if at == 0 { "look at: " } else { "         " };
+        lines.push(hanging(begin, &shown(item), columns));
+    }
+    let text = lines.join("\n");
+    let is_unknown = summary.buses.iter().any(|bus| bus.replies.unknown + bus.uplink.unknown > 0);
+    let colour = match (summary.verdict.well, summary.outcome.exit_code()) {
+        (true, _) => GREEN,
+        (false, 0) if !is_unknown => YELLOW,
+        (false, _) => RED,
+    };
+    if look.is_coloured { format!("{colour}{text}{PLAIN}\n") } else { format!("{text}\n") }
+}
+
+fn rows(summary: &Summary, look: Look) -> Rows {
     let cells = format!("{}, {:.1} s", count(summary.cells.len(), "cell"), summary.duration_s);
     let (cells, ended) = match summary.halts.last().filter(|_| summary.outcome == Outcome::Halted) {
         Some(halted) => (cells, format!("halted at {:.3} s", halted.at_s)),
         None => (format!("{cells}, {}", summary.outcome), String::new()),
     };
-    let mut rows = Rows::new(&summary.skin, cells, ended);
+    let is_verbose = look.is_verbose;
+    let mut rows = if is_verbose {
+        Rows::in_columns(look.columns, &summary.skin, cells, ended)
+    } else {
+        Rows::in_columns(look.columns, &summary.skin, cells, ended).names_in(NAME)
+    };
+    rows = rows.coloured(look.is_coloured);
     halts(&mut rows, summary);
     for error in &summary.cell_errors {
         rows.section("ended by errors of their own", count(error.count(), "cell"), &error.reason);
         rows.row("cells", error.names(), "");
     }
-    accuracy(&mut rows, summary);
-    control(&mut rows, summary);
+    accuracy(&mut rows, summary, is_verbose);
+    control(&mut rows, summary, is_verbose);
     for bus in &summary.buses {
-        replies(&mut rows, bus);
-        frames(&mut rows, bus);
+        replies(&mut rows, bus, is_verbose);
+        frames(&mut rows, bus, is_verbose);
         noteworthy(&mut rows, bus, &summary.cells);
     }
-    costs(&mut rows, summary);
+    costs(&mut rows, summary, is_verbose);
     rows
 }
 
@@ -52,47 +104,67 @@ fn halts(rows: &mut Rows, summary: &Summary) {
     }
 }
 
-fn accuracy(rows: &mut Rows, summary: &Summary) {
+fn accuracy(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
     let accuracy = &summary.accuracy;
     let [single, sums] = [&accuracy.single, &accuracy.sums].map(|errors| errors.mean().is_some());
-    if !single && !sums {
-        return;
+    if single || sums {
+        rows.section("accuracy", "mean (max) error, Nm", "against central torques");
     }
-    rows.section("accuracy", "mean (max) error, Nm", "distributed against central");
+    let name = |short: &'static str, long: &'static str| if is_verbose { long } else { short };
+    let of_paper = |errors: &Errors, paper: f64| format!("{}, paper {paper}", compared(errors));
     if single {
-        let paper = format!("paper {}", paper::SINGLE_NM);
-        rows.row("single cells, loaded joints", errors(&accuracy.single), paper);
-        rows.row("  against unrounded parameters", errors(&accuracy.unquantised), "");
-        rows.row("the whole skin, all joints", errors(&accuracy.whole), "");
+        let errors = &accuracy.single;
+        rows.row(
+            name("single cells", "single cells, loaded joints"),
+            error(errors),
+            of_paper(errors, paper::SINGLE_NM),
+        );
+        if is_verbose {
+            let errors = &accuracy.unquantised;
+            rows.row("  against unrounded parameters", error(errors), compared(errors));
+        }
+        let errors = &accuracy.whole;
+        if is_verbose || errors.count() > 0 {
+            rows.row(name("the whole skin", "the whole skin, all joints"), error(errors), compared(errors));
+        }
     }
     if sums {
-        let paper = format!("paper {}", paper::SUMMED_NM);
-        rows.row("sums, loaded joints", errors(&accuracy.sums), paper);
-        rows.row("  averaged over 32 epochs", errors(&accuracy.sums_averaged), "");
+        let errors = &accuracy.sums;
+        rows.row(name("sums", "sums, loaded joints"), error(errors), of_paper(errors, paper::SUMMED_NM));
+        let errors = &accuracy.sums_averaged;
+        if is_verbose || errors.count() > 0 {
+            rows.row("  averaged over 32 epochs", error(errors), compared(errors));
+        }
     }
     rows.any("saturated words, left out", accuracy.saturated, "beyond the range of the torque format");
 }
 
-fn errors(errors: &Errors) -> String {
-    errors.mean().map_or_else(
-        || "nothing compared".to_owned(),
-        |mean| format!("{mean:.2e} ({:.1e}), {} torques", errors.max(), errors.count()),
-    )
+fn error(errors: &Errors) -> String {
+    or(errors.mean().map(|mean| format!("{mean:.2e} ({:.1e})", errors.max())), "nothing compared")
 }
 
-fn control(rows: &mut Rows, summary: &Summary) {
+fn compared(errors: &Errors) -> String {
+    count(errors.count(), "torque")
+}
+
+fn control(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
     let control = &summary.control;
-    rows.section("control loop", "50 % / 90 % / 99 % / max, µs", "");
+    rows.section("control loop", "median / 90 % / 99 % / max", "µs");
     rows.row("began late", quantiles(&control.late_us), format!("idle {}", quantiles(&control.idle_late_us)));
-    if control.central_us.count > 0 {
+    if is_verbose && control.central_us.count > 0 {
         rows.row("tick", quantiles(&control.took_us), "");
         rows.row("  central computation in it", quantiles(&control.central_us), "distributed: 0");
     }
-    if control.took_distributed_us.count > 0 {
+    if is_verbose && control.took_distributed_us.count > 0 {
         rows.row("tick, distributed", quantiles(&control.took_distributed_us), "");
     }
-    rows.row("ticks", control.ticks, format!("{} skipped", control.ticks_skipped));
-    rows.row("broadcasts", control.broadcasts, format!("{} skipped", control.broadcasts_skipped));
+    let counts = [
+        ("ticks", control.ticks, control.ticks_skipped),
+        ("broadcasts", control.broadcasts, control.broadcasts_skipped),
+    ];
+    for (name, count, skipped) in counts.into_iter().filter(|(_, _, skipped)| is_verbose || *skipped > 0) {
+        rows.row(name, count, format!("{skipped} skipped"));
+    }
     let why = "the bus did not take them, or this machine was busy";
     rows.any("frames not sent", control.unsent, why);
     rows.any("records of ticks lost", control.records_lost, why);
@@ -102,17 +174,19 @@ fn control(rows: &mut Rows, summary: &Summary) {
     for (reason, count) in &control.bad_cycles {
         rows.row("bad cycles", count, reason);
     }
-    let granted = |granted| if granted { "granted" } else { "refused" };
-    let locked = granted(control.memory_locked);
-    rows.row("SCHED_FIFO", granted(control.fifo), format!("memory lock {locked}"));
+    if is_verbose {
+        let granted = |granted| if granted { "granted" } else { "refused" };
+        let locked = granted(control.memory_locked);
+        rows.row("SCHED_FIFO", granted(control.fifo), format!("memory lock {locked}"));
+    }
 }
 
-fn replies(rows: &mut Rows, bus: &BusSummary) {
+fn replies(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
     let replies = &bus.replies;
-    rows.section(format!("{} ({})", bus.name, bus.kind), each(&bus.cells), "");
+    rows.section(&bus.name, each(&bus.cells), &bus.kind);
     if bus.outages.times > 0 {
         let end = if bus.outages.at_end { ", also at the end" } else { "" };
-        let ticks = format!("{} ticks without it", bus.outages.ticks);
+        let ticks = format!("{} without it", count(bus.outages.ticks, "tick"));
         let times = count(bus.outages.times, "time");
         rows.row("lost", format!("{times}, {:.1} s{end}", bus.outages.lost_s), ticks);
     }
@@ -121,7 +195,7 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
         let end = (!it.at_end).then(|| "not reached at the end".to_owned());
         let lost = list(
             [(it.lost_from, "from there"), (it.lost_to, "to there")]
-                .map(|(n, way)| format!("{n} frames lost {way}")),
+                .map(|(n, way)| format!("{} lost {way}", count(n, "frame"))),
         );
         let cells = count(it.cells, "cell");
         rows.row(format!("host {}", it.name), list([cells].into_iter().chain(gone).chain(end)), lost);
@@ -129,54 +203,110 @@ fn replies(rows: &mut Rows, bus: &BusSummary) {
     if !bus.silent_cells.is_empty() {
         rows.row("silent cells", list(ranges(&bus.silent_cells)), "");
     }
-    let complete = format!("{} of {} epochs complete", bus.epochs_complete, bus.epochs_due);
+    let complete = format!("{} of {} complete", bus.epochs_complete, count(bus.epochs_due, "epoch"));
     if let Some(sums) = &bus.sums {
-        let (counts, parts) = (sums.counts, sums.contributions);
+        let parts = sums.contributions;
         let unexpected = parts.unasked - parts.contact_unknown;
-        due(rows, "cells due in sums", parts.due, complete, [parts.contact_unknown, unexpected]);
-        rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
+        let is_brief = !is_verbose && parts.in_time == parts.due;
+        due(rows, "cells due in sums", parts.due, is_brief, complete, [parts.contact_unknown, unexpected]);
+        if !is_brief {
+            rows.row("  in time", parts.in_time, format!("{} late, {} missing", parts.late, parts.missing));
+        }
+        sums_on_the_bus(rows, bus, is_verbose);
+    } else {
+        let is_brief = !is_verbose && replies.in_time == replies.due;
+        due(
+            rows,
+            "replies due",
+            replies.due,
+            is_brief,
+            complete,
+            [replies.contact_unknown, replies.unexpected],
+        );
+        if !is_brief {
+            rows.row("  in time", replies.in_time, format!("{} late", replies.late));
+            let missing = replies.due - replies.in_time - replies.late;
+            if is_verbose || missing > 0 {
+                let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, spoken(why)));
+                unexplained(
+                    rows,
+                    "  missing",
+                    missing,
+                    explained(&reasons, replies.unknown),
+                    replies.unknown,
+                );
+            }
+        }
+    }
+    if is_verbose {
+        let last = if bus.sums.is_some() { "last sum" } else { "last reply" };
+        let name = format!("{last} after broadcast, µs");
+        rows.row(name, quantiles(&bus.last_reply_us), "by kernel time stamps");
+        if bus.sums.is_none() {
+            rows.row("  each reply, µs", quantiles(&bus.reply_us), "late ones included");
+        }
+        hearing(rows, bus);
+    } else if bus.last_reply_us.count > 0 {
+        let name = if bus.sums.is_some() { "last sum, µs" } else { "last reply, µs" };
+        rows.row(name, quantiles(&bus.last_reply_us), "after the joints");
+    }
+}
+
+/// Sums, and the tree that they go along.
+fn sums_on_the_bus(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
+    let Some(sums) = &bus.sums else { return };
+    let counts = sums.counts;
+    if is_verbose || counts.resent + counts.overheard + counts.stale > 0 {
         let more =
             format!("{} resent, {} overheard, {} stale", counts.resent, counts.overheard, counts.stale);
         rows.row(format!("sums from {}", count(sums.roots, "root")), counts.first, more);
+    }
+    if is_verbose {
         let on_the_bus = counts.received + bus.uplink.unheard;
         let taken =
             format!("the gateway took {}: the tree saves it frames, but not a shared bus", counts.received);
         rows.row("sums on the bus, of all cells", on_the_bus, taken);
-        if let Some(network) = &bus.network {
-            let tree_ready =
-                network.tree_ready_s.map_or_else(|| "never complete".to_owned(), |s| format!("in {s:.2} s"));
-            let changes = format!("{tree_ready}, {} changes of parents", network.parent_changes);
-            rows.row("tree, wires deep", network.deepest, changes);
-            if !network.unreachable.is_empty() {
-                let unreachable = words(&network.unreachable);
-                rows.row("unreachable cells", unreachable, "no sum contains them");
-            }
-            for difference in &network.differences {
-                rows.row("not as described", difference, "");
-            }
-        }
-        rows.row("last sum after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
-        hearing(rows, bus);
-        return;
     }
-    due(rows, "replies due", replies.due, complete, [replies.contact_unknown, replies.unexpected]);
-    rows.row("  in time", replies.in_time, format!("{} late", replies.late));
-    let missing = replies.due - replies.in_time - replies.late;
-    let [reasons @ .., _] = replies.missing().map(|(why, count)| (count, spoken(why)));
-    rows.row("  missing", missing, explained(&reasons, replies.unknown));
-    rows.row("last reply after broadcast, µs", quantiles(&bus.last_reply_us), "by kernel time stamps");
-    rows.row("  each reply, µs", quantiles(&bus.reply_us), "late ones included");
-    hearing(rows, bus);
+    let Some(network) = &bus.network else { return };
+    if is_verbose || network.tree_ready_s.is_none() {
+        let tree_ready = or(network.tree_ready_s.map(|s| format!("in {s:.2} s")), "never complete");
+        let changes = count(network.parent_changes, "change");
+        rows.row("tree, wires deep", network.deepest, format!("{tree_ready}, {changes} of parents"));
+    }
+    if !network.unreachable.is_empty() {
+        rows.row("unreachable cells", words(&network.unreachable), "no sum contains them");
+    }
+    for difference in &network.differences {
+        rows.row("not as described", difference, "");
+    }
+}
+
+/// Adds a row whose last text is red if something is missing for an unknown reason.
+fn unexplained(rows: &mut Rows, name: &str, value: impl Display, reasons: String, unknown: u64) {
+    if unknown > 0 {
+        rows.row_in_colour(name, value, reasons, Color::Red);
+    } else {
+        rows.row(name, value, reasons);
+    }
 }
 
 /// What was due, and torques that came and were not, which are not compared: by reason.
-fn due(rows: &mut Rows, name: &str, due: u64, complete: String, [contact_unknown, unexpected]: [u64; 2]) {
+fn due(
+    rows: &mut Rows,
+    name: &str,
+    due: u64,
+    is_brief: bool,
+    complete: String,
+    [contact_unknown, unexpected]: [u64; 2],
+) {
     let reasons =
         [(contact_unknown, "their contact is not known"), (unexpected, "nothing touched their cells")];
     let mut reasons = reasons.into_iter().filter(|(count, _)| *count > 0);
     let beside = if due == 0 { reasons.next() } else { None };
     match beside {
         Some((count, why)) => rows.row_in_one_line(name, due, &format!("{count} not due: {why}")),
+        None if due == 0 => rows.row(name, due, "no cell was in contact"),
+        None if is_brief => rows.row(name, format!("{due}, all in time"), complete),
         None => rows.row(name, due, complete),
     }
     for (count, why) in reasons {
@@ -223,7 +353,7 @@ fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
         let kinds = cell.stuck.iter().map(|(kind, count)| format!("{count} times one {kind}"));
         rows.row(format!("stuck: cell {}", cell.node), list(kinds), "while it should have sent others");
     }
-    let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > OFF_NM);
+    let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| mean > CELL_ERROR_NM);
     let rank =
         |cell: &CellSummary| (is_off(cell), cell.missing.values().sum::<u64>(), cell.late, cell.restarts);
     let mut worst: Vec<_> = all().filter(|cell| rank(cell) > (false, 0, 0, 0)).collect();
@@ -243,9 +373,34 @@ fn noteworthy(rows: &mut Rows, bus: &BusSummary, all: &[CellSummary]) {
     rows.any("further cells that stand out", more as u64, "--summary has each cell");
 }
 
-fn frames(rows: &mut Rows, bus: &BusSummary) {
+fn frames(rows: &mut Rows, bus: &BusSummary, is_verbose: bool) {
     let up = &bus.uplink;
     let lost = up.dropped + up.backlog + up.outage + up.hosts + up.unknown;
+    let odd = up.rejected + up.surplus + up.outsiders + up.in_doubt + u64::from(up.restarts);
+    if is_verbose || lost + odd > 0 {
+        packets(rows, bus, lost);
+    } else {
+        rows.row("packets of cells", up.sent, "none lost");
+    }
+    if is_verbose {
+        rows.row("received", each(&bus.received), "");
+    }
+    let sensors = &bus.sensors;
+    if let (Some(min), Some(mean), Some(max)) = (sensors.min_hz, sensors.mean_hz, sensors.max_hz) {
+        let touches = list([count(sensors.touches, "touch"), count(sensors.releases, "release")]);
+        rows.row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
+    }
+    if is_verbose {
+        rows.row("sent", each(&bus.sent), "");
+    }
+    if !bus.events.is_empty() {
+        rows.row("anomalies", each(&bus.events), "");
+    }
+}
+
+/// Packets from the cells, by what became of them.
+fn packets(rows: &mut Rows, bus: &BusSummary, lost: u64) {
+    let up = &bus.uplink;
     rows.row("packets sent by cells", up.sent, "by their own count");
     rows.row("  delivered", up.delivered, format!("{} rejected", up.rejected));
     rows.any("  for other cells", up.unheard, "sums that the gateway does not take");
@@ -255,42 +410,42 @@ fn frames(rows: &mut Rows, bus: &BusSummary) {
         (up.outage, "with the bus"),
         (up.hosts, "between hosts"),
     ];
-    rows.row("  lost", lost, explained(&reasons, up.unknown));
+    unexplained(rows, "  lost", lost, explained(&reasons, up.unknown), up.unknown);
     rows.any("  surplus", up.surplus, "");
     rows.any("  of other senders", up.outsiders, "");
     rows.any("  in doubt", up.in_doubt, "");
     rows.any("  after the last heartbeat", up.unsettled, "");
     rows.any("  restarts of cells", up.restarts, "what they sent last is in doubt");
-    rows.row("received", each(&bus.received), "");
-    let sensors = &bus.sensors;
-    if let (Some(min), Some(mean), Some(max)) = (sensors.min_hz, sensors.mean_hz, sensors.max_hz) {
-        let touches = list([count(sensors.touches, "touch"), count(sensors.releases, "release")]);
-        rows.row("  sensors of a cell, Hz", format!("{min:.1} / {mean:.1} / {max:.1}"), touches);
-    }
-    rows.row("sent", each(&bus.sent), "");
-    if !bus.events.is_empty() {
-        rows.row("odd", each(&bus.events), "");
-    }
 }
 
-fn costs(rows: &mut Rows, summary: &Summary) {
+fn costs(rows: &mut Rows, summary: &Summary, is_verbose: bool) {
     let Processor { gateway, cells, buses } = summary.processor;
-    rows.section("cost", "", "");
-    let parts = format!("gateway {gateway:.3}, cells {cells:.3}, buses {buses:.3}");
-    rows.row("processor, cores", format!("{:.3}", gateway + cells + buses), parts);
-    if let Some(kib) = summary.memory.cell_private_kib {
-        rows.row("private memory of a cell process", format!("{kib} KiB"), "the largest");
-    }
-    if let Some(kib) = summary.memory.gateway_private_kib {
-        let buses = summary.memory.buses_private_kib.map(|kib| format!("its servers of buses {kib} KiB"));
-        rows.row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
-    }
-    rows.row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");
-    if let Some(recording) = &summary.recording {
-        for file in &recording.files {
-            rows.row("recording", &file.path, format!("{} frames, {}", file.frames, size(file.bytes)));
+    // Not -0.0.
+    let [gateway, cells, buses] = [gateway, cells, buses].map(|cores| cores.max(0.0) + 0.0);
+    let cores = format!("{:.3}", gateway + cells + buses);
+    if is_verbose {
+        rows.section("cost", "", "");
+        let parts = format!("gateway {gateway:.3}, cells {cells:.3}, buses {buses:.3}");
+        rows.row("processor, cores", cores, parts);
+        if let Some(kib) = summary.memory.cell_private_kib {
+            rows.row("private memory of a cell process", format!("{kib} KiB"), "the largest");
         }
-        rows.row("  frames in every format", recording.frames, format!("{} lost", recording.lost));
+        if let Some(kib) = summary.memory.gateway_private_kib {
+            let buses = summary.memory.buses_private_kib.map(|kib| format!("its servers of buses {kib} KiB"));
+            rows.row("private memory of the gateway", format!("{kib} KiB"), buses.unwrap_or_default());
+        }
+        rows.row("start to first broadcast", format!("{:.2} s", summary.first_broadcast_s), "");
+    } else {
+        rows.section("processor", format!("{cores} cores"), format!("of them {cells:.3} for cells"));
+    }
+    let Some(recording) = &summary.recording else { return };
+    for file in &recording.files {
+        let frames = count(file.frames, "frame");
+        let size = size(file.bytes);
+        rows.section("recording", &file.path, format!("{frames}, {size}"));
+    }
+    if is_verbose || recording.lost > 0 || recording.files.is_empty() {
+        rows.row("frames in every format", recording.frames, format!("{} lost", recording.lost));
     }
 }
 
@@ -301,3 +456,6 @@ fn size(bytes: u64) -> String {
         _ => format!("{} MB", bytes / 1_000_000),
     }
 }
+
+#[cfg(test)]
+mod tests;

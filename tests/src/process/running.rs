@@ -45,6 +45,12 @@ impl Ended {
         self
     }
 
+    /// The head of the table that a run prints below its verdict.
+    pub fn head(&self) -> &str {
+        let mut table = self.stdout.lines().skip_while(|line| !line.starts_with('┌'));
+        table.nth(1).unwrap_or_else(|| panic!("no table: {self:#?}"))
+    }
+
     /// Checks that it ended with this code and one line, and returns that.
     pub fn refusal(&self, code: i32) -> &str {
         assert_eq!((self.code(), self.stdout.as_str()), (Some(code), ""), "{self:#?}");

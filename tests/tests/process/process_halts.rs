@@ -50,7 +50,7 @@ fn ended_halted(ended: &process::Ended, summary: &Summary, reason: &str) -> Valu
             "skinbus: the robot was halted at {at:.3} s (epoch {epoch}) and not resumed: {reason}{HISTORY}"
         )
     );
-    let head = ended.stdout.lines().nth(1).unwrap();
+    let head = ended.head();
     assert!(head.contains(&format!("halted at {at:.3} s")) && !head.contains("done"), "{head}");
     // It may be broken into several lines.
     let last = reason.split(' ').next_back().unwrap();
@@ -197,5 +197,5 @@ fn cells_that_are_halted_at_the_end_of_a_run_are_no_halt_of_the_robot() {
     let summary = place.summary();
     assert_eq!((&summary.0["outcome"], &summary.0["halts"]), (&"interrupted".into(), &serde_json::json!([])));
     assert_eq!(summary.0["before_halt"], serde_json::json!([]));
-    assert!(ended.stdout.lines().nth(1).unwrap().contains("interrupted"), "{}", ended.stdout);
+    assert!(ended.head().contains("interrupted"), "{}", ended.stdout);
 }

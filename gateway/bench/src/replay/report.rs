@@ -159,8 +159,8 @@ impl Summary {
             }
             if expect.joints_skipped > 0 && self.lockstep.is_none() {
                 wrong.push(format!(
-                    "cells came too late for joints {} times: --lockstep waits for them",
-                    expect.joints_skipped
+                    "cells came too late for joints {}: --lockstep waits for them",
+                    counted(expect.joints_skipped, "time", "times")
                 ));
             }
         }
@@ -168,18 +168,142 @@ impl Summary {
             wrong.push(format!("cells did not answer: {}", lockstep.silent_cells.join(", ")));
         }
         if self.lost > 0 {
-            wrong.push(format!("{} frames were lost while a bus was down", self.lost));
+            let were = if self.lost == 1 { "was" } else { "were" };
+            let frames = counted(self.lost, "frame", "frames");
+            wrong.push(format!("{frames} {were} lost while a bus was down"));
         }
         if self.refused > 0 {
-            wrong.push(format!("{} frames were refused: a bus stayed full", self.refused));
+            let were = if self.refused == 1 { "was" } else { "were" };
+            let frames = counted(self.refused, "frame", "frames");
+            wrong.push(format!("{frames} {were} refused: a bus stayed full"));
         }
         (!wrong.is_empty()).then(|| wrong.join("; "))
     }
+
+    /// Returns the result in one line, and whether all is well: everything was sent, compared and equal.
+    #[must_use]
+    pub fn first_line(&self) -> (bool, String) {
+        let until = if self.interrupted { " until it was interrupted" } else { "" };
+        let sent = format!("{} sent", counted(self.sent, "frame", "frames"));
+        match (self.verdict(true), &self.expect) {
+            (Some(why), _) => (false, format!("look at: {why}")),
+            (None, None) => {
+                (false, format!("all sent{until}: {sent}; no reply was compared, which --expect does"))
+            }
+            (None, Some(expect)) if expect.tally.equal == 0 => {
+                (false, format!("look at: no reply was compared, {sent}"))
+            }
+            (None, Some(expect)) => {
+                let equal = format!("{} as recorded", counted(expect.tally.equal, "reply", "replies"));
+                let lacking = expect.tally.lacking.reasons().iter().map(|(_, count)| count).sum::<u64>();
+                let unread = self.buses.iter().map(|bus| bus.unheard).sum();
+                let unchecked = [
+                    (lacking, counted(lacking, "reply not compared", "replies not compared")),
+                    (unread, counted(unread, "reply not read in time", "replies not read in time")),
+                    (
+                        expect.recording_dropped,
+                        counted(
+                            expect.recording_dropped,
+                            "frame not in the recording",
+                            "frames not in the recording",
+                        ),
+                    ),
+                    (
+                        expect.unchecked_cells,
+                        counted(
+                            expect.unchecked_cells,
+                            "configuration not known",
+                            "configurations not known",
+                        ),
+                    ),
+                ];
+                let unchecked = unchecked.into_iter().filter(|(count, _)| *count > 0).map(|(_, text)| text);
+                let unchecked: Vec<_> = unchecked.collect();
+                if unchecked.is_empty() {
+                    return (true, format!("all well{until}: {sent}, {equal}"));
+                }
+                (false, format!("no difference{until}: {sent}, {equal}, {}", unchecked.join(", ")))
+            }
+        }
+    }
+}
+
+/// Formats a count with its noun.
+fn counted(count: u64, one: &str, more: &str) -> String {
+    format!("{count} {}", if count == 1 { one } else { more })
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// A replay of 100 frames whose 40 replies are as recorded.
+    fn well() -> Summary {
+        Summary {
+            file: "run.log".to_owned(),
+            duration_s: 1.0,
+            interrupted: false,
+            sent: 100,
+            refused: 0,
+            lost: 0,
+            skipped: BTreeMap::new(),
+            sent_at_once: 0,
+            buses: Vec::new(),
+            late_us: None,
+            idle_late_us: None,
+            spin_us: 0.0,
+            fifo: true,
+            memory_locked: true,
+            lockstep: None,
+            expect: Some(Expect {
+                tolerance: 0,
+                tally: Tally { equal: 40, ..Tally::default() },
+                joints_skipped: 0,
+                recording_dropped: 0,
+                unchecked_cells: 0,
+                first: None,
+            }),
+            cell_errors: Vec::new(),
+            failure: None,
+        }
+    }
+
+    #[test]
+    fn the_first_line_is_well_only_if_everything_was_compared() {
+        let line = |change: fn(&mut Summary, &mut Expect)| {
+            let mut summary = well();
+            let mut expect = summary.expect.take().unwrap();
+            change(&mut summary, &mut expect);
+            summary.expect = Some(expect);
+            summary.first_line()
+        };
+        assert_eq!(line(|_, _| {}), (true, "all well: 100 frames sent, 40 replies as recorded".to_owned()));
+        let interrupted = line(|it, _| it.interrupted = true);
+        assert!(interrupted.0 && interrupted.1.starts_with("all well until it was interrupted: "));
+        for (change, begin) in [
+            (
+                (|_, expect| expect.tally.lacking.ended = 1) as fn(&mut Summary, &mut Expect),
+                "no difference: 100 frames sent, 40 replies as recorded, 1 reply not compared",
+            ),
+            (|_, expect| expect.recording_dropped = 2, "no difference: "),
+            (|_, expect| expect.unchecked_cells = 1, "no difference: "),
+            (|_, expect| expect.tally.equal = 0, "look at: no reply was compared"),
+            (
+                |_, expect| expect.tally.different = 3,
+                "look at: replies are not as they were recorded: 3 different",
+            ),
+            (|it, _| it.refused = 1, "look at: 1 frame was refused"),
+            (|it, _| it.failure = Some("no bus".to_owned()), "look at: no bus"),
+        ] {
+            let (is_well, text) = line(change);
+            assert!(!is_well && text.starts_with(begin), "{text}");
+        }
+        let sent = Summary { expect: None, ..well() }.first_line();
+        assert_eq!(
+            sent,
+            (false, "all sent: 100 frames sent; no reply was compared, which --expect does".to_owned())
+        );
+    }
 
     #[test]
     fn every_reason_has_a_text() {

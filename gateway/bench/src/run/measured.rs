@@ -9,6 +9,7 @@ use protocol::time::Span;
 
 use super::accelerations::Moved;
 use super::halts::Halts;
+use super::status_line::StatusLine;
 use crate::remote::Lateness;
 use control::cycle::turn::Timed;
 use model::accelerometer::RobotState;
@@ -102,31 +103,30 @@ impl Measured {
         Some(Moved { at_s, state, is_halted: last.halted.is_some() })
     }
 
-    /// The progress: the most important first, as a narrow terminal shows no more.
+    /// Returns the progress, for a line of `width` letters.
     pub(super) fn line(
         &self,
         elapsed: Duration,
         (duration, skin): (Span, &Skin),
         comparing: bool,
         lost: &[&str],
+        width: Option<usize>,
     ) -> String {
         let Some(Timed { record, .. }) = self.last else { return "starting".to_owned() };
-        let (seconds, of) = (elapsed.as_secs_f64(), duration.seconds());
-        let mode = if comparing { Mode::Compare } else { Mode::Distributed }.name();
-        let torque: Vec<_> =
-            record.torque.iter().take(skin.robot.joints.len()).map(|nm| format!("{nm:6.2}")).collect();
-        let lost = if lost.is_empty() { String::new() } else { format!("  LOST: {}", lost.join(", ")) };
-        let halted = self.halts.why().map(|why| format!("  HALTED: {why}")).unwrap_or_default();
-        let cells = skin.cells.len();
-        format!(
-            "{seconds:5.1} of {of:.1} s{lost}{halted}  {:3} of {cells} in contact, {} stale, {} dead  \
-             late p99 {:.0} us  {mode:11}  torque {} Nm",
-            record.contributing,
-            record.stale,
-            record.dead,
-            Quantiles::of(&self.late, 1e-3).p99,
-            torque.join(" "),
-        )
+        let line = StatusLine {
+            elapsed_s: elapsed.as_secs_f64(),
+            duration_s: duration.seconds(),
+            lost,
+            halted: self.halts.why(),
+            contributing: record.contributing,
+            cells: skin.cells.len(),
+            stale: record.stale,
+            dead: record.dead,
+            late_us: Quantiles::of(&self.late, 1e-3).p99,
+            mode: if comparing { Mode::Compare } else { Mode::Distributed }.name(),
+            torque_nm: record.torque.get(..skin.robot.joints.len()).unwrap_or(&record.torque),
+        };
+        line.text(width)
     }
 }
 

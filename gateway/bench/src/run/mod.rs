@@ -34,6 +34,7 @@ pub mod receiver;
 pub mod roots;
 pub mod served;
 mod start;
+mod status_line;
 mod usage;
 mod watch;
 mod words;

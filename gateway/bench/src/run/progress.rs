@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use protocol::usage::{say, shown};
+use rustix::termios::tcgetwinsize;
 
 /// How often the line is renewed on a terminal, and elsewhere.
 const PERIODS: [Duration; 2] = [Duration::from_millis(200), Duration::from_secs(2)];
@@ -44,8 +45,8 @@ impl Progress {
         self.bar.clone()
     }
 
-    /// Shows the line when its time has come.
-    pub fn show(&mut self, text: impl FnOnce() -> String) {
+    /// Shows the line when its time has come. `text` gets the letters that a line has room for, `None` without a terminal.
+    pub fn show(&mut self, text: impl FnOnce(Option<usize>) -> String) {
         let now = Instant::now();
         if self.quiet || now < self.due {
             return;
@@ -53,10 +54,10 @@ impl Progress {
         let [here, elsewhere] = PERIODS;
         if self.bar.is_hidden() {
             self.due = now + elsewhere;
-            return say(&text());
+            return say(&text(None));
         }
         self.due = now + here;
-        self.bar.set_message(shown(&text()).into_owned());
+        self.bar.set_message(shown(&text(columns())).into_owned());
         self.bar.tick();
     }
 
@@ -76,6 +77,12 @@ impl Progress {
     pub fn clear(&self) {
         self.bar.finish_and_clear();
     }
+}
+
+/// Returns the columns of the terminal on standard error; `None` if it does not report them.
+fn columns() -> Option<usize> {
+    let size = tcgetwinsize(std::io::stderr()).ok()?;
+    Some(usize::from(size.ws_col)).filter(|columns| *columns > 0)
 }
 
 /// A line that is cut where the terminal ends.

@@ -203,11 +203,11 @@ impl Bench<'_> {
             progress.note(&line);
         }
         let lost = self.bus_links.iter().filter(|bus_link| !bus_link.link.state.is_there());
-        progress.show(|| {
+        progress.show(|width| {
             let lost: Vec<_> = lost.map(|bus_link| bus_link.link.name.as_str()).collect();
             let comparing = self.shared.comparing.load(Ordering::Relaxed);
             let of = (self.options.scenario.duration, &self.options.skin);
-            measured.line(script.started.elapsed(), of, comparing, &lost)
+            measured.line(script.started.elapsed(), of, comparing, &lost, width)
         });
         Ok(())
     }

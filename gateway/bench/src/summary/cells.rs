@@ -76,7 +76,7 @@ impl RepliesSummary {
 }
 
 /// One cell.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Default, Serialize)]
 pub struct CellSummary {
     /// Its node id.
     pub node: u8,

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::summary::{
     BusSummary, CellError, CellSummary, ErrorCells, Halted, HostSummary, Loop, Memory, NetworkSummary,
-    Outcome, Processor, Recording, RepliesSummary, Summary, SumsSummary, TickBefore, Written,
+    Outcome, Processor, Recording, RepliesSummary, Summary, SumsSummary, TickBefore, Verdict, Written,
 };
 use model::quantiles::{Quantiles, histogram};
 use model::table::{Accuracy, Event, Status, Table};
@@ -36,6 +36,10 @@ fn summary(bus: BusSummary, cells: Vec<CellSummary>) -> Summary {
     let quantiles = Quantiles::of(&histogram(), 1.0);
     Summary {
         skin: "two-cells".to_owned(),
+        verdict: Verdict {
+            well: false,
+            look_at: vec!["the run failed: lost at the end of the run: vcan0".to_owned()],
+        },
         cells,
         outcome: Outcome::Failed,
         failure: Some("lost at the end of the run: vcan0".to_owned()),

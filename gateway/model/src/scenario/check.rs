@@ -26,9 +26,10 @@ pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     let modes = modes(&raw.mode, end)?;
     let names = Names::of(skin);
     let touches = touches(&raw.touch, end, &names)?;
+    let touches_repeat = raw.touches_repeat_s.map(|seconds| repeat(&raw.touch, seconds)).transpose()?;
     let faults = faults::faults(&raw.fault, end, &names)?;
     let sensors = sensors::sensors(&raw.sensors, end)?;
-    Ok(Scenario { duration, seed, motion, modes, touches, touches_repeat: None, faults, sensors })
+    Ok(Scenario { duration, seed, motion, modes, touches, touches_repeat, faults, sensors })
 }
 
 /// The scenario's duration in s.
@@ -170,6 +171,23 @@ fn touches(raw: &[raw::Touch], end: EndS, names: &Names<'_>) -> Checked<Vec<Touc
         together(&at.key("force_n"), &touches, names)?;
     }
     Ok(touches)
+}
+
+/// The period of the touches: each of them ends before all begin again.
+fn repeat(touches: &[raw::Touch], seconds: f64) -> Checked<Span> {
+    let period = length(&Place::named("touches_repeat_s"), seconds)?;
+    for (index, touch) in touches.iter().enumerate() {
+        let ends = span(touch.at_s).0.saturating_add(span(touch.for_s.unwrap_or(0.0)).0);
+        // A touch without a length begins before.
+        if ends > period.0 || span(touch.at_s) >= period {
+            let key = if touch.for_s.is_some() { "for_s" } else { "at_s" };
+            let got = touch.for_s.unwrap_or(touch.at_s);
+            let why =
+                format_args!("the touch must end before touches_repeat_s = {seconds}, when all begin again");
+            return Err(Place::named("touch").nth(index).key(key).fault(got, why));
+        }
+    }
+    Ok(period)
 }
 
 fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<Touch> {

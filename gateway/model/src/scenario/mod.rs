@@ -42,7 +42,7 @@ pub struct Scenario {
     pub modes: Vec<ModeChange>,
     /// The touches, in the file's order.
     pub touches: Vec<Touch>,
-    /// The period after which the touches repeat.
+    /// The period after which all touches begin again; each of them ends before. The motion and the faults go on.
     pub touches_repeat: Option<Span>,
     /// The faults, in the order of time.
     pub faults: Vec<Fault>,

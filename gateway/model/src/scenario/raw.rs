@@ -14,6 +14,7 @@ pub(super) struct Scenario {
     pub(super) duration_s: Option<f64>,
     #[serde(default = "one")]
     pub(super) seed: i64,
+    pub(super) touches_repeat_s: Option<f64>,
     #[serde(default)]
     pub(super) motion: Motion,
     #[serde(default)]

@@ -1,5 +1,7 @@
 use proptest::prelude::*;
 
+mod repeat;
+
 use super::*;
 use crate::testing::{SKIN, skin};
 
@@ -332,17 +334,6 @@ fn touches_come_and_go_by_their_profile() {
     let text = GOOD.replacen("\"half-sine\"", "\"ramp\"", 1);
     let scenario = Scenario::parse("s.toml", &text, &three()).unwrap();
     assert_eq!(force(&Touches::new(&scenario, &three()), 0, 150), 0.75);
-}
-
-#[test]
-fn touches_repeat_after_their_period() {
-    let scenario = Scenario { touches_repeat: Some(Span(12_000_000)), ..good() };
-    let mut touches = Touches::new(&scenario, &three());
-    for epoch in [0, 125, 150, 188, 219] {
-        // 12 s are 750 epochs.
-        assert_eq!(force(&touches, 0, epoch), force(&touches, 0, epoch + 750_000), "{epoch}");
-    }
-    assert_eq!(touches.stimuli_for(750 + 126).count(), 2);
 }
 
 #[test]

@@ -29,6 +29,15 @@ impl Serialize for Errors {
     }
 }
 
+impl FromIterator<f64> for Errors {
+    /// Collects errors in Nm, of either sign.
+    fn from_iter<T: IntoIterator<Item = f64>>(errors: T) -> Self {
+        let mut all = Self::default();
+        errors.into_iter().for_each(|error| all.add(error));
+        all
+    }
+}
+
 impl Errors {
     fn add(&mut self, error: f64) {
         self.sum += error.abs();

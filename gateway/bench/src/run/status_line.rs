@@ -1,0 +1,225 @@
+//! The text of the progress line of a run, for a line of any width.
+
+use protocol::usage::shown;
+
+/// A duration in s from which on a run counts as one without an end.
+const ENDLESS_S: f64 = 86_400.0;
+
+/// The values of the progress line of a run.
+#[derive(Clone, Debug)]
+pub(super) struct StatusLine<'a> {
+    /// Time since the loop began, in s.
+    pub(super) elapsed_s: f64,
+    /// The run's duration, in s.
+    pub(super) duration_s: f64,
+    /// Names of the buses that are lost.
+    pub(super) lost: &'a [&'a str],
+    /// The reason of the halt, while the robot is halted.
+    pub(super) halted: Option<&'a str>,
+    /// Cells in contact.
+    pub(super) contributing: u32,
+    /// All cells of the skin.
+    pub(super) cells: usize,
+    /// Cells in contact that missed the last epoch.
+    pub(super) stale: u32,
+    /// Cells that have fallen silent.
+    pub(super) dead: u32,
+    /// The 99th percentile of how late ticks began, in µs.
+    pub(super) late_us: f64,
+    /// The name of what the gateway computes.
+    pub(super) mode: &'static str,
+    /// The torque on each joint, in Nm.
+    pub(super) torque_nm: &'a [f64],
+}
+
+/// The detail of each part of a line, from 0 for none or the shortest form upwards.
+#[derive(Clone, Copy)]
+struct Detail {
+    time: u8,
+    alarm: u8,
+    contact: u8,
+    late: u8,
+    mode: u8,
+    torque: u8,
+}
+
+/// The details of a line, the longest first: what is left out first matters less than what stays.
+const DETAILS: [Detail; 12] = [
+    Detail { time: 1, alarm: 1, contact: 3, late: 1, mode: 1, torque: 2 },
+    Detail { time: 1, alarm: 1, contact: 3, late: 1, mode: 0, torque: 2 },
+    Detail { time: 1, alarm: 1, contact: 3, late: 0, mode: 0, torque: 2 },
+    Detail { time: 1, alarm: 1, contact: 2, late: 0, mode: 0, torque: 2 },
+    Detail { time: 1, alarm: 1, contact: 1, late: 0, mode: 0, torque: 2 },
+    Detail { time: 1, alarm: 1, contact: 1, late: 0, mode: 0, torque: 1 },
+    Detail { time: 1, alarm: 0, contact: 1, late: 0, mode: 0, torque: 1 },
+    Detail { time: 1, alarm: 0, contact: 0, late: 0, mode: 0, torque: 1 },
+    Detail { time: 0, alarm: 0, contact: 0, late: 0, mode: 0, torque: 1 },
+    Detail { time: 1, alarm: 0, contact: 1, late: 0, mode: 0, torque: 0 },
+    Detail { time: 1, alarm: 0, contact: 0, late: 0, mode: 0, torque: 0 },
+    Detail { time: 0, alarm: 0, contact: 0, late: 0, mode: 0, torque: 0 },
+];
+
+impl StatusLine<'_> {
+    /// Returns the text for a line of `width` letters: the most detailed one that fits, the shortest if none does, and all
+    /// of it without a width. The torque stands in each of them.
+    pub(super) fn text(&self, width: Option<usize>) -> String {
+        let fits = |text: &String| width.is_none_or(|width| text.chars().count() <= width);
+        let mut texts = DETAILS.into_iter().map(|detail| self.detailed(detail));
+        let first = texts.find(fits);
+        first.unwrap_or_else(|| DETAILS.last().map_or_else(String::new, |detail| self.detailed(*detail)))
+    }
+
+    fn detailed(&self, detail: Detail) -> String {
+        let late = (detail.late > 0).then(|| format!("ticks late 99 % {:.0} µs", self.late_us));
+        let mode = (detail.mode > 0).then(|| format!("{:11}", self.mode));
+        let parts = [
+            Some(self.time(detail.time)),
+            self.lost(detail.alarm),
+            self.halted(detail.alarm),
+            self.contact(detail.contact),
+            late,
+            mode,
+            Some(self.torque(detail.torque)),
+        ];
+        parts.into_iter().flatten().collect::<Vec<_>>().join("  ")
+    }
+
+    fn time(&self, detail: u8) -> String {
+        let (elapsed, duration) = (self.elapsed_s, self.duration_s);
+        let has_end = detail > 0 && duration < ENDLESS_S;
+        if has_end { format!("{elapsed:5.1} of {duration:.1} s") } else { format!("{elapsed:5.1} s") }
+    }
+
+    fn lost(&self, detail: u8) -> Option<String> {
+        match (self.lost, detail) {
+            ([], _) => None,
+            (lost, 0) => Some(format!("LOST: {}", lost.len())),
+            (lost, _) => Some(format!("LOST: {}", shown(&lost.join(", ")))),
+        }
+    }
+
+    fn halted(&self, detail: u8) -> Option<String> {
+        let why = self.halted?;
+        Some(if detail > 0 { format!("HALTED: {}", shown(why)) } else { "HALTED".to_owned() })
+    }
+
+    /// Returns the cells in contact; below the full detail the others only where there are some.
+    fn contact(&self, detail: u8) -> Option<String> {
+        let (contributing, cells) = (self.contributing, self.cells);
+        let width = cells.to_string().len();
+        let mut text = match detail {
+            0 => return None,
+            1 => format!("{contributing:width$} in contact"),
+            _ => format!("{contributing:width$} of {cells} in contact"),
+        };
+        for (count, what) in [(self.stale, "stale"), (self.dead, "dead")] {
+            if detail > 2 || count > 0 {
+                text += &format!(", {count} {what}");
+            }
+        }
+        Some(text)
+    }
+
+    fn torque(&self, detail: u8) -> String {
+        let each =
+            |one: &dyn Fn(&f64) -> String| self.torque_nm.iter().map(one).collect::<Vec<_>>().join(" ");
+        match detail {
+            0 => {
+                let max = self.torque_nm.iter().map(|nm| nm.abs()).fold(0.0, f64::max);
+                format!("torque up to {max:.1} Nm")
+            }
+            1 => format!("torque {} Nm", each(&|nm| format!("{nm:4.1}"))),
+            _ => format!("torque {} Nm", each(&|nm| format!("{nm:5.2}"))),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TORQUE: [f64; 7] = [0.0, -12.345, 1.0, 0.5, -0.25, 0.0, 3.0];
+
+    fn line(joints: usize) -> StatusLine<'static> {
+        StatusLine {
+            elapsed_s: 3.21,
+            duration_s: 12.0,
+            lost: &[],
+            halted: None,
+            contributing: 4,
+            cells: 253,
+            stale: 0,
+            dead: 0,
+            late_us: 45.4,
+            mode: "compare",
+            torque_nm: &TORQUE[..joints],
+        }
+    }
+
+    #[test]
+    fn a_line_without_a_width_has_everything() {
+        let all = "  3.2 of 12.0 s    4 of 253 in contact, 0 stale, 0 dead  ticks late 99 % 45 µs  compare      torque  \
+                   0.00 -12.35  1.00  0.50 -0.25  0.00 Nm";
+        assert_eq!(line(6).text(None), all);
+        assert_eq!(line(6).text(Some(1_000)), all);
+    }
+
+    #[test]
+    fn a_narrow_line_leaves_out_what_matters_less() {
+        for (width, text) in [
+            (
+                120,
+                "  3.2 of 12.0 s    4 of 253 in contact, 0 stale, 0 dead  torque  0.00 -12.35  1.00  0.50 -0.25  0.00 Nm",
+            ),
+            (80, "  3.2 of 12.0 s    4 in contact  torque  0.00 -12.35  1.00  0.50 -0.25  0.00 Nm"),
+            (60, "  3.2 of 12.0 s  torque  0.0 -12.3  1.0  0.5 -0.2  0.0 Nm"),
+            (40, "  3.2 of 12.0 s  torque up to 12.3 Nm"),
+            (20, "  3.2 s  torque up to 12.3 Nm"),
+        ] {
+            assert_eq!(line(6).text(Some(width)), text);
+        }
+    }
+
+    #[test]
+    fn what_is_wrong_stays_in_a_narrow_line() {
+        let (lost, halted) = (&["vcan1"][..], Some("somebody sent a halt frame"));
+        let wrong = StatusLine { lost, halted, dead: 3, ..line(6) };
+        for (width, text) in [
+            (
+                150,
+                "  3.2 of 12.0 s  LOST: vcan1  HALTED: somebody sent a halt frame    4 of 253 in contact, 3 dead  torque  \
+                 0.00 -12.35  1.00  0.50 -0.25  0.00 Nm",
+            ),
+            (80, "  3.2 of 12.0 s  LOST: 1  HALTED  torque  0.0 -12.3  1.0  0.5 -0.2  0.0 Nm"),
+            (60, "  3.2 of 12.0 s  LOST: 1  HALTED  torque up to 12.3 Nm"),
+            (40, "  3.2 s  LOST: 1  HALTED  torque up to 12.3 Nm"),
+        ] {
+            assert_eq!(wrong.text(Some(width)), text);
+        }
+    }
+
+    #[test]
+    fn eighty_columns_hold_all_torques_and_every_width_has_some() {
+        let lost = ["vcan0", "a-bus-of-15-let"];
+        for (joints, lost, halted) in [(6, &lost[..0], None), (7, &lost[..], Some("the torque is not valid"))]
+        {
+            let line = StatusLine { lost, halted, dead: 3, ..line(joints) };
+            for width in 1..300 {
+                let text = line.text(Some(width));
+                let torques = text.rsplit("torque ").next().unwrap().split_whitespace();
+                assert!(text.chars().count() <= width.max(46), "{width}: {text}");
+                assert!(width < 80 || torques.count() == joints + 1, "{width}: {text}");
+                assert_eq!(
+                    (text.contains("LOST"), text.contains("HALTED")),
+                    (!lost.is_empty(), halted.is_some())
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn a_run_without_an_end_has_no_duration() {
+        let endless = StatusLine { duration_s: ENDLESS_S, ..line(6) };
+        assert!(endless.text(None).starts_with("  3.2 s    4 of 253"));
+    }
+}

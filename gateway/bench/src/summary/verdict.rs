@@ -1,0 +1,459 @@
+//! The verdict on a run: all is well, or what to look at.
+//!
+//! A pure function of the other figures of the [`Summary`]. A run is well only if everything that can be checked was
+//! checked: with nothing in contact, or nothing compared, there is something to look at.
+
+use std::collections::BTreeMap;
+
+use model::table::Event;
+use serde::Serialize;
+
+use super::{BusSummary, CellSummary, Outcome, RepliesSummary, Summary, cells_in_error, ranges};
+
+/// The mean error of one cell's torques that rounding explains, at most, in Nm: four steps of a torque's word. A correct
+/// cell has about a tenth of it.
+pub const CELL_ERROR_NM: f64 = 4.0 / 4_096.0;
+/// The mean error of sums along a tree that rounding explains, at most, in Nm: four steps of a sum's word.
+const SUM_ERROR_NM: f64 = 4.0 / 256.0;
+/// Events that have a line of their own, by their names in the summary.
+const SATURATED: &str = Event::Saturated.name();
+const STALE: &str = Event::StaleTorque.name();
+/// Groups of node ids that are listed; more are counted.
+const RANGES: usize = 12;
+
+/// The verdict on a run.
+#[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
+pub struct Verdict {
+    /// Whether the run came to its end, everything was checked, and nothing is wrong.
+    pub well: bool,
+    /// What to look at, the most important first; empty if all is well.
+    pub look_at: Vec<String>,
+}
+
+impl Verdict {
+    /// Returns the verdict on a run from the other figures of its summary.
+    #[must_use]
+    pub fn of(summary: &Summary) -> Self {
+        let mut look_at = Vec::new();
+        ending(&mut look_at, summary);
+        let buses = || summary.buses.iter();
+        absent(&mut look_at, summary);
+        buses().for_each(|bus| unknown(&mut look_at, bus));
+        buses().for_each(|bus| network(&mut look_at, bus));
+        wrong_torques(&mut look_at, summary);
+        restarts(&mut look_at, summary);
+        recording(&mut look_at, summary);
+        buses().for_each(|bus| lost(&mut look_at, bus));
+        unchecked(&mut look_at, summary);
+        control(&mut look_at, summary);
+        buses().for_each(|bus| late(&mut look_at, bus));
+        buses().for_each(|bus| incomplete(&mut look_at, bus));
+        ticks(&mut look_at, summary);
+        buses().for_each(|bus| anomalies(&mut look_at, bus));
+        let ended_well = matches!(summary.outcome, Outcome::Done | Outcome::Interrupted);
+        if look_at.is_empty() && !ended_well {
+            look_at.push(format!("the run ended as {}", summary.outcome));
+        }
+        Self { well: look_at.is_empty(), look_at }
+    }
+}
+
+impl Summary {
+    /// Returns the sums of a run that is well, in one line.
+    #[must_use]
+    pub fn sums_of_all(&self) -> String {
+        let of = |figure: fn(&BusSummary) -> u64| self.buses.iter().map(figure).sum::<u64>();
+        let (complete, due) = (of(|bus| bus.epochs_complete), of(|bus| bus.epochs_due));
+        let on = match self.buses.len() {
+            0 | 1 => String::new(),
+            buses => format!(" on {buses} buses"),
+        };
+        let mut parts = vec![
+            many(self.cells.len(), "cell", "cells"),
+            format!("{complete} of {} complete{on}", many(due, "epoch", "epochs")),
+        ];
+        let replies = of(|bus| bus.replies.in_time);
+        if replies > 0 {
+            parts.push(format!("{} in time", many(replies, "reply", "replies")));
+        }
+        let contributions = of(|bus| bus.sums.map_or(0, |sums| sums.contributions.in_time));
+        if contributions > 0 {
+            parts.push(format!("{} due in sums in time", many(contributions, "cell", "cells")));
+        }
+        let accuracy = &self.accuracy;
+        let error = accuracy.single.mean().or_else(|| accuracy.sums.mean());
+        parts.extend(error.map(|mean| format!("error {mean:.1e} Nm")));
+        parts.join(", ")
+    }
+}
+
+/// Formats a count with its noun.
+fn many(count: impl TryInto<u64>, one: &str, more: &str) -> String {
+    let count = count.try_into().unwrap_or(u64::MAX);
+    format!("{count} {}", if count == 1 { one } else { more })
+}
+
+/// Formats how often something happened.
+fn times(count: u64) -> String {
+    if count == 1 { "once".to_owned() } else { format!("{count} times") }
+}
+
+/// Names cells of a bus: `cell 3 on vcan0`, `cells 1-4, 6 on vcan0`.
+fn named(nodes: &[u8], bus: &str) -> String {
+    let all = ranges(nodes);
+    let noun = if nodes.len() == 1 { "cell" } else { "cells" };
+    match all.get(..RANGES).filter(|_| all.len() > RANGES) {
+        Some(first) => format!("{} cells ({}, ...) on {bus}", nodes.len(), first.join(", ")),
+        None => format!("{noun} {} on {bus}", all.join(", ")),
+    }
+}
+
+/// Names the cells for which a condition holds, by bus.
+fn cells_that(summary: &Summary, holds: impl Fn(&CellSummary) -> bool) -> Vec<String> {
+    let mut buses = BTreeMap::<&str, Vec<u8>>::new();
+    for cell in summary.cells.iter().filter(|cell| holds(cell)) {
+        buses.entry(&cell.bus).or_default().push(cell.node);
+    }
+    for nodes in buses.values_mut() {
+        nodes.sort_unstable();
+    }
+    buses.into_iter().map(|(bus, nodes)| named(&nodes, bus)).collect()
+}
+
+/// Lists counts with their nouns, without zeros.
+fn nonzero<'a>(counts: impl IntoIterator<Item = (u64, &'a str)>) -> Vec<String> {
+    let counts = counts.into_iter().filter(|(count, _)| *count > 0);
+    counts.map(|(count, what)| format!("{count} {what}")).collect()
+}
+
+/// Returns true of a value above a limit, and of one that is not a number.
+fn is_above(value: f64, limit: f64) -> bool {
+    value.is_nan() || value > limit
+}
+
+/// The run did not come to its end, or not as it should.
+fn ending(look_at: &mut Vec<String>, summary: &Summary) {
+    look_at.extend(summary.failure.as_ref().map(|failure| format!("the run failed: {failure}")));
+    if let Some(why) = &summary.halted {
+        let at = summary.halts.last().map_or_else(String::new, |halt| format!(" at {:.3} s", halt.at_s));
+        look_at.push(format!(
+            "the robot was halted{at} and not resumed: {why}; before_halt of --summary FILE has the ticks before it"
+        ));
+    }
+    look_at.extend(summary.no_controller.clone());
+    look_at.extend(cells_in_error(&summary.cell_errors, true));
+}
+
+/// Buses that were lost, and cells that did not speak at the end.
+fn absent(look_at: &mut Vec<String>, summary: &Summary) {
+    for bus in summary.buses.iter().filter(|bus| bus.outages.times > 0) {
+        let end = if bus.outages.at_end { ", also at the end" } else { "" };
+        look_at.push(format!(
+            "{} was lost {} for {:.1} s in all{end}: its cells' torques decayed to zero",
+            bus.name,
+            times(bus.outages.times),
+            bus.outages.lost_s
+        ));
+    }
+    for bus in summary.buses.iter().filter(|bus| !bus.silent_cells.is_empty()) {
+        look_at.push(format!(
+            "{}: dead, or never heard; check that each runs and is wired",
+            named(&bus.silent_cells, &bus.name)
+        ));
+    }
+    // The receiver of such a bus has left no figures.
+    let is_known = |cell: &CellSummary| summary.buses.iter().any(|bus| bus.name == cell.bus);
+    if summary.failure.is_none() {
+        let unknown = cells_that(summary, |cell| !is_known(cell));
+        look_at
+            .extend(unknown.into_iter().map(|cells| format!("{cells}: the run has no figures of this bus")));
+    }
+    for host in summary.buses.iter().flat_map(|bus| &bus.hosts) {
+        let lost = host.lost_from + host.lost_to;
+        let gone =
+            (host.gone > 0).then(|| format!("gone {} for {:.1} s in all", times(host.gone), host.gone_s));
+        let end = (!host.at_end).then(|| "not reached at the end".to_owned());
+        let lost = (lost > 0).then(|| format!("{} lost", many(lost, "frame", "frames")));
+        let parts: Vec<_> = [gone, end, lost].into_iter().flatten().collect();
+        if !parts.is_empty() {
+            look_at.push(format!(
+                "host {}: {}; vcan-setup status shows its link",
+                host.name,
+                parts.join(", ")
+            ));
+        }
+    }
+}
+
+/// What is missing for no known reason.
+fn unknown(look_at: &mut Vec<String>, bus: &BusSummary) {
+    let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
+    if replies.unknown > 0 {
+        look_at.push(format!(
+            "{} missing without a reason (unknown) on {name}: cells[].missing of --summary FILE has which cells",
+            many(replies.unknown, "reply", "replies")
+        ));
+    }
+    if up.unknown > 0 {
+        look_at.push(format!(
+            "{} sent by cells and not received, without a reason (unknown), on {name}: check its wiring and load",
+            many(up.unknown, "packet", "packets")
+        ));
+    }
+    if let Some(parts) = bus.sums.map(|sums| sums.contributions).filter(|parts| parts.missing > 0) {
+        look_at.push(format!(
+            "{} of {} due in sums missing on {name}: no route to a root, lost sums, or a busy machine",
+            parts.missing,
+            many(parts.due, "cell", "cells")
+        ));
+    }
+}
+
+/// A tree that is not as described.
+fn network(look_at: &mut Vec<String>, bus: &BusSummary) {
+    let Some(network) = &bus.network else { return };
+    if !network.unreachable.is_empty() {
+        look_at.push(format!(
+            "{}: no route to a root at the end, so no sum contains them; check their wires",
+            named(&network.unreachable, &bus.name)
+        ));
+    } else if network.tree_ready_s.is_none() {
+        look_at.push(format!("the tree on {} was not complete when the run began", bus.name));
+    }
+    for difference in &network.differences {
+        look_at.push(format!("{} is not as the skin describes it: {difference}", bus.name));
+    }
+}
+
+/// Torques that are not what they should be.
+fn wrong_torques(look_at: &mut Vec<String>, summary: &Summary) {
+    let accuracy = &summary.accuracy;
+    let is_off = |cell: &CellSummary| cell.error.mean().is_some_and(|mean| is_above(mean, CELL_ERROR_NM));
+    for cells in cells_that(summary, is_off) {
+        look_at.push(format!(
+            "{cells}: mean error above {CELL_ERROR_NM:.1e} Nm, which rounding does not explain; check pose and parameters"
+        ));
+    }
+    let of_all = [("single cells", &accuracy.single, CELL_ERROR_NM), ("sums", &accuracy.sums, SUM_ERROR_NM)];
+    for (what, errors, limit) in of_all {
+        if let Some(mean) = errors.mean().filter(|mean| is_above(*mean, limit)) {
+            look_at.push(format!(
+                "mean error of {what} {mean:.1e} Nm: rounding explains at most {limit:.1e} Nm"
+            ));
+        }
+    }
+    let saturated: u64 = summary.buses.iter().filter_map(|bus| bus.events.get(SATURATED)).sum();
+    if saturated > 0 {
+        look_at.push(format!(
+            "{} saturated: larger than the torque format can carry, and not compared",
+            many(saturated, "torque", "torques")
+        ));
+    } else if accuracy.saturated > 0 {
+        look_at.push(format!("{} saturated, and not compared", many(accuracy.saturated, "word", "words")));
+    }
+    for cells in cells_that(summary, |cell| !cell.stuck.is_empty()) {
+        look_at.push(format!("{cells}: stuck, sent the same words while it should have sent others"));
+    }
+    for bus in &summary.buses {
+        let parts = bus.sums.map(|sums| sums.contributions);
+        let in_sums = parts.map_or(0, |parts| parts.unasked.saturating_sub(parts.contact_unknown));
+        let RepliesSummary { unexpected, .. } = bus.replies;
+        if unexpected + in_sums > 0 {
+            look_at.push(format!(
+                "{} that nothing touched, or that were halted, on {}: not compared",
+                many(unexpected + in_sums, "torque of cells", "torques of cells"),
+                bus.name
+            ));
+        }
+    }
+}
+
+/// Restarts of cells, and halts that have ended.
+fn restarts(look_at: &mut Vec<String>, summary: &Summary) {
+    for cells in cells_that(summary, |cell| cell.restarts > 0) {
+        look_at.push(format!("{cells}: restarted; what was due then is in doubt"));
+    }
+    for bus in &summary.buses {
+        let of_cells = summary.cells.iter().filter(|cell| cell.bus == bus.name).map(|cell| cell.restarts);
+        let others = bus.uplink.restarts.saturating_sub(of_cells.sum());
+        if others > 0 {
+            look_at.push(format!(
+                "{} on {}",
+                many(others, "restart of a cell", "restarts of cells"),
+                bus.name
+            ));
+        }
+    }
+    let halts = summary.halts.len() as u64 + summary.further_halts;
+    let ended = halts.saturating_sub(summary.halted.is_some().into());
+    if ended > 0 {
+        let why = summary.halts.first().map_or("", |halt| &halt.reason);
+        look_at.push(format!("the robot was halted {} and resumed, at first because {why}", times(ended)));
+    }
+}
+
+fn recording(look_at: &mut Vec<String>, summary: &Summary) {
+    let Some(recording) = &summary.recording else { return };
+    let messages = recording.messages_lost.values().sum::<u64>();
+    // A failure names what could not be written.
+    if recording.lost + messages > 0 && summary.failure.is_none() {
+        look_at.push(format!(
+            "the recording is incomplete, without {} and {}: this machine was busy, or its disk is slow",
+            many(recording.lost, "frame", "frames"),
+            many(messages, "other message", "other messages")
+        ));
+    }
+}
+
+/// What was lost for a known reason.
+fn lost(look_at: &mut Vec<String>, bus: &BusSummary) {
+    let (name, replies, up) = (&bus.name, &bus.replies, &bus.uplink);
+    let reasons = [
+        (replies.lost, "lost on the way to the gateway"),
+        (replies.not_heard, "not sent, because the cell did not receive the joints"),
+        (replies.in_doubt, "in doubt, of cells that were silent or restarted, or of a lost bus"),
+    ];
+    let missing = nonzero(reasons);
+    if !missing.is_empty() {
+        look_at.push(format!("replies missing on {name}: {}", missing.join(", ")));
+    }
+    let reasons = [
+        (up.dropped, "dropped by the bus, because this machine did not read them in time"),
+        (up.backlog, "dropped by the kernel's backlog (net.core.netdev_max_backlog)"),
+        (up.outage, "lost with the bus"),
+        (up.hosts, "lost between hosts"),
+        (up.rejected, "damaged"),
+        (up.in_doubt, "in doubt, from before a restart"),
+        (up.surplus, "more than their cells have sent: duplicates, or another sender"),
+    ];
+    let packets = nonzero(reasons);
+    if !packets.is_empty() {
+        look_at.push(format!("packets of cells on {name}: {}", packets.join(", ")));
+    }
+    if bus.dropped_by_bus > up.dropped {
+        look_at.push(format!(
+            "{} of any sender dropped by {name}, because this machine did not read them in time",
+            many(bus.dropped_by_bus - up.dropped, "frame", "frames")
+        ));
+    }
+}
+
+fn control(look_at: &mut Vec<String>, summary: &Summary) {
+    let control = &summary.control;
+    let bad = control.bad_cycles.values().sum::<u64>();
+    if bad > 0 {
+        let worst = control.bad_cycles.iter().max_by_key(|(_, count)| **count);
+        let why = worst.map_or("", |(reason, _)| reason);
+        look_at.push(format!("{}, most of them because {why}", many(bad, "bad cycle", "bad cycles")));
+    }
+    if control.unsent > 0 {
+        let frames = many(control.unsent, "frame", "frames");
+        look_at.push(format!("{frames} of the gateway not sent: a bus did not take them"));
+    }
+    if control.records_lost > 0 {
+        let records = many(control.records_lost, "record of a tick", "records of ticks");
+        look_at
+            .push(format!("{records} lost, so figures of the control loop lack them: this machine was busy"));
+    }
+}
+
+/// Ticks that were skipped.
+fn ticks(look_at: &mut Vec<String>, summary: &Summary) {
+    let control = &summary.control;
+    if control.ticks_skipped > 0 {
+        let fifo = if control.fifo { "" } else { " (SCHED_FIFO was refused)" };
+        let joints = match control.broadcasts_skipped {
+            0 => String::new(),
+            joints => format!(", {joints} of them with joints"),
+        };
+        look_at.push(format!(
+            "{} of {} of the control loop skipped{joints}: this machine was busy{fifo}",
+            control.ticks_skipped,
+            many(control.ticks + control.ticks_skipped, "tick", "ticks")
+        ));
+    }
+}
+
+/// Replies that came too late, and those of cells that got the joints too late.
+fn late(look_at: &mut Vec<String>, bus: &BusSummary) {
+    let RepliesSummary { due, late, too_late, skipped, .. } = bus.replies;
+    let parts =
+        nonzero([(late + too_late, "late"), (skipped, "skipped by cells that took the joints too late")]);
+    if !parts.is_empty() {
+        look_at.push(format!(
+            "{} of {} on {}: this machine was busy, or the cells are slow; -v has the times",
+            parts.join(" and "),
+            many(due, "reply", "replies"),
+            bus.name
+        ));
+    }
+    if let Some(parts) = bus.sums.map(|sums| sums.contributions).filter(|parts| parts.late > 0) {
+        look_at.push(format!(
+            "{} of {} due in sums late on {}: this machine was busy, or the tree is deep",
+            parts.late,
+            many(parts.due, "cell", "cells"),
+            bus.name
+        ));
+    }
+}
+
+/// Epochs that are not complete although no reply is late or missing.
+fn incomplete(look_at: &mut Vec<String>, bus: &BusSummary) {
+    let parts = bus.sums.map(|sums| sums.contributions);
+    let explained =
+        bus.replies.due > bus.replies.in_time || parts.is_some_and(|parts| parts.due > parts.in_time);
+    let missing = bus.epochs_due.saturating_sub(bus.epochs_complete);
+    if missing > 0 && !explained {
+        look_at.push(format!(
+            "{} of {} not complete on {}",
+            missing,
+            many(bus.epochs_due, "epoch", "epochs"),
+            bus.name
+        ));
+    }
+}
+
+/// Irregular frames, except for those above: saturated torques, and torques that came too late.
+fn anomalies(look_at: &mut Vec<String>, bus: &BusSummary) {
+    let odd = bus.events.iter().map(|(name, count)| match *name {
+        SATURATED => (0, SATURATED),
+        STALE => (count.saturating_sub(bus.replies.too_late), STALE),
+        name => (*count, name),
+    });
+    let odd = nonzero(odd);
+    if !odd.is_empty() {
+        look_at.push(format!("anomalies on {}: {}; skinbus dump shows the frames", bus.name, odd.join(", ")));
+    }
+}
+
+/// What the run could not check.
+fn unchecked(look_at: &mut Vec<String>, summary: &Summary) {
+    for cells in cells_that(summary, |cell| cell.contact_unknown > 0 && !cell.measures()) {
+        look_at.push(format!(
+            "{cells}: contact not known, torques not compared; stimuli from before this run, or a baseline"
+        ));
+    }
+    for cells in cells_that(summary, CellSummary::measures) {
+        look_at
+            .push(format!("{cells}: in mode \"measure\", not pressed by the scenario, torques not compared"));
+    }
+    // A run that failed early has its reason above.
+    if summary.failure.is_some() {
+        return;
+    }
+    let due = |bus: &BusSummary| bus.replies.due + bus.sums.map_or(0, |sums| sums.contributions.due);
+    let compared = summary.accuracy.single.count() + summary.accuracy.sums.count();
+    if summary.buses.iter().map(due).sum::<u64>() == 0 {
+        look_at.push(
+            "no torque was due: no cell was in contact, so nothing was compared; --scenario FILE touches cells".to_owned(),
+        );
+    } else if compared == 0 {
+        look_at.push(
+            "no torque was compared with the central computation: none came in time while the mode was \"compare\""
+                .to_owned(),
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests;
