@@ -7,7 +7,7 @@ use clap::Command;
 /// The groups, and their commands in order.
 const GROUPS: [(&str, &[&str]); 7] = [
     ("Run", &["demo", "run", "view"]),
-    ("Look", &["dump", "explain", "report", "cells"]),
+    ("Look", &["dump", "explain", "report", "cells", "compare"]),
     ("Files", &["convert", "replay", "recover"]),
     ("Size", &["fit"]),
     ("Real cells", &["commission", "calibrate", "conformance", "frame"]),

@@ -80,7 +80,7 @@ pub(crate) fn remark_another(files: &[PathBuf], path: &Path, skin: &Skin) {
 }
 
 /// The first thing in which two skins differ, and what each has.
-fn difference(one: &Skin, other: &Skin) -> Option<(String, String, String)> {
+pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, String)> {
     let buses = |skin: &Skin| skin.buses.iter().map(|bus| bus.name.clone()).collect::<Vec<_>>().join(", ");
     let joints = |skin: &Skin| skin.robot.joints.len().to_string();
     let cells = |skin: &Skin| skin.cells.len().to_string();

@@ -13,6 +13,7 @@ mod cells;
 mod check;
 mod columns;
 mod commission;
+mod compare;
 mod completions;
 mod conformance;
 mod convert;
@@ -24,6 +25,7 @@ mod former;
 mod frame;
 mod groups;
 mod input;
+mod junit;
 mod output;
 mod print;
 mod recover;
@@ -59,6 +61,7 @@ enum Command {
     Explain(explain::Explain),
     Report(report::Report),
     Cells(cells::Cells),
+    Compare(compare::Compare),
     Convert(convert::Convert),
     Replay(replay::Replay),
     Recover(recover::Recover),
@@ -84,6 +87,7 @@ impl Command {
             Self::Explain(command) => command.run(),
             Self::Report(command) => command.run(),
             Self::Cells(command) => command.run(),
+            Self::Compare(command) => command.run(),
             Self::Convert(command) => command.run(),
             Self::Replay(command) => command.run(),
             Self::Recover(command) => command.run(),

@@ -3,13 +3,13 @@
 use std::fmt::Write;
 use std::time::Duration;
 
-use analysis::report::svg::escaped;
 use conformance::Saved;
 use conformance::bus::Stop;
 use conformance::findings::{Finding, Verdict};
 use protocol::can::Format;
 use serde::Serialize;
 
+use crate::junit::{Case, Outcome, Suite};
 use crate::print::{count, list, readable, table};
 
 /// All that is printed.
@@ -96,34 +96,30 @@ impl Whole {
 
     /// A JUnit report: a test case for each requirement.
     pub(super) fn junit(&self) -> String {
-        let Self { bus, node, failed, seconds, .. } = self;
-        let tests = self.requirements.len();
-        let skipped = self.not_applicable + self.not_tested;
-        let mut text = format!(
-            "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n<testsuite name=\"cell {node} on {}\" tests=\"{tests}\" \
-             failures=\"{failed}\" skipped=\"{skipped}\" time=\"{seconds:.1}\">\n",
-            escaped(bus)
-        );
-        for Finding { requirement, verdict } in &self.requirements {
-            let name = escaped(&format!("{} {}", requirement.id, requirement.title));
+        let case = |Finding { requirement, verdict }: &Finding| {
             let document = serde_json::to_value(requirement.document).unwrap_or_default();
-            let class = escaped(document.as_str().unwrap_or_default());
-            let _ = write!(text, "  <testcase classname=\"{class}\" name=\"{name}\"");
-            let _ = match verdict {
-                Verdict::Passed { .. } => writeln!(text, "/>"),
-                Verdict::Failed { what, frames, .. } => writeln!(
-                    text,
-                    "><failure message=\"{}\">{}</failure></testcase>",
-                    escaped(what),
-                    escaped(&frames.join("\n"))
-                ),
-                Verdict::NotApplicable { why } | Verdict::NotTested { why } => {
-                    writeln!(text, "><skipped message=\"{}\"/></testcase>", escaped(why))
+            let outcome = match verdict {
+                Verdict::Passed { .. } => Outcome::Passed,
+                Verdict::Failed { what, frames, .. } => {
+                    Outcome::Failed { message: what.clone(), text: frames.join("\n") }
                 }
-                Verdict::Open => writeln!(text, "><skipped/></testcase>"),
+                Verdict::NotApplicable { why } | Verdict::NotTested { why } => {
+                    Outcome::Skipped { why: Some(why.clone()) }
+                }
+                Verdict::Open => Outcome::Skipped { why: None },
             };
-        }
-        text + "</testsuite>\n"
+            Case {
+                class: document.as_str().unwrap_or_default().to_owned(),
+                name: format!("{} {}", requirement.id, requirement.title),
+                outcome,
+            }
+        };
+        let suite = Suite {
+            name: format!("cell {} on {}", self.node, self.bus),
+            seconds: self.seconds,
+            cases: self.requirements.iter().map(case).collect(),
+        };
+        suite.text()
     }
 }
 

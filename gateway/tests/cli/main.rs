@@ -1,6 +1,7 @@
 //! The gateway's commands as processes: what they print, what they write, and what they refuse.
 
 mod commands;
+mod compare;
 mod convert;
 mod fit;
 mod fits;

@@ -1,0 +1,107 @@
+//! Where captures stand that did not begin with their run.
+//!
+//! A capture that begins in the middle of a run has the epochs of its joints modulo 256. Which of the numbers these are is
+//! found by the joints themselves: the place where most of them are those of the other capture.
+
+use protocol::message::{Joints, Message};
+use protocol::packet::Epoch;
+use protocol::skin::Skin;
+
+use super::Both;
+use super::numbering::Numbering;
+
+/// Joints that are kept: at 62.5 Hz a day has 5.4 million. Of longer captures the first ones.
+const MOST: usize = 6_000_000;
+/// Joints that are compared for each place.
+const SAMPLES: usize = 512;
+/// Epochs that captures have in common where they are laid over each other by their joints.
+const COMMON: usize = 8;
+
+/// The joints of a capture, each as a number that tells different ones apart.
+#[derive(Debug)]
+pub struct Trace {
+    bus: Option<String>,
+    numbering: Numbering,
+    first: Option<Epoch>,
+    /// By number since the first; `None` where joints are missing.
+    joints: Vec<Option<u32>>,
+}
+
+impl Trace {
+    /// Follows the joints of the first bus of a skin that has cells.
+    #[must_use]
+    pub fn new(skin: &Skin) -> Self {
+        let bus = skin.cells.first().and_then(|cell| skin.buses.get(cell.bus));
+        Self {
+            bus: bus.map(|bus| bus.name.clone()),
+            numbering: Numbering::new(super::period_ns(skin), Some(0)),
+            first: None,
+            joints: Vec::new(),
+        }
+    }
+
+    /// The epoch of the first joints.
+    #[must_use]
+    pub fn first(&self) -> Option<u8> {
+        self.first.map(|first| first.0)
+    }
+
+    /// Takes the next message of a bus.
+    pub fn take(&mut self, nanos: u64, bus: &str, message: &Message) {
+        let Message::Joints { epoch, joints } = message else { return };
+        if self.bus.as_deref() != Some(bus) {
+            return;
+        }
+        let last = self.numbering.newest();
+        let Some(key) = self.numbering.take(nanos, *epoch, last).filter(|key| key.run == 0) else { return };
+        self.first.get_or_insert(*epoch);
+        let Some(at) = usize::try_from(key.number).ok().filter(|at| *at < MOST) else { return };
+        if at >= self.joints.len() {
+            self.joints.resize(at + 1, None);
+        }
+        if let Some(place) = self.joints.get_mut(at) {
+            *place = Some(number_of(joints));
+        }
+    }
+}
+
+/// FNV-1a of the words.
+fn number_of(joints: &Joints) -> u32 {
+    let words = joints.positions.iter().flat_map(|word| word.to_bits().to_le_bytes());
+    words.fold(0x811C_9DC5, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))
+}
+
+/// The numbers of the first joints of two captures of one skin.
+#[must_use]
+pub fn starts(a: &Trace, b: &Trace) -> Both<Option<u64>> {
+    let (Some(first_a), Some(first_b)) = (a.first, b.first) else { return Both { a: None, b: None } };
+    let of = |first: Epoch, laps: usize| u64::from(first.0) + 256 * laps as u64;
+    let mut best = (share(a, b, of(first_a, 0), of(first_b, 0)).unwrap_or(0.0), 0, 0);
+    let most = a.joints.len().max(b.joints.len()) / 256 + 1;
+    for laps in 1..=most {
+        for (laps_a, laps_b) in [(0, laps), (laps, 0)] {
+            let share = share(a, b, of(first_a, laps_a), of(first_b, laps_b)).unwrap_or(0.0);
+            if share > best.0 && share >= 0.5 {
+                best = (share, laps_a, laps_b);
+            }
+        }
+    }
+    Both { a: Some(of(first_a, best.1)), b: Some(of(first_b, best.2)) }
+}
+
+/// The share of equal joints where two captures begin with these numbers; `None` where too few are in both.
+fn share(a: &Trace, b: &Trace, start_a: u64, start_b: u64) -> Option<f64> {
+    let begin = start_a.max(start_b);
+    let [skip_a, skip_b] =
+        [start_a, start_b].map(|start| usize::try_from(begin - start).unwrap_or(usize::MAX));
+    let (a, b) = (a.joints.get(skip_a..)?, b.joints.get(skip_b..)?);
+    let common = a.len().min(b.len());
+    if common < COMMON {
+        return None;
+    }
+    let step = common.div_ceil(SAMPLES);
+    let pairs = a.iter().zip(b).take(common).step_by(step).filter(|(a, b)| a.is_some() && b.is_some());
+    let (equal, all) =
+        pairs.fold((0_u32, 0_u32), |(equal, all), (a, b)| (equal + u32::from(a == b), all + 1));
+    (all > 0).then(|| f64::from(equal) / f64::from(all))
+}

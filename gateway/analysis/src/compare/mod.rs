@@ -1,0 +1,291 @@
+//! Two captures of one skin, joints by joints: `skinbus compare`.
+//!
+//! ```text
+//!   frames of A ──> Side: Moments by Key ──┐
+//!                                          ├──> the same Key ──> Tally, First ──> Report
+//!   frames of B ──> Side: Moments by Key ──┘
+//! ```
+//!
+//! A `Key` is the number of some joints since the run began. The captures are read in lockstep, always the one that is
+//! behind ([`Comparison::next`]), so that memory does not grow with them: of each bus some 100 joints are held.
+
+mod align;
+mod numbering;
+mod outcome;
+mod pair;
+mod report;
+mod side;
+
+use protocol::id::CellId;
+use protocol::message::Message;
+use protocol::skin::Skin;
+use serde::Serialize;
+
+use self::numbering::Key;
+use self::pair::{Firsts, Found, Tally, compare};
+use self::side::{Moment, Side};
+use crate::explain::NotFound;
+
+pub use self::align::{Trace, starts};
+pub use self::report::{
+    ASPECTS, CellRow, Contacts, Epochs, ExtraCell, First, Joints, Losses, Only, Replies, Report, Source,
+};
+
+/// One of the two captures.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Which {
+    /// The first one.
+    A,
+    /// The second one.
+    B,
+}
+
+impl Which {
+    const fn other(self) -> Self {
+        if matches!(self, Self::A) { Self::B } else { Self::A }
+    }
+}
+
+/// Something of each capture.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
+pub struct Both<T> {
+    /// Of the first one.
+    pub a: T,
+    /// Of the second one.
+    pub b: T,
+}
+
+impl<T> Both<T> {
+    /// That of one.
+    #[must_use]
+    pub const fn of(&self, which: Which) -> &T {
+        match which {
+            Which::A => &self.a,
+            Which::B => &self.b,
+        }
+    }
+
+    /// That of one, to be changed.
+    pub const fn of_mut(&mut self, which: Which) -> &mut T {
+        match which {
+            Which::A => &mut self.a,
+            Which::B => &mut self.b,
+        }
+    }
+}
+
+/// What does not count as a difference.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub struct Options {
+    /// Steps by which words of torques (1/4096 Nm) and sums (1/256 Nm) may differ.
+    pub tolerance: u32,
+    /// Steps by which words of joints may differ: 2^-14 quarter turns, of prismatic joints m.
+    pub joints_tolerance: u32,
+    /// Replies and joints that one capture alone may have.
+    pub missing: u64,
+}
+
+/// Compares two captures.
+#[derive(Debug)]
+pub struct Comparison<'a> {
+    skin: &'a Skin,
+    options: Options,
+    sides: Both<Side<'a>>,
+    tallies: Vec<Tally>,
+    epochs: Epochs,
+    /// The first difference that counts in any case, and the first of what is missing; with its joints and bus.
+    first: Option<(Key, usize, First)>,
+    first_missing: Option<(Key, usize, First)>,
+}
+
+/// From one epoch to the next, in ns.
+fn period_ns(skin: &Skin) -> u64 {
+    skin.timing.tick_nanos() * u64::from(skin.timing.ticks_per_broadcast)
+}
+
+impl<'a> Comparison<'a> {
+    /// Begins before the first frames; the numbers of the first joints are those of `starts`, else their epochs.
+    #[must_use]
+    pub fn new(skin: &'a Skin, options: Options, starts: Both<Option<u64>>) -> Self {
+        let period = period_ns(skin);
+        let side = |start| Side::new(skin, period, start);
+        Self {
+            skin,
+            options,
+            sides: Both { a: side(starts.a), b: side(starts.b) },
+            tallies: skin.buses.iter().map(|_| Tally::default()).collect(),
+            epochs: Epochs::default(),
+            first: None,
+            first_missing: None,
+        }
+    }
+
+    /// The capture to read from next: the one that is behind; `None` when both have ended.
+    #[must_use]
+    pub fn next(&self) -> Option<Which> {
+        let Both { a, b } = &self.sides;
+        match (a.is_ended, b.is_ended) {
+            (true, true) => None,
+            (true, false) => Some(Which::B),
+            (false, true) => Some(Which::A),
+            (false, false) => Some(if a.newest() <= b.newest() { Which::A } else { Which::B }),
+        }
+    }
+
+    /// Takes a frame from before a capture that is latched when it begins.
+    pub fn begin(&mut self, which: Which, nanos: u64, bus: &str, message: &Message) {
+        self.sides.of_mut(which).begin(nanos, bus, message);
+    }
+
+    /// Takes the next frame of a capture; `message` is its meaning, if it has one.
+    pub fn take(&mut self, which: Which, nanos: u64, bus: &str, message: Option<&Message>) {
+        if self.sides.of_mut(which).take(nanos, bus, message) {
+            self.pair();
+        }
+    }
+
+    /// Counts frames that the recorder of a capture lost.
+    pub fn dropped(&mut self, which: Which, frames: u64) {
+        let dropped = &mut self.sides.of_mut(which).counts.dropped;
+        *dropped = dropped.saturating_add(frames);
+    }
+
+    /// Notes that a capture's times mean nothing.
+    pub fn without_times(&mut self, which: Which) {
+        self.sides.of_mut(which).has_times = false;
+    }
+
+    /// Notes that a capture has no more frames; `is_unfinished` if its end is missing.
+    pub fn end(&mut self, which: Which, is_unfinished: bool) {
+        let side = self.sides.of_mut(which);
+        side.counts.unfinished = is_unfinished;
+        side.end();
+        self.pair();
+    }
+
+    /// The reason why a capture that has ended has no joints of the skin; `None` if it has.
+    pub fn not_found(&mut self, which: Which) -> Option<NotFound> {
+        self.sides.of_mut(which).not_found()
+    }
+
+    /// Cells of a capture that have reported a configuration, and those of them with the skin's, if these are fewer than
+    /// half.
+    #[must_use]
+    pub fn other_configurations(&self, which: Which) -> Option<(usize, usize)> {
+        let hash = |bus: usize, node| {
+            let cell = self.sides.of(which).buses.get(bus)?.cells.get(node)?;
+            cell.tracked.claim().heartbeat().map(|it| it.configuration).filter(|hash| *hash != 0)
+        };
+        let reported = self.skin.cells.iter().filter_map(|cell| Some((cell, hash(cell.bus, cell.node)?)));
+        let (all, same) = reported.fold((0, 0), |(all, same), (cell, hash)| {
+            (all + 1, same + usize::from(hash == self.skin.parameters(cell).hash()))
+        });
+        (same * 2 < all).then_some((all, same))
+    }
+
+    /// Compares all joints that are complete.
+    fn pair(&mut self) {
+        for bus in 0..self.skin.buses.len() {
+            while self.pair_on(bus).is_some() {}
+        }
+    }
+
+    /// Compares the next joints of a bus; `None` if they are not complete.
+    fn pair_on(&mut self, bus: usize) -> Option<()> {
+        let front = |side: &Side<'_>| side.buses.get(bus).and_then(|it| it.ready.front()).map(|it| it.key);
+        let both = (front(&self.sides.a), front(&self.sides.b));
+        let which = match both {
+            (Some(a), Some(b)) if a == b => {
+                let mut take = |which| self.sides.of_mut(which).buses.get_mut(bus)?.ready.pop_front();
+                let (a, b) = (take(Which::A)?, take(Which::B)?);
+                self.same(bus, &a, &b);
+                return Some(());
+            }
+            (Some(a), Some(b)) => {
+                if a < b {
+                    Which::A
+                } else {
+                    Which::B
+                }
+            }
+            (Some(a), None) if self.sides.b.is_past(bus, a) => Which::A,
+            (None, Some(b)) if self.sides.a.is_past(bus, b) => Which::B,
+            _ => return None,
+        };
+        let moment = self.sides.of_mut(which).buses.get_mut(bus)?.ready.pop_front()?;
+        self.alone(bus, which, &moment);
+        Some(())
+    }
+
+    fn same(&mut self, bus: usize, a: &Moment, b: &Moment) {
+        self.epochs.compared += 1;
+        let Some(tally) = self.tallies.get_mut(bus) else { return };
+        let found = compare(tally, (self.skin, bus), Both { a, b }, &self.options);
+        self.note(bus, Both { a: Some(a), b: Some(b) }, found);
+    }
+
+    /// Counts joints that one capture alone has.
+    fn alone(&mut self, bus: usize, which: Which, moment: &Moment) {
+        let other = self.sides.of(which.other());
+        let is_a = which == Which::A;
+        match (other.first, other.newest()) {
+            (Some((first, _)), _) if moment.key < first => self.epochs.before.count(is_a),
+            (None, _) => self.epochs.before.count(is_a),
+            (_, Some(last)) if other.is_ended && moment.key > last && !other.counts.unfinished => {
+                self.epochs.after.count(is_a);
+            }
+            _ => {
+                let missing =
+                    if is_a { &mut self.epochs.missing_in_b } else { &mut self.epochs.missing_in_a };
+                *missing += 1;
+                let moments = match which {
+                    Which::A => Both { a: Some(moment), b: None },
+                    Which::B => Both { a: None, b: Some(moment) },
+                };
+                self.note(bus, moments, Found::missing_epoch(!is_a));
+            }
+        }
+    }
+
+    /// Keeps differences if they are the first ones so far: buses are not compared in the order of time.
+    fn note(&mut self, bus: usize, moments: Both<Option<&Moment>>, firsts: Firsts) {
+        let Some(key) = moments.a.or(moments.b).map(|moment| moment.key) else { return };
+        let is_first = |kept: &Option<(Key, usize, First)>| {
+            kept.as_ref().is_none_or(|(first, on, _)| (*first, *on) > (key, bus))
+        };
+        if let Some(found) = firsts.other.filter(|_| is_first(&self.first)) {
+            self.first = self.describe(bus, &moments, found).map(|first| (key, bus, first));
+        }
+        if let Some(found) = firsts.missing.filter(|_| is_first(&self.first_missing)) {
+            self.first_missing = self.describe(bus, &moments, found).map(|first| (key, bus, first));
+        }
+    }
+
+    fn describe(&self, bus: usize, moments: &Both<Option<&Moment>>, mut found: Found) -> Option<First> {
+        if let Some(cell) = found.cell()
+            && self.restarts(bus, cell, Which::A) != self.restarts(bus, cell, Which::B)
+        {
+            found.inputs.push("restart");
+        }
+        let Both { a, b } = &self.sides;
+        let time_s = Both {
+            a: moments.a.and_then(|moment| a.seconds(moment.watched.at_ns)),
+            b: moments.b.and_then(|moment| b.seconds(moment.watched.at_ns)),
+        };
+        found.describe((self.skin, bus), moments, time_s)
+    }
+
+    fn restarts(&self, bus: usize, cell: CellId, which: Which) -> u32 {
+        let cell = self.sides.of(which).buses.get(bus).and_then(|bus| bus.cells.get(cell));
+        cell.map_or(0, |cell| cell.tracked.account.uplink().restarts)
+    }
+
+    /// Moments that are held.
+    #[cfg(test)]
+    fn held(&self) -> usize {
+        self.sides.a.held() + self.sides.b.held()
+    }
+}
+
+#[cfg(test)]
+mod tests;

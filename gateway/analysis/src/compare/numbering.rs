@@ -1,0 +1,168 @@
+//! Numbers of joints that do not wrap.
+//!
+//! An epoch is a number modulo 256. The step from one epoch to the next that is there is known modulo 256 too; how often
+//! 256 were left out in between follows from the time that passed. A step that does not fit the time is a pause of the
+//! gateway, or the counting began again: then a new run begins.
+
+use protocol::packet::Epoch;
+
+/// The place of some joints among all of a capture: which counting, and their number in it.
+#[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
+pub(super) struct Key {
+    /// How often the counting began again before.
+    pub(super) run: u32,
+    /// The number since that counting began.
+    pub(super) number: u64,
+}
+
+/// Joints of one bus may stand so many epochs behind those of another.
+const BEHIND: u64 = 16;
+/// Epochs by which the time that passed may be wrong.
+const SLACK: u64 = 4;
+
+/// Numbers the joints of all buses of a capture: they share one counter.
+#[derive(Debug)]
+pub(super) struct Numbering {
+    /// From one epoch to the next, in ns; at least 1.
+    period_ns: u64,
+    /// The number of the first joints, if that is known.
+    start: Option<u64>,
+    newest: Option<Newest>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Newest {
+    key: Key,
+    epoch: Epoch,
+    nanos: u64,
+}
+
+impl Numbering {
+    /// Begins before the first joints; their number is `start`, else their epoch.
+    pub(super) const fn new(period_ns: u64, start: Option<u64>) -> Self {
+        Self { period_ns: if period_ns == 0 { 1 } else { period_ns }, start, newest: None }
+    }
+
+    /// The newest joints.
+    pub(super) fn newest(&self) -> Option<Key> {
+        self.newest.map(|newest| newest.key)
+    }
+
+    /// The key of joints that came on a bus behind `last`; `None` if they are not behind it.
+    pub(super) fn take(&mut self, nanos: u64, epoch: Epoch, last: Option<Key>) -> Option<Key> {
+        let Some(newest) = self.newest else {
+            let key = Key { run: 0, number: self.start.unwrap_or_else(|| epoch.0.into()) };
+            self.newest = Some(Newest { key, epoch, nanos });
+            return Some(key);
+        };
+        let elapsed = nanos.saturating_sub(newest.nanos) / self.period_ns;
+        // Of another bus, or out of order.
+        let back = u64::from(newest.epoch.0.wrapping_sub(epoch.0));
+        if back <= BEHIND && elapsed <= BEHIND {
+            let number = newest.key.number.checked_sub(back)?;
+            let key = Key { number, ..newest.key };
+            return last.is_none_or(|last| last < key).then_some(key);
+        }
+        let key = match self.steps(newest, epoch, elapsed) {
+            Some(steps) => Key { number: newest.key.number + steps, ..newest.key },
+            None => Key { run: newest.key.run + 1, number: epoch.0.into() },
+        };
+        self.newest = Some(Newest { key, epoch, nanos });
+        last.is_none_or(|last| last < key).then_some(key)
+    }
+
+    /// Steps from the newest joints to those of an epoch after so many periods; `None` if the counting began again.
+    fn steps(&self, newest: Newest, epoch: Epoch, elapsed: u64) -> Option<u64> {
+        let modulo = u64::from(epoch.0.wrapping_sub(newest.epoch.0));
+        let laps = (elapsed + 128).saturating_sub(modulo) / 256;
+        let steps = modulo + 256 * laps;
+        let fits = steps.abs_diff(elapsed) <= SLACK + elapsed / 1_000;
+        match modulo {
+            // The next one after a pause is as frequent as 257 lost ones are rare.
+            1 if elapsed < 252 => Some(1),
+            _ if fits => Some(steps),
+            1 => Some(1),
+            _ if epoch.0 == 0 && modulo > 0 || modulo >= 128 => None,
+            // The gateway was late: the epochs are in order, and the times are not.
+            _ => Some(modulo),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const PERIOD: u64 = 16_000_000;
+
+    fn key(number: u64) -> Option<Key> {
+        Some(Key { run: 0, number })
+    }
+
+    /// Takes joints by number and period, on one bus.
+    fn numbers(joints: &[(u64, u64)]) -> Vec<Option<Key>> {
+        let (mut numbering, mut last) = (Numbering::new(PERIOD, None), None);
+        let each = joints.iter().map(|&(number, period)| {
+            let epoch = Epoch(u8::try_from(number % 256).unwrap());
+            let key = numbering.take(1_000 + period * PERIOD, epoch, last);
+            last = key.or(last);
+            key
+        });
+        each.collect()
+    }
+
+    #[test]
+    fn numbers_go_on_where_epochs_wrap() {
+        assert_eq!(numbers(&[(254, 0), (255, 1), (256, 2), (257, 3)]), [254, 255, 256, 257].map(key));
+    }
+
+    #[test]
+    fn lost_joints_are_counted_by_the_time_that_passed() {
+        for lost in [1, 100, 127, 128, 200, 254, 255, 256, 257, 300, 511, 512, 1_000, 70_000] {
+            let found = numbers(&[(3, 0), (4, 1), (4 + lost, 1 + lost)]);
+            assert_eq!(found[2], key(4 + lost), "{lost} steps");
+        }
+    }
+
+    #[test]
+    fn a_pause_is_no_loss_and_a_new_count_is_a_new_run() {
+        assert_eq!(numbers(&[(7, 0), (8, 400)])[1], key(8), "the next ones after 6.4 s");
+        assert_eq!(numbers(&[(7, 0), (8, 100)])[1], key(8));
+        assert_eq!(numbers(&[(7, 0), (20, 90)])[1], key(20), "late by 77 periods");
+        let restarted = Some(Key { run: 1, number: 0 });
+        assert_eq!(numbers(&[(200, 0), (256, 150)])[1], restarted);
+        assert_eq!(numbers(&[(100, 0), (256, 30)])[1], restarted);
+    }
+
+    #[test]
+    fn buses_share_the_count_and_repeated_joints_are_none() {
+        let mut numbering = Numbering::new(PERIOD, Some(1_000));
+        let mut take = |nanos, epoch, last| numbering.take(nanos, Epoch(epoch), last);
+        let (first, next) = (key(1_000), key(1_001));
+        assert_eq!(take(5, 232, None), first);
+        assert_eq!(take(6, 232, None), first, "on another bus");
+        assert_eq!(take(PERIOD, 233, first), next);
+        assert_eq!(take(PERIOD + 1, 233, next), None, "again");
+        assert_eq!(take(PERIOD + 2, 232, next), None, "out of order");
+        assert_eq!(take(PERIOD + 3, 233, first), next);
+    }
+
+    proptest! {
+        #[test]
+        fn any_losses_and_a_clock_that_is_not_exact_give_the_numbers(
+            first in 0_u64..256,
+            gaps in prop::collection::vec(prop_oneof![5 => Just(1_u64), 1 => 2_u64..3_000], 1..60),
+            late in prop::collection::vec(0_u64..PERIOD * 2, 60),
+        ) {
+            let (mut numbering, mut number) = (Numbering::new(PERIOD, None), first);
+            let mut last = numbering.take(0, Epoch(u8::try_from(first).unwrap()), None);
+            for (gap, late) in gaps.iter().zip(&late) {
+                number += gap;
+                let nanos = (number - first) * PERIOD + late;
+                last = numbering.take(nanos, Epoch(u8::try_from(number % 256).unwrap()), last);
+                prop_assert_eq!(last, key(number));
+            }
+        }
+    }
+}

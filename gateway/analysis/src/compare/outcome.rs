@@ -1,0 +1,137 @@
+//! What a comparison adds up to.
+
+use model::quantiles::Quantiles;
+use protocol::id::CellId;
+
+use super::numbering::Key;
+use super::report::{CellRow, ExtraCell, Losses, Replies, Report, Source};
+use super::side::{Cell, Side};
+use super::{ASPECTS, Both, Comparison, Which};
+
+impl Comparison<'_> {
+    /// The outcome, when both captures have ended.
+    #[must_use]
+    pub fn report(self) -> Report {
+        let captures = Both { a: source(&self.sides.a), b: source(&self.sides.b) };
+        let mut report = Report {
+            equal: false,
+            differs: Vec::new(),
+            captures,
+            epochs: self.epochs,
+            joints: Default::default(),
+            halts: Default::default(),
+            contacts: Default::default(),
+            torques: Replies::default(),
+            sums: Replies::default(),
+            cells: Vec::new(),
+            extra_cells: self.extra_cells(),
+            first: None,
+        };
+        for tally in &self.tallies {
+            report.joints.equal += tally.joints.equal;
+            report.joints.tolerated += tally.joints.tolerated;
+            report.joints.different += tally.joints.different;
+            report.joints.max_steps = report.joints.max_steps.max(tally.joints.max_steps);
+            report.halts.only_a += tally.halts.only_a;
+            report.halts.only_b += tally.halts.only_b;
+            report.contacts.both += tally.contacts.both;
+            report.contacts.only.only_a += tally.contacts.only.only_a;
+            report.contacts.only.only_b += tally.contacts.only.only_b;
+            report.torques.add(&tally.torques);
+            report.sums.add(&tally.sums);
+        }
+        report.cells = self.cells();
+        let epochs = &report.epochs;
+        let lost = epochs.missing_in_a + epochs.missing_in_b;
+        let are_missing = lost + report.torques.missing() + report.sums.missing() > self.options.missing;
+        report.differs = differs(&report, lost, are_missing);
+        report.equal = report.differs.is_empty();
+        let firsts = [self.first, self.first_missing.filter(|_| are_missing)];
+        let first = firsts.into_iter().flatten().min_by_key(|(key, bus, _)| (*key, *bus));
+        report.first = first.map(|(.., first)| first);
+        report
+    }
+
+    /// Cells that differ, or lost something.
+    fn cells(&self) -> Vec<CellRow> {
+        let mut rows = Vec::new();
+        for (at, (bus, tally)) in self.skin.buses.iter().zip(&self.tallies).enumerate() {
+            for (node, replies) in tally.cells.iter() {
+                let of = |which| self.cell(which, at, node).map(losses).unwrap_or_default();
+                let losses = Both { a: of(Which::A), b: of(Which::B) };
+                let is_quiet = losses == Both::default()
+                    && replies.different + replies.tolerated + replies.missing() == 0;
+                if !is_quiet {
+                    rows.push(CellRow { bus: bus.name.clone(), node: node.get(), replies: *replies, losses });
+                }
+            }
+        }
+        rows
+    }
+
+    fn cell(&self, which: Which, bus: usize, node: CellId) -> Option<&Cell> {
+        self.sides.of(which).buses.get(bus)?.cells.get(node)
+    }
+
+    /// Cells that one capture alone has, in the time of both.
+    fn extra_cells(&self) -> Vec<ExtraCell> {
+        let range = |which| {
+            let side = self.sides.of(which);
+            side.first.map(|(first, _)| first).zip(side.newest())
+        };
+        let (Some(a), Some(b)) = (range(Which::A), range(Which::B)) else { return Vec::new() };
+        let common: (Key, Key) = (a.0.max(b.0), a.1.min(b.1));
+        let mut extra = Vec::new();
+        for (at, bus) in self.skin.buses.iter().enumerate() {
+            for node in CellId::all() {
+                let heard = |which| self.cell(which, at, node).and_then(|cell| cell.heard);
+                let (span, only_in) = match (heard(Which::A), heard(Which::B)) {
+                    (Some(span), None) => (span, "a"),
+                    (None, Some(span)) => (span, "b"),
+                    _ => continue,
+                };
+                if span.0 <= common.1 && span.1 >= common.0 {
+                    extra.push(ExtraCell { bus: bus.name.clone(), node: node.get(), only_in });
+                }
+            }
+        }
+        extra
+    }
+}
+
+/// The aspects that differ.
+fn differs(report: &Report, lost: u64, are_missing: bool) -> Vec<&'static str> {
+    let Report { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = report;
+    let replies = |it: &Replies| it.different > 0 || are_missing && it.missing() > 0;
+    let differs = [
+        epochs.compared == 0 || are_missing && lost > 0,
+        joints.different > 0,
+        halts.sum() > 0,
+        contacts.only.sum() > 0,
+        replies(torques),
+        replies(sums),
+        !extra_cells.is_empty(),
+    ];
+    ASPECTS.into_iter().zip(differs).filter_map(|(name, differs)| differs.then_some(name)).collect()
+}
+
+fn losses(cell: &Cell) -> Losses {
+    let uplink = cell.tracked.account.uplink();
+    Losses { late: cell.late, too_late: cell.too_late, lost: uplink.lost, restarts: uplink.restarts.into() }
+}
+
+fn source(side: &Side<'_>) -> Source {
+    let mut source = side.counts.clone();
+    source.first = side.first.map(|(first, _)| first.number);
+    source.last = side.newest().map(|last| last.number);
+    source.last_s = side.last_s();
+    for cell in side.buses.iter().flat_map(|bus| bus.cells.iter()).map(|(_, cell)| losses(cell)) {
+        source.late += cell.late;
+        source.too_late += cell.too_late;
+        source.lost += cell.lost;
+        source.restarts += cell.restarts;
+    }
+    let histogram = side.reply().histogram();
+    source.reply_us = (side.has_times && !histogram.is_empty()).then(|| Quantiles::of(histogram, 1e-3));
+    source
+}

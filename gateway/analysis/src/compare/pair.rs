@@ -1,0 +1,374 @@
+//! The same joints in both captures.
+
+use model::tracker::PerCell;
+use protocol::fixed::{Q1_14, TorqueFormat};
+use protocol::id::CellId;
+use protocol::message::SkinSensors;
+use protocol::packet::Words;
+use protocol::schema::Units;
+use protocol::skin::{JointKind, Skin};
+
+use super::report::{Contacts, First, Joints, Only, Replies};
+use super::side::Moment;
+use super::{Both, Options};
+use crate::explain::CellMoment;
+
+/// The counts of one bus.
+#[derive(Debug, Default)]
+pub(super) struct Tally {
+    pub(super) joints: Joints,
+    pub(super) halts: Only,
+    pub(super) contacts: Contacts,
+    pub(super) torques: Replies,
+    pub(super) sums: Replies,
+    pub(super) cells: PerCell<Replies>,
+}
+
+/// What a difference is, before it is described.
+#[derive(Debug, Default)]
+pub(super) struct Found {
+    what: &'static str,
+    how: &'static str,
+    cell: Option<CellId>,
+    /// The place in the chain, from 0, the steps, both words, their values and unit.
+    word: Option<Differing>,
+    pub(super) inputs: Vec<&'static str>,
+    unknown: Vec<&'static str>,
+}
+
+/// The first differences of some joints. What is missing may be allowed, so it is kept apart.
+#[derive(Debug, Default)]
+pub(super) struct Firsts {
+    pub(super) missing: Option<Found>,
+    pub(super) other: Option<Found>,
+}
+
+impl Firsts {
+    fn note(&mut self, found: Found) {
+        let is_missing = found.how != "different" && matches!(found.what, "epoch" | "torque" | "sum");
+        (if is_missing { &mut self.missing } else { &mut self.other }).get_or_insert(found);
+    }
+}
+
+#[derive(Debug)]
+struct Differing {
+    place: usize,
+    steps: u32,
+    words: [i16; 2],
+    values: [f64; 2],
+    unit: &'static str,
+}
+
+impl Found {
+    pub(super) fn missing_epoch(in_a: bool) -> Firsts {
+        let found = Self { what: "epoch", how: missing(in_a), ..Self::default() };
+        Firsts { missing: Some(found), other: None }
+    }
+
+    /// The cell, if it is one's.
+    pub(super) const fn cell(&self) -> Option<CellId> {
+        self.cell
+    }
+
+    /// Describes it on a bus; `moments` are those of both captures, as far as they are there.
+    pub(super) fn describe(
+        self,
+        (skin, bus): (&Skin, usize),
+        moments: &Both<Option<&Moment>>,
+        time_s: Both<Option<f64>>,
+    ) -> Option<First> {
+        let moment = moments.a.or(moments.b)?;
+        let words = self.word.as_ref();
+        let place = words.map(|word| word.place);
+        let joint = place.and_then(|place| skin.joints_of(bus).nth(place));
+        let pair = |of: fn(&Differing) -> [i16; 2]| words.map(of);
+        let [word_a, word_b] = pair(|word| word.words).map_or([None; 2], |words| words.map(Some));
+        let [value_a, value_b] = words.map_or([None; 2], |word| word.values.map(Some));
+        Some(First {
+            what: self.what,
+            how: self.how,
+            bus: skin.buses.get(bus).map(|bus| bus.name.clone()).unwrap_or_default(),
+            cell: self.cell.map(CellId::get),
+            joint: joint.and_then(|(joint, _)| u8::try_from(joint + 1).ok()),
+            epoch: moment.epoch.0,
+            number: moment.key.number,
+            time_s,
+            words: Both { a: word_a, b: word_b },
+            values: Both { a: value_a, b: value_b },
+            unit: words.map(|word| word.unit),
+            steps: words.map(|word| word.steps),
+            inputs: self.inputs,
+            unknown_inputs: self.unknown,
+            occurrence: Both {
+                a: moments.a.map(|moment| moment.occurrence),
+                b: moments.b.map(|moment| moment.occurrence),
+            },
+        })
+    }
+}
+
+const fn missing(in_a: bool) -> &'static str {
+    if in_a { "missing in a" } else { "missing in b" }
+}
+
+/// Compares joints that both captures have. Returns the first differences.
+pub(super) fn compare(
+    tally: &mut Tally,
+    (skin, bus): (&Skin, usize),
+    moments: Both<&Moment>,
+    options: &Options,
+) -> Firsts {
+    let Both { a, b } = moments;
+    let mut first = Firsts::default();
+    let joints = joints(skin, bus, moments);
+    let steps = joints.as_ref().map_or(0, |joints| joints.steps);
+    tally.joints.max_steps = tally.joints.max_steps.max(steps);
+    let same_joints = steps == 0;
+    if steps == 0 {
+        tally.joints.equal += 1;
+    } else if steps <= options.joints_tolerance {
+        tally.joints.tolerated += 1;
+    } else {
+        tally.joints.different += 1;
+        first.note(Found { what: "joints", how: "different", word: joints, ..Found::default() });
+    }
+    if a.watched.halted != b.watched.halted {
+        tally.halts.count(a.watched.halted);
+        first.note(Found { what: "halt", how: missing(!a.watched.halted), ..Found::default() });
+    }
+    for ((cell, in_a), in_b) in CellId::all().zip(&a.watched.cells).zip(&b.watched.cells) {
+        contact(&mut tally.contacts, cell, (in_a, in_b), &mut first);
+        if in_a.answer.is_none() && in_b.answer.is_none() {
+            continue;
+        }
+        let reply = Reply {
+            what: "torque",
+            cell,
+            words: [in_a.answer.map(|(_, words)| words), in_b.answer.map(|(_, words)| words)],
+            format: skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default(),
+            cells_in: None,
+        };
+        let inputs = || inputs(moments, same_joints, (in_a, in_b));
+        let all = (&mut tally.torques, tally.cells.get_mut(cell));
+        reply.compare(all, moments, (Units::of(skin, bus), options.tolerance), inputs, &mut first);
+    }
+    sums(tally, (skin, bus), moments, (options.tolerance, same_joints), &mut first);
+    first
+}
+
+/// Compares the sums of roots.
+fn sums(
+    tally: &mut Tally,
+    (skin, bus): (&Skin, usize),
+    moments: Both<&Moment>,
+    (tolerance, same_joints): (u32, bool),
+    first: &mut Firsts,
+) {
+    let Both { a, b } = moments;
+    let of = |moment: &Moment, root: CellId| {
+        let sum = moment.sums.iter().find(|(cell, _)| *cell == root);
+        sum.map(|(_, sum)| (sum.words, sum.count))
+    };
+    let in_b_alone = b.sums.iter().filter(|(root, _)| of(a, *root).is_none());
+    for (root, _) in a.sums.iter().chain(in_b_alone) {
+        let both = [of(a, *root), of(b, *root)];
+        let reply = Reply {
+            what: "sum",
+            cell: *root,
+            words: both.map(|sum| sum.map(|(words, _)| words)),
+            format: TorqueFormat::Q7_8,
+            cells_in: Some(both.map(|sum| sum.map_or(0, |(_, count)| count))),
+        };
+        let inputs = || {
+            let cells = a.watched.cells.iter().zip(&b.watched.cells);
+            let touched = |cell: &CellMoment| cell.contact_state.is_some_and(|(skin, _)| is_touched(&skin));
+            let mut all = (Vec::new(), Vec::new());
+            for (in_a, in_b) in cells.filter(|(a, b)| touched(a) || touched(b)) {
+                let (differ, unknown) = inputs(moments, same_joints, (in_a, in_b));
+                all.0.extend(differ);
+                all.1.extend(unknown);
+            }
+            if !same_joints {
+                all.0.push("joints");
+            }
+            for names in [&mut all.0, &mut all.1] {
+                names.sort_unstable();
+                names.dedup();
+            }
+            all
+        };
+        let all = (&mut tally.sums, tally.cells.get_mut(*root));
+        reply.compare(all, moments, (Units::of(skin, bus), tolerance), inputs, first);
+    }
+}
+
+/// A cell's reply in both captures.
+struct Reply {
+    what: &'static str,
+    cell: CellId,
+    words: [Option<Words>; 2],
+    format: TorqueFormat,
+    /// Cells in each sum.
+    cells_in: Option<[u8; 2]>,
+}
+
+impl Reply {
+    fn compare(
+        &self,
+        (all, of_cell): (&mut Replies, Option<&mut Replies>),
+        moments: Both<&Moment>,
+        (units, tolerance): (Units, u32),
+        inputs: impl Fn() -> (Vec<&'static str>, Vec<&'static str>),
+        first: &mut Firsts,
+    ) {
+        let mut once = Replies::default();
+        let mut how = None;
+        let mut word = None;
+        match self.words {
+            [Some(a), Some(b)] => {
+                word = self.largest(&a, &b, units);
+                let steps = word.as_ref().map_or(0, |word| word.steps);
+                once.max_steps = steps;
+                let other_cells = self.cells_in.is_some_and(|[a, b]| a != b);
+                if steps <= tolerance && !other_cells && a.length() == b.length() {
+                    *(if steps == 0 { &mut once.equal } else { &mut once.tolerated }) = 1;
+                } else {
+                    once.different = 1;
+                    how = Some("different");
+                }
+            }
+            [a, _] => {
+                let is_in_a = a.is_some();
+                let other = if is_in_a { moments.b } else { moments.a };
+                if other.is_settled {
+                    *(if is_in_a { &mut once.missing_in_b } else { &mut once.missing_in_a }) = 1;
+                    how = Some(missing(!is_in_a));
+                } else {
+                    once.open = 1;
+                }
+            }
+        }
+        if let Some(how) = how {
+            let (mut differ, unknown) = inputs();
+            once.different_with_same_inputs =
+                u64::from(once.different > 0 && differ.is_empty() && unknown.is_empty());
+            if self.cells_in.is_some_and(|[a, b]| a != b) && once.different > 0 {
+                differ.push("cells");
+            }
+            let (what, cell) = (self.what, Some(self.cell));
+            first.note(Found { what, how, cell, word, inputs: differ, unknown });
+        }
+        for counts in [Some(all), of_cell].into_iter().flatten() {
+            counts.add(&once);
+        }
+    }
+
+    /// The word that differs most.
+    fn largest(&self, a: &Words, b: &Words, units: Units) -> Option<Differing> {
+        // Tolerances are in steps of 1/4096, those of sums in steps of 1/256.
+        let fine =
+            |word| if self.cells_in.is_some() { i32::from(word) } else { self.format.finest_steps(word) };
+        let places = a.padded().into_iter().zip(b.padded()).enumerate();
+        let differing = places.map(|(place, (a, b))| Differing {
+            place,
+            steps: fine(a).abs_diff(fine(b)),
+            words: [a, b],
+            values: [a, b].map(|word| self.format.real(word)),
+            unit: units.torque_unit(place),
+        });
+        let differing = differing.filter(|word| word.steps > 0);
+        differing.reduce(|most, word| if word.steps > most.steps { word } else { most })
+    }
+}
+
+impl Replies {
+    pub(super) const fn add(&mut self, other: &Self) {
+        self.equal += other.equal;
+        self.tolerated += other.tolerated;
+        self.different += other.different;
+        self.different_with_same_inputs += other.different_with_same_inputs;
+        self.missing_in_a += other.missing_in_a;
+        self.missing_in_b += other.missing_in_b;
+        self.open += other.open;
+        if other.max_steps > self.max_steps {
+            self.max_steps = other.max_steps;
+        }
+    }
+}
+
+/// The joint whose words differ most.
+fn joints(skin: &Skin, bus: usize, moments: Both<&Moment>) -> Option<Differing> {
+    let Both { a, b } = moments;
+    let pairs = a.watched.joints.positions.iter().zip(&b.watched.joints.positions);
+    let kinds = skin.joints_of(bus).map(|(_, joint)| joint.kind);
+    let differing = pairs.zip(kinds).enumerate().map(|(place, ((a, b), kind))| {
+        let words = [a.to_bits(), b.to_bits()];
+        let [one, other] = words;
+        let steps = match kind {
+            // Angles wrap.
+            JointKind::Revolute => u32::from(one.wrapping_sub(other).unsigned_abs()),
+            JointKind::Prismatic => u32::from(one.abs_diff(other)),
+        };
+        let values = words.map(|word| kind.position(Q1_14::from_bits(word)));
+        Differing { place, steps, words, values, unit: kind.unit() }
+    });
+    let differing = differing.filter(|word| word.steps > 0);
+    differing.reduce(|most, word| if word.steps > most.steps { word } else { most })
+}
+
+fn is_touched(skin: &SkinSensors) -> bool {
+    *skin != SkinSensors { temperature: skin.temperature, ..SkinSensors::default() }
+}
+
+/// Compares whether something touches a cell.
+fn contact(
+    contacts: &mut Contacts,
+    cell: CellId,
+    (in_a, in_b): (&CellMoment, &CellMoment),
+    first: &mut Firsts,
+) {
+    let both = match (&in_a.contact_state, &in_b.contact_state) {
+        (Some((a, _)), Some((b, _))) => Some((is_touched(a), is_touched(b))),
+        // By the torques, where stimuli do not show it.
+        _ => in_a.answer.zip(in_b.answer).map(|((_, a), (_, b))| (!a.is_zero(), !b.is_zero())),
+    };
+    match both {
+        Some((true, true)) => contacts.both += 1,
+        Some((is_in_a, is_in_b)) if is_in_a != is_in_b => {
+            contacts.only.count(is_in_a);
+            first.note(Found {
+                what: "contact",
+                how: missing(is_in_b),
+                cell: Some(cell),
+                ..Found::default()
+            });
+        }
+        Some(_) | None => {}
+    }
+}
+
+/// The inputs of a cell that differ, and those that are not known.
+fn inputs(
+    Both { a, b }: Both<&Moment>,
+    same_joints: bool,
+    (in_a, in_b): (&CellMoment, &CellMoment),
+) -> (Vec<&'static str>, Vec<&'static str>) {
+    let (mut differ, mut unknown) = (Vec::new(), Vec::new());
+    if !same_joints {
+        differ.push("joints");
+    }
+    if a.watched.halted != b.watched.halted {
+        differ.push("halt");
+    }
+    match (&in_a.contact_state, &in_b.contact_state) {
+        (Some((a, _)), Some((b, _))) if a != b => differ.push("stimulus"),
+        (Some(_), Some(_)) => {}
+        _ => unknown.push("stimulus"),
+    }
+    match (in_a.hash, in_b.hash) {
+        (Some(a), Some(b)) if a != b => differ.push("configuration"),
+        (Some(_), Some(_)) => {}
+        _ => unknown.push("configuration"),
+    }
+    (differ, unknown)
+}

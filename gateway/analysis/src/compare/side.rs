@@ -1,0 +1,297 @@
+//! One capture: its joints, and what answers them, in the order of their numbers.
+
+use std::collections::VecDeque;
+
+use model::quantiles::Times;
+use model::tracker::{LATEST, PerCell, Tracked};
+use protocol::id::CellId;
+use protocol::message::{Joints, Message};
+use protocol::packet::{Epoch, Words};
+use protocol::skin::Skin;
+use protocol::time::Micros;
+
+use super::numbering::{Key, Numbering};
+use super::report::Source;
+use crate::explain::{self, NotFound, Watch};
+
+/// Epochs that a capture is ahead when its other buses have passed a bus that is silent.
+const PASSED: u64 = 64;
+
+/// Some joints of one bus, and their answers.
+#[derive(Debug)]
+pub(super) struct Moment {
+    pub(super) key: Key,
+    pub(super) epoch: Epoch,
+    /// Which joints of this epoch on their bus, from 1, as `skinbus explain` counts them.
+    pub(super) occurrence: u32,
+    /// The joints, the cells' contact states and torques.
+    pub(super) watched: explain::Moment,
+    /// The sums of roots.
+    pub(super) sums: Vec<(CellId, Sum)>,
+    /// Whether so many joints followed that no answer is outstanding.
+    pub(super) is_settled: bool,
+}
+
+/// The sum of a root.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Sum {
+    pub(super) words: Words,
+    pub(super) count: u8,
+    nanos: u64,
+}
+
+/// Joints that answers may still come to.
+#[derive(Debug)]
+struct Pending {
+    /// `None` for joints out of order, which are left out.
+    key: Option<Key>,
+    epoch: Epoch,
+    occurrence: u32,
+    /// Which joints of their bus, from 0.
+    index: u64,
+    sums: Vec<(CellId, Sum)>,
+}
+
+/// A cell of one capture.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Cell {
+    pub(super) tracked: Tracked,
+    /// Answers after the next joints, of these too late to be used.
+    pub(super) late: u64,
+    pub(super) too_late: u64,
+    /// The joints before its first and its last packet.
+    pub(super) heard: Option<(Key, Key)>,
+}
+
+#[derive(Debug, Default)]
+pub(super) struct BusSide {
+    /// Joints of the chain.
+    chain: usize,
+    roots: Vec<CellId>,
+    last: Option<Epoch>,
+    last_key: Option<Key>,
+    occurrences: Vec<u32>,
+    joints: u64,
+    pending: VecDeque<Pending>,
+    /// Joints whose answers are complete.
+    pub(super) ready: VecDeque<Moment>,
+    pub(super) cells: PerCell<Cell>,
+}
+
+/// Whether joints are so far behind that none of their bus come any more before the newest ones.
+const fn is_far(newest: Key, key: Key) -> bool {
+    newest.run > key.run || newest.run == key.run && newest.number > key.number + PASSED
+}
+
+/// Reads one capture.
+#[derive(Debug)]
+pub(super) struct Side<'a> {
+    skin: &'a Skin,
+    watch: Watch<'a>,
+    numbering: Numbering,
+    period_ns: u64,
+    pub(super) buses: Vec<BusSide>,
+    /// The first joints and when they came.
+    pub(super) first: Option<(Key, u64)>,
+    /// When the last joints came.
+    last_nanos: Option<u64>,
+    pub(super) is_ended: bool,
+    pub(super) has_times: bool,
+    reply: Times,
+    /// What grows as frames come.
+    pub(super) counts: Source,
+}
+
+impl<'a> Side<'a> {
+    pub(super) fn new(skin: &'a Skin, period_ns: u64, start: Option<u64>) -> Self {
+        let bus_side = |bus| BusSide {
+            chain: skin.joints_of(bus).len(),
+            roots: skin.cells_of(bus).filter(|cell| cell.root).map(|cell| cell.node).collect(),
+            occurrences: vec![0; 256],
+            ..BusSide::default()
+        };
+        Self {
+            skin,
+            watch: Watch::all(skin),
+            numbering: Numbering::new(period_ns, start),
+            period_ns,
+            buses: (0..skin.buses.len()).map(bus_side).collect(),
+            first: None,
+            last_nanos: None,
+            is_ended: false,
+            has_times: true,
+            reply: Times::default(),
+            counts: Source::default(),
+        }
+    }
+
+    /// Takes a frame from before the capture that is latched when it begins.
+    pub(super) fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
+        self.watch.begin(nanos, bus, message);
+        if let Message::Joints { epoch, joints } = message
+            && let Some(bus) = self.bus(bus).filter(|bus| usize::from(joints.in_use) == bus.chain)
+        {
+            bus.last = Some(*epoch);
+        }
+    }
+
+    fn bus(&mut self, name: &str) -> Option<&mut BusSide> {
+        let at = self.skin.bus_named(name)?;
+        self.buses.get_mut(at)
+    }
+
+    /// Takes the next frame; `message` is its meaning, if it has one. Returns true if joints may be complete now.
+    pub(super) fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
+        self.counts.frames += 1;
+        let at = self.skin.bus_named(bus);
+        let mut is_new = false;
+        if let (Some(at), Some(message)) = (at, message) {
+            if let Message::Joints { epoch, joints } = message {
+                is_new = self.joints(at, nanos, *epoch, joints);
+            } else if let Some(from) = message.sender() {
+                self.packet(at, nanos, from, message);
+            }
+        }
+        self.watch.take(nanos, bus, message);
+        if is_new {
+            self.collect(false);
+        }
+        is_new
+    }
+
+    /// Takes joints by the same rules as [`Watch`]. Returns true if they are new.
+    fn joints(&mut self, at: usize, nanos: u64, epoch: Epoch, joints: &Joints) -> bool {
+        let Some(bus) = self.buses.get_mut(at) else { return false };
+        if usize::from(joints.in_use) != bus.chain || bus.last == Some(epoch) {
+            return false;
+        }
+        bus.last = Some(epoch);
+        let key = self.numbering.take(nanos, epoch, bus.last_key);
+        let mut occurrence = 1;
+        if let Some(count) = bus.occurrences.get_mut(usize::from(epoch.0)) {
+            *count += 1;
+            occurrence = *count;
+        }
+        bus.pending.push_back(Pending { key, epoch, occurrence, index: bus.joints, sums: Vec::new() });
+        bus.joints += 1;
+        self.counts.epochs += 1;
+        match key {
+            Some(key) => {
+                bus.last_key = Some(key);
+                self.counts.countings = key.run + 1;
+                self.first.get_or_insert((key, nanos));
+                self.last_nanos = Some(nanos);
+            }
+            None => self.counts.out_of_order += 1,
+        }
+        true
+    }
+
+    /// Takes a packet of a cell.
+    fn packet(&mut self, at: usize, nanos: u64, from: CellId, message: &Message) {
+        let newest = self.numbering.newest().unwrap_or_default();
+        let Some(bus) = self.buses.get_mut(at) else { return };
+        let Some(cell) = bus.cells.get_mut(from) else { return };
+        cell.tracked.hear(Micros(nanos / 1_000), message, None);
+        let (first, _) = cell.heard.unwrap_or((newest, newest));
+        cell.heard = Some((first, newest));
+        let (epoch, sum) = if let Message::Torque { epoch, .. } = *message {
+            (epoch, None)
+        } else if let Message::Sum { epoch, torque, count, .. } = *message
+            && bus.roots.contains(&from)
+        {
+            (epoch, Some(Sum { words: torque, count, nanos }))
+        } else {
+            return;
+        };
+        let newer = bus.pending.iter().rev().position(|pending| pending.epoch == epoch);
+        let Some(age) = newer else { return };
+        cell.late += u64::from(age > 0);
+        cell.too_late += u64::from(age > LATEST);
+        let Some(sum) = sum.filter(|_| age <= LATEST) else { return };
+        let Some(pending) = bus.pending.iter_mut().rev().nth(age) else { return };
+        match pending.sums.iter_mut().find(|(cell, _)| *cell == from) {
+            Some((_, last)) if last.count < sum.count => *last = sum,
+            Some(_) => {}
+            None => pending.sums.push((from, sum)),
+        }
+    }
+
+    /// No more frames come.
+    pub(super) fn end(&mut self) {
+        self.collect(true);
+        self.is_ended = true;
+    }
+
+    fn collect(&mut self, is_end: bool) {
+        let newest = self.numbering.newest();
+        for (at, bus) in self.buses.iter_mut().enumerate() {
+            while let Some(first) = bus.pending.front() {
+                // Behind a gap, and on a bus that is silent while others go on, no reply is waited for.
+                let is_far = newest.zip(first.key).is_some_and(|(newest, key)| is_far(newest, key));
+                let Some((epoch, watched)) = self.watch.pop(at, is_end || is_far) else { break };
+                let Some(pending) = bus.pending.pop_front() else { break };
+                let answers = watched.cells.iter().filter_map(|cell| cell.answer.map(|(nanos, _)| nanos));
+                let sums = pending.sums.iter().map(|(_, sum)| sum.nanos);
+                for nanos in answers.clone().chain(sums) {
+                    self.reply.record(nanos.saturating_sub(watched.at_ns));
+                }
+                self.counts.torques += answers.count() as u64;
+                self.counts.sums += pending.sums.len() as u64;
+                let Some(key) = pending.key else { continue };
+                let followed = bus.joints - 1 - pending.index;
+                bus.ready.push_back(Moment {
+                    key,
+                    epoch,
+                    occurrence: pending.occurrence,
+                    watched,
+                    sums: pending.sums,
+                    is_settled: is_far || followed > LATEST as u64,
+                });
+            }
+        }
+    }
+
+    /// The newest joints, if any came.
+    pub(super) fn newest(&self) -> Option<Key> {
+        self.numbering.newest()
+    }
+
+    /// Whether joints of a bus that are not ready will not come any more.
+    pub(super) fn is_past(&self, bus: usize, key: Key) -> bool {
+        let Some(side) = self.buses.get(bus) else { return true };
+        let is_pending = side.pending.iter().any(|pending| pending.key.is_some_and(|it| it <= key));
+        let is_behind = side.last_key.is_some_and(|last| last >= key);
+        !is_pending && (self.is_ended || is_behind || self.newest().is_some_and(|it| is_far(it, key)))
+    }
+
+    /// The time of some joints in s of the run; `None` where captures have no times.
+    #[expect(clippy::cast_precision_loss, reason = "to be read")]
+    pub(super) fn seconds(&self, nanos: u64) -> Option<f64> {
+        let (first, began) = self.first.filter(|_| self.has_times)?;
+        let earlier = first.number as f64 * self.period_ns as f64;
+        Some((nanos.saturating_sub(began) as f64 + earlier) / 1e9)
+    }
+
+    /// The time of the last joints in s of the run.
+    pub(super) fn last_s(&self) -> Option<f64> {
+        self.seconds(self.last_nanos?)
+    }
+
+    /// Times from joints to their answers.
+    pub(super) const fn reply(&self) -> &Times {
+        &self.reply
+    }
+
+    /// Moments that are held.
+    #[cfg(test)]
+    pub(super) fn held(&self) -> usize {
+        self.buses.iter().map(|bus| bus.ready.len() + bus.pending.len()).sum()
+    }
+
+    /// The reason why the capture has no joints of the skin; `None` if it has.
+    pub(super) fn not_found(&mut self) -> Option<NotFound> {
+        let watch = std::mem::replace(&mut self.watch, Watch::all(self.skin));
+        if self.first.is_some() { None } else { watch.moments().err() }
+    }
+}

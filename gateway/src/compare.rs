@@ -1,0 +1,304 @@
+//! `skinbus compare`.
+
+mod files;
+mod show;
+
+use std::path::{Path, PathBuf};
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+
+use analysis::compare::{Both, Comparison, Options, Report, Which};
+use analysis::explain::NotFound;
+use clap::Args;
+use model::decode::Decoder;
+use protocol::skin::Skin;
+use protocol::stop;
+use protocol::time::Micros;
+use protocol::usage::Failure;
+use serde::Serialize;
+use trace::capture::{Entry, Format, NoteKind, Reader};
+
+use self::files::{parts, starts};
+use super::input;
+use super::input::{captures, difference, format, no_frame, place, skin_of};
+use super::output::{self, Overwrite, apart, print_beside};
+use super::print::{count, json};
+
+/// Compare two recordings or logs of one skin, epoch by epoch: joints, torques, sums, contacts, cells
+///
+/// Joints and their replies are aligned by the number of their epoch. What one run has before the other begins or after it
+/// ends is not compared, and said. Times from joints to replies, late replies and lost packets are shown beside each other
+/// and are no difference. docs/how-to/compare.md explains what counts. Exit code 0: equal; 1: different, or a file is
+/// damaged; 2: wrong use, or two skins.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  skinbus compare yesterday.mcap today.mcap
+  skinbus compare run.mcap run.log --skin skin.toml
+  skinbus compare a.mcap b.mcap --tolerance 2 --joints-tolerance 8 --junit compare.xml
+  skinbus compare a.mcap b.mcap --json | jq .first
+
+Keys of --json:
+  a, b, skin         names; tolerance, joints_tolerance, allow_missing as given
+  equal, differs     whether nothing differs that counts; the aspects that differ
+  captures.a, .b     frames, epochs, first and last number, last_s, torques, sums,
+                     late, lost, restarts, reply_us; dropped, unfinished
+  epochs             compared; missing_in_a, missing_in_b; before, after: only_a, only_b
+  joints             epochs equal, tolerated, different; max_steps
+  torques, sums      equal, tolerated, different, different_with_same_inputs, missing_in_a,
+                     missing_in_b, open (the other run ended first), max_steps
+  contacts, halts    both; only_a, only_b
+  cells, extra_cells cells that differ or lost something; cells of one run alone
+  first              the first difference: what, how, bus, cell, joint, epoch, number, time_s,
+                     words, values, unit, steps, inputs, unknown_inputs, occurrence")]
+pub(crate) struct Compare {
+    /// An MCAP recording or a candump log, - for standard input; of a split recording the first part: those behind it are
+    /// found beside it
+    #[arg(value_name = "A")]
+    a: PathBuf,
+    /// The other one
+    #[arg(value_name = "B")]
+    b: PathBuf,
+    /// The skin's description; else the one in a recording
+    #[arg(long, value_name = "SKIN")]
+    skin: Option<PathBuf>,
+    /// Take torques for equal whose words differ by at most so many steps of 1/4096 Nm, and sums, of 1/256 Nm
+    #[arg(long, value_name = "STEPS", default_value_t = 0)]
+    tolerance: u16,
+    /// Take joints for equal whose words differ by at most so many steps of 1/16384 quarter turn or m
+    #[arg(long, value_name = "STEPS", default_value_t = 0)]
+    joints_tolerance: u16,
+    /// Up to so many replies and joints that one run alone has are no difference
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    allow_missing: u64,
+    /// Print one JSON object instead of the table
+    #[arg(long, short)]
+    json: bool,
+    /// Write a JUnit report too: a test case for each aspect
+    #[arg(long, value_name = "FILE")]
+    junit: Option<PathBuf>,
+    #[command(flatten)]
+    overwrite: Overwrite,
+}
+
+/// All that is printed.
+#[derive(Serialize)]
+struct Whole<'a> {
+    a: &'a str,
+    b: &'a str,
+    skin: &'a str,
+    tolerance: u16,
+    joints_tolerance: u16,
+    allow_missing: u64,
+    #[serde(flatten)]
+    report: &'a Report,
+}
+
+/// One capture, as it is read.
+struct Input {
+    files: Vec<PathBuf>,
+    name: String,
+    reader: Reader,
+    decoder: Decoder,
+    missing: input::Missing,
+    has_frames: bool,
+    /// The error that ended it.
+    damage: Option<Failure>,
+}
+
+impl Input {
+    fn open(files: Vec<PathBuf>) -> Result<Self, Failure> {
+        let reader = captures(&files, |file| Box::new(file))?;
+        let (name, missing) = (reader.name().to_owned(), input::Missing::default());
+        let decoder = Decoder::new(None);
+        Ok(Self { files, name, reader, decoder, missing, has_frames: false, damage: None })
+    }
+
+    /// Hands on the frames that are latched when the capture begins.
+    fn begin(&mut self, which: Which, comparison: &mut Comparison<'_>) {
+        for before in &self.reader.extras().latched {
+            let at = Micros(before.nanos / 1_000);
+            if let Some(message) = self.decoder.decode(at, &before.bus, &before.frame).message() {
+                comparison.begin(which, before.nanos, &before.bus, message);
+            }
+        }
+    }
+
+    /// Hands on the next entry.
+    fn read(&mut self, which: Which, comparison: &mut Comparison<'_>) {
+        match self.reader.next() {
+            Ok(Some(Entry::Frame(record))) => {
+                self.has_frames = true;
+                let nanos = record.time.nanos;
+                let decoded = self.decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
+                comparison.take(which, nanos, record.interface, decoded.message());
+            }
+            Ok(Some(Entry::Note(note))) => {
+                self.missing.take(&note);
+                match note.kind {
+                    NoteKind::Dropped(frames) => comparison.dropped(which, frames),
+                    NoteKind::Unreadable(why) if self.missing.unreadable() == 1 => {
+                        output::note(format_args!("{}: {why}", place(&self.name, note.line)));
+                    }
+                    NoteKind::Text | NoteKind::CanXl | NoteKind::Unreadable(_) => {}
+                }
+            }
+            Ok(None) => {
+                if !self.reader.has_times() {
+                    comparison.without_times(which);
+                }
+                comparison.end(which, self.reader.extras().unfinished.is_some());
+            }
+            Err(error) => {
+                self.damage = Some(Failure::run(error));
+                comparison.end(which, true);
+            }
+        }
+    }
+}
+
+impl Compare {
+    pub(crate) fn run(self) -> Result<(), Failure> {
+        let began = Instant::now();
+        let read = [&self.a, &self.b].into_iter().chain(&self.skin).map(PathBuf::as_path);
+        apart([("--junit", self.junit.as_deref())], read)?;
+        if [&self.a, &self.b].iter().all(|file| is_input(file)) {
+            return Err(Failure::usage(
+                "- and -: standard input is read once: name a file for one of the two",
+            ));
+        }
+        let files = Both { a: parts(&self.a)?, b: parts(&self.b)? };
+        let skin = self.skin(&files)?;
+        let junit = self.junit.as_ref().map(|path| self.overwrite.create("--junit", path)).transpose()?;
+        let mut comparison = Comparison::new(&skin, self.options(), starts(&files, &skin)?);
+        let Both { a, b } = files;
+        let mut inputs = Both { a: Input::open(a)?, b: Input::open(b)? };
+        for which in [Which::A, Which::B] {
+            inputs.of_mut(which).begin(which, &mut comparison);
+        }
+        while let Some(which) = comparison.next() {
+            inputs.of_mut(which).read(which, &mut comparison);
+        }
+        if stop::flag().load(Ordering::Relaxed) {
+            return Err(Failure::run("stopped before all was compared"));
+        }
+        for which in [Which::A, Which::B] {
+            self.check(inputs.of_mut(which), which, &mut comparison, &skin)?;
+        }
+        let report = comparison.report();
+        for which in [Which::A, Which::B] {
+            let input = inputs.of(which);
+            input.missing.tell(&input.reader, "left out");
+        }
+        let shown = show::Shown {
+            inputs: Both { a: about(&inputs.a), b: about(&inputs.b) },
+            skin: self.skin.as_deref(),
+            report: &report,
+        };
+        let whole = Whole {
+            a: &inputs.a.name,
+            b: &inputs.b.name,
+            skin: &skin.name,
+            tolerance: self.tolerance,
+            joints_tolerance: self.joints_tolerance,
+            allow_missing: self.allow_missing,
+            report: &report,
+        };
+        let text = if self.json { json(&whole)? } else { shown.text() };
+        let printed = print_beside([self.junit.as_deref()], &text);
+        let reported = junit.map_or(Ok(()), |(file, out)| {
+            output::finish("--junit", file, out, &shown.junit(began.elapsed()).text())
+        });
+        printed.and(reported)?;
+        match inputs.a.damage.or(inputs.b.damage) {
+            Some(damage) => Err(damage),
+            None if report.equal => Ok(()),
+            None => Err(Failure::said()),
+        }
+    }
+
+    fn options(&self) -> Options {
+        Options {
+            tolerance: self.tolerance.into(),
+            joints_tolerance: self.joints_tolerance.into(),
+            missing: self.allow_missing,
+        }
+    }
+
+    /// The skin of both: that of the option, else of a recording. A recording of another one is refused.
+    fn skin(&self, files: &Both<Vec<PathBuf>>) -> Result<Skin, Failure> {
+        let named = self.skin.as_deref().map(input::read_skin).transpose()?;
+        let (mut skin, mut name) = (named, self.skin.clone());
+        for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
+            // A log has none; of standard input it is compared at the end.
+            if !path.is_file() || Reader::open_all(files).map_err(Failure::usage)?.format() == Format::Candump
+            {
+                continue;
+            }
+            let own = match skin_of(files) {
+                Err(_) if skin.is_some() => continue,
+                own => own?,
+            };
+            match (&skin, &name) {
+                (Some(skin), Some(name)) => same_skin((name, skin), (path, &own))?,
+                _ => (skin, name) = (Some(own), Some(path.clone())),
+            }
+        }
+        skin.ok_or_else(|| {
+            let (a, b) = (self.a.display(), self.b.display());
+            Failure::usage(format!("neither {a} nor {b} has a skin in it: name one with --skin"))
+        })
+    }
+
+    /// Refuses a capture without frames or joints, and one of another skin.
+    fn check(
+        &self,
+        input: &mut Input,
+        which: Which,
+        comparison: &mut Comparison<'_>,
+        skin: &Skin,
+    ) -> Result<(), Failure> {
+        if let Some(damage) = input.damage.take_if(|_| !input.has_frames) {
+            return Err(damage);
+        }
+        if !input.has_frames {
+            return Err(no_frame(&input.reader));
+        }
+        let name = &input.name;
+        if let Some(Ok(own)) = input.reader.extras().skin() {
+            let of = self.skin.as_ref().unwrap_or(&self.a);
+            same_skin((of, skin), (Path::new(name), &own))?;
+        }
+        if let Some(error) = comparison.not_found(which) {
+            let text = format!("{name}: {error}");
+            let is_other = matches!(error, NotFound::Buses { .. } | NotFound::Robot { .. });
+            return Err(if is_other { Failure::usage(text) } else { Failure::run(text) });
+        }
+        comparison.other_configurations(which).map_or(Ok(()), |(all, same)| {
+            Err(Failure::usage(format!(
+                "{name} is of another skin than {}: of {} {same} have its parameters; name the right one with --skin",
+                skin.name,
+                count(all, "cell")
+            )))
+        })
+    }
+}
+
+fn is_input(file: &Path) -> bool {
+    file.as_os_str() == "-"
+}
+
+/// Refuses two skins.
+fn same_skin(
+    (one, skin): (impl AsRef<Path>, &Skin),
+    (other, own): (impl AsRef<Path>, &Skin),
+) -> Result<(), Failure> {
+    let Some((what, is, was)) = difference(skin, own) else { return Ok(()) };
+    let (one, other) = (one.as_ref().display(), other.as_ref().display());
+    Err(Failure::usage(format!(
+        "{one} and {other} have two skins: {what} {is}, in the other {was}; compare captures of one skin"
+    )))
+}
+
+fn about(input: &Input) -> show::About<'_> {
+    show::About { name: &input.name, format: format(&input.reader), files: &input.files }
+}

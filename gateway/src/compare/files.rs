@@ -1,0 +1,83 @@
+//! The files of a capture, and where it begins in its run.
+
+use std::path::{Path, PathBuf};
+
+use analysis::compare::{self, Both, Trace};
+use model::decode::Decoder;
+use protocol::skin::Skin;
+use protocol::time::Micros;
+use protocol::usage::Failure;
+use trace::capture::{Entry, Reader};
+
+use super::is_input;
+
+/// The parts of a recording that follow a file, which are called `run-1.mcap`, `run-2.mcap` behind `run.mcap`.
+pub(super) fn parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
+    if first.is_dir() {
+        return Err(Failure::usage(format!(
+            "{} is a directory: name a candump log or an MCAP recording",
+            first.display()
+        )));
+    }
+    let mut files = vec![first.to_owned()];
+    // A pipe is read once.
+    if is_input(first) || !first.is_file() {
+        return Ok(files);
+    }
+    let Some((began, 0)) = part(first) else { return Ok(files) };
+    let (Some(stem), Some(end)) = (first.file_stem(), first.extension()) else { return Ok(files) };
+    for number in 1_u32.. {
+        let mut name = stem.to_owned();
+        name.push(format!("-{number}."));
+        name.push(end);
+        let next = first.with_file_name(name);
+        if part(&next).is_none_or(|part| part != (began.clone(), number)) {
+            break;
+        }
+        files.push(next);
+    }
+    Ok(files)
+}
+
+/// When a recording began, as it says itself, and which part of it a file is.
+fn part(file: &Path) -> Option<(String, u32)> {
+    let reader = file.is_file().then(|| Reader::open(file).ok()).flatten()?;
+    let fact = |record, key| reader.extras().fact(record, key).map(str::to_owned);
+    Some((fact("program", "began_ns")?, fact("part", "number")?.parse().ok()?))
+}
+
+/// The numbers of the first joints. Captures that began in the middle of a run are read for that, if they can be read twice.
+pub(super) fn starts(files: &Both<Vec<PathBuf>>, skin: &Skin) -> Result<Both<Option<u64>>, Failure> {
+    let unknown = Both { a: None, b: None };
+    if ![&files.a, &files.b].iter().all(|files| files.iter().all(|file| file.is_file())) {
+        return Ok(unknown);
+    }
+    let begins = |files: &[PathBuf]| {
+        let is_later = files.first().and_then(|first| part(first)).is_some_and(|(_, number)| number > 0);
+        !is_later && trace(files, skin, true).is_none_or(|trace| trace.first() == Some(0))
+    };
+    if begins(&files.a) && begins(&files.b) {
+        return Ok(unknown);
+    }
+    let both = trace(&files.a, skin, false).zip(trace(&files.b, skin, false));
+    Ok(both.map_or(unknown, |(a, b)| compare::starts(&a, &b)))
+}
+
+/// The joints of a capture, or the first of them; what cannot be read is reported when it is compared.
+fn trace(files: &[PathBuf], skin: &Skin, is_first_enough: bool) -> Option<Trace> {
+    let mut reader = super::captures(files, |file| Box::new(file)).ok()?;
+    let mut decoder = Decoder::new(None);
+    let mut trace = Trace::new(skin);
+    while let Ok(Some(entry)) = reader.next() {
+        let Entry::Frame(record) = entry else { continue };
+        let nanos = record.time.nanos;
+        let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
+        if let Some(message) = decoded.message() {
+            trace.take(nanos, record.interface, message);
+        }
+        if is_first_enough && trace.first().is_some() {
+            break;
+        }
+    }
+    Some(trace)
+}

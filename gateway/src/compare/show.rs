@@ -1,0 +1,296 @@
+//! The outcome of a comparison as text and as JUnit.
+
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use analysis::compare::{ASPECTS, Both, CellRow, First, Replies, Report, Source, Which};
+use model::quantiles::Quantiles;
+use protocol::usage::shown;
+
+use crate::junit::{Case, Outcome, Suite};
+use crate::print::{count, decimals, list, or, some, table};
+
+/// Columns of the tables.
+const WIDTH: u16 = 80;
+/// Cells in the table.
+const CELLS: usize = 8;
+
+/// A capture as it is called.
+#[derive(Debug)]
+pub(super) struct About<'a> {
+    pub(super) name: &'a str,
+    pub(super) format: &'static str,
+    pub(super) files: &'a [PathBuf],
+}
+
+/// The outcome, and what it is of.
+#[derive(Debug)]
+pub(super) struct Shown<'a> {
+    pub(super) inputs: Both<About<'a>>,
+    /// The file of the option `--skin`.
+    pub(super) skin: Option<&'a Path>,
+    pub(super) report: &'a Report,
+}
+
+impl Shown<'_> {
+    /// The verdict, tables, and the first difference.
+    pub(super) fn text(&self) -> String {
+        let mut text = format!("{}\n", self.verdict());
+        for (letter, about) in [("A", &self.inputs.a), ("B", &self.inputs.b)] {
+            let _ = writeln!(text, "{letter}  {} ({})", shown(about.name), about.format);
+        }
+        text += &self.table();
+        text += &self.cells();
+        if let Some(first) = &self.report.first {
+            text += &self.first(first);
+        }
+        text
+    }
+
+    fn verdict(&self) -> String {
+        let Report { epochs, torques, sums, first, .. } = self.report;
+        if self.report.equal {
+            let tolerated = torques.tolerated + sums.tolerated + self.report.joints.tolerated;
+            let within = if tolerated > 0 { " within the tolerance" } else { "" };
+            let mut all = vec![count(epochs.compared, "epoch")];
+            let replies = [(torques, "torque"), (sums, "sum")];
+            all.extend(
+                replies
+                    .iter()
+                    .map(|(it, name)| (it.equal + it.tolerated, name))
+                    .filter(|(count, _)| *count > 0)
+                    .map(|(number, name)| count(number, name)),
+            );
+            return format!("equal{within}: {}", list(all));
+        }
+        if epochs.compared == 0 {
+            return "different: no epoch is in both".to_owned();
+        }
+        let at = first.as_ref().map(|first| {
+            let time = first.time_s.a.or(first.time_s.b);
+            let time = time.map_or_else(String::new, |time| format!(" ({time:.3} s)"));
+            format!("; first at epoch {}{time}", first.epoch)
+        });
+        format!("different: {}{}", list(&self.report.differs), or(at, ""))
+    }
+
+    fn table(&self) -> String {
+        let Report { captures: Both { a, b }, epochs, joints, halts, contacts, torques, sums, .. } =
+            self.report;
+        let mut rows = Vec::new();
+        let mut row = |name: &str, a: String, b: String, both: String| {
+            rows.push(vec![name.to_owned(), a, b, both]);
+        };
+        let none = String::new;
+        row("epochs", a.epochs.to_string(), b.epochs.to_string(), format!("{} in both", epochs.compared));
+        for (name, a, b, both) in [
+            ("  missing", epochs.missing_in_a, epochs.missing_in_b, "the other has them"),
+            ("  before the other", epochs.before.only_a, epochs.before.only_b, "not compared"),
+            ("  after the other", epochs.after.only_a, epochs.after.only_b, "not compared"),
+            ("  halted", halts.only_a, halts.only_b, "and the other not"),
+        ] {
+            if a + b > 0 {
+                row(name, a.to_string(), b.to_string(), both.to_owned());
+            }
+        }
+        row("last epoch, s", decimals(a.last_s, 3, "-"), decimals(b.last_s, 3, "-"), none());
+        let only_joints = Replies {
+            equal: joints.equal,
+            tolerated: joints.tolerated,
+            different: joints.different,
+            max_steps: joints.max_steps,
+            ..Replies::default()
+        };
+        row("joints", none(), none(), said(&only_joints));
+        let touched = [contacts.only.only_a, contacts.only.only_b].map(|only| contacts.both + only);
+        let [in_a, in_b] = touched.map(|touched| touched.to_string());
+        row("touched, cells x epochs", in_a, in_b, format!("{} in both", contacts.both));
+        for (name, replies, a, b) in
+            [("torques", torques, a.torques, b.torques), ("sums", sums, a.sums, b.sums)]
+        {
+            if a + b == 0 {
+                continue;
+            }
+            row(name, a.to_string(), b.to_string(), said(replies));
+            if replies.missing() > 0 {
+                let [a, b] = [replies.missing_in_a, replies.missing_in_b].map(|it| it.to_string());
+                row("  missing", a, b, "the other has them".to_owned());
+            }
+        }
+        let at =
+            |of: fn(&Quantiles) -> f64, source: &Source| decimals(source.reply_us.as_ref().map(of), 0, "-");
+        let information = || "information only".to_owned();
+        row("reply, 50 %, µs", at(|it| it.p50, a), at(|it| it.p50, b), information());
+        row("reply, 99 %, µs", at(|it| it.p99, a), at(|it| it.p99, b), information());
+        for (name, of) in [
+            ("late replies", (|it| it.late) as fn(&Source) -> u64),
+            ("lost packets", |it| it.lost),
+            ("restarts of cells", |it| it.restarts),
+            ("lost by the recorder", |it| it.dropped),
+            ("joints out of order", |it| it.out_of_order),
+            ("counts that began again", |it| it.countings.saturating_sub(1).into()),
+        ] {
+            if of(a) + of(b) > 0 {
+                row(name, of(a).to_string(), of(b).to_string(), information());
+            }
+        }
+        let mut table = table(["", "A", "B", "compared"], rows, |column| column == 1 || column == 2);
+        if table.width().is_none_or(|width| width > WIDTH) {
+            table.set_width(WIDTH);
+        }
+        format!("{table}\n")
+    }
+
+    /// Cells that differ, and those of one capture alone.
+    fn cells(&self) -> String {
+        let differs = |row: &&CellRow| row.replies.different + row.replies.missing() > 0;
+        let mut cells: Vec<_> = self.report.cells.iter().filter(differs).collect();
+        let total = cells.len();
+        cells.sort_by_key(|row| std::cmp::Reverse(row.replies.different + row.replies.missing()));
+        let mut text = String::new();
+        if total > 0 {
+            let rows = cells.iter().take(CELLS).map(|row| {
+                let Replies { different, missing_in_a, missing_in_b, max_steps, .. } = row.replies;
+                let numbers = [different, u64::from(max_steps), missing_in_a, missing_in_b];
+                let name = format!("{}:{}", row.bus, row.node);
+                [name].into_iter().chain(numbers.map(|number| number.to_string())).collect::<Vec<_>>()
+            });
+            let head = ["cell", "different", "max steps", "missing in A", "missing in B"];
+            let mut table = table(head, rows, |column| column > 0);
+            if table.width().is_none_or(|width| width > WIDTH) {
+                table.set_width(WIDTH);
+            }
+            let _ = writeln!(text, "{table}");
+            if total > CELLS {
+                let _ = writeln!(text, "and {}; --json has all", count(total - CELLS, "further cell"));
+            }
+        }
+        for (letter, only_in) in [("A", "a"), ("B", "b")] {
+            let cells = self.report.extra_cells.iter().filter(|cell| cell.only_in == only_in);
+            let names: Vec<_> = cells.map(|cell| format!("{}:{}", cell.bus, cell.node)).collect();
+            if !names.is_empty() {
+                let _ = writeln!(text, "only {letter} has {}", shown(&some(&names)));
+            }
+        }
+        text
+    }
+
+    /// The first difference, and how to look further.
+    fn first(&self, first: &First) -> String {
+        let First { what, bus, epoch, number, time_s, words, values, .. } = first;
+        let cell = first.cell.map_or_else(String::new, |cell| format!(" of cell {cell}"));
+        let joint = first.joint.map_or_else(String::new, |joint| format!(", joint {joint}"));
+        let mut text = format!(
+            "the first difference: {what}{cell} on {}{joint}, epoch {epoch} (number {number})\n",
+            shown(bus)
+        );
+        for (letter, which) in [("A", Which::A), ("B", Which::B)] {
+            let is_missing = first.how == format!("missing in {}", letter.to_lowercase());
+            let unit = first.unit.unwrap_or_default();
+            let has = match (words.of(which), values.of(which)) {
+                (Some(word), Some(value)) => format!("word {word}, {value:.4} {unit}"),
+                _ if is_missing => "nothing".to_owned(),
+                _ => match *what {
+                    "torque" | "sum" => "a reply".to_owned(),
+                    "contact" => "touched".to_owned(),
+                    "halt" => "halted".to_owned(),
+                    _ => "joints".to_owned(),
+                },
+            };
+            let time = time_s.of(which).map_or_else(String::new, |time| format!("{time:.3} s  "));
+            let _ = writeln!(text, "  {letter}  {time}{has}");
+        }
+        if let Some(steps) = first.steps {
+            let _ = writeln!(text, "  {} apart", count(steps, "step"));
+        }
+        if first.cell.is_some() && *what != "contact" {
+            let inputs = match (first.inputs.as_slice(), first.unknown_inputs.as_slice()) {
+                ([], []) => "the inputs are the same: joints, halt, stimulus, configuration".to_owned(),
+                ([], unknown) => format!("no input is known to differ; not known: {}", list(unknown)),
+                (inputs, []) => format!("other inputs: {}", list(inputs)),
+                (inputs, unknown) => {
+                    format!("other inputs: {}; not known: {}", list(inputs), list(unknown))
+                }
+            };
+            let _ = writeln!(text, "  {inputs}");
+        }
+        for which in [Which::A, Which::B] {
+            if let Some(line) = self.explain(first, which) {
+                let _ = writeln!(text, "  {line}");
+            }
+        }
+        text
+    }
+
+    /// The command that shows more of some joints.
+    fn explain(&self, first: &First, which: Which) -> Option<String> {
+        let occurrence = (*first.occurrence.of(which))?;
+        let about = self.inputs.of(which);
+        let names = about.files.iter().map(|file| shown(&file.display().to_string()).into_owned());
+        let mut line =
+            format!("skinbus explain {} --epoch {}", names.collect::<Vec<_>>().join(" "), first.epoch);
+        if occurrence > 1 {
+            let _ = write!(line, " --occurrence {occurrence}");
+        }
+        if let Some(cell) = first.cell {
+            let _ = write!(line, " --cell {}:{cell}", shown(&first.bus));
+        }
+        match self.skin {
+            Some(skin) => _ = write!(line, " --skin {}", shown(&skin.display().to_string())),
+            None if about.format != "MCAP" => line += " --skin SKIN",
+            None => {}
+        }
+        Some(line)
+    }
+
+    /// A JUnit report: a test case for each aspect.
+    pub(super) fn junit(&self, took: Duration) -> Suite {
+        let first = self.report.first.as_ref().map(|first| self.first(first)).unwrap_or_default();
+        let cases = ASPECTS.into_iter().map(|aspect| {
+            let outcome = match self.report.differs.contains(&aspect) {
+                false => Outcome::Passed,
+                true => Outcome::Failed { message: self.failed(aspect), text: first.clone() },
+            };
+            Case { class: "skinbus.compare".to_owned(), name: aspect.to_owned(), outcome }
+        });
+        Suite {
+            name: format!("{} and {}", self.inputs.a.name, self.inputs.b.name),
+            seconds: took.as_secs_f64(),
+            cases: cases.collect(),
+        }
+    }
+
+    /// An aspect's difference in one line.
+    fn failed(&self, aspect: &str) -> String {
+        let Report { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = self.report;
+        let missing = |a, b| format!("{a} missing in A, {b} in B");
+        match aspect {
+            "epochs" if epochs.compared == 0 => "no epoch is in both".to_owned(),
+            "epochs" => missing(epochs.missing_in_a, epochs.missing_in_b),
+            "joints" => format!("{} different, at most {} steps", joints.different, joints.max_steps),
+            "halts" => format!("{} only in A, {} only in B", halts.only_a, halts.only_b),
+            "contacts" => format!("{} only in A, {} only in B", contacts.only.only_a, contacts.only.only_b),
+            "cells" => count(extra_cells.len(), "extra cell"),
+            _ => {
+                let replies = if aspect == "sums" { sums } else { torques };
+                format!("{}, {}", said(replies), missing(replies.missing_in_a, replies.missing_in_b))
+            }
+        }
+    }
+}
+
+/// Equal and different ones.
+fn said(replies: &Replies) -> String {
+    let Replies { equal, tolerated, different, open, max_steps, .. } = *replies;
+    let mut all = vec![format!("{equal} equal")];
+    for (count, what) in [(tolerated, "tolerated"), (different, "different"), (open, "open")] {
+        if count > 0 {
+            all.push(format!("{count} {what}"));
+        }
+    }
+    if max_steps > 0 {
+        all.push(format!("max {max_steps} off"));
+    }
+    list(all)
+}
