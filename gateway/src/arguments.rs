@@ -8,7 +8,7 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::can::Format;
 use protocol::id::CellId;
-use protocol::skin::Skin;
+use protocol::skin::{CellName, Skin};
 use protocol::usage::Failure;
 
 use super::print::list;
@@ -124,11 +124,8 @@ pub(crate) struct Named {
 
 /// Parses a cell: its node id, or BUS:NODE.
 pub(crate) fn cell(text: &str) -> Result<Named, String> {
-    let (bus, number) = match text.rsplit_once(':') {
-        Some((bus, number)) => (Some(bus.to_owned()), number),
-        None => (None, text),
-    };
-    Ok(Named { bus, node: node(number)? })
+    let CellName { bus, node } = text.parse()?;
+    Ok(Named { bus, node })
 }
 
 /// Parses a node id.

@@ -7,26 +7,34 @@ use std::path::{Path, PathBuf};
 use analysis::report::run::{self, ReportError};
 use analysis::report::{figure::Page, page, svg};
 use clap::Args;
-use protocol::usage::{Failure, command_line, shown};
+use protocol::skin::Skin;
+use protocol::usage::{Failure, command_line, shown, written};
 use protocol::wire_time::bit_rate;
 
-use super::output::{Overwrite, apart, note, print_beside};
+use super::input::{difference, read_skin};
+use super::output::{Overwrite, apart, is_standard_output, note, print_beside};
 
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
 /// The page needs nothing else, no network and no script; it is readable on a phone, on a dark screen and on paper. A
-/// recording that was cut off is reported as far as it goes, and what is missing is named in it and on standard error.
-/// Exit code 0: the report is written; 1: it cannot be; 2: wrong use, or no recording of a run.
+/// recording that was cut off is reported as far as it goes, and what is missing is named in it and on standard error. So
+/// are the parts that a candump log cannot have: it holds frames only, and needs the skin that they are of. Exit code 0: the
+/// report is written; 1: it cannot be; 2: wrong use, or no recording of a run.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus report run.mcap -o run.html
   skinbus report run.mcap --svg figures --overwrite
-  skinbus report run.mcap run-*.mcap -o all.html")]
+  skinbus report run.mcap run-*.mcap -o all.html
+  skinbus report run.log --skin skin.toml -o - > log.html")]
 pub(crate) struct Report {
-    /// The recording of a run: what `skinbus run SKIN --record FILE` wrote; all parts of a split one in any order
+    /// The recording of a run: what `skinbus run SKIN --record FILE` wrote; all parts of a split one in any order. Or frames
+    /// only: a candump log, or another program's MCAP file
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
-    /// The page; else the recording's name with .html
+    /// The skin of a log; a recording has its own
+    #[arg(long, value_name = "SKIN")]
+    skin: Option<PathBuf>,
+    /// The page; - for standard output; else the recording's name with .html
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Also each figure as an SVG file, in this folder, which is made if it is not there
@@ -45,14 +53,20 @@ pub(crate) struct Report {
 impl Report {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let first = self.files.iter().min_by_key(|file| (file.as_os_str().len(), file.as_os_str()));
-        let page = first.map(|first| first.with_extension("html")).unwrap_or_default();
+        let page = match first {
+            Some(first) if first.as_os_str() != "-" => first.with_extension("html"),
+            _ => PathBuf::from("report.html"),
+        };
         let output = self.output.clone().unwrap_or(page);
+        let read = |file: &Path| Ok::<_, Failure>((file.display().to_string(), read_skin(file)?));
+        let skin = self.skin.as_deref().map(read).transpose()?;
+        let command = command_line().join(" ");
+        let options = run::Options { command, nominal: self.nominal, data: self.data, skin };
+        let refused = |error| refused(error, options.skin.as_ref());
         if let Err(taken) = self.is_free(&output, "-o") {
             // What is read is looked at before what would be overwritten.
-            return Err(run::check(&self.files).err().map_or(taken, refused));
+            return Err(run::check(&self.files, &options).err().map_or(taken, refused));
         }
-        let options =
-            run::Options { command: command_line().join(" "), nominal: self.nominal, data: self.data };
         let report = run::report(&self.files, &options).map_err(refused)?;
         let mut files = vec![("-o", output.clone(), page::html(&report.page))];
         if let Some(folder) = &self.svg {
@@ -75,6 +89,9 @@ impl Report {
         if let Some(missing) = report.missing.as_ref().filter(|_| !report.is_damaged) {
             note(format_args!("skinbus: {}: {missing}", report.name));
         }
+        for remark in &report.remarks {
+            note(format_args!("skinbus: {}: {remark}", report.name));
+        }
         let figures = drawings(&report.page).count();
         let beside =
             self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
@@ -93,15 +110,19 @@ impl Report {
     }
 }
 
-/// What is no recording of a run is wrong use; what cannot be read is not.
-fn refused(error: ReportError) -> Failure {
-    match error {
-        ReportError::Capture(_) | ReportError::Unfinished { .. } => Failure::run(error),
-        ReportError::Open(_)
-        | ReportError::Log { .. }
-        | ReportError::Foreign { .. }
-        | ReportError::Rates { .. } => Failure::usage(error),
-        _ => Failure::usage(error),
+/// The failure for an error of a report: what is no recording of a run is wrong use, what cannot be read is not.
+fn refused(error: ReportError, skin: Option<&(String, Skin)>) -> Failure {
+    match (error, skin) {
+        (error @ (ReportError::Capture(_) | ReportError::Unfinished { .. }), _) => Failure::run(error),
+        (ReportError::OtherSkin { name, recorded }, Some((file, skin))) => {
+            let first = difference(skin, &recorded);
+            let first =
+                first.map_or_else(String::new, |(what, is, was)| format!(": {what} {is}, recorded {was}"));
+            Failure::usage(format!(
+                "{name} was recorded with another skin than {file}{first}; leave --skin out: the recording has its own"
+            ))
+        }
+        (error, _) => Failure::usage(error),
     }
 }
 
@@ -131,8 +152,13 @@ fn write(files: &[(&str, PathBuf, String)], overwrite: Overwrite) -> Result<(), 
     let mut whole = Vec::with_capacity(files.len());
     for (option, path, text) in files {
         let (begun, mut file) = overwrite.create(option, path)?;
-        file.write_all(text.as_bytes()).map_err(|error| failed(option, path, error))?;
-        whole.push((option, path, begun));
+        let done = file.write_all(text.as_bytes());
+        if is_standard_output(path) {
+            written(done)?;
+        } else {
+            done.map_err(|error| failed(option, path, error))?;
+            whole.push((option, path, begun));
+        }
     }
     whole
         .into_iter()

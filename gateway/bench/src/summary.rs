@@ -10,7 +10,7 @@ use protocol::time::Micros;
 use serde::Serialize;
 
 pub use self::cells::{CellSummary, RepliesSummary};
-pub use self::outcome::{CellError, ErrorCells, Halted, Outcome, TickBefore, cells_in_error, ranges};
+pub use self::outcome::{CellError, ErrorCells, Halted, Outcome, TickBefore, cells_in_error};
 pub use self::verdict::{CELL_ERROR_NM, Verdict};
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Contributions, Event, Status, SumCounts, Table};

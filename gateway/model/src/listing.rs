@@ -8,6 +8,17 @@ use protocol::time::{Micros, Span};
 
 use crate::tracker::{Claim, Word};
 
+/// Writes node ids, which are in order, as text: three and more in a row as one, `1-3`, `5`.
+#[must_use]
+pub fn ranges(nodes: &[u8]) -> Vec<String> {
+    let in_a_row = nodes.chunk_by(|one, next| one.checked_add(1) == Some(*next));
+    let text = |row: &[u8]| match row {
+        [first, _, .., last] => vec![format!("{first}-{last}")],
+        few => few.iter().map(u8::to_string).collect(),
+    };
+    in_a_row.flat_map(text).collect()
+}
+
 /// The reports of one cell.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Cell {
@@ -118,6 +129,12 @@ mod tests {
 
     fn says(number: i64, page: NetworkPage) -> Message {
         Message::Network { from: Node::Cell(CellId::new(number).unwrap()), epoch: Epoch(0), page }
+    }
+
+    #[test]
+    fn node_ids_in_a_row_are_folded() {
+        assert_eq!(ranges(&[1, 2, 4, 5, 6, 253, 254, 255]), ["1", "2", "4-6", "253-255"]);
+        assert_eq!(ranges(&[]), [""; 0]);
     }
 
     #[test]

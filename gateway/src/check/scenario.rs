@@ -4,7 +4,9 @@ use std::path::Path;
 
 use bench::run::RunError;
 use bench::run::launch::groups;
-use model::scenario::{BusFault, FaultKind, ForceErrors, MotionKind, Scenario as Description, SensorFault};
+use model::scenario::{
+    BusFault, FaultKind, ForceErrors, MotionKind, Profile, Scenario as Description, SensorFault,
+};
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 use protocol::usage::{Failure, shown};
@@ -12,6 +14,9 @@ use serde::Serialize;
 use serde_json::{Map, Value, json};
 
 use crate::print::{count, decimals, json as pretty, list, or, table, words};
+
+/// Values of a list that are shown one by one.
+const LISTED: usize = 8;
 
 /// Checks a scenario that a file describes for a skin, and says what it will do.
 ///
@@ -88,7 +93,13 @@ impl Plan {
             });
         }
         for touch in &scenario.touches {
-            let mut how = map([("force_n", json!(touch.force_n)), ("profile", json!(touch.profile.name()))]);
+            let profile = match &touch.profile {
+                Profile::Points(points) => {
+                    json!(points.iter().map(|(at, force_n)| (at.seconds(), force_n)).collect::<Vec<_>>())
+                }
+                named @ (Profile::HalfSine | Profile::Step | Profile::Ramp) => json!(named.name()),
+            };
+            let mut how = map([("force_n", json!(touch.force_n)), ("profile", profile)]);
             let proximity = touch.proximity.to_f64();
             if proximity > 0.0 {
                 how.extend(map([("proximity", json!((proximity * 1e4).round() / 1e4))]));
@@ -253,7 +264,12 @@ fn parameters(fault: &BusFault) -> Map<String, Value> {
 fn described(how: &Map<String, Value>) -> String {
     let words_of = |value: &Value| match value {
         Value::String(text) => text.clone(),
-        Value::Array(values) => words(values),
+        Value::Array(values) => match values.as_slice() {
+            [first, second, .., last] if values.len() > LISTED => {
+                format!("{first} {second} ... {last} ({} in all)", values.len())
+            }
+            few => words(few),
+        },
         Value::Object(values) => format!("({})", described(values)),
         Value::Null | Value::Bool(_) | Value::Number(_) => value.to_string(),
     };

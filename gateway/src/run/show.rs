@@ -4,8 +4,9 @@ use std::cmp::Reverse;
 use std::fmt::Display;
 
 use analysis::paper;
-use bench::summary::{BusSummary, CELL_ERROR_NM, CellSummary, Halted, Outcome, Processor, Summary, ranges};
+use bench::summary::{BusSummary, CELL_ERROR_NM, CellSummary, Halted, Outcome, Processor, Summary};
 use comfy_table::Color;
+use model::listing::ranges;
 use model::table::Errors;
 use protocol::usage::shown;
 

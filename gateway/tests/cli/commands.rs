@@ -380,6 +380,21 @@ fn a_scenario_is_shown_in_the_order_of_time() {
 }
 
 #[test]
+fn a_scenario_shows_the_points_of_a_profile_as_they_are_followed() {
+    let scenario = "[[touch]]\ncells = [\"vcan0:1\", 3]\nprofile = [[0.5, 2.0], [2.0, 0.5]]\n";
+    let plan: serde_json::Value = serde_json::from_slice(&checked(scenario, "--json").stdout).unwrap();
+    let values = ["profile", "force_n", "for_s", "cells"].map(|key| &plan["events"][0][key]);
+    let points = serde_json::json!([[0.0, 0.0], [0.5, 2.0], [2.0, 0.5]]);
+    assert_eq!(values, [&points, &2.0.into(), &2.0.into(), &serde_json::json!([1, 3])]);
+    let shown = |scenario: &str| text(&checked(scenario, "").stdout).to_owned();
+    let few = shown(scenario);
+    assert!(few.contains("force_n 2.0, profile [0.0,0.0] [0.5,2.0] [2.0,0.5]"), "{few}");
+    let many: Vec<_> = (1..30).map(|at| format!("[{at}.0, 1.0]")).collect();
+    let many = shown(&format!("[[touch]]\nall = true\nprofile = [{}]\n", many.join(", ")));
+    assert!(many.contains("profile [0.0,0.0] [1.0,1.0] ... [29.0,1.0] (30 in all)"), "{many}");
+}
+
+#[test]
 fn what_is_wrong_with_a_scenario_has_a_line_and_a_column() {
     let said = |scenario: &str| {
         let Output { status, stderr, .. } = checked(scenario, "");
@@ -387,7 +402,10 @@ fn what_is_wrong_with_a_scenario_has_a_line_and_a_column() {
         text(&stderr).trim_end().to_owned()
     };
     let wrong = said("[[touch]]\ncells = [1, 9]\nforce_n = 3.0\n");
-    assert_eq!(wrong, "skinbus: s.toml:2:13: touch[0].cells[1] = 9: no cell of \"vcan0\" has this node");
+    assert_eq!(
+        wrong,
+        "skinbus: s.toml:2:13: touch[0].cells[1] = 9: no cell of \"vcan0\" has node 9: it has 1-3"
+    );
     let drop = "[[fault]]\nat_s = 1.0\nkind = \"drop\"\nprobability = 0.5\n";
     let refused = said(drop);
     assert!(refused.starts_with("skinbus: the fault \"drop\" of vcan0 at 1 s: a run"), "{refused}");

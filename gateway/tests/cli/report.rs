@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use tempfile::TempDir;
+use trace::capture::{Reader, SKIN};
 
 const LOG: &str = "(1.000001) vcan0 123#11\n(2.000000) vcan0 22C##5AABB\n";
 
@@ -44,7 +45,8 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
     write("begun.mcap", b"\x89MCAP0\r\n");
     write("picture.mcap", b"PK\x03\x04 and more");
     assert!(gateway(folder.path(), "convert run.log foreign.mcap").status.success());
-    let made = "`skinbus run SKIN --record run.mcap` makes what a report needs";
+    let made =
+        "`skinbus run SKIN --record run.mcap` makes what a report needs, and frames alone need their --skin";
     assert_eq!(refuses(&folder, "empty.mcap", 2), format!("empty.mcap holds no run: it is empty; {made}"));
     assert_eq!(
         refuses(&folder, "foreign.mcap", 2),
@@ -59,7 +61,8 @@ fn what_is_no_recording_of_a_run_is_refused_in_one_line_and_nothing_is_written()
     );
     assert_eq!(
         refuses(&folder, "run.log", 2),
-        format!("run.log is no MCAP recording, and frames alone are not enough: {made}")
+        "run.log is a log, and frames alone are not enough: name their skin with --skin; a recording, `skinbus run SKIN \
+         --record run.mcap`, has it"
     );
     assert!(refuses(&folder, "picture.mcap", 2).contains("is a zip archive"));
     let mut damaged = fs::read(concat!(env!("CARGO_MANIFEST_DIR"), "/../tests/recordings/fd.mcap")).unwrap();
@@ -85,4 +88,155 @@ fn what_would_be_overwritten_or_is_no_bit_rate_is_refused_before_anything_is_rea
     let rate = refuses(&folder, "run.mcap -o new.html --nominal fast", 2);
     assert!(rate.contains("--nominal") && rate.contains("not a bit rate"), "{rate}");
     assert_eq!(fs::read_to_string(folder.path().join("run.html")).unwrap(), "mine");
+}
+
+/// A folder with the log and the recording of one run, and its skin.
+fn recorded() -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let recordings = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/recordings");
+    for name in ["classic.log", "classic.mcap", "sums.log", "fd.mcap"] {
+        fs::copy(recordings.join(name), folder.path().join(name)).unwrap();
+    }
+    for name in ["classic", "sums"] {
+        let mut reader = Reader::open(&recordings.join(format!("{name}.mcap"))).unwrap();
+        reader.next().unwrap();
+        let attached = &reader.extras().attachments;
+        let (_, skin) = attached.iter().find(|(attachment, _)| attachment == SKIN).unwrap();
+        fs::write(folder.path().join(format!("{name}.toml")), skin).unwrap();
+    }
+    folder
+}
+
+/// The page on standard output, and standard error.
+fn page(folder: &TempDir, arguments: &str) -> (String, String) {
+    let Output { status, stdout, stderr } = gateway(folder.path(), &format!("report {arguments} -o -"));
+    let said = String::from_utf8(stderr).unwrap();
+    assert_eq!(status.code(), Some(0), "{said}");
+    let page = String::from_utf8(stdout).unwrap();
+    // Options of commands, which do not break.
+    (page.replace("<span>", "").replace("</span>", ""), said)
+}
+
+/// A table of a page, by its title.
+fn table<'a>(page: &'a str, title: &str) -> &'a str {
+    let (_, rest) = page.split_once(&format!("<h3>{title}")).unwrap();
+    rest.split("</table>").next().unwrap()
+}
+
+/// The cells of the first row of a table that begins with a text.
+fn row<'a>(table: &'a str, first: &str) -> Vec<&'a str> {
+    let row = table.split("<tr>").find(|row| row.contains(&format!(">{first}</td>"))).unwrap();
+    row.split("</td>").filter_map(|cell| cell.rsplit('>').next()).collect()
+}
+
+#[test]
+fn a_log_gives_the_accounts_of_the_recording_of_the_same_run_and_names_what_it_lacks() {
+    let folder = recorded();
+    let before = names(folder.path());
+    let (of_run, said) = page(&folder, "classic.mcap");
+    assert_eq!(said, "");
+    let lacks =
+        "joint velocities; ticks and cycle times; the scenario; the command, program and machine of the run";
+    let (of_log, said) = page(&folder, "classic.log --skin classic.toml");
+    assert_eq!(said, format!("skinbus: classic.log: not in a log: {lacks}\n"));
+    assert_eq!(names(folder.path()), before, "-o - writes no file");
+    for title in ["Absolute errors, joint by joint", "Torque formats: "] {
+        assert_eq!(table(&of_log, title), table(&of_run, title));
+    }
+    let replies = |page: &str| row(table(page, "Replies by bus"), "vcan0")[..7].join(" ");
+    assert_eq!(replies(&of_log), replies(&of_run));
+    for text in [
+        format!("Not in a log: {lacks}."),
+        "Not in a log: joint velocities, as joints frames have positions.".to_owned(),
+        "Not in a log: how long ticks and the central computation in them took".to_owned(),
+        "Not in a log: ticks that the loop skipped, and bad cycles.".to_owned(),
+        "skinbus view classic.log --skin classic.toml --at ".to_owned(),
+    ] {
+        assert!(of_log.contains(&text), "{text}");
+        assert!(!of_run.contains(&text), "{text}");
+    }
+    for figure in
+        ["positions", "torque-joint1", "torque-error", "touches", "map-force", "active-cells", "load-vcan0"]
+    {
+        for page in [&of_log, &of_run] {
+            assert!(page.contains(&format!("id=\"{figure}\"")), "{figure}");
+        }
+    }
+    for of_loop in [
+        "id=\"velocities\"",
+        "id=\"cycle-",
+        "The control loop",
+        "control loop",
+        "ticks skipped by",
+        "unknown,",
+    ] {
+        assert!(!of_log.contains(of_loop), "{of_loop}");
+    }
+
+    assert!(gateway(folder.path(), "convert classic.log foreign.mcap").status.success());
+    let (foreign, said) = page(&folder, "foreign.mcap --skin classic.toml");
+    assert_eq!(said, format!("skinbus: foreign.mcap: not in frames alone: {lacks}\n"));
+    assert_eq!(replies(&foreign), replies(&of_log));
+    let (sums, said) = page(&folder, "sums.log --skin sums.toml");
+    assert!(
+        said.contains(": not in a log: joint velocities; ") && sums.contains("id=\"positions\""),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_log_without_stimuli_does_not_say_that_nothing_was_touched() {
+    let folder = recorded();
+    let log = fs::read_to_string(folder.path().join("classic.log")).unwrap();
+    // Kind 7: the stimuli.
+    let is_stimulus = |line: &&str| line.split(' ').nth(2).is_some_and(|frame| frame.starts_with('7'));
+    assert!(log.lines().any(|line| is_stimulus(&line)));
+    let rest: String =
+        log.lines().filter(|line| !is_stimulus(line)).map(|line| format!("{line}\n")).collect();
+    fs::write(folder.path().join("rest.log"), rest).unwrap();
+    let (page, said) = page(&folder, "rest.log --skin classic.toml");
+    assert!(said.contains("not in a log: stimuli or sensors, and with them central torques; "), "{said}");
+    for text in [
+        "Not in a log: stimuli or sensors of the cells that sent torques, and so the forces on them.",
+        "Not in a log: stimuli or sensors from which central torques, and the difference to them, follow.",
+        "Not in a log: stimuli or sensors of all cells, and so which are in contact.",
+    ] {
+        assert!(page.contains(text), "{text}");
+    }
+    assert!(!page.contains("No cell was touched") && !page.contains("No cell was in contact"));
+    assert!(page.contains("id=\"torque-joint1\"") && !page.contains("id=\"torque-error\""));
+}
+
+#[test]
+fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() {
+    let folder = recorded();
+    let write = |name: &str, text: &str| fs::write(folder.path().join(name), text).unwrap();
+    write("other.log", "(1.000001) can7 123#11\n");
+    write("untimed.log", "  vcan0  201   [2]  11 22\n");
+    write("words.log", "nothing\n");
+    write("empty.log", "");
+    for (arguments, said) in [
+        ("other.log", "other.log has no frame of the skin's buses (vcan0): its frames are of can7"),
+        (
+            "untimed.log",
+            "untimed.log has lines without times: a report needs them, as `candump -L` writes them",
+        ),
+        ("words.log", "words.log has no frame in it: a log is what `candump -L` writes"),
+        ("empty.log", "empty.log holds no run: it is empty"),
+        ("nowhere.log", "nowhere.log: "),
+        (
+            "fd.mcap",
+            "fd.mcap was recorded with another skin than sums.toml: cells 5, recorded 3; leave --skin out: the recording has \
+             its own",
+        ),
+    ] {
+        let refused = refuses(&folder, &format!("{arguments} --skin sums.toml -o out.html"), 2);
+        assert!(refused.starts_with(said), "{arguments}: {refused}");
+    }
+    let missing = refuses(&folder, "classic.log --skin nowhere.toml", 2);
+    assert!(missing.starts_with("nowhere.toml: "), "{missing}");
+    // The skin that it has is the same.
+    let (with, _) = page(&folder, "classic.mcap --skin classic.toml");
+    let (without, _) = page(&folder, "classic.mcap");
+    assert_eq!(with.replace(" --skin classic.toml", ""), without);
 }

@@ -5,6 +5,8 @@ use core::ops::Range;
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
+use crate::skin::CellName;
+
 /// The most characters of a value that are quoted.
 const QUOTED: usize = 40;
 
@@ -40,10 +42,10 @@ fn allowed(path: &str, message: &str) -> Option<String> {
         "f64" => "a number is needed".to_owned(),
         "i64" | "u64" | "u32" | "u8" if got.starts_with("integer ") => "the number is too large".to_owned(),
         "i64" | "u64" | "u32" | "u8" => match cell_of_bus(got) {
-            Some((bus, node)) => {
+            Some(CellName { bus: Some(bus), node }) => {
                 format!("a whole number is needed: write {node}, and bus = \"{bus}\" as a key of its own")
             }
-            None => "a whole number is needed".to_owned(),
+            Some(_) | None => "a whole number is needed".to_owned(),
         },
         table if table.starts_with("struct ") => format!("it is a table: write [{path}], and its keys below"),
         "a string" => "text in quotes is needed".to_owned(),
@@ -51,14 +53,15 @@ fn allowed(path: &str, message: &str) -> Option<String> {
         list if list == "a sequence" || list.starts_with("an array") || list.starts_with("a tuple") => {
             "a list of values in brackets is needed".to_owned()
         }
+        // A value of several types names them itself.
+        either if either.starts_with("either ") => format!("{either} is needed"),
         _ => return None,
     })
 }
 
-/// Returns the bus and the node id of a cell that is written as `string "BUS:NODE"`, as on the command line.
-fn cell_of_bus(got: &str) -> Option<(&str, u8)> {
-    let (bus, node) = got.strip_prefix("string \"")?.strip_suffix('"')?.rsplit_once(':')?;
-    Some((bus, node.parse().ok()?))
+/// Returns a cell that is written as `string "BUS:NODE"`, as on the command line.
+fn cell_of_bus(got: &str) -> Option<CellName> {
+    got.strip_prefix("string \"")?.strip_suffix('"')?.parse().ok()
 }
 
 /// What is no TOML at all; the parser's advice fits texts only.

@@ -5,6 +5,7 @@
 
 mod baseline;
 mod buses;
+mod cell_name;
 mod cells;
 mod check;
 mod names;
@@ -25,6 +26,7 @@ use crate::packet::Length;
 use crate::parameters::{Baseline, Contact, Events, Parameters, Pose, Row, Sensing};
 use crate::time::Span;
 
+pub use cell_name::CellName;
 pub use reach::{REACH, reach};
 pub use robot::{Base, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;

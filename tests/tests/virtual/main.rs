@@ -16,3 +16,4 @@ mod bench_replay;
 mod bench_sensing;
 mod bench_sound;
 mod bench_sums;
+mod bench_touches;

@@ -120,8 +120,8 @@ fn findings(out: &mut String, findings: &[Finding]) {
         let limit = finding.bar.as_ref().or(finding.against.as_ref());
         let limit = limit.map(|limit| format!("{limit}{origin}")).unwrap_or_default();
         let papers = finding.paper.as_ref().map(ToString::to_string).unwrap_or_default();
-        let command = finding.command.as_deref().map(svg::escaped);
-        let command = command.map_or_else(String::new, |command| format!("<br/><code>{command}</code>"));
+        let command = finding.command.as_deref().map(command);
+        let command = command.map_or_else(String::new, |command| format!("<br/>{command}"));
         let _ = write!(out, "<tr><td>{}{command}</td>", svg::escaped(&finding.what));
         let cells: [(&str, &str); 4] = [
             (&papers, " class=\"n\" data-head=\"paper\""),
@@ -153,13 +153,22 @@ fn table(out: &mut String, table: &Table) {
             Some((command, cells)) if table.commands => {
                 out.push_str("<tr>");
                 self::cells(out, "td", cells.iter().map(String::as_str).zip(classes()));
-                let _ = write!(out, "<td><code>{}</code></td></tr>", svg::escaped(command));
+                let _ = write!(out, "<td>{}</td></tr>", self::command(command));
             }
             _ => row(out, "td", cells.iter().map(String::as_str).zip(classes())),
         }
         out.push('\n');
     }
     out.push_str("</tbody>\n</table></div>\n");
+}
+
+/// A command, of which no line ends within the name of an option: a line may end behind a hyphen.
+fn command(text: &str) -> String {
+    let word = |word: &str| match word.starts_with('-') {
+        true => format!("<span>{}</span>", svg::escaped(word)),
+        false => svg::escaped(word),
+    };
+    format!("<code>{}</code>", text.split(' ').map(word).collect::<Vec<_>>().join(" "))
 }
 
 /// Those of some columns that are shown.

@@ -1,5 +1,6 @@
 //! How a run ended, and when and why the robot was halted.
 
+use model::listing::ranges;
 use serde::Serialize;
 
 /// Errors of cells that are given one by one.
@@ -109,17 +110,6 @@ pub fn cells_in_error(errors: &[CellError], with_reasons: bool) -> Option<String
         count => format!("{count} cells ended by errors of their own{above}"),
     };
     Some(format!("{all}: {each}{more}"))
-}
-
-/// Node ids in order as text, three and more in a row as one: `1-3`, `5`.
-#[must_use]
-pub fn ranges(nodes: &[u8]) -> Vec<String> {
-    let in_a_row = nodes.chunk_by(|one, next| one.checked_add(1) == Some(*next));
-    let text = |row: &[u8]| match row {
-        [first, _, .., last] => vec![format!("{first}-{last}")],
-        few => few.iter().map(u8::to_string).collect(),
-    };
-    in_a_row.flat_map(text).collect()
 }
 
 /// One time that the robot was halted.
@@ -256,11 +246,5 @@ mod tests {
         );
         assert!(line.ends_with("; and 248 more reasons, which --summary FILE keeps"), "{line}");
         assert!(line.len() < 300, "{line}");
-    }
-
-    #[test]
-    fn node_ids_in_a_row_are_folded() {
-        assert_eq!(ranges(&[1, 2, 4, 5, 6, 253, 254, 255]), ["1", "2", "4-6", "253-255"]);
-        assert_eq!(ranges(&[]), [""; 0]);
     }
 }

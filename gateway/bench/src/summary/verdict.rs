@@ -5,10 +5,11 @@
 
 use std::collections::BTreeMap;
 
+use model::listing::ranges;
 use model::table::Event;
 use serde::Serialize;
 
-use super::{BusSummary, CellSummary, Outcome, RepliesSummary, Summary, cells_in_error, ranges};
+use super::{BusSummary, CellSummary, Outcome, RepliesSummary, Summary, cells_in_error};
 
 /// The mean error of one cell's torques that rounding explains, at most, in Nm: four steps of a torque's word. A correct
 /// cell has about a tenth of it.

@@ -1,16 +1,13 @@
 //! Checks a scenario's file against one skin.
 
 use core::f64::consts::TAU;
-use std::collections::HashMap;
 
 use protocol::document::{Fault as Wrong, Place, span};
-use protocol::fixed::{Q, Q1_14};
-use protocol::skin::{MAX_ROBOT_JOINTS, Reply, Skin};
+use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
 use protocol::time::{Micros, Span};
-use protocol::wire::PORTS;
 
-use super::touches::MAX_FORCE_N;
-use super::{Mode, ModeChange, Motion, MotionKind, Profile, Scenario, Touch, faults, raw, sensors};
+use super::names::Names;
+use super::{Mode, ModeChange, Motion, MotionKind, Scenario, Touch, faults, pressed, raw, sensors};
 
 pub(super) type Checked<T> = Result<T, Wrong>;
 
@@ -25,8 +22,9 @@ pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     let motion = motion(&raw.motion, skin)?;
     let modes = modes(&raw.mode, end)?;
     let names = Names::of(skin);
-    let touches = touches(&raw.touch, end, &names)?;
-    let touches_repeat = raw.touches_repeat_s.map(|seconds| repeat(&raw.touch, seconds)).transpose()?;
+    let touches = pressed::touches(&raw.touch, end, &names)?;
+    let touches_repeat =
+        raw.touches_repeat_s.map(|seconds| repeat(&raw.touch, &touches, seconds)).transpose()?;
     let faults = faults::faults(&raw.fault, end, &names)?;
     let sensors = sensors::sensors(&raw.sensors, end)?;
     Ok(Scenario { duration, seed, motion, modes, touches, touches_repeat, faults, sensors })
@@ -163,188 +161,19 @@ fn modes(raw: &[raw::Mode], end: EndS) -> Checked<Vec<ModeChange>> {
     Ok(modes)
 }
 
-fn touches(raw: &[raw::Touch], end: EndS, names: &Names<'_>) -> Checked<Vec<Touch>> {
-    let mut touches = Vec::with_capacity(raw.len());
-    for (index, raw) in raw.iter().enumerate() {
-        let at = Place::named("touch").nth(index);
-        touches.push(touch(&at, raw, end, names)?);
-        together(&at.key("force_n"), &touches, names)?;
-    }
-    Ok(touches)
-}
-
 /// The period of the touches: each of them ends before all begin again.
-fn repeat(touches: &[raw::Touch], seconds: f64) -> Checked<Span> {
+fn repeat(raw: &[raw::Touch], touches: &[Touch], seconds: f64) -> Checked<Span> {
     let period = length(&Place::named("touches_repeat_s"), seconds)?;
-    for (index, touch) in touches.iter().enumerate() {
-        let ends = span(touch.at_s).0.saturating_add(span(touch.for_s.unwrap_or(0.0)).0);
+    for (index, (raw, touch)) in raw.iter().zip(touches).enumerate() {
         // A touch without a length begins before.
-        if ends > period.0 || span(touch.at_s) >= period {
-            let key = if touch.for_s.is_some() { "for_s" } else { "at_s" };
-            let got = touch.for_s.unwrap_or(touch.at_s);
+        let lasts = if touch.length == Span(u64::MAX) { 0 } else { touch.length.0 };
+        if touch.at.0.saturating_add(lasts) > period.0 || touch.at.0 >= period.0 {
+            let key = if raw.for_s.is_some() { "for_s" } else { "at_s" };
+            let got = raw.for_s.unwrap_or(raw.at_s);
             let why =
                 format_args!("the touch must end before touches_repeat_s = {seconds}, when all begin again");
             return Err(Place::named("touch").nth(index).key(key).fault(got, why));
         }
     }
     Ok(period)
-}
-
-fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<Touch> {
-    if !(0.0..=MAX_FORCE_N).contains(&raw.force_n) {
-        let why = format!("0 to {MAX_FORCE_N:.3} N are possible, the range of three contact words");
-        return Err(at.key("force_n").fault(raw.force_n, why));
-    }
-    if !(0.0..=1.0).contains(&raw.proximity) {
-        return Err(at.key("proximity").fault(raw.proximity, "0 (nothing near) to 1 are possible"));
-    }
-    let degrees = |got| at.key("temperature_c").fit(got, Q::try_nearest);
-    let temperature = match raw.temperature_c {
-        Some([first, second]) => Some([degrees(first)?, degrees(second)?]),
-        None => None,
-    };
-    let profiles = [Profile::HalfSine, Profile::Step, Profile::Ramp].map(|profile| (profile.name(), profile));
-    let profile = at.key("profile").word(&raw.profile, &profiles)?;
-    let length = match (raw.for_s, profile) {
-        (Some(seconds), _) => length(&at.key("for_s"), seconds)?,
-        (None, Profile::Step) => Span(u64::MAX),
-        (None, Profile::HalfSine | Profile::Ramp) => {
-            return Err(at.key("for_s").fault("", format_args!("needed with profile = {:?}", raw.profile)));
-        }
-    };
-    Ok(Touch {
-        at: end.moment(&at.key("at_s"), raw.at_s)?,
-        length,
-        cells: names.cells(at, raw.bus.as_deref(), raw.cells.as_deref(), raw.all)?,
-        force_n: raw.force_n,
-        profile,
-        proximity: Q1_14::nearest(raw.proximity),
-        temperature,
-    })
-}
-
-/// Whether the last of these touches, with those before it in the file, presses no cell with more than
-/// its words can hold. The force is largest when one of the touches begins.
-fn together(at: &Place, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
-    let Some((last, before)) = touches.split_last() else { return Ok(()) };
-    for start in touches.iter().map(|touch| touch.at).filter(|&at| last.holds_at(at)) {
-        let at_once: Vec<&Touch> = before.iter().filter(|touch| touch.holds_at(start)).collect();
-        if at_once.is_empty() {
-            continue;
-        }
-        for cell in &last.cells {
-            let others = at_once.iter().filter(|touch| touch.cells.binary_search(cell).is_ok());
-            let force = last.force_n + others.map(|touch| touch.force_n).sum::<f64>();
-            if force > MAX_FORCE_N {
-                let why = format!(
-                    "with the touches before it that makes {force} N on {}, more than the \
-                     {MAX_FORCE_N:.3} N of three contact words",
-                    names.name(*cell)
-                );
-                return Err(at.fault(last.force_n, why));
-            }
-        }
-    }
-    Ok(())
-}
-
-/// How the file names buses and cells.
-pub(super) struct Names<'a> {
-    skin: &'a Skin,
-    index: HashMap<(usize, i64), usize>,
-}
-
-impl<'a> Names<'a> {
-    fn of(skin: &'a Skin) -> Self {
-        let cells = skin.cells.iter().enumerate();
-        let index = cells.map(|(index, cell)| ((cell.bus, cell.node.get().into()), index)).collect();
-        Self { skin, index }
-    }
-
-    fn name(&self, cell: usize) -> String {
-        let found = self.skin.cells.get(cell).and_then(|cell| Some((cell, self.skin.buses.get(cell.bus)?)));
-        found.map_or_else(String::new, |(cell, bus)| format!("cell {} of {:?}", cell.node, bus.name))
-    }
-
-    /// The bus of this name; it need not be named when there is only one.
-    pub(super) fn bus(&self, at: &Place, name: Option<&str>) -> Checked<usize> {
-        let names =
-            || self.skin.buses.iter().map(|bus| format!("{:?}", bus.name)).collect::<Vec<_>>().join(", ");
-        match name {
-            Some(name) => self.skin.bus_named(name).ok_or_else(|| {
-                let why = format_args!("no such bus; there is {}", names());
-                at.key("bus").fault(format_args!("{name:?}"), why)
-            }),
-            None if self.skin.buses.len() == 1 => Ok(0),
-            None => Err(at.key("bus").fault("", format_args!("which bus? there is {}", names()))),
-        }
-    }
-
-    /// The two cells of one bus that the keys `bus` and `cells` of the table at `at` name, in the file's order; wires
-    /// lead from one to the other.
-    pub(super) fn wired(
-        &self,
-        at: &Place,
-        bus: Option<&str>,
-        nodes: Option<&[i64]>,
-    ) -> Checked<(usize, usize)> {
-        let path = at.key("cells");
-        self.cells(at, bus, nodes, false)?;
-        let &[from, to] = nodes.unwrap_or_default() else {
-            let got = format!("{} cells", nodes.unwrap_or_default().len());
-            return Err(path.fault(got, "a wire is between two"));
-        };
-        let bus = self.bus(at, bus)?;
-        let described = self.skin.buses.get(bus);
-        if described.is_some_and(|bus| bus.reply == Reply::Torque) {
-            return Err(path.fault("", "wires are used on a bus with reply = \"sum\" only"));
-        }
-        let find = |node: i64| self.index.get(&(bus, node)).copied();
-        let wires = self.skin.wires(bus);
-        let node = |cell: usize| self.skin.cells.get(cell).map(|cell| cell.node);
-        let leads = |&(from, to): &(usize, usize)| {
-            let (Some(from), Some(to)) = (node(from), node(to)) else { return false };
-            (0..PORTS).any(|port| wires.other_end(from, port).is_some_and(|(other, _)| other == to))
-        };
-        let pair = find(from).zip(find(to)).filter(leads);
-        pair.ok_or_else(|| path.fault(format_args!("[{from}, {to}]"), "no wire is between them"))
-    }
-
-    /// The cells that the keys `bus` and `cells` of the table at `at` name, or all of them; sorted.
-    pub(super) fn cells(
-        &self,
-        at: &Place,
-        bus: Option<&str>,
-        nodes: Option<&[i64]>,
-        all: bool,
-    ) -> Checked<Vec<usize>> {
-        let path = at.key("cells");
-        let nodes = match nodes {
-            Some(_) if all => return Err(path.fault("", "either some cells, or all = true")),
-            None if !all => return Err(path.fault("", "which cells? give their nodes, or all = true")),
-            None => {
-                let bus = bus.map(|name| self.bus(at, Some(name))).transpose()?;
-                let cells = self.skin.cells.iter().enumerate();
-                let target = cells.filter(|(_, cell)| bus.is_none_or(|bus| cell.bus == bus));
-                return Ok(target.map(|(index, _)| index).collect());
-            }
-            Some([]) => return Err(path.fault("[]", "at least one cell is needed")),
-            Some(nodes) => nodes,
-        };
-        let bus = self.bus(at, bus)?;
-        let mut cells = Vec::with_capacity(nodes.len());
-        for (index, &node) in nodes.iter().enumerate() {
-            let wrong = |why| Err(path.nth(index).fault(node, why));
-            let name = self.skin.buses.get(bus).map_or("", |bus| &bus.name);
-            let Some(&cell) = self.index.get(&(bus, node)) else {
-                return wrong(format!("no cell of {name:?} has this node"));
-            };
-            if let Some(first) = cells.iter().position(|&before| before == cell) {
-                return wrong(format!("cells[{first}] names it already"));
-            }
-            cells.push(cell);
-        }
-        cells.sort_unstable();
-        Ok(cells)
-    }
 }

@@ -3,7 +3,8 @@
 use protocol::document::Place;
 use protocol::time::Span;
 
-use super::check::{Checked, EndS, Names, length};
+use super::check::{Checked, EndS, length};
+use super::names::{Given, Names};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
 pub(super) const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \
@@ -78,7 +79,7 @@ impl Entry<'_> {
         if self.raw.all {
             return Err(self.at.key("all").fault(true, "the two cells of a wire are needed"));
         }
-        let (from, to) = self.names.wired(&self.at, self.raw.bus.as_deref(), self.raw.cells.as_deref())?;
+        let (from, to) = self.names.wired(self.named())?;
         Ok(FaultKind::Wire { link_down, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
     }
 
@@ -104,13 +105,19 @@ impl Entry<'_> {
 
     fn bus(&self, fault: BusFault, keys: &[&str]) -> Checked<FaultKind> {
         self.only(keys)?;
-        let bus = self.names.bus(&self.at, self.raw.bus.as_deref())?;
-        let cells = if self.raw.cells.is_some() { self.cells()? } else { Vec::new() };
+        let bus = self.names.bus(self.named())?;
+        let is_filtered = self.raw.cells.is_some();
+        let cells = if is_filtered { self.names.cells_on(self.named(), bus)? } else { Vec::new() };
         Ok(FaultKind::Bus { fault, length: self.length()?, bus, cells })
     }
 
     fn cells(&self) -> Checked<Vec<usize>> {
-        self.names.cells(&self.at, self.raw.bus.as_deref(), self.raw.cells.as_deref(), self.raw.all)
+        self.names.cells(self.named())
+    }
+
+    fn named(&self) -> Given<'_> {
+        let Self { at, raw, .. } = self;
+        Given { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all }
     }
 
     /// How long it lasts; without `for_s` it stays.

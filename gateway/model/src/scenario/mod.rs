@@ -7,6 +7,8 @@
 mod check;
 mod faults;
 mod measured;
+mod names;
+mod pressed;
 mod raw;
 mod remarks;
 mod sensors;
@@ -151,7 +153,7 @@ pub struct Touch {
     pub length: Span,
     /// What it touches, in the skin's order.
     pub cells: Vec<usize>,
-    /// The maximum force on each of the cells, in N.
+    /// The peak force on each of the cells, in N.
     pub force_n: f64,
     /// How the force comes and goes.
     pub profile: Profile,
@@ -162,7 +164,7 @@ pub struct Touch {
 }
 
 /// How a touch's force comes and goes.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum Profile {
     /// `half-sine`: it grows and falls like half a swing.
     HalfSine,
@@ -170,16 +172,20 @@ pub enum Profile {
     Step,
     /// `ramp`: it grows evenly to all of it, and then is gone.
     Ramp,
+    /// Points of a curve, linear between them: the time since the begin of the touch, the first 0, and the force in N. The touch
+    /// ends at the last point.
+    Points(Vec<(Span, f64)>),
 }
 
 impl Profile {
-    /// The word in the file.
+    /// The word in the file; `points` for a list of them.
     #[must_use]
-    pub const fn name(self) -> &'static str {
+    pub const fn name(&self) -> &'static str {
         match self {
             Self::HalfSine => "half-sine",
             Self::Step => "step",
             Self::Ramp => "ramp",
+            Self::Points(_) => "points",
         }
     }
 }

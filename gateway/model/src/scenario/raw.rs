@@ -1,9 +1,12 @@
 //! A scenario's file as it is read, before it is checked.
 
-use serde::Deserialize;
+use core::fmt;
+
+use serde::de::{Error, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
 
 use super::check::LONGEST_S;
-use super::{IDLE, MotionKind, Profile};
+use super::{IDLE, MotionKind};
 use crate::accelerometer::sensor::Given;
 
 #[derive(Debug, Deserialize)]
@@ -31,8 +34,84 @@ const fn one() -> i64 {
     1
 }
 
-fn step() -> String {
-    Profile::Step.name().to_owned()
+/// How a touch's force comes and goes, as the file has it.
+#[derive(Debug)]
+pub(super) enum Profile {
+    Word(String),
+    /// Times in s after the touch's begin, and forces in N: two numbers each, if they are right.
+    Points(Vec<Vec<f64>>),
+}
+
+impl Default for Profile {
+    fn default() -> Self {
+        Self::Word(super::Profile::Step.name().to_owned())
+    }
+}
+
+impl<'de> Deserialize<'de> for Profile {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        struct Either;
+        impl<'de> Visitor<'de> for Either {
+            type Value = Profile;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("either a word in quotes or a list of points [[t_s, force_n], ...]")
+            }
+
+            fn visit_str<E: Error>(self, word: &str) -> Result<Profile, E> {
+                Ok(Profile::Word(word.to_owned()))
+            }
+
+            fn visit_seq<A: SeqAccess<'de>>(self, mut all: A) -> Result<Profile, A::Error> {
+                let mut points = Vec::new();
+                while let Some(point) = all.next_element()? {
+                    points.push(point);
+                }
+                Ok(Profile::Points(points))
+            }
+        }
+        from.deserialize_any(Either)
+    }
+}
+
+/// A cell as the file names it.
+#[derive(Debug)]
+pub(super) enum Named {
+    Node(i64),
+    /// `BUS:NODE`.
+    Text(String),
+}
+
+impl fmt::Display for Named {
+    /// As it stands in the file.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Node(node) => node.fmt(f),
+            Self::Text(text) => write!(f, "{text:?}"),
+        }
+    }
+}
+
+impl<'de> Deserialize<'de> for Named {
+    fn deserialize<D: Deserializer<'de>>(from: D) -> Result<Self, D::Error> {
+        struct Either;
+        impl Visitor<'_> for Either {
+            type Value = Named;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("either a node id or \"BUS:NODE\"")
+            }
+
+            fn visit_i64<E: Error>(self, node: i64) -> Result<Named, E> {
+                Ok(Named::Node(node))
+            }
+
+            fn visit_str<E: Error>(self, text: &str) -> Result<Named, E> {
+                Ok(Named::Text(text.to_owned()))
+            }
+        }
+        from.deserialize_any(Either)
+    }
 }
 
 impl Scenario {
@@ -40,7 +119,7 @@ impl Scenario {
     /// later.
     pub(super) fn duration_s(&self) -> f64 {
         let end = |at_s: f64, for_s: Option<f64>| at_s + for_s.unwrap_or(0.0);
-        let touches = self.touch.iter().map(|touch| end(touch.at_s, touch.for_s));
+        let touches = self.touch.iter().map(|touch| end(touch.at_s, touch.for_s()));
         let faults = self.fault.iter().map(|fault| end(fault.at_s, fault.for_s));
         let ends = touches.chain(faults).chain(self.mode.iter().map(|mode| mode.at_s));
         let last = || ends.fold(0.0, f64::max) + 1.0;
@@ -86,15 +165,25 @@ pub(super) struct Touch {
     pub(super) at_s: f64,
     pub(super) for_s: Option<f64>,
     pub(super) bus: Option<String>,
-    pub(super) cells: Option<Vec<i64>>,
+    pub(super) cells: Option<Vec<Named>>,
     #[serde(default)]
     pub(super) all: bool,
-    pub(super) force_n: f64,
-    #[serde(default = "step")]
-    pub(super) profile: String,
+    pub(super) force_n: Option<f64>,
+    #[serde(default)]
+    pub(super) profile: Profile,
     #[serde(default)]
     pub(super) proximity: f64,
     pub(super) temperature_c: Option<[f64; 2]>,
+}
+
+impl Touch {
+    /// The duration, if the file has one: also the time of a profile's last point.
+    fn for_s(&self) -> Option<f64> {
+        match &self.profile {
+            Profile::Points(points) => points.last()?.first().copied(),
+            Profile::Word(_) => self.for_s,
+        }
+    }
 }
 
 #[derive(Debug, Deserialize)]
@@ -104,7 +193,7 @@ pub(super) struct Fault {
     pub(super) kind: String,
     pub(super) for_s: Option<f64>,
     pub(super) bus: Option<String>,
-    pub(super) cells: Option<Vec<i64>>,
+    pub(super) cells: Option<Vec<Named>>,
     #[serde(default)]
     pub(super) all: bool,
     pub(super) one_way: Option<bool>,

@@ -4,7 +4,7 @@ use protocol::message::SkinSensors;
 use protocol::skin::{ControllerKind, Skin};
 use protocol::time::Span;
 
-use super::{MotionKind, Scenario, Touch, contact_words};
+use super::{MotionKind, Profile, Scenario, Touch, contact_words};
 use crate::central::force;
 
 impl Scenario {
@@ -40,9 +40,10 @@ fn weak(touch: &Touch, skin: &Skin) -> Option<String> {
     let in_vain = touch.force_n > 0.0 && cells.all(|cell| force(&cell.contact, &sensors) <= 0.0);
     in_vain.then(|| {
         let at_s = Span(touch.at.0).seconds();
-        format!(
-            "the touch at {at_s} s: force_n = {} is below the thresholds of its cells: they send no torque",
-            touch.force_n
-        )
+        let peak = match touch.profile {
+            Profile::Points(_) => format!("the largest force of its profile, {} N,", touch.force_n),
+            Profile::HalfSine | Profile::Step | Profile::Ramp => format!("force_n = {}", touch.force_n),
+        };
+        format!("the touch at {at_s} s: {peak} is below the thresholds of its cells: they send no torque")
     })
 }

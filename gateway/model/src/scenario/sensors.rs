@@ -6,6 +6,7 @@ use protocol::time::Micros;
 
 use super::check::{Checked, EndS};
 use super::raw;
+use super::touches::linear;
 use crate::accelerometer::sensor::DataSheet;
 
 /// Data sheets state errors at this temperature, in °C.
@@ -61,16 +62,7 @@ impl Sensors {
     /// The temperature of all cells at a time, if it is simulated.
     #[must_use]
     pub fn temperature_at(&self, time: Micros) -> Option<f64> {
-        let after = self.temperature.partition_point(|(at, _)| *at <= time);
-        let before = after.checked_sub(1).and_then(|index| self.temperature.get(index));
-        match (before, self.temperature.get(after)) {
-            (Some(&(from, low)), Some(&(to, high))) => {
-                let part = time.since(from).seconds() / to.since(from).seconds();
-                Some(low + (high - low) * part)
-            }
-            (Some((_, one)), None) | (None, Some((_, one))) => Some(*one),
-            (None, None) => None,
-        }
+        linear(&self.temperature, time.0, |Micros(micros)| micros)
     }
 }
 

@@ -127,7 +127,7 @@ fn most_keys_have_defaults() {
     let short = parse("[[touch]]\ncells = [1]\nforce_n = 3.0\n");
     let touch = &short.touches[0];
     assert_eq!((short.duration, touch.at, touch.length), (IDLE, Micros(0), Span(u64::MAX)));
-    assert_eq!((touch.profile, touch.cells.as_slice()), (Profile::Step, [0].as_slice()));
+    assert_eq!((&touch.profile, touch.cells.as_slice()), (&Profile::Step, [0].as_slice()));
     let pressed = Touches::new(&short, &skin()).sensors(0, 1_000_000);
     assert_eq!(pressed.contact, contact_words(3.0), "also when the run is longer");
     let later = "[[touch]]\nat_s = 12.5\nfor_s = 1.0\nall = true\nforce_n = 3.0\nprofile = \"ramp\"\n";
@@ -246,7 +246,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("[1, 3]", "[1, 4]"),
-        "s.toml:22: touch[0].cells[1] = 4: no cell of \"vcan0\" has this node"
+        "s.toml:22: touch[0].cells[1] = 4: no cell of \"vcan0\" has node 4: it has 1-3"
     );
     assert_eq!(says("[1, 3]", "[1, 1]"), "s.toml:22: touch[0].cells[1] = 1: cells[0] names it already");
     assert_eq!(says("[1, 3]", "[]"), "s.toml:22: touch[0].cells = []: at least one cell is needed");
@@ -260,7 +260,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("\"step\"", "\"poke\""),
-        "s.toml:31: touch[1].profile = \"poke\": \"half-sine\", \"step\" or \"ramp\""
+        "s.toml:31: touch[1].profile = \"poke\": \"half-sine\", \"step\", \"ramp\" or points [[t_s, force_n], ...]"
     );
     assert_eq!(
         says("31.5]", "600.0]"),
@@ -304,12 +304,12 @@ fn with_several_buses_the_bus_must_be_named() {
     let text = "version = 1\nduration_s = 1.0\n[[fault]]\nat_s = 0.5\nkind = \"kill\"\ncells = [1]\n";
     assert_eq!(
         by_line(Scenario::parse("s.toml", text, &skin).unwrap_err()),
-        "s.toml:3: fault[0].bus: which bus? there is \"vcan0\", \"vcan1\""
+        "s.toml:3: fault[0].bus: which bus? there is \"vcan0\", \"vcan1\"; a cell of one is also \"vcan0:1\""
     );
     let text = format!("{text}bus = \"vcan1\"\n");
     assert_eq!(
         by_line(Scenario::parse("s.toml", &text, &skin).unwrap_err()),
-        "s.toml:6: fault[0].cells[0] = 1: no cell of \"vcan1\" has this node"
+        "s.toml:6: fault[0].cells[0] = 1: no cell of \"vcan1\" has node 1: it has no cells"
     );
 }
 

@@ -294,6 +294,21 @@ impl Touches {
     }
 }
 
+/// The value of a curve at a time in µs: linear between its points, which are in the order of time, and constant before the
+/// first and after the last one; `None` without any.
+pub(super) fn linear<T: Copy>(points: &[(T, f64)], at: u64, micros: impl Fn(T) -> u64) -> Option<f64> {
+    let after = points.partition_point(|(point, _)| micros(*point) <= at);
+    let before = after.checked_sub(1).and_then(|index| points.get(index));
+    match (before, points.get(after)) {
+        (Some(&(from, low)), Some(&(to, high))) => {
+            let passed = |until: u64| seconds(Span(until.saturating_sub(micros(from))));
+            Some(low + (high - low) * (passed(at) / passed(micros(to))))
+        }
+        (Some((_, one)), None) | (None, Some((_, one))) => Some(*one),
+        (None, None) => None,
+    }
+}
+
 impl Wrong {
     fn holds_at(&self, time: Micros) -> bool {
         self.at <= time && time.since(self.at) < self.length
@@ -307,15 +322,17 @@ impl Touch {
     }
 
     /// The force in N at a time; `None` when it does not touch then.
-    fn level(&self, time: Micros) -> Option<f64> {
+    pub(super) fn level(&self, time: Micros) -> Option<f64> {
         if !self.holds_at(time) {
             return None;
         }
-        let part = seconds(time.since(self.at)) / seconds(self.length);
-        Some(match self.profile {
+        let since = time.since(self.at);
+        let part = seconds(since) / seconds(self.length);
+        Some(match &self.profile {
             Profile::Step => self.force_n,
             Profile::Ramp => self.force_n * part,
             Profile::HalfSine => self.force_n * (PI * part).sin(),
+            Profile::Points(points) => linear(points, since.0, |Span(micros)| micros).unwrap_or(0.0),
         })
     }
 }

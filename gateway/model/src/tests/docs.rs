@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use crate::scenario::Scenario;
 use protocol::skin::{ControllerKind, Skin};
+use protocol::time::Micros;
 
 const SKIN_MD: &str = include_str!("../../../../docs/reference/skin.md");
 const SCENARIO_MD: &str = include_str!("../../../../docs/reference/scenario.md");
@@ -70,6 +71,10 @@ fn the_examples_are_read_and_mean_what_the_text_says() {
     assert!(second.contact.force_threshold.to_f64() >= 0.5 && first.contact.force_threshold.to_f64() < 0.2);
     let scenario = Scenario::parse("scenario.toml", scenario_text(), &skin).unwrap();
     assert_eq!((scenario.touches.len(), scenario.faults.len(), scenario.modes.len()), (2, 2, 2));
+    let points =
+        Scenario::parse("scenario.toml", block(SCENARIO_MD, "# a touch that follows points"), &skin).unwrap();
+    let touch = points.touches.first().unwrap();
+    assert_eq!((touch.cells.len(), touch.at + touch.length), (2, Micros(2_500_000)), "gone at 2.5 s");
     let nowhere = skin_text().replacen("joint = 2", "joint = 9", 1);
     let said = read_skin(&nowhere);
     assert!(said.ends_with(": cell[0].joint = 9: the robot has joints 1 to 6"), "{said}");

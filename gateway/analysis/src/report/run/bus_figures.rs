@@ -2,17 +2,19 @@
 
 use protocol::candump::{Direction, Record};
 use protocol::message::{Message, SensorPage};
+use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
+use super::frames_only::is_for_cells;
 use super::moments::Moments;
 use super::touched::Touched;
 use crate::fit::rates::Chosen;
 use crate::report::thin::{Binned, Thinned};
 use model::central::Central;
 use model::decode::{Decoded, Decoder};
-use model::table::{Replies, Table};
+use model::table::{Replies, Sums, Table};
 use trace::capture::Latched;
 
 /// Time is let pass for the cells as often as a receiver does it.
@@ -57,6 +59,28 @@ pub(super) struct Lines {
     pub(super) difference: Vec<Thinned>,
 }
 
+/// The effect of a frame that the lines of a capture without a loop need.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Effect {
+    /// New joints, by joint of the chain in rad or m.
+    Joints([f64; MAX_JOINTS]),
+    /// Cells are halted, or go on.
+    Halted(bool),
+}
+
+/// The state of a bus' frames so far.
+#[derive(Debug)]
+pub(super) struct Received {
+    decoder: Decoder,
+    looked: Micros,
+    /// Whether frames have no direction that tells the gateway's own.
+    is_of_frames_only: bool,
+    /// What had come before the newest joints.
+    pub(super) before: Sums,
+    /// Cells in contact since the newest joints; `None` while that is not known of all.
+    pub(super) in_contact: Option<u32>,
+}
+
 /// One bus.
 #[derive(Debug)]
 pub(super) struct LinkId {
@@ -72,9 +96,8 @@ pub(super) struct LinkId {
     pub(super) farthest: Option<(f64, f64)>,
     /// Whether cells answer with sums.
     pub(super) sums: bool,
-    decoder: Decoder,
+    pub(super) received: Received,
     open: Option<Open>,
-    looked: Micros,
     pub(super) lines: Lines,
     /// By place among the bus' cells.
     pub(super) latency: Vec<Latency>,
@@ -94,7 +117,12 @@ pub(super) struct LinkId {
 }
 
 impl LinkId {
-    pub(super) fn new(skin: &Skin, bus: usize, (rates, rates_from): (Chosen, Option<&'static str>)) -> Self {
+    pub(super) fn new(
+        skin: &Skin,
+        bus: usize,
+        (rates, rates_from): (Chosen, Option<&'static str>),
+        is_of_frames_only: bool,
+    ) -> Self {
         let mut table = Table::new(skin, bus);
         table.set_comparing(true);
         let described = skin.buses.get(bus);
@@ -108,9 +136,14 @@ impl LinkId {
             farthest: None,
             table,
             sums: described.is_some_and(|bus| bus.reply != Reply::Torque),
-            decoder: Decoder::new(described.map(|bus| bus.format)),
+            received: Received {
+                decoder: Decoder::new(described.map(|bus| bus.format)),
+                looked: Micros(0),
+                is_of_frames_only,
+                before: Sums::default(),
+                in_contact: None,
+            },
             open: None,
-            looked: Micros(0),
             lines: Lines {
                 difference: vec![Thinned::default(); skin.joints_of(bus).len()],
                 ..Lines::default()
@@ -137,28 +170,47 @@ impl LinkId {
     }
 
     /// The next frame, `at` seconds after the recording's beginning.
-    pub(super) fn frame(&mut self, at: f64, record: &Record<'_>) {
+    pub(super) fn frame(&mut self, at: f64, record: &Record<'_>) -> Option<Effect> {
         let now = Micros(record.time.nanos / 1_000);
         self.frames += 1;
-        if now.0 >= self.looked.0 + LOOK_US {
-            self.looked = now;
+        if now.0 >= self.received.looked.0 + LOOK_US {
+            self.received.looked = now;
             self.table.handle_time(now);
             for notice in self.table.notices() {
                 self.moments.notice(at, notice);
             }
         }
-        let own = record.direction == Some(Direction::Sent);
-        let decoded = self.decoder.decode(now, &self.name, &record.frame);
+        let own = match self.received.is_of_frames_only {
+            true => is_for_cells(&record.frame),
+            false => record.direction == Some(Direction::Sent),
+        };
+        let decoded = self.received.decoder.decode(now, &self.name, &record.frame);
         if let Decoded::Message(message) = &decoded {
             self.answer(now, message);
             self.measure(message);
         }
         let seconds = Bits::of(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
         self.load_of_all.add(at, seconds);
+        let before = self.table.snapshot().sums;
         self.table.handle_frame(now, own, &record.frame, &mut |_| None);
         let newest = self.table.newest().map(|(number, _, _)| number);
-        if newest.is_some() && newest != self.open.map(|open| open.number) {
+        let is_next = newest.is_some() && newest != self.open.map(|open| open.number);
+        if is_next {
             self.next(newest.unwrap_or(0), at);
+            self.received.before = before;
+        }
+        match decoded {
+            Decoded::Message(Message::Joints { joints, .. }) if is_next => {
+                Some(Effect::Joints(self.central.positions(&joints.positions)))
+            }
+            Decoded::Message(Message::Halt) => Some(Effect::Halted(true)),
+            Decoded::Message(Message::Resume) => Some(Effect::Halted(false)),
+            Decoded::Foreign(_)
+            | Decoded::Wire(..)
+            | Decoded::Segment { .. }
+            | Decoded::Damaged { .. }
+            | Decoded::Meaningless { .. }
+            | Decoded::Message(_) => None,
         }
     }
 
@@ -199,12 +251,18 @@ impl LinkId {
     /// The force on each cell since the newest joints: by its stimuli, or as it measures it.
     fn forces(&mut self, at: f64) {
         let (table, central, measured) = (&self.table, &self.central, &self.measured);
-        let sensors = table.sensors(self.looked).zip(table.cells()).zip(measured).enumerate();
+        let sensors = table.sensors(self.received.looked).zip(table.cells()).zip(measured).enumerate();
+        let mut in_contact = Some(0);
         let forces = sensors.map(|(place, (((sensors, _), cell), measured))| {
             let stimulated = sensors.map(|sensors| central.force(place, &sensors));
-            stimulated.or_else(|| measured.filter(|_| cell.measures() == Some(true)))
+            let force = stimulated.or_else(|| measured.filter(|_| cell.measures() == Some(true)));
+            let is_known = !cell.is_ready() || force.is_some() && !cell.has_unseen_stimuli();
+            let is_pressed = force.is_some_and(|force| force > 0.0);
+            in_contact = in_contact.filter(|_| is_known).map(|count| count + u32::from(is_pressed));
+            force
         });
         self.touched.joints(at, forces);
+        self.received.in_contact = in_contact;
     }
 
     /// What is due and what has come of it, all epochs together.

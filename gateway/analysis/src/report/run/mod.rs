@@ -12,6 +12,7 @@
 //! real bus is that of `skinbus fit` for the same recording.
 
 mod bus_figures;
+mod frames_only;
 mod moments;
 mod motion;
 mod page;
@@ -27,6 +28,7 @@ use super::figure::Page;
 use crate::fit::rates::{Chosen, Requested};
 use crate::shadow::{self, Shadow};
 use bus_figures::LinkId;
+use frames_only::FramesOnly;
 use motion::Motion;
 use trace::capture::{CaptureError, Entry, Extras, Format, Item, Note, NoteKind, Other, Reader, SKIN};
 use trace::recording::layout::Layout;
@@ -42,17 +44,36 @@ pub enum ReportError {
     /// It cannot be read.
     #[error(transparent)]
     Capture(#[from] CaptureError),
-    /// Frames alone.
+    /// Frames alone, and no skin for them.
     #[error(
-        "{name} is no MCAP recording, and frames alone are not enough: `skinbus run SKIN --record run.mcap` makes what a \
-         report needs"
+        "{name} is a log, and frames alone are not enough: name their skin with --skin; a recording, `skinbus run SKIN \
+         --record run.mcap`, has it"
     )]
     Log {
         /// Its name.
         name: String,
     },
+    /// Frames of which none can be reported.
+    #[error("{name} {what}")]
+    Frames {
+        /// Its name.
+        name: String,
+        /// What is wrong with it, as the rest of a sentence, and what to do.
+        what: String,
+    },
+    /// The skin of the options is another than the recording's.
+    #[error("{name} was recorded with another skin")]
+    OtherSkin {
+        /// Its name.
+        name: String,
+        /// The skin that is attached to it.
+        recorded: Box<Skin>,
+    },
     /// Of another program, or of nothing.
-    #[error("{name} holds no run: {what}; `skinbus run SKIN --record run.mcap` makes what a report needs")]
+    #[error(
+        "{name} holds no run: {what}; `skinbus run SKIN --record run.mcap` makes what a report needs, and frames alone need \
+         their --skin"
+    )]
     Foreign {
         /// Its name.
         name: String,
@@ -88,6 +109,8 @@ pub struct Report {
     pub is_damaged: bool,
     /// What the recording is called.
     pub name: String,
+    /// What a capture of frames only lacks, and remarks on it: lines for standard error.
+    pub remarks: Vec<String>,
 }
 
 /// How a report is asked for.
@@ -99,6 +122,8 @@ pub struct Options {
     pub nominal: Option<u32>,
     /// Bits in a second of FD frames' data, in place of the skin's.
     pub data: Option<u32>,
+    /// The skin of a capture of frames only, behind the name of its file.
+    pub skin: Option<(String, Skin)>,
 }
 
 impl Options {
@@ -128,25 +153,27 @@ pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportErro
     let (run, broken, is_damaged) = read(paths, options)?;
     let missing = broken.map(|why| run.missing(&why));
     let page = page::page(&run, &options.command, missing.as_deref());
-    Ok(Report { page, missing, is_damaged, name: run.name })
+    let lacking = run.frames_only.as_ref().map(|it| format!("not in {}: {}", it.noun, run.lacking()));
+    let remarks = lacking.into_iter().chain(run.remarks).collect();
+    Ok(Report { page, missing, is_damaged, name: run.name, remarks })
 }
 
 /// Sees that these are recordings, without reading them.
 ///
 /// # Errors
 /// When they are not, or cannot be opened.
-pub fn check(paths: &[PathBuf]) -> Result<(), ReportError> {
-    open(paths).map(drop)
+pub fn check(paths: &[PathBuf], options: &Options) -> Result<(), ReportError> {
+    open(paths, options).map(drop)
 }
 
 /// Opens a recording; also how long its files are, if that is known.
-fn open(paths: &[PathBuf]) -> Result<(Reader, Option<u64>), ReportError> {
+fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), ReportError> {
     let items = Reader::open_with_others(paths).map_err(ReportError::Open)?;
     let name = items.name().to_owned();
     let bytes =
         |path: &PathBuf| path.metadata().ok().filter(std::fs::Metadata::is_file).map(|about| about.len());
     let bytes = paths.iter().map(bytes).sum::<Option<u64>>();
-    if items.format() == Format::Candump {
+    if items.format() == Format::Candump && (options.skin.is_none() || bytes == Some(0)) {
         let empty = bytes == Some(0);
         return Err(if empty {
             ReportError::Foreign { name, what: "it is empty".to_owned() }
@@ -159,11 +186,11 @@ fn open(paths: &[PathBuf]) -> Result<(Reader, Option<u64>), ReportError> {
 
 /// Reads it all; also why it has no proper end, if it has none, and whether that is damage.
 fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bool), ReportError> {
-    let (mut items, bytes) = open(paths)?;
+    let (mut items, bytes) = open(paths, options)?;
     let name = items.name().to_owned();
     // What stands before the first message is known when it is open, unless the file is damaged: that is the reason then.
-    let begun = Run::begin(&name, bytes.unwrap_or(0), items.extras(), options);
-    while items.extras().skin().is_none() && items.next_item()?.is_some() {}
+    let begun = Run::begin(&name, bytes.unwrap_or(0), (items.format(), items.extras()), options);
+    while begun.is_err() && items.extras().skin().is_none() && items.next_item()?.is_some() {}
     let mut run = begun?;
     run.files = paths.iter().map(|path| path.display().to_string()).collect();
     let damaged = loop {
@@ -175,6 +202,12 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bo
     };
     run.finish();
     let unfinished = items.extras().unfinished.clone();
+    if run.frames_only.is_some() {
+        run.remarks = items.remarks();
+        if let Some(what) = run.unusable(&items).filter(|_| damaged.is_none()) {
+            return Err(ReportError::Frames { name, what });
+        }
+    }
     if run.is_empty() {
         let nothing = || "it has no tick and no frame of its skin's buses".to_owned();
         return Err(match damaged {
@@ -221,16 +254,30 @@ struct Run {
     shadow: Shadow,
     /// Packets of any network that the kernel dropped on their way to sockets.
     backlog: u64,
-    /// Frames of buses that the skin does not have.
+    /// Frames of buses that the skin does not have, and the name of the first of them.
     others: u64,
+    other_bus: Option<String>,
     /// Messages that do not match the type of their topic.
     unreadable: u64,
+    /// Of a capture without a loop.
+    frames_only: Option<FramesOnly>,
+    /// Remarks on a capture without a loop.
+    remarks: Vec<String>,
 }
 
 impl Run {
-    fn begin(name: &str, bytes: u64, extras: &Extras, options: &Options) -> Result<Self, ReportError> {
+    fn begin(
+        name: &str,
+        bytes: u64,
+        (format, extras): (Format, &Extras),
+        options: &Options,
+    ) -> Result<Self, ReportError> {
         let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what };
-        let Some(skin) = extras.skin() else {
+        let recorded = extras.skin();
+        let skin_file = options.skin.as_ref().map_or("", |(file, _)| file);
+        let is_log = format == Format::Candump;
+        let frames_only = recorded.is_none().then(|| FramesOnly::new(is_log, skin_file));
+        let Some(skin) = recorded.or_else(|| options.skin.clone().map(|(_, skin)| Ok(skin))) else {
             let what = format!("{SKIN} is not attached to it");
             return Err(match &extras.unfinished {
                 Some(why) => {
@@ -240,10 +287,15 @@ impl Run {
             });
         };
         let skin = skin.map_err(|error| foreign(format!("the attached {error}")))?;
+        if options.skin.as_ref().is_some_and(|(_, given)| *given != skin) {
+            return Err(ReportError::OtherSkin { name: name.to_owned(), recorded: Box::new(skin) });
+        }
         let layout = Layout::new(&skin);
         let buses = skin.buses.iter().enumerate();
-        let bus_figures =
-            buses.map(|(at, bus)| Ok(LinkId::new(&skin, at, (options.rates(bus)?, options.origin(bus)))));
+        let bus_figures = buses.map(|(at, bus)| {
+            let rates = (options.rates(bus)?, options.origin(bus));
+            Ok(LinkId::new(&skin, at, rates, frames_only.is_some()))
+        });
         let mut bus_figures = bus_figures.collect::<Result<Vec<_>, ReportError>>()?;
         let mut shadow = shadow(&skin, &bus_figures);
         for before in &extras.latched {
@@ -267,7 +319,10 @@ impl Run {
             shadow,
             backlog: 0,
             others: 0,
+            other_bus: None,
             unreadable: 0,
+            frames_only,
+            remarks: Vec::new(),
         })
     }
 
@@ -276,17 +331,28 @@ impl Run {
             Item::Entry(Entry::Frame(record)) => {
                 let at = self.seconds(record.time.nanos);
                 self.first_frame.get_or_insert(at);
-                match self.skin.bus_named(record.interface).and_then(|bus| self.bus_figures.get_mut(bus)) {
-                    Some(bus_figures) => {
-                        bus_figures.frame(at, record);
+                let bus = self.skin.bus_named(record.interface);
+                match bus.and_then(|bus| Some((bus, self.bus_figures.get_mut(bus)?))) {
+                    Some((bus, bus_figures)) => {
+                        let effect = bus_figures.frame(at, record);
+                        if let Some(frames_only) = &mut self.frames_only {
+                            frames_only.began.get_or_insert(record.time.nanos);
+                            let so_far = (&self.skin, self.bus_figures.as_slice());
+                            frames_only.take((at, bus, effect), so_far, &mut self.motion);
+                        }
                         self.shadow.frame(record.interface, record.time.nanos, &record.frame);
                         self.carried();
                     }
-                    None => self.others += 1,
+                    None => {
+                        self.others += 1;
+                        self.other_bus.get_or_insert_with(|| record.interface.to_owned());
+                    }
                 }
             }
             Item::Entry(Entry::Note(note)) => self.note(note),
-            Item::Other(other) => self.message(other),
+            // Of a recording without its skin they are not read: what is said to be missing is.
+            Item::Other(other) if self.frames_only.is_none() => self.message(other),
+            Item::Other(_) => {}
         }
     }
 
@@ -338,6 +404,40 @@ impl Run {
         self.bus_figures.iter_mut().for_each(LinkId::finish);
         self.shadow.finish();
         self.carried();
+        if let Some(frames_only) = &self.frames_only {
+            frames_only.finish(&mut self.motion);
+        }
+    }
+
+    /// Whether joints were on a bus of a capture of frames only.
+    fn has_joints(&self) -> bool {
+        self.frames_only.is_some() && self.bus_figures.iter().any(|bus_figures| bus_figures.joints.is_some())
+    }
+
+    /// The parts that a capture of frames only lacks, as a list in words.
+    fn lacking(&self) -> String {
+        let missing = self.frames_only.as_ref().map(|it| it.missing(&self.bus_figures, &self.motion));
+        missing.unwrap_or_default().join("; ")
+    }
+
+    /// Why a capture of frames only cannot be reported, as the rest of a sentence.
+    fn unusable(&self, items: &Reader) -> Option<String> {
+        if !items.has_times() {
+            return Some(
+                "has lines without times: a report needs them, as `candump -L` writes them".to_owned(),
+            );
+        }
+        if self.bus_figures.iter().any(|bus_figures| bus_figures.frames > 0) {
+            return None;
+        }
+        let buses: Vec<_> = self.skin.buses.iter().map(|bus| bus.name.as_str()).collect();
+        Some(match (&self.other_bus, items.text_kind()) {
+            (Some(other), _) => {
+                format!("has no frame of the skin's buses ({}): its frames are of {other}", buses.join(", "))
+            }
+            (None, Some((what, hint))) => format!("is {what}, and no candump log or MCAP recording: {hint}"),
+            (None, None) => "has no frame in it: a log is what `candump -L` writes".to_owned(),
+        })
     }
 
     fn is_empty(&self) -> bool {

@@ -25,7 +25,7 @@ pub(super) struct Motion {
     pub(super) counts: Counts,
     /// Active cells of all ticks with a central computation together, and these ticks.
     pub(super) active_sum: (u64, u64),
-    /// The first and the last tick, in s.
+    /// The first and the last tick, in s; of frames only, the first joints and the last frame.
     pub(super) first: Option<f64>,
     pub(super) last: f64,
     /// When most ticks were skipped at once, and how many.
@@ -111,7 +111,7 @@ impl Motion {
         }
     }
 
-    fn turn(&mut self, at: f64, what: &'static str) {
+    pub(super) fn turn(&mut self, at: f64, what: &'static str) {
         if self.turns.len() < TURNS {
             self.turns.push((at, what));
         }

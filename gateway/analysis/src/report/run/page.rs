@@ -2,12 +2,14 @@
 
 mod arm;
 mod bus;
+mod facts;
 mod formats;
 mod moments;
 mod skin;
 
 use super::Run;
 use super::bus_figures::LinkId;
+use super::frames_only::FramesOnly;
 use super::moments::Loss;
 use crate::paper;
 use crate::report::figure::{Axis, Figure, Finding, Mark, Page, Section, Series, Shape, number, quantity};
@@ -27,32 +29,60 @@ const NAMED: usize = 10;
 /// What a page is made of.
 struct Draft<'a> {
     run: &'a Run,
-    /// When the loop began, in s after the recording's first message.
+    /// When the loop began, or joints did where only frames are, in s after the recording's first message.
     zero: f64,
 }
 
 pub(super) fn page(run: &Run, command: &str, missing: Option<&str>) -> Page {
     let draft = Draft { run, zero: run.motion.first.unwrap_or(0.0) };
-    let (skin, motion) = (&run.skin, &run.motion);
-    let seconds = quantity((motion.seconds() * 100.0).round() / 100.0, "s");
-    let mut intro = format!(
-        "A run of {} with {} cells on {} and {seconds} of its {} control loop, from the recording {}. \
-         Times count from the first tick.",
-        skin.name,
-        skin.cells.len(),
-        several(skin.buses.len(), "bus", "buses"),
-        quantity(skin.timing.control_hz, "Hz"),
-        run.name,
-    );
+    let mut intro = match &run.frames_only {
+        Some(frames_only) => intro_of_frames(run, frames_only),
+        None => intro_of_run(run),
+    };
     if let Some(missing) = missing {
         intro = format!("Not all of the run is here: {missing}. {intro}");
     }
     let mut sections = vec![draft.summary(), draft.skin()];
-    if motion.counts.ticks > 0 {
+    if run.motion.counts.ticks > 0 || run.has_joints() {
         sections.extend([draft.torque(), draft.motion(), draft.cells(), draft.cycle()]);
     }
     sections.extend([draft.replies(), draft.load(), draft.losses()]);
-    Page { title: format!("{}: report on a run", skin.name), intro, facts: facts(run, command), sections }
+    let of = if run.frames_only.is_some() { "a capture" } else { "a run" };
+    let facts = facts::facts(run, command);
+    Page { title: format!("{}: report on {of}", run.skin.name), intro, facts, sections }
+}
+
+fn intro_of_run(run: &Run) -> String {
+    format!(
+        "A run of {} on {} and {} of its {} control loop, from the recording {}. Times count from the first tick.",
+        cells_of(run),
+        several(run.skin.buses.len(), "bus", "buses"),
+        hundredths(run.motion.seconds()),
+        quantity(run.skin.timing.control_hz, "Hz"),
+        run.name,
+    )
+}
+
+fn intro_of_frames(run: &Run, frames_only: &FramesOnly) -> String {
+    let remarks: String = run.remarks.iter().map(|remark| format!(" {remark}.")).collect();
+    format!(
+        "Frames of {} on {} during {}, from the {} {}. Times count from the first joints. Not in {}: {}.{remarks}",
+        cells_of(run),
+        several(run.skin.buses.len(), "bus", "buses"),
+        hundredths(run.motion.seconds()),
+        frames_only.format,
+        run.name,
+        frames_only.noun,
+        run.lacking(),
+    )
+}
+
+fn cells_of(run: &Run) -> String {
+    format!("{} with {} cells", run.skin.name, run.skin.cells.len())
+}
+
+fn hundredths(seconds: f64) -> String {
+    quantity((seconds * 100.0).round() / 100.0, "s")
 }
 
 impl Draft<'_> {
@@ -71,7 +101,8 @@ impl Draft<'_> {
 
     fn time(&self) -> Axis {
         let axis = Axis::new("time", "s");
-        if self.run.motion.counts.ticks > 1 { axis.between(0.0, self.run.motion.seconds()) } else { axis }
+        let seconds = self.run.motion.seconds();
+        if seconds > 0.0 { axis.between(0.0, seconds) } else { axis }
     }
 
     fn marks(&self) -> Vec<Mark> {
@@ -124,17 +155,21 @@ impl Draft<'_> {
         findings.push(Finding::stated("cells", skin.cells.len() as f64).beside(PAPER_CELLS));
         if motion.seconds() > 0.0 {
             let hertz = |count: u64, seconds: f64| (count.saturating_sub(1) as f64 / seconds, "Hz");
-            let loop_hz =
-                hertz(motion.counts.ticks.saturating_add(motion.counts.unrecorded), motion.seconds());
-            findings.push(Finding::stated("control loop", loop_hz).beside(PAPER_CONTROL_HZ));
+            if motion.counts.ticks > 0 {
+                let ticks = motion.counts.ticks.saturating_add(motion.counts.unrecorded);
+                let loop_hz = hertz(ticks, motion.seconds());
+                findings.push(Finding::stated("control loop", loop_hz).beside(PAPER_CONTROL_HZ));
+            }
             let joints = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.joints);
             let most = joints.max_by_key(|(_, _, count)| *count).filter(|(first, last, _)| last > first);
             if let Some((first, last, count)) = most {
                 let finding = Finding::stated("joints", hertz(count, last - first));
                 findings.push(finding.beside(PAPER_BROADCAST_HZ));
             }
-            let skipped = none("ticks skipped".to_owned(), motion.counts.skipped);
-            findings.push(skipped.look(motion.skip.map(|(at, _)| self.look(at))));
+            if motion.counts.ticks > 0 {
+                let skipped = none("ticks skipped".to_owned(), motion.counts.skipped);
+                findings.push(skipped.look(motion.skip.map(|(at, _)| self.look(at))));
+            }
         }
         let accounts = self.run.bus_figures.iter().map(LinkId::account);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
@@ -177,6 +212,12 @@ impl Draft<'_> {
         (!cells.is_empty()).then(|| none(what, cells.len() as u64))
     }
 
+    /// A sentence that names a part which only a recording of a run has; `None` in one.
+    fn lacks(&self, what: &str) -> Option<String> {
+        let frames_only = self.run.frames_only.as_ref()?;
+        Some(format!("Not in {}: {what}.", frames_only.noun))
+    }
+
     /// The command for the loss with most of what a count names.
     fn worst_loss(&self, of: impl Fn(&Loss) -> u64) -> Option<String> {
         let all = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.moments.worst(&of));
@@ -197,57 +238,4 @@ fn none(what: String, count: u64) -> Finding {
 
 fn several(count: usize, one: &str, more: &str) -> String {
     format!("{count} {}", if count == 1 { one } else { more })
-}
-
-/// A time in µs as the recording's metadata has it.
-fn micros(text: &str) -> String {
-    text.parse().map_or_else(|_| text.to_owned(), |micros| quantity(micros, "µs"))
-}
-
-/// What it came about with.
-fn facts(run: &Run, command: &str) -> Vec<(String, String)> {
-    let fact = |record: &str, key: &str| run.fact(record, key).unwrap_or("unknown");
-    let [machine, program] = ["machine", "program"].map(|record| move |key: &str| fact(record, key));
-    let began = program("began_ns").parse().map_or_else(|_| "unknown".to_owned(), utc);
-    let idle = run.fact("machine", "idle_late_p50_us").map(|idle| {
-        let (p99, max) = (machine("idle_late_p99_us"), machine("idle_late_max_us"));
-        let [idle, p99, max] = [idle, p99, max].map(micros);
-        format!("woke a thread {idle} late (median), 99 % within {p99}, at most {max}")
-    });
-    let clock = format!(
-        "{}, of {}; wall clock in steps of {} ns",
-        machine("clocksource"),
-        machine("clocksources"),
-        machine("realtime_resolution_ns")
-    );
-    let kernel = [machine("sysname"), machine("release"), "on", machine("machine")].join(" ");
-    let configuration = run.metadata.iter().find(|(name, _)| name == "configuration").map(|(_, facts)| {
-        facts.iter().map(|(key, value)| format!("{key} = {value}")).collect::<Vec<_>>().join("; ")
-    });
-    let facts = [
-        ("run's command", Some(program("command_line").to_owned())),
-        ("program", Some(format!("{}, revision {}", program("program"), program("git_revision")))),
-        ("began", Some(began)),
-        ("machine", Some(format!("{kernel}, {} processors", machine("processors")))),
-        ("clock", Some(clock)),
-        ("idle machine", idle),
-        ("recording", Some(format!("{}, part {}, {} bytes", run.name, fact("part", "number"), run.bytes))),
-        ("report's command", Some(command.to_owned())),
-        ("configuration", configuration),
-    ];
-    facts.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
-}
-
-/// A time in ns since 1970 as people write it (Hinnant's `civil_from_days`).
-fn utc(nanos: u64) -> String {
-    let seconds = nanos / 1_000_000_000;
-    let (days, second) = (seconds / 86_400 + 719_468, seconds % 86_400);
-    let (era, day) = (days / 146_097, days % 146_097);
-    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
-    let day = day - (365 * year + year / 4 - year / 100);
-    let month = (5 * day + 2) / 153;
-    let (day, month) = (day - (153 * month + 2) / 5 + 1, if month < 10 { month + 3 } else { month - 9 });
-    let year = year + era * 400 + u64::from(month <= 2);
-    let (hour, minute, second) = (second / 3_600, second / 60 % 60, second % 60);
-    format!("{year}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02} UTC")
 }

@@ -3,7 +3,8 @@
 use hdrhistogram::Histogram;
 
 use super::super::bus_figures::LinkId;
-use super::{Draft, micros, shown};
+use super::facts::micros;
+use super::{Draft, shown};
 use crate::paper;
 use crate::report::figure::{Axis, Below, Figure, Mark, Section, Shape, Table, quantity};
 use crate::report::thin::Thinned;
@@ -11,6 +12,14 @@ use model::quantiles::Quantiles;
 use model::table::{Accuracy, Errors};
 use protocol::fixed::TorqueFormat;
 use protocol::skin::{JointKind, Reply};
+
+/// The central computation rounds by less than this, in Nm: a smaller error is none.
+const ROUNDING_NM: f64 = 1e-12;
+
+/// An error without the rounding of the computation that it is compared with.
+fn without_rounding(error: f64) -> f64 {
+    if error.abs() < ROUNDING_NM { 0.0 } else { error }
+}
 
 impl Draft<'_> {
     /// The paper's Fig. 6.
@@ -24,18 +33,23 @@ impl Draft<'_> {
                 |format: &str, mean| Mark::y(mean, format!("paper, {format}: {}", quantity(mean, "Nm")));
             let title = "Mean absolute error of an epoch that all cells answered in time";
             self.figure("torque-error", title, Axis::new("error", "Nm").log())
-                .series(
-                    errors
-                        .iter()
-                        .map(|bus_figures| self.line(self.named(bus_figures), &bus_figures.lines.error)),
-                )
+                .series(errors.iter().map(|bus_figures| {
+                    let mut series = self.line(self.named(bus_figures), &bus_figures.lines.error);
+                    series.points.iter_mut().for_each(|(_, error)| *error = without_rounding(*error));
+                    series
+                }))
                 .marks([papers("Q3.12", paper::SINGLE_NM), papers("Q7.8", paper::SUMMED_NM)])
         });
         let mut section = Section::new("torque", "Torque, and its difference from the central one");
         if !loaded.is_empty() {
-            section = section.text("The upper curve is the sum of what has come at each tick. The difference below it compares like with like, once \
+            let when = if self.run.frames_only.is_some() { "before each joints" } else { "at each tick" };
+            section = section.text(format!("The upper curve is the sum of what has come {when}. The difference below it compares like with like, once \
              an epoch: what all cells answered to these joints, less the central computation for them; an epoch without an \
-             answer in time is a gap. Dotted: one step of the torque words.");
+             answer in time is a gap. Dotted: one step of the torque words."));
+            let is_compared = self.run.bus_figures.iter().any(|it| it.lines.error.count() > 0);
+            let lacks = self
+                .lacks("stimuli or sensors from which central torques, and the difference to them, follow");
+            section.text.extend(lacks.filter(|_| !is_compared));
         }
         if !free.is_empty() {
             let names: Vec<_> = free.iter().map(|joint| self.joint(*joint)).collect();
@@ -143,8 +157,8 @@ impl Draft<'_> {
         }
         let single = by_joint.iter().map(|[single, whole]| (single, whole));
         let text = |errors: &Errors, unit: &str| {
-            let mean = quantity(errors.mean().unwrap_or(f64::NAN), unit);
-            [mean, quantity(errors.max(), unit), errors.count().to_string()]
+            let [mean, max] = [errors.mean().unwrap_or(f64::NAN), errors.max()].map(without_rounding);
+            [quantity(mean, unit), quantity(max, unit), errors.count().to_string()]
         };
         let row = |name: String, unit: &str, single: &Errors, whole: &Errors| {
             [name].into_iter().chain(text(single, unit)).chain(text(whole, unit)).collect::<Vec<_>>()
@@ -181,8 +195,11 @@ impl Draft<'_> {
                 figure("velocities", "Joint velocities", Axis::new("velocity", speed), &motion.velocity),
             ]
         });
-        let (still, figures): (Vec<_>, Vec<_>) = figures.partition(is_zero);
-        let section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
+        let no_velocity = self.lacks("joint velocities, as joints frames have positions");
+        let is_there = |figure: &Figure| no_velocity.is_none() || !figure.name.starts_with("velocities");
+        let (still, figures): (Vec<_>, Vec<_>) = figures.filter(is_there).partition(is_zero);
+        let mut section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
+        section.text.extend(no_velocity);
         if still.is_empty() { section } else { section.text("What is not drawn here was 0 throughout.") }
     }
 
@@ -205,15 +222,22 @@ impl Draft<'_> {
 
     pub(super) fn cells(&self) -> Section {
         let motion = &self.run.motion;
+        let is_known = motion.active.count() > 0 && !self.lacks_forces();
+        let active = if is_known { self.points(&motion.active) } else { Vec::new() };
         let title = "Active cells: those whose torque is in the sum, and those that are in contact";
         let figure = self
             .figure("active-cells", title, Axis::new("cells", ""))
             .draw("in the torque", Shape::Steps, self.points(&motion.contributing))
-            .draw("in contact, by the central computation", Shape::Steps, self.points(&motion.active))
+            .draw("in contact, by the central computation", Shape::Steps, active)
             .marks(self.marks());
-        let section = Section::new("cells", "Active cells");
+        let mut section = Section::new("cells", "Active cells");
+        section.text.extend(
+            self.lacks("stimuli or sensors of all cells, and so which are in contact").filter(|_| !is_known),
+        );
         if is_zero(&figure) {
-            section.text("No cell was in contact.")
+            let none =
+                if is_known || self.run.frames_only.is_none() { "was in contact" } else { "sent a torque" };
+            section.text(format!("No cell {none}."))
         } else {
             section.figures(shown(figure))
         }
@@ -222,6 +246,10 @@ impl Draft<'_> {
     /// The paper's Fig. 8.
     pub(super) fn cycle(&self) -> Section {
         let motion = &self.run.motion;
+        let lacks = "how long ticks and the central computation in them took, and how late they began";
+        if let Some(lacks) = self.lacks(lacks) {
+            return Section::new("cycle", "Cycle times").text(lacks);
+        }
         let figure = |name: &str, title: &str, series: &[(&str, &Thinned)]| {
             let series = series.iter().map(|(caption, thinned)| self.line(*caption, thinned));
             self.figure(name, title, Axis::new("time", "µs").log()).series(series).marks(self.marks())

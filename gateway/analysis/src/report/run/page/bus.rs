@@ -157,7 +157,7 @@ impl Draft<'_> {
         Some(Table::new(title, head, rows))
     }
 
-    /// A load in % from the first tick on: before it cells start, all at once.
+    /// A load in % from the first tick or joints on: before it cells start, all at once.
     pub(super) fn percent(&self, binned: &Binned) -> Vec<(f64, f64)> {
         let rates = binned.rates().into_iter().map(|(x, part)| (x - self.zero, part * 100.0));
         rates.filter(|(x, _)| *x >= 0.0).collect()
@@ -223,8 +223,11 @@ impl Draft<'_> {
                 rows.push(vec![what, count.to_string()]);
             }
         };
-        row("ticks skipped by the loop".to_owned(), ticks.skipped, true);
-        row("ticks that happened and are not in the recording".to_owned(), ticks.unrecorded, true);
+        let has_loop = run.frames_only.is_none();
+        if has_loop {
+            row("ticks skipped by the loop".to_owned(), ticks.skipped, true);
+            row("ticks that happened and are not in the recording".to_owned(), ticks.unrecorded, true);
+        }
         row("bad cycles".to_owned(), ticks.bad, false);
         row("ticks while the robot was halted".to_owned(), ticks.halted, false);
         row("ticks whose velocity was not finite".to_owned(), ticks.refused, false);
@@ -247,11 +250,11 @@ impl Draft<'_> {
         }
         row("packets of any network in the kernel's backlog".to_owned(), run.backlog, false);
         row("frames of buses that the skin does not have".to_owned(), run.others, false);
-        row("messages that cannot be read".to_owned(), run.unreadable, false);
-        Section::new("losses", "Losses")
-            .text("Rows of possible losses are always shown; other rows only when they are not 0.")
-            .tables(self.lost())
-            .tables([Table::new("All counts", ["what", "count"], rows)])
+        row("messages or lines that cannot be read".to_owned(), run.unreadable, false);
+        let mut section = Section::new("losses", "Losses")
+            .text("Rows of possible losses are always shown; other rows only when they are not 0.");
+        section.text.extend(self.lacks("ticks that the loop skipped, and bad cycles"));
+        section.tables(self.lost()).tables([Table::new("All counts", ["what", "count"], rows)])
     }
 }
 

@@ -25,7 +25,8 @@ impl Draft<'_> {
     pub(super) fn look(&self, at: f64) -> String {
         let seconds = (at - self.run.first_frame.unwrap_or(0.0)).max(0.0);
         let files: Vec<_> = self.run.files.iter().map(|file| quoted(file)).collect();
-        format!("skinbus view {} --at {seconds:.3}", files.join(" "))
+        let skin = self.run.frames_only.as_ref().map(|it| format!(" --skin {}", quoted(&it.skin_file)));
+        format!("skinbus view {}{} --at {seconds:.3}", files.join(" "), skin.unwrap_or_default())
     }
 
     /// Touches, link by link.

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use model::surface::lay_flat;
 
+use super::super::bus_figures::LinkId;
 use super::Draft;
 use crate::report::figure::{
     Drawing, Legend, Map, Panel, Section, Spot, Strip, StripGroup, StripRow, quantity,
@@ -35,6 +36,9 @@ impl Draft<'_> {
                 .text("A force is that of Algorithm 1 on the cell's sensors, from the joints at which it was latched to the next.")
                 .drawings([Drawing::Strip(strip), Drawing::Map(force)])
                 .tables(self.touches()),
+            (..) if self.lacks_forces() => section.text(
+                self.lacks("stimuli or sensors of the cells that sent torques, and so the forces on them").unwrap_or_default(),
+            ),
             (..) => section.text("No cell was touched, as far as the frames say."),
         };
         let sums = self.run.bus_figures.iter().any(|bus_figures| bus_figures.sums);
@@ -48,6 +52,14 @@ impl Draft<'_> {
                  map of it.",
             ),
         }
+    }
+
+    /// Whether cells of frames without a loop sent torques, and nothing on the buses tells the forces that they are from.
+    pub(super) fn lacks_forces(&self) -> bool {
+        let lines = self.run.motion.distributed.iter();
+        let is_loaded = lines.flat_map(|line| line.points()).any(|(_, torque)| torque != 0.0);
+        let is_untouched = |it: &LinkId| it.touched.cells().next().is_none();
+        self.run.frames_only.is_some() && is_loaded && self.run.bus_figures.iter().all(is_untouched)
     }
 
     /// Each row's cells over time, those that were touched.

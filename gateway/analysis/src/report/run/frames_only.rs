@@ -1,0 +1,174 @@
+//! A capture that holds frames only, as a candump log does: series from joints and torques on the buses in place of the loop's
+//! topics, and the parts of a report that are missing.
+
+use protocol::can::Frame;
+use protocol::id::{Command, Kind};
+use protocol::packet::data_id;
+use protocol::skin::Skin;
+
+use super::bus_figures::{Effect, LinkId};
+use super::motion::Motion;
+
+/// Returns true for frames that cells receive and that change a table as the gateway's own do. Whoever took the capture
+/// does not tell who sent a frame; its identifier tells for whom it is.
+pub(super) fn is_for_cells(frame: &Frame) -> bool {
+    let Ok(id) = data_id(frame) else { return false };
+    // A table learns of a resume from others' frames only: the gateway knows of its own.
+    let is_resume = id.kind == Kind::Command && Command::from_byte(id.node) == Some(Command::Resume);
+    id.sender().is_none() && !is_resume
+}
+
+/// What a capture without a loop is, and what of it has been read.
+#[derive(Debug)]
+pub(super) struct FramesOnly {
+    /// What it is in a sentence, without its article: `candump log`.
+    pub(super) format: &'static str,
+    /// What lacks the loop's parts: `a log`.
+    pub(super) noun: &'static str,
+    /// The file of its skin.
+    pub(super) skin_file: String,
+    /// The bus whose joints are the times of the series.
+    clock: Option<usize>,
+    is_halted: bool,
+    /// When the last frame was, in s after the first.
+    end: f64,
+    /// Time of the first frame in ns since 1970.
+    pub(super) began: Option<u64>,
+}
+
+impl FramesOnly {
+    pub(super) fn new(is_log: bool, skin_file: &str) -> Self {
+        let (format, noun) =
+            if is_log { ("candump log", "a log") } else { ("MCAP file of another program", "frames alone") };
+        let skin_file = skin_file.to_owned();
+        Self { format, noun, skin_file, clock: None, is_halted: false, end: 0.0, began: None }
+    }
+
+    /// Takes a frame of one of the skin's buses, which had this effect there.
+    pub(super) fn take(
+        &mut self,
+        (at, bus, effect): (f64, usize, Option<Effect>),
+        (skin, bus_figures): (&Skin, &[LinkId]),
+        motion: &mut Motion,
+    ) {
+        self.end = self.end.max(at);
+        match effect {
+            Some(Effect::Joints(positions)) => {
+                motion.first.get_or_insert(at);
+                if *self.clock.get_or_insert(bus) == bus {
+                    sums(at, skin, bus_figures, motion);
+                }
+                for ((joint, _), position) in skin.joints_of(bus).zip(positions) {
+                    // A joint of several chains is broadcast on the buses of all of them.
+                    let owner = (0..bus_figures.len()).find(|bus| {
+                        let has_joints = bus_figures.get(*bus).is_some_and(|it| it.joints.is_some());
+                        has_joints && skin.joints_of(*bus).any(|(it, _)| it == joint)
+                    });
+                    if let Some(line) = motion.position.get_mut(joint).filter(|_| owner == Some(bus)) {
+                        line.push(at, position);
+                    }
+                }
+            }
+            Some(Effect::Halted(is_halted))
+                if std::mem::replace(&mut self.is_halted, is_halted) != is_halted =>
+            {
+                motion.turn(at, if is_halted { "halted" } else { "goes on" });
+            }
+            Some(Effect::Halted(_)) | None => {}
+        }
+    }
+
+    /// No more frames follow: sets the time that the capture covers, from the first joints to the last frame.
+    pub(super) fn finish(&self, motion: &mut Motion) {
+        motion.first.get_or_insert(0.0);
+        motion.last = self.end;
+    }
+
+    /// The parts of a report that are not here, as items of a list.
+    pub(super) fn missing(&self, bus_figures: &[LinkId], motion: &Motion) -> Vec<&'static str> {
+        let has_joints = bus_figures.iter().any(|it| it.joints.is_some());
+        let compared = bus_figures.iter().any(|it| {
+            let accuracy = it.table.accuracy();
+            accuracy.single.count() + accuracy.sums.count() > 0
+        });
+        let has_torque = motion.distributed.iter().any(|line| line.points().iter().any(|(_, y)| *y != 0.0));
+        let all = [
+            (!has_joints, "joints, and with them torques and replies"),
+            (has_torque && !compared, "stimuli or sensors, and with them central torques"),
+            (true, "joint velocities"),
+            (true, "ticks and cycle times"),
+            (true, "the scenario"),
+            (true, "the command, program and machine of the run"),
+        ];
+        all.into_iter().filter(|(is_missing, _)| *is_missing).map(|(_, what)| what).collect()
+    }
+}
+
+/// Adds the sums of all buses before joints.
+fn sums(at: f64, skin: &Skin, bus_figures: &[LinkId], motion: &mut Motion) {
+    let mut torque = vec![0.0; motion.distributed.len()];
+    let (mut contributing, mut active) = (0, Some(0));
+    for (bus, figures) in bus_figures.iter().enumerate() {
+        for ((joint, _), of_bus) in skin.joints_of(bus).zip(figures.received.before.torque) {
+            if let Some(torque) = torque.get_mut(joint) {
+                *torque += of_bus;
+            }
+        }
+        contributing += figures.received.before.contributing;
+        active = active.zip(figures.received.in_contact).map(|(sum, of_bus)| sum + of_bus);
+    }
+    motion.distributed.iter_mut().zip(torque).for_each(|(line, torque)| line.push(at, torque));
+    motion.contributing.push(at, contributing.into());
+    motion.active.push(at, active.map_or(f64::NAN, f64::from));
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::can::Format;
+    use protocol::id::{CellId, Node};
+    use protocol::message::{Heartbeat, Joints, Message, NetworkPage};
+    use protocol::packet::{Epoch, Packet};
+
+    fn frames(message: &Message) -> Vec<Frame> {
+        let packet: Packet = message.encode();
+        packet.frames(Format::Classic).collect()
+    }
+
+    #[test]
+    fn frames_for_cells_are_told_from_those_of_cells_by_their_identifiers() {
+        let page = NetworkPage::Heartbeat(Heartbeat::default());
+        let network = |from| Message::Network { from, epoch: Epoch(0), page };
+        let cell = Node::Cell(CellId::new(3).unwrap());
+        for (message, is) in [
+            (Message::Joints { epoch: Epoch(1), joints: Joints::default() }, true),
+            (Message::Sync, true),
+            (Message::Report, true),
+            (Message::Halt, true),
+            (Message::Resume, false),
+            (network(Node::Gateway), true),
+            (network(cell), false),
+        ] {
+            let frames = frames(&message);
+            assert!(
+                !frames.is_empty() && frames.iter().all(|frame| is_for_cells(frame) == is),
+                "{message:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn halts_are_turns_and_a_repeated_one_is_none() {
+        let skin = model::testing::skin();
+        let mut motion = Motion::new(6);
+        let mut frames_only = FramesOnly::new(true, "skin.toml");
+        for (at, is_halted) in [(1.0, true), (1.1, true), (2.0, false), (3.0, false)] {
+            frames_only.take((at, 0, Some(Effect::Halted(is_halted))), (&skin, &[]), &mut motion);
+        }
+        frames_only.finish(&mut motion);
+        assert_eq!(motion.turns, [(1.0, "halted"), (2.0, "goes on")]);
+        assert!((motion.seconds() - 3.0).abs() < 1e-9);
+        let missing = frames_only.missing(&[], &motion);
+        assert_eq!(missing.first(), Some(&"joints, and with them torques and replies"));
+    }
+}

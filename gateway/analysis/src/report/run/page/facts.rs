@@ -1,0 +1,64 @@
+//! How a capture came about, and on what machine.
+
+use super::super::Run;
+use crate::report::figure::quantity;
+
+/// A time in µs as the recording's metadata has it.
+pub(super) fn micros(text: &str) -> String {
+    text.parse().map_or_else(|_| text.to_owned(), |micros| quantity(micros, "µs"))
+}
+
+/// What it came about with, by name.
+pub(super) fn facts(run: &Run, command: &str) -> Vec<(String, String)> {
+    if let Some(frames_only) = &run.frames_only {
+        let began = frames_only.began.map(utc).map(|began| ("first frame", began));
+        let capture = ("capture", format!("{}, {}, {} bytes", run.name, frames_only.format, run.bytes));
+        let skin = ("skin", frames_only.skin_file.clone());
+        let all = [Some(capture), Some(skin), began, Some(("report's command", command.to_owned()))];
+        return all.into_iter().flatten().map(|(name, value)| (name.to_owned(), value)).collect();
+    }
+    let fact = |record: &str, key: &str| run.fact(record, key).unwrap_or("unknown");
+    let [machine, program] = ["machine", "program"].map(|record| move |key: &str| fact(record, key));
+    let began = program("began_ns").parse().map_or_else(|_| "unknown".to_owned(), utc);
+    let idle = run.fact("machine", "idle_late_p50_us").map(|idle| {
+        let (p99, max) = (machine("idle_late_p99_us"), machine("idle_late_max_us"));
+        let [idle, p99, max] = [idle, p99, max].map(micros);
+        format!("woke a thread {idle} late (median), 99 % within {p99}, at most {max}")
+    });
+    let clock = format!(
+        "{}, of {}; wall clock in steps of {} ns",
+        machine("clocksource"),
+        machine("clocksources"),
+        machine("realtime_resolution_ns")
+    );
+    let kernel = [machine("sysname"), machine("release"), "on", machine("machine")].join(" ");
+    let configuration = run.metadata.iter().find(|(name, _)| name == "configuration").map(|(_, facts)| {
+        facts.iter().map(|(key, value)| format!("{key} = {value}")).collect::<Vec<_>>().join("; ")
+    });
+    let facts = [
+        ("run's command", Some(program("command_line").to_owned())),
+        ("program", Some(format!("{}, revision {}", program("program"), program("git_revision")))),
+        ("began", Some(began)),
+        ("machine", Some(format!("{kernel}, {} processors", machine("processors")))),
+        ("clock", Some(clock)),
+        ("idle machine", idle),
+        ("recording", Some(format!("{}, part {}, {} bytes", run.name, fact("part", "number"), run.bytes))),
+        ("report's command", Some(command.to_owned())),
+        ("configuration", configuration),
+    ];
+    facts.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
+}
+
+/// A time in ns since 1970 as people write it (Hinnant's `civil_from_days`).
+fn utc(nanos: u64) -> String {
+    let seconds = nanos / 1_000_000_000;
+    let (days, second) = (seconds / 86_400 + 719_468, seconds % 86_400);
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
+    let day = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * day + 2) / 153;
+    let (day, month) = (day - (153 * month + 2) / 5 + 1, if month < 10 { month + 3 } else { month - 9 });
+    let year = year + era * 400 + u64::from(month <= 2);
+    let (hour, minute, second) = (second / 3_600, second / 60 % 60, second % 60);
+    format!("{year}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02} UTC")
+}

@@ -1,0 +1,289 @@
+//! How a scenario's file names buses and cells.
+
+use std::collections::HashMap;
+
+use protocol::document::Place;
+use protocol::skin::{CellName, Reply, Skin};
+use protocol::wire::PORTS;
+
+use super::check::Checked;
+use super::raw;
+use crate::listing::ranges;
+
+/// Ranges of node ids that an error lists.
+const LISTED: usize = 8;
+
+/// The buses and cells of a skin, by their names.
+pub(super) struct Names<'a> {
+    skin: &'a Skin,
+    index: HashMap<(usize, i64), usize>,
+}
+
+/// The keys of a table that name cells.
+#[derive(Clone, Copy)]
+pub(super) struct Given<'a> {
+    /// The table.
+    pub(super) at: &'a Place,
+    /// The bus of cells that are node ids alone.
+    pub(super) bus: Option<&'a str>,
+    /// Node ids, and cells with their buses.
+    pub(super) cells: Option<&'a [raw::Named]>,
+    /// Every cell, of the bus if that is given.
+    pub(super) all: bool,
+}
+
+impl<'a> Names<'a> {
+    pub(super) fn of(skin: &'a Skin) -> Self {
+        let cells = skin.cells.iter().enumerate();
+        let index = cells.map(|(index, cell)| ((cell.bus, cell.node.get().into()), index)).collect();
+        Self { skin, index }
+    }
+
+    pub(super) fn name(&self, cell: usize) -> String {
+        let found = self.skin.cells.get(cell).and_then(|cell| Some((cell, self.skin.buses.get(cell.bus)?)));
+        found.map_or_else(String::new, |(cell, bus)| format!("cell {} of {:?}", cell.node, bus.name))
+    }
+
+    fn bus_name(&self, bus: usize) -> &str {
+        self.skin.buses.get(bus).map_or("", |bus| &bus.name)
+    }
+
+    /// A bus by its name; `at` is where the name stands, and `value` what stands there.
+    fn named(&self, at: &Place, value: &dyn core::fmt::Display, name: &str) -> Checked<usize> {
+        let wrong = || at.fault(value, format_args!("no such bus; there is {}", self.buses()));
+        self.skin.bus_named(name).ok_or_else(wrong)
+    }
+
+    fn buses(&self) -> String {
+        let names = self.skin.buses.iter().map(|bus| format!("{:?}", bus.name));
+        names.collect::<Vec<_>>().join(", ")
+    }
+
+    /// The bus that the key `bus` names; it need not be named when there is only one.
+    fn key(&self, given: Given<'_>) -> Checked<usize> {
+        let at = given.at.key("bus");
+        match given.bus {
+            Some(name) => self.named(&at, &format_args!("{name:?}"), name),
+            None if self.skin.buses.len() == 1 => Ok(0),
+            None => {
+                let first = self.bus_name(0);
+                let why =
+                    format_args!("which bus? there is {}; a cell of one is also \"{first}:1\"", self.buses());
+                Err(at.fault("", why))
+            }
+        }
+    }
+
+    /// The bus that a table is about: that of its key, else that of its first cell.
+    pub(super) fn bus(&self, given: Given<'_>) -> Checked<usize> {
+        match given.cells {
+            Some([first, ..]) if given.bus.is_none() => {
+                let cell = self.cell(&given.at.key("cells").nth(0), first, given)?;
+                Ok(self.skin.cells.get(cell).map_or(0, |cell| cell.bus))
+            }
+            _ => self.key(given),
+        }
+    }
+
+    /// The cell that stands at `at`.
+    fn cell(&self, at: &Place, named: &raw::Named, given: Given<'_>) -> Checked<usize> {
+        let (bus, node) = match named {
+            raw::Named::Node(node) => (self.key(given)?, *node),
+            raw::Named::Text(text) => {
+                let name: CellName = text.parse().map_err(|why: String| at.fault(named, why))?;
+                let bus = match &name.bus {
+                    Some(bus) => self.named(at, named, bus)?,
+                    None => self.key(given)?,
+                };
+                (bus, name.node.get().into())
+            }
+        };
+        self.index.get(&(bus, node)).copied().ok_or_else(|| {
+            let why = format!("no cell of {:?} has node {node}: {}", self.bus_name(bus), self.nodes(bus));
+            at.fault(named, why)
+        })
+    }
+
+    /// The node ids of a bus in words.
+    fn nodes(&self, bus: usize) -> String {
+        let mut nodes: Vec<_> = self.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
+        nodes.sort_unstable();
+        let all = ranges(&nodes);
+        match all.get(..LISTED) {
+            _ if all.is_empty() => "it has no cells".to_owned(),
+            Some(few) if all.len() > LISTED => format!("it has {}, ...", few.join(", ")),
+            _ => format!("it has {}", all.join(", ")),
+        }
+    }
+
+    /// The cells that a table names one by one, in the file's order, each once.
+    fn each(&self, given: Given<'_>, named: &[raw::Named]) -> Checked<Vec<usize>> {
+        if given.bus.is_some() {
+            self.key(given)?;
+        }
+        let path = given.at.key("cells");
+        let mut cells = Vec::with_capacity(named.len());
+        for (index, named) in named.iter().enumerate() {
+            let at = path.nth(index);
+            let cell = self.cell(&at, named, given)?;
+            if let Some(first) = cells.iter().position(|&before| before == cell) {
+                return Err(at.fault(named, format_args!("cells[{first}] names it already")));
+            }
+            cells.push(cell);
+        }
+        Ok(cells)
+    }
+
+    /// The cells that a table names, or all of them; sorted.
+    pub(super) fn cells(&self, given: Given<'_>) -> Checked<Vec<usize>> {
+        let path = given.at.key("cells");
+        match given.cells {
+            Some(_) if given.all => Err(path.fault("", "either some cells, or all = true")),
+            None if !given.all => Err(path.fault("", "which cells? give their nodes, or all = true")),
+            None => {
+                let bus = given.bus.map(|_| self.key(given)).transpose()?;
+                let cells = self.skin.cells.iter().enumerate();
+                let target = cells.filter(|(_, cell)| bus.is_none_or(|bus| cell.bus == bus));
+                Ok(target.map(|(index, _)| index).collect())
+            }
+            Some([]) => Err(path.fault("[]", "at least one cell is needed")),
+            Some(named) => {
+                let mut cells = self.each(given, named)?;
+                cells.sort_unstable();
+                Ok(cells)
+            }
+        }
+    }
+
+    /// The cells that a table names, all of them on one bus; sorted.
+    pub(super) fn cells_on(&self, given: Given<'_>, bus: usize) -> Checked<Vec<usize>> {
+        let cells = self.cells(given)?;
+        let is_here = |cell: usize| self.skin.cells.get(cell).is_some_and(|cell| cell.bus == bus);
+        let path = given.at.key("cells");
+        for (index, named) in given.cells.unwrap_or_default().iter().enumerate() {
+            let at = path.nth(index);
+            if !is_here(self.cell(&at, named, given)?) {
+                let why = format_args!(
+                    "it is about one bus, {:?}: give another table for this cell",
+                    self.bus_name(bus)
+                );
+                return Err(at.fault(named, why));
+            }
+        }
+        Ok(cells)
+    }
+
+    /// The two cells of one bus that a table names, in the file's order; wires lead from one to the other.
+    pub(super) fn wired(&self, given: Given<'_>) -> Checked<(usize, usize)> {
+        let path = given.at.key("cells");
+        self.cells(given)?;
+        let named = given.cells.unwrap_or_default();
+        let [one, other] = named else {
+            return Err(path.fault(format_args!("{} cells", named.len()), "a wire is between two"));
+        };
+        let bus = self.bus(given)?;
+        self.cells_on(given, bus)?;
+        let described = self.skin.buses.get(bus);
+        if described.is_some_and(|bus| bus.reply == Reply::Torque) {
+            return Err(path.fault("", "wires are used on a bus with reply = \"sum\" only"));
+        }
+        let wires = self.skin.wires(bus);
+        let node = |cell: usize| self.skin.cells.get(cell).map(|cell| cell.node);
+        let leads = |&(from, to): &(usize, usize)| {
+            let (Some(from), Some(to)) = (node(from), node(to)) else { return false };
+            (0..PORTS).any(|port| wires.other_end(from, port).is_some_and(|(other, _)| other == to))
+        };
+        let pair = (self.cell(&path.nth(0), one, given)?, self.cell(&path.nth(1), other, given)?);
+        let wrong = || path.fault(format_args!("[{one}, {other}]"), "no wire is between them");
+        Some(pair).filter(leads).ok_or_else(wrong)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::scenario::{FaultKind, Scenario};
+    use crate::testing::SKIN;
+    use protocol::skin::Skin;
+
+    /// Cells 1 to 3 of `vcan0`, and 1 and 5 of `vcan1`: places 0 to 4.
+    fn two_buses() -> Skin {
+        let second = "[[bus]]\nname = \"vcan1\"\nreply = \"torque\"\nformat = \"fd\"\n\n[controller]";
+        let (head, cell) = SKIN.split_at(SKIN.find("[[cell]]").unwrap());
+        let cells =
+            [("vcan0", 1), ("vcan0", 2), ("vcan0", 3), ("vcan1", 1), ("vcan1", 5)].map(|(bus, node)| {
+                cell.replace("node = 1", &format!("node = {node}")).replace("\"vcan0\"", &format!("{bus:?}"))
+            });
+        let text = format!("{}{}", head.replacen("[controller]", second, 1), cells.join("\n"));
+        Skin::parse("skin.toml", &text).unwrap()
+    }
+
+    fn read(text: &str) -> Result<Scenario, String> {
+        let text = format!("duration_s = 9.0\n{text}\n");
+        Scenario::parse("s.toml", &text, &two_buses()).map_err(|error| error.to_string())
+    }
+
+    fn touched(keys: &str) -> Result<Vec<usize>, String> {
+        read(&format!("[[touch]]\nforce_n = 1.0\n{keys}")).map(|it| it.touches[0].cells.clone())
+    }
+
+    fn fault(keys: &str) -> Result<FaultKind, String> {
+        read(&format!("[[fault]]\nat_s = 1.0\n{keys}")).map(|it| it.faults[0].kind.clone())
+    }
+
+    #[test]
+    fn cells_are_named_with_their_bus_or_by_the_key_of_the_table() {
+        for (keys, cells) in [
+            ("cells = [\"vcan1:5\", \"vcan0:3\"]", vec![2, 4]),
+            ("bus = \"vcan0\"\ncells = [1, \"vcan1:1\", \"2\"]", vec![0, 1, 3]),
+            ("bus = \"vcan1\"\ncells = [1, \"vcan0:1\"]", vec![0, 3]),
+            ("bus = \"vcan1\"\nall = true", vec![3, 4]),
+        ] {
+            assert_eq!(touched(keys), Ok(cells), "{keys}");
+        }
+        let FaultKind::Process { cells, .. } = fault("kind = \"kill\"\ncells = [\"vcan1:5\"]").unwrap()
+        else {
+            panic!()
+        };
+        assert_eq!(cells, [4]);
+        for keys in ["bus = \"vcan1\"\ncells = [5]", "cells = [\"vcan1:5\"]"] {
+            let kind = fault(&format!("kind = \"drop\"\nprobability = 0.5\n{keys}")).unwrap();
+            assert!(matches!(&kind, FaultKind::Bus { bus: 1, cells, .. } if *cells == [4]), "{kind:?}");
+        }
+    }
+
+    #[test]
+    fn a_cell_that_is_not_there_is_named_beside_those_that_are() {
+        let which = "which bus? there is \"vcan0\", \"vcan1\"; a cell of one is also \"vcan0:1\"";
+        for (keys, said) in [
+            (
+                "cells = [\"vcan0:9\"]",
+                "s.toml:4:10: touch[0].cells[0] = \"vcan0:9\": no cell of \"vcan0\" has node 9: it has 1-3",
+            ),
+            (
+                "bus = \"vcan1\"\ncells = [1, 2]",
+                "touch[0].cells[1] = 2: no cell of \"vcan1\" has node 2: it has 1, 5",
+            ),
+            (
+                "cells = [\"can0:1\"]",
+                "touch[0].cells[0] = \"can0:1\": no such bus; there is \"vcan0\", \"vcan1\"",
+            ),
+            ("cells = [\"vcan0:1\", 2]", &format!("touch[0].bus: {which}")),
+            ("cells = [\"vcan0:x\"]", "touch[0].cells[0] = \"vcan0:x\": \"x\" is no node id: 1 to 254 are"),
+            ("cells = [2.5]", "touch[0].cells[0] = 2.5: either a node id or \"BUS:NODE\" is needed"),
+            ("cells = [99999999999999999999]", "touch[0].cells[0] = 99999999999999999999: "),
+            ("bus = \"can9\"\ncells = [\"vcan0:1\"]", "touch[0].bus = \"can9\": no such bus"),
+            (
+                "bus = \"vcan0\"\ncells = [1, \"vcan0:1\"]",
+                "touch[0].cells[1] = \"vcan0:1\": cells[0] names it already",
+            ),
+        ] {
+            let got = touched(keys).unwrap_err();
+            assert!(got.contains(said), "{keys}\n{got}");
+        }
+        let two = "kind = \"drop\"\nprobability = 0.5\ncells = [\"vcan0:1\", \"vcan1:5\"]";
+        let said = "fault[0].cells[1] = \"vcan1:5\": it is about one bus, \"vcan0\": give another table for this cell";
+        assert!(fault(two).unwrap_err().contains(said));
+        let wire = fault("kind = \"link_down\"\ncells = [\"vcan0:1\", \"vcan1:5\"]").unwrap_err();
+        assert!(wire.contains("it is about one bus, \"vcan0\""), "{wire}");
+    }
+}
