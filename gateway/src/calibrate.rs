@@ -35,7 +35,6 @@ use super::arguments::{BusKinds, bus_names, seconds};
 use super::output::{Overwrite, apart, note, print_beside};
 use super::print::{count, json};
 use super::robot_file::{RobotOfSkin, urdf_of};
-use super::visuals::Packages;
 
 /// Find where cells sit, from their accelerometers
 ///
@@ -91,8 +90,6 @@ pub(crate) struct Calibrate {
     no_spawn: bool,
     #[command(flatten)]
     kinds: BusKinds,
-    #[command(flatten)]
-    packages: Packages,
     /// Show no progress
     #[arg(long, short)]
     quiet: bool,
@@ -134,7 +131,7 @@ impl Calibrate {
         let shown = if self.json { json(&calibration)? } else { report(&skin, &calibration) };
         print_beside([self.output.as_deref(), self.page.as_deref()], &shown)?;
         if let Some(path) = &self.page {
-            let page = picture::page(&self.skin, &skin, &self.packages, &calibration);
+            let page = picture::page(&self.skin, &skin, &calibration);
             self.overwrite.write("--page", path, &page)?;
         }
         match calibration.summary.troubled {

@@ -24,7 +24,6 @@ use paper::{Effort, Experiment as Named, Lab, Session, files};
 use protocol::usage::{Failure, print, quoted_os};
 use serde_json::Value;
 
-use super::arguments::Processes;
 use super::input::stopped;
 use super::output::{Overwrite, note};
 use super::print::{Rows, json};
@@ -57,8 +56,6 @@ pub(crate) struct Experiment {
     /// Measure little: a few cells, a few seconds, to see that everything works
     #[arg(long)]
     quick: bool,
-    #[command(flatten)]
-    processes: Processes,
     /// Show no progress and no findings
     #[arg(long, short)]
     quiet: bool,
@@ -114,7 +111,7 @@ impl Experiment {
     fn perform(&self, named: &[Named], folder: &Folder, stop: Arc<AtomicBool>) -> Result<Page, Failure> {
         let effort = if self.quick { Effort::Quick } else { Effort::Full };
         let progress = Progress::new(named.iter().map(|named| named.seconds(effort)).sum(), self.quiet);
-        let benches = Benches { folder: folder.inside(), processes: self.processes, stop: Arc::clone(&stop) };
+        let benches = Benches { folder: folder.inside(), stop: Arc::clone(&stop) };
         let mut lab = Here { benches, stop, idle: None };
         let mut session = Session::new(effort);
         let mut sections = Vec::with_capacity(named.len());

@@ -40,17 +40,21 @@ pub(crate) fn option(words: &[String], option: &str) -> Option<String> {
         ("check", "--cells") => "--list",
         ("cells", "--for") => "--duration",
         ("replay", "--max") => "--speed max",
+        ("replay", "--json") => "--summary -",
+        ("skin", "--robot") => "nothing: it is a UR5",
         ("replay", "--view" | "--address-file" | "--token-file") => "skinbus view SKIN beside it",
         ("replay", "--kind" | "--node") => {
             "--only, or skinbus dump to choose frames and canplayer to send them"
         }
         ("replay", "--spin" | "--send-timeout" | "--strict") => "nothing: it has a fixed value now",
-        ("demo", "--cells-per-process" | "--record-split" | "--address-file" | "--token-file") => {
-            "skinbus run"
-        }
+        ("demo", "--record-split" | "--address-file" | "--token-file") => "skinbus run",
         ("run", "--receive-buffer") => "the environment variable SKINBUS_RECEIVE_BUFFER",
         ("calibrate", "--from") => "--recording",
-        ("calibrate", "--seed" | "--cells-per-process") => "nothing: it has a fixed value now",
+        ("demo", "--cells-per-process") => "the environment variable SKINBUS_CELLS_PER_PROCESS",
+        ("calibrate", "--package") => "a skin whose URDF is beside its packages",
+        ("calibrate", "--seed") | ("calibrate" | "experiment", "--cells-per-process") => {
+            "nothing: it has a fixed value now"
+        }
         ("skin", "--cells") => "--places",
         _ => return None,
     };

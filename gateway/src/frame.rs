@@ -118,10 +118,12 @@ impl Frame {
         }
         listen::send(&bus, message, format).map_err(Failure::run)?;
         output::note(format_args!("sent on {name} ({})", bus.kind()));
-        let tag = match message {
-            Message::Stimulus { .. } => None,
-            Message::Configure { tag, .. } => Some(*tag),
-            _ => return Ok(()),
+        let tag = if let Message::Configure { tag, .. } = message {
+            Some(*tag)
+        } else if let Message::Stimulus { .. } = message {
+            None
+        } else {
+            return Ok(());
         };
         let answers = wait(Listener::new(bus, Some(format)), only, tag).map_err(Failure::run)?;
         verdict(&answers, only, tag, (&name, format))

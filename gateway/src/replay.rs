@@ -13,7 +13,7 @@ use clap::Args;
 use protocol::usage::{Failure, shown, shown_lines};
 
 use super::arguments::{BusKinds, Processes, Word, nanos, of_environment, one_of};
-use super::output::{self, Overwrite, apart, print_beside, print_table};
+use super::output::{self, Overwrite, apart, print_table};
 use super::print::{GREEN, PLAIN, Rows, YELLOW, count, hanging, json, list, or, quantiles};
 
 /// Bytes for frames that wait: all cells may answer a report at once.
@@ -75,7 +75,7 @@ pub(crate) struct Replay {
     /// Let cells that measure obey stimuli while the replay lasts, and measure again afterwards
     #[arg(long)]
     test_mode: bool,
-    /// Write the figures of the end as JSON; docs/reference/replay.md explains its keys
+    /// Write the figures of the end as JSON, - for standard output; docs/reference/replay.md explains its keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     #[command(flatten)]
@@ -87,9 +87,6 @@ pub(crate) struct Replay {
 /// What is shown, and how.
 #[derive(Args, Debug)]
 struct Shown {
-    /// Print the figures as JSON instead of the table
-    #[arg(long, short)]
-    json: bool,
     /// Show no progress, only the table at the end
     #[arg(long, short)]
     quiet: bool,
@@ -150,11 +147,7 @@ impl Replay {
         let write = |(whole, file)| output::finish("--summary", whole, file, &json);
         let written = file.map_or(Ok(()), write);
         let files = [self.summary.as_deref()];
-        let printed = match self.shown.json {
-            true => print_beside(files, &json),
-            false => print_table(files, |is_coloured| table(&summary, is_coloured)),
-        };
-        printed.and(written)?;
+        print_table(files, |is_coloured| table(&summary, is_coloured)).and(written)?;
         summary.verdict(self.shown.quiet).map_or(Ok(()), |why| Err(Failure::run(why)))
     }
 

@@ -8,11 +8,11 @@ use analysis::report::run::{self, ReportError};
 use analysis::report::{figure::Page, page, svg};
 use clap::Args;
 use protocol::skin::Skin;
-use protocol::usage::{Failure, command_line, shown, written};
+use protocol::usage::{Failure, command_line, print, shown, written};
 use protocol::wire_time::bit_rate;
 
 use super::input::{difference, read_skin};
-use super::output::{Overwrite, apart, is_standard_output, note, print_beside};
+use super::output::{Overwrite, apart, is_standard_output, note};
 
 /// Report on a recorded run: one HTML page with figures, beside the paper's numbers
 ///
@@ -96,7 +96,9 @@ impl Report {
         let beside =
             self.svg.map_or_else(String::new, |folder| format!(", also as files in {}", folder.display()));
         let said = format!("{}: {figures} figures{beside}", output.display());
-        print_beside([Some(output.as_path())], &format!("{}\n", shown(&said)))?;
+        if !is_standard_output(&output) {
+            print(&format!("{}\n", shown(&said)))?;
+        }
         match report.missing.filter(|_| report.is_damaged) {
             Some(missing) => Err(Failure::run(format!("{}: {missing}", report.name))),
             None => Ok(()),

@@ -2,6 +2,7 @@
 
 mod show;
 
+use std::net::SocketAddr;
 use std::panic::{self, AssertUnwindSafe};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -58,8 +59,9 @@ struct Common {
     /// then ends with Ctrl-C
     #[arg(long)]
     view: bool,
-    #[command(flatten)]
-    page: PageOptions,
+    /// The address of the page; else any free port of this machine
+    #[arg(long, value_name = "ADDRESS:PORT", requires = "view")]
+    listen: Option<SocketAddr>,
     #[command(flatten)]
     recording: Recording,
 }
@@ -174,6 +176,8 @@ pub(crate) struct Run {
     record_split: Vec<Limit>,
     #[command(flatten)]
     processes: Processes,
+    #[command(flatten)]
+    page: PageOptions,
     /// Write all frames as candump text: a log that can be followed while it grows
     #[arg(long, value_name = "FILE")]
     candump: Option<PathBuf>,
@@ -217,7 +221,7 @@ impl Demo {
         let place = place.map(|path| format!("SKINBUS_DIR={} ", quoted_os(path.as_os_str())));
         let place = place.filter(|_| kind == BusKind::Embedded).unwrap_or_default();
         options.announced.push(format!("its frames in words: {place}skinbus dump vcan0 --bus-kind {kind}"));
-        let Common { recording, summary, verbose, view, page, .. } = self.common;
+        let Common { recording, summary, verbose, view, listen, .. } = self.common;
         let numbered = self.candump.is_none();
         let path = self.candump.unwrap_or_else(|| DEMO_LOG.into());
         let candump = Some(Candump { path, numbered });
@@ -227,7 +231,7 @@ impl Demo {
         };
         let files = Files { skin: SKIN.to_owned(), scenario: Some(SCENARIO.to_owned()), robot };
         options.record = recording.options(candump, files, &[]);
-        let page = view.then(|| Page::of(&options, &page)).transpose()?;
+        let page = view.then(|| Page::of(&options, listen, &PageOptions::default())).transpose()?;
         bench(&options, (summary.as_deref(), recording.overwrite), verbose, &[], page)
     }
 }
@@ -262,7 +266,7 @@ impl Run {
             note(format_args!("remark: {remark}"));
         }
         let mut options = self.common.options(skin_file, skin, scenario);
-        let Common { recording, summary, verbose, view, page, .. } = self.common;
+        let Common { recording, summary, verbose, view, listen, .. } = self.common;
         options.kinds = self.kinds.of(bus_names(&options.skin))?;
         let candump = self.candump.map(|path| Candump { path, numbered: false });
         let files = Files { skin: skin_text, scenario: scenario_text, robot };
@@ -274,7 +278,7 @@ impl Run {
         let bytes = of_environment("SKINBUS_RECEIVE_BUFFER", 0..=1 << 30)?;
         options.receive_buffer = bytes.unwrap_or(GATEWAY_RECEIVE_BUFFER) as usize;
         options.cells_per_process = self.processes.cells_per_process.into();
-        let page = view.then(|| Page::of(&options, &page)).transpose()?;
+        let page = view.then(|| Page::of(&options, listen, &self.page)).transpose()?;
         bench(&options, (summary.as_deref(), recording.overwrite), verbose, &read, page)
     }
 }

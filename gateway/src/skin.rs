@@ -9,7 +9,7 @@ mod urdf;
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
-use model::generate::{Reply as Answers, Robot, Target, generate};
+use model::generate::{Reply as Answers, Target, generate};
 use protocol::can::Format;
 use protocol::usage::{Failure, print};
 
@@ -17,7 +17,6 @@ use super::arguments::{FORMATS, Word, one_of};
 use super::output::Overwrite;
 pub(crate) use show::drawing;
 
-const ROBOTS: &[Word<Robot>] = &[("ur5", "Universal Robots UR5", Robot::Ur5)];
 const REPLIES: &[Word<Answers>] =
     &[("torque", "Each cell its own torque", Answers::Torque), ("sum", "Sums along the tree", Answers::Sum)];
 
@@ -37,7 +36,7 @@ enum Command {
     Urdf(urdf::Urdf),
 }
 
-/// Describe a skin of hexagonal cells on a robot's arm
+/// Describe a skin of hexagonal cells on the arm of a UR5
 ///
 /// The same options give the same text; its first line is the command that generates it.
 #[derive(Args, Debug)]
@@ -45,9 +44,6 @@ enum Command {
   skinbus skin generate -o skin.toml
   skinbus skin generate --cells 508 --buses 2 --format classic > skin.toml")]
 struct Generate {
-    /// The robot that wears the skin
-    #[arg(long, value_parser = one_of(ROBOTS), default_value = "ur5")]
-    robot: Robot,
     /// How many cells, 1 to 254 a bus
     #[arg(long, default_value_t = 253)]
     cells: usize,
@@ -84,8 +80,8 @@ impl Skin {
 
 impl Generate {
     fn run(self) -> Result<(), Failure> {
-        let Self { robot, cells, buses, broadcast_hz, reply, format, output, overwrite } = self;
-        let target = Target { robot, cells, buses, broadcast_hz, reply, format };
+        let Self { cells, buses, broadcast_hz, reply, format, output, overwrite } = self;
+        let target = Target { cells, buses, broadcast_hz, reply, format, ..Target::default() };
         let text = generate(&target).map_err(Failure::usage)?;
         match output {
             Some(path) => overwrite.write("-o", &path, &text),

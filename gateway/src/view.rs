@@ -95,11 +95,8 @@ pub(crate) struct View {
 }
 
 /// The options of a run's page.
-#[derive(Args, Debug)]
+#[derive(Args, Debug, Default)]
 pub(crate) struct PageOptions {
-    /// The address of the page; else any free port of this machine
-    #[arg(long, value_name = "ADDRESS:PORT", requires = "view")]
-    listen: Option<SocketAddr>,
     /// Write the page's address to this file as well, for scripts: only you can read it, and it goes with the page; - is
     /// standard output
     #[arg(long, value_name = "FILE", requires = "view")]
@@ -293,7 +290,11 @@ pub(crate) struct Page {
 
 impl Page {
     /// Serves the page of a run, whose buses open later; and where it sends what pages want of the run.
-    pub(crate) fn of(run: &run::Options, options: &PageOptions) -> Result<(Self, Lines), Failure> {
+    pub(crate) fn of(
+        run: &run::Options,
+        listen: Option<SocketAddr>,
+        options: &PageOptions,
+    ) -> Result<(Self, Lines), Failure> {
         let run::Options { skin_file, skin, kinds, directory, .. } = run;
         let program = std::env::current_exe().map_err(|error| failed(&error))?;
         let mut command = Command::new(program);
@@ -305,7 +306,7 @@ impl Page {
         if let Some(directory) = directory {
             command.env("SKINBUS_DIR", directory);
         }
-        let listen = options.listen.unwrap_or(LISTEN);
+        let listen = listen.unwrap_or(LISTEN);
         let token = token::needed(token::chosen(options.token_file.as_deref())?, true, listen)?;
         // In its environment only this user can read it, on its command line everybody.
         match &token {

@@ -9,7 +9,7 @@ use robots::{Geometry, Shape, Urdf};
 use trace::files::folder_of;
 
 /// Where the files of packages are.
-#[derive(Args, Clone, Debug)]
+#[derive(Args, Clone, Debug, Default)]
 pub(crate) struct Packages {
     /// Where files are that the URDF names as package://NAME/..., as often as there are packages; else they are searched
     /// for in the folder of the URDF and those above it

@@ -67,7 +67,7 @@ pub enum Stop {
     #[error("{0}")]
     Bus(String),
     /// The cell sends nothing any more.
-    #[error("the cell fell silent: nothing came for 1.5 s")]
+    #[error("the cell fell silent: nothing came for 3 s")]
     Silent,
     /// Somebody else commands cells.
     #[error("{0} was sent by somebody else: stop the gateway that is on this bus")]

@@ -34,7 +34,7 @@ pub(crate) const LINGER: Span = Span::from_millis(5);
 /// What was sent is on the bus by then, whatever else this computer does.
 const ON_BUS: Span = Span::from_millis(1_200);
 /// A cell that sends nothing for so long has fallen silent.
-const SILENT: Span = Span::from_millis(1_500);
+const SILENT: Span = Span::from_millis(3_000);
 
 /// A packet of the cell.
 #[derive(Clone, Copy, Debug)]

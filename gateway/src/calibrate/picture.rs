@@ -10,7 +10,7 @@ use crate::skin::drawing;
 use crate::visuals::Packages;
 
 /// The page: cells where they were found, and a line from where each of them was described.
-pub(super) fn page(file: &Path, skin: &Skin, packages: &Packages, calibration: &Calibration) -> String {
+pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> String {
     let mut found = skin.clone();
     for (cell, result) in found.cells.iter_mut().zip(&calibration.cells) {
         let Some(pose) = result.found.filter(|_| result.is_written()) else { continue };
@@ -19,8 +19,9 @@ pub(super) fn page(file: &Path, skin: &Skin, packages: &Packages, calibration: &
         cell.orientation = Some(pose.orientation);
         cell.normal = [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)];
     }
-    let described = drawing(file, skin, packages);
-    let mut picture = drawing(file, &found, packages);
+    let packages = Packages::default();
+    let described = drawing(file, skin, &packages);
+    let mut picture = drawing(file, &found, &packages);
     for ((cell, old), result) in picture.cells.iter_mut().zip(&described.cells).zip(&calibration.cells) {
         picture.segments.push([old.position, cell.position]);
         let mut detail = |name: &str, value: String| cell.details.push((name.to_owned(), value));

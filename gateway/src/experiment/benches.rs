@@ -20,7 +20,6 @@ use rustix::process::{Pid, Signal, kill_process};
 use serde_json::Value;
 use trace::files::write_whole;
 
-use crate::arguments::Processes;
 use crate::buses;
 
 /// Where benches are run, and with what.
@@ -28,7 +27,6 @@ use crate::buses;
 pub(super) struct Benches {
     /// For their skins, scenarios, recordings and summaries.
     pub(super) folder: PathBuf,
-    pub(super) processes: Processes,
     /// Set when it has to end.
     pub(super) stop: Arc<AtomicBool>,
 }
@@ -60,7 +58,7 @@ impl Benches {
         let text = arm::skin(reply, effort);
         let texts = [text.as_str(), arm::scenario(effort)];
         let buses = buses::directory("experiment")?;
-        let ended = self.perform(&what, &files, texts, self.processes.cells_per_process, buses.path())?;
+        let ended = self.perform(&what, &files, texts, 1, buses.path())?;
         if !ended.status.success() {
             return Err(failed(&what, &last_words(&ended)));
         }

@@ -133,7 +133,8 @@ impl Fit {
             ReceiveEnd::open(&name, kinds.of(&name), None, options)
         };
         let mut receive_ends = self.sources.iter().map(open).collect::<Result<Vec<_>, _>>()?;
-        let end = self.duration.map(|seconds| Instant::now() + Duration::from_secs_f64(seconds));
+        let length = self.duration.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+        let end = length.map(|length| Instant::now() + length);
         let mut ended = Ok(());
         while ended.is_ok() && !stopped.load(Ordering::Relaxed) && end.is_none_or(|end| Instant::now() < end)
         {

@@ -42,10 +42,8 @@ fn verdict(summary: &Summary, look: Look, columns: usize) -> String {
     let look_at = &summary.verdict.look_at;
     let mut lines = Vec::new();
     if summary.verdict.well {
-        let begin = match summary.outcome {
-            Outcome::Interrupted => "all well until it was interrupted: ",
-            _ => "all well: ",
-        };
+        let is_interrupted = summary.outcome == Outcome::Interrupted;
+        let begin = if is_interrupted { "all well until it was interrupted: " } else { "all well: " };
         lines.push(hanging("", &format!("{begin}{}", shown(&summary.sums_of_all())), columns));
     }
     let many = if look.is_verbose { look_at.len() } else { LINES };

@@ -1,5 +1,7 @@
 //! Completions and man pages, as a shell and `man` take them; former names; standard output in the place of a file.
 
+#![allow(clippy::unwrap_used, reason = "a test may stop")]
+
 use std::fs;
 use std::path::Path;
 use std::process::{Command, Output};

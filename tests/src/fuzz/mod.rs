@@ -27,7 +27,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("slcan", frames::slcan),
     ("hosts", frames::hosts),
     ("decoder", frames::decoder),
-    ("fit", frames::shadow),
+    ("shadow", frames::shadow),
     ("candump", files::candump),
     ("capture", files::capture),
     ("recover", files::recover),

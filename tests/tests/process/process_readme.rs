@@ -4,7 +4,6 @@
 use skinbus_tests::process;
 
 use std::fmt::Write as _;
-use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::time::Duration;
@@ -12,7 +11,6 @@ use std::time::Duration;
 use process::{Ended, Place, Running, program};
 
 const README: &str = include_str!("../../../README.md");
-const PICTURE: &str = include_str!("../../../docs/explanation/report-torque.svg");
 /// Programs that `cargo build --release` makes for the user. They are built already, so the build is replaced.
 const PROGRAMS: [&str; 3] = ["skinbus", "cell-node", "vcan-setup"];
 /// The other programs that the commands may use. Nothing else is found.
@@ -116,7 +114,7 @@ fn every_command_does_what_it_should() {
     // Each line of the quoted output begins as a line of the demo's output.
     let quoted = blocks(README).into_iter().find_map(|(_, block)| block.split_once("\nur5-253 ")).unwrap();
     let (verdict, table) = (quoted.0, format!("ur5-253 {}", quoted.1));
-    let demo = printed(&ended, "skinbus demo");
+    let demo = printed(&ended, "cargo build --release && target/release/skinbus demo");
     let said = demo.lines().nth(1).unwrap();
     // What is good and what is not depends on the machine.
     let is_verdict = |line: &str| line.starts_with("all well: 253 cells, 575 of 575 epochs complete, ");
@@ -127,9 +125,6 @@ fn every_command_does_what_it_should() {
         let found = rest.split_once(&format!(" {rank} "));
         rest = found.unwrap_or_else(|| panic!("{rank:?} comes not, or earlier, in\n{demo}")).1;
     }
-    let drawn = fs::read_to_string(place.path("figures/torque-joint2.svg")).unwrap();
-    let head = |svg: &str| svg.lines().take(2).map(str::to_owned).collect::<Vec<_>>();
-    assert_eq!(head(&drawn), head(PICTURE), "the picture in README.md is what the commands draw");
 }
 
 #[test]
@@ -141,7 +136,7 @@ fn commands_in_the_text_are_run_too() {
     let named: Vec<_> = named.collect();
     assert!(named.len() > 2, "{named:?}");
     for span in named {
-        assert!(commands.iter().any(|command| command.starts_with(span)), "no block has `{span}`");
+        assert!(commands.iter().any(|command| command.contains(span)), "no block has `{span}`");
     }
 }
 

@@ -188,8 +188,7 @@ fn replayed(skin: &Skin, before: &[capture::Latched], part: &[Seen]) -> Comparat
     let mut comparator = Comparator::new([(BUS.to_owned(), bus.cells.clone())], part[0].at_nanos, Some(0));
     comparator.record_begin();
     bus.latched.iter().for_each(|message| comparator.record(0, message, false));
-    let selection =
-        Selection { only: Only::Inputs, pick: Default::default(), bus_links: vec![Some(0)], reads: true };
+    let selection = Selection { only: Only::Inputs, bus_links: vec![Some(0)], reads: true };
     let mut replay_plan = ReplayPlan::new(&survey, &selection);
     let mut cells = Cells::of(skin);
     cells.tell(&Message::Report, format, &mut comparator);

@@ -162,9 +162,34 @@ fn hardware_of_a_skin_that_is_a_vcan_is_noted() {
 }
 
 #[test]
+fn a_bus_of_either_kind_that_is_absent_is_made_by_a_run_that_starts_its_cells() {
+    let absent = |no_spawn: bool, heard: Option<Heard>| {
+        about(|facts| {
+            facts.buses = vec![Bus { heard: Ok(heard), ..bus(None) }];
+            facts.no_spawn = no_spawn;
+        })
+    };
+    let text = "there is no interface vcan0";
+    assert_eq!(
+        absent(false, None),
+        [format!(
+            "note: {text}: a run that starts its cells makes an embedded bus; for SocketCAN: | sudo vcan-setup up skin.toml"
+        )]
+    );
+    assert_eq!(
+        absent(true, None),
+        [format!(
+            "fault: {text}, and no embedded bus of this name is served | sudo vcan-setup up skin.toml | vcan-setup serve vcan0 &"
+        )]
+    );
+    assert_eq!(absent(true, Some(Heard::default())).len(), 1, "no cell is heard there");
+}
+
+#[test]
 fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     let missing = |user: User, vcan: Module| {
         about(|facts| {
+            facts.choice = Choice::Only(BusKind::SocketCan);
             facts.buses = vec![bus(None)];
             facts.user = user;
             facts.kernel.vcan = vcan;
@@ -195,11 +220,13 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     let contained = missing(User { root: true, admin: false }, Module::There);
     assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
     let named = about(|facts| {
+        facts.choice = Choice::Only(BusKind::SocketCan);
         facts.buses = vec![Bus { target: Target::named("vcan9"), cells: None, ..bus(None) }];
         facts.user = admin;
     });
     assert_eq!(named, ["fault: there is no interface vcan9 | vcan-setup up vcan9"]);
     let hardware = about(|facts| {
+        facts.choice = Choice::Only(BusKind::SocketCan);
         facts.buses = vec![bus(None)];
         facts.buses[0].target.skin.as_mut().unwrap().rates.bitrate = Some(500_000);
         facts.user = admin;
@@ -277,7 +304,7 @@ fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
     assert_eq!(
         listens(Heard { gateway: true, ..Heard::default() }, false),
         [
-            "fault: another gateway sends joints on vcan0 | pgrep -a gateway  # and stop it, or take another bus"
+            "fault: another gateway sends joints on vcan0 | pgrep -a skinbus  # and stop it, or take another bus"
         ]
     );
     let there = listens(cells(1..=14), false);

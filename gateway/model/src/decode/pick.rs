@@ -238,7 +238,7 @@ mod tests {
         assert_eq!(taken(&[], &["12"]), [0x20C, 0x50C]);
         assert_eq!(taken(&["configure"], &["12", "everyone"]), [0x50C, 0x5FF]);
         assert_eq!(taken(&[], &["gateway"]), [0x000, 0x001, 0x400]);
-        assert_eq!(taken(&[], &["can0:12", "can1:255"]), [0x20C, 0x50C]);
+        assert_eq!(taken(&[], &["can0:12", "can1:everyone"]), [0x20C, 0x50C]);
         assert_eq!(taken(&[], &["can1:12"]), [0_u32; 0]);
         assert_eq!(taken(&["damaged"], &[]), [0_u32; 0]);
         let wire = wire::LinkId { wire: 3, back: true }.frame(wire::PortMessage::Join);

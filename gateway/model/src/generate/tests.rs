@@ -23,7 +23,7 @@ fn wired<'a>(skin: &'a Skin, cell: &'a Cell) -> impl Iterator<Item = &'a Cell> {
 #[test]
 fn the_example_is_what_its_first_line_makes() {
     let example = include_str!("../../../examples/ur5-253.toml");
-    assert!(example.starts_with("# skinbus skin generate --robot ur5 --cells 253\n"));
+    assert!(example.starts_with("# skinbus skin generate --cells 253\n"));
     assert!(generate(&Target::default()).unwrap() == example, "generate it again with that command");
 }
 
@@ -114,7 +114,8 @@ fn the_reply_and_the_format_are_the_requested_ones() {
         robot: Robot::Ur5,
     };
     let text = generate(&target).unwrap();
-    let first = "# skinbus skin generate --robot ur5 --cells 300 --buses 2 --broadcast-hz 50 --reply sum --format classic";
+    let first =
+        "# skinbus skin generate --cells 300 --buses 2 --broadcast-hz 50 --reply sum --format classic";
     assert_eq!(text.lines().next(), Some(first));
     let skin = skin(&target);
     assert_eq!(skin.timing.ticks_per_broadcast, 10);

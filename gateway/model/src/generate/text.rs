@@ -38,7 +38,7 @@ pub(super) fn toml(target: &Target, arm: &Covered) -> String {
     });
     let described = places().flat_map(|(bus, places)| places.iter().zip(1..).map(move |it| cell(bus, it)));
     format!(
-        "# skinbus skin generate --robot {robot} --cells {cells}{options}\n#\n\
+        "# skinbus skin generate --cells {cells}{options}\n#\n\
          # Hexagonal cells, {pitch} mm apart, in rings that are turned by half a cell\n\
          # against each other: {on_upper} around the {upper}, {on_lower} around the {lower}.\n\
          # Ports: 0 and 1 along the ring, 2 to the ring before, 3 to the ring after.\n{cable}\

@@ -149,7 +149,7 @@ fn a_declared_encoding_is_read() {
 }
 
 #[test]
-fn utf_16_is_refused_as_by_ros_with_a_command_that_mends_it() {
+fn utf_16_is_refused_as_by_ros_with_a_command_that_repairs_it() {
     let declared =
         wrap(ARM).replace("<?xml version=\"1.0\"?>", "<?xml version=\"1.0\" encoding=\"UTF-16\"?>");
     for (mark, name) in [("\u{feff}", "utf-16"), ("", "utf-16le")] {

@@ -160,7 +160,8 @@ fn verbose_has_all_rows() {
 
 #[test]
 fn what_is_not_usual_is_shown_without_verbose() {
-    let changes: [(fn(&mut Summary), &str); 11] = [
+    type Change = (fn(&mut Summary), &'static str);
+    let changes: [Change; 11] = [
         (|it| it.control.ticks_skipped = 3, "3 skipped"),
         (|it| it.control.unsent = 1, "frames not sent"),
         (|it| it.control.records_lost = 1, "records of ticks lost"),

@@ -30,6 +30,7 @@ const COMMANDS: &[(&str, i32, &[&str])] = &[
     ("fit @c.log --nominal 1M --data 5M", 0, &[]),
     ("fit @skin.toml", 0, &[]),
     ("check @skin.toml", 0, &[]),
+    ("compare @run.mcap @run.mcap", 0, &[]),
     ("completions bash", 0, &[]),
     ("man @pages", 2, &[]),
     ("skin show @skin.toml -o @skin.html", 0, &["skin.html"]),
