@@ -27,7 +27,7 @@ fn cantools_reads_every_golden_frame_as_its_comment_says_and_writes_it_again() {
     let folder = tempfile::tempdir().unwrap();
     let [skin, dbc] = ["skin.toml", "skin.dbc"].map(|name| folder.path().join(name));
     said(Command::new(program("skinbus")).args(["skin", "generate", "--cells", "254", "-o"]).arg(&skin));
-    said(Command::new(program("skinbus")).arg("dbc").arg(&skin).arg("-o").arg(&dbc));
+    said(Command::new(program("skinbus")).args(["skin", "dbc"]).arg(&skin).arg("-o").arg(&dbc));
     let golden = here.join("../protocol/tests/golden/fd.log");
     let compared = said(Command::new(python).arg(here.join("tools/dbc.py")).arg(&dbc).arg(golden));
     let expected = "halt=1 heard=3 heartbeat=12 joints=8 longer=20 ports=3 read=20 refusal=17 refused=3 report=1 \

@@ -383,7 +383,7 @@ fn who_is_not_root_is_told_so_and_may_look() {
     assert!(said.code == 1 && said.err.starts_with("vcan-setup: not allowed to remove vcan20"), "{said:?}");
     let said = run_as(65_534, "status vcan20");
     assert!(said.code == 0 && said.out.contains("vcan20"), "{said:?}");
-    let said = run_as(65_534, "doctor vcan77");
+    let said = run_as(65_534, "doctor vcan77 --bus-kind socketcan");
     assert!(said.out.contains("fault there is no interface vcan77\n        sudo "), "{said:?}");
     let namespace = run_as(65_534, "up vcan21 --peer vcan22 --namespace /proc/1/ns/net");
     assert!(
@@ -429,7 +429,7 @@ fn status_agrees_with_ip() {
 }
 
 fn doctor(arguments: &str) -> (i32, Vec<String>) {
-    let said = run_as(0, &format!("doctor {arguments} --no-spawn --json"));
+    let said = run_as(0, &format!("doctor {arguments} --bus-kind socketcan --no-spawn --json"));
     let json: Value = serde_json::from_str(&said.out).unwrap();
     assert_eq!(
         (json["bus_kind"].as_str(), json["would_run"].as_bool()),
