@@ -73,6 +73,9 @@ pub(crate) struct Convert {
     skin: Option<PathBuf>,
 }
 
+/// The hint where a capture without an end is refused.
+const WITHOUT_STRICT: &str = "without --strict what is there would be written";
+
 const DIGITS: &[Word<Digits>] = &[("6", "", Digits::Six), ("9", "", Digits::Nine)];
 
 impl Convert {
@@ -162,7 +165,7 @@ impl Convert {
         if let Some(why) = &reader.extras().unfinished {
             let said = format!("{name}: {why}");
             if self.strict {
-                return Err(sink.discard(Failure::run(said)));
+                return Err(sink.discard(Failure::run(format!("{said}; {WITHOUT_STRICT}"))));
             }
             note(said);
         }
@@ -238,7 +241,7 @@ impl Convert {
             return Err(Failure::run(format!("interrupted after {epochs} epochs: {to} is not written")));
         }
         if let Some(why) = reader.extras().unfinished.as_ref().filter(|_| self.strict) {
-            return Err(Failure::run(format!("{name}: {why}")));
+            return Err(Failure::run(format!("{name}: {why}; {WITHOUT_STRICT}")));
         }
         if let Some(whole) = whole {
             whole.finish().map_err(|error| Failure::run(format!("{to}: {error}")))?;

@@ -131,7 +131,10 @@ fn as_capture(file: &Path) -> Option<Failure> {
     };
     let name = file.display();
     Some(match reader.has_frame().ok()? {
-        true => Failure::usage(format!("{name} is a capture ({}), and a skin is needed", format(&reader))),
+        true => Failure::usage(format!(
+            "{name} is a capture ({}), and a skin is needed: name the skin's own file",
+            format(&reader)
+        )),
         false => no_frame(&reader),
     })
 }

@@ -34,6 +34,9 @@ impl Recover {
         if names::is_held(&file) {
             return Err(Failure::usage(format!("{name} is being recorded: wait for the run's end")));
         }
+        if self.output.is_none() && self.file.as_os_str() == "-" {
+            return Err(Failure::usage("-: standard input has no name for a new file: name one with -o"));
+        }
         let output = self.output.unwrap_or_else(|| names::recovered(&names::goal_of(&self.file)));
         let out = output.display();
         apart([("-o", Some(output.as_path()))], [self.file.as_path()])?;

@@ -41,8 +41,12 @@ impl Surface {
 
     fn of(urdf: Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<Self, String> {
         let found = skin.robot.chains.iter().map(|chain| {
-            chain_of(&urdf, chain)
-                .ok_or_else(|| format!("the rows of chain {} are none of {}", chain.name, urdf.file))
+            chain_of(&urdf, chain).ok_or_else(|| {
+                format!(
+                    "{} has no chain with the rows of {}: import the skin from it again",
+                    urdf.file, chain.name
+                )
+            })
         });
         let chains = found.collect::<Result<Vec<_>, _>>()?;
         let visuals = Visuals::new(&urdf, file, packages);

@@ -15,6 +15,16 @@ pub(crate) struct Packages {
     /// for in the folder of the URDF and those above it
     #[arg(long, value_name = "NAME=DIR", value_parser = package)]
     package: Vec<(String, PathBuf)>,
+    /// The command has no such option.
+    #[arg(skip)]
+    only_beside: bool,
+}
+
+impl Packages {
+    /// Those beside the URDF, for a command without the option.
+    pub(crate) fn beside() -> Self {
+        Self { package: Vec::new(), only_beside: true }
+    }
 }
 
 fn package(text: &str) -> Result<(String, PathBuf), String> {
@@ -112,9 +122,12 @@ impl<'a> Visuals<'a> {
             .map_or_else(String::new, |path| path.display().to_string());
         let hint = match given {
             Some((_, folder)) if folder.is_dir() => {
-                format!("{} is not the package, or lacks this file", folder.display())
+                format!("{} is not the package, or lacks this file: correct one of them", folder.display())
             }
             Some((_, folder)) => format!("{} is no folder: correct --package {name}=", folder.display()),
+            None if self.packages.only_beside => {
+                format!("put the folder of package {name} beside the URDF, or above it")
+            }
             None => format!("say where the package is with --package {name}=DIR"),
         };
         Err(format!("mesh {uri}: {shown} is no file: {hint}"))
@@ -147,6 +160,17 @@ fn decoded(path: &str) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_command_without_the_option_does_not_name_it() {
+        let urdf = Urdf::parse("r.urdf", "<robot><link name=\"a\"/></robot>").unwrap();
+        let hint = |packages: &Packages| {
+            Visuals::new(&urdf, Path::new("none/r.urdf"), packages).find("package://p/a.stl").unwrap_err()
+        };
+        assert!(hint(&Packages::default()).ends_with("say where the package is with --package p=DIR"));
+        let beside = hint(&Packages::beside());
+        assert!(beside.ends_with("put the folder of package p beside the URDF, or above it"), "{beside}");
+    }
 
     #[test]
     fn uris_name_files() {

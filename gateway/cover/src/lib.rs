@@ -185,9 +185,7 @@ pub enum CoverError {
     #[error("{0} nodes per bus: it is 1 to {MAX_NODES}; correct it")]
     Nodes(usize),
     /// There are too many links.
-    #[error(
-        "{0} links, at most {MAX_LINKS}: take those far from the skin as not there, with --leave-out LINK,.."
-    )]
+    #[error("{0} links, at most {MAX_LINKS}: add those far from the skin to --leave-out")]
     Links(usize),
     /// A box is of no link, or inside out.
     #[error("keep-out box {index}: {reason}; correct it")]
@@ -220,7 +218,8 @@ pub enum CoverError {
     /// The surface is too large for the pitch.
     #[error(
         "link {link}: {area:.3e} m² of triangles would take {cells:.0} cells at a pitch of {pitch} m, at most {most}; \
-         correct the mesh's scale, or raise the pitch"
+         correct the mesh's scale{}",
+        raised(*.pitch, *.cells, *.most)
     )]
     TooLarge {
         /// The link's name.
@@ -252,6 +251,14 @@ pub fn cover(links: &[Link], others: &[Link], options: &Options) -> Result<Skin,
     }
     let (cells, buses) = wire::wire(&placed, options);
     Ok(Skin { cells, buses, links: figures })
+}
+
+/// Formats the pitch in m that is large enough; nothing where none is.
+fn raised(pitch: f64, cells: f64, most: usize) -> String {
+    let most = u32::try_from(most).map_or(f64::INFINITY, f64::from);
+    // In whole mm, upwards.
+    let needed = (pitch * (cells / most).sqrt() * 1e3).ceil() / 1e3;
+    if needed <= MAX_PITCH { format!(", or raise the pitch to {needed} m") } else { String::new() }
 }
 
 fn check(links: &[Link], others: &[Link], options: &Options) -> Result<(), CoverError> {

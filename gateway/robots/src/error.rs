@@ -141,7 +141,7 @@ pub enum Problem {
     },
     /// A chain of a skin is another one than that of the file.
     #[error(
-        "behind joint {joint:?} it is not where chain {chain:?} of the skin has it: import the skin from this file again, or          correct the rows"
+        "behind joint {joint:?} it is not where chain {chain:?} of the skin has it: import the skin from this file again, or correct the rows"
     )]
     OtherRows {
         /// The joint.
@@ -161,7 +161,7 @@ pub enum Problem {
     },
     /// No joint of the chain moves.
     #[error(
-        "no joint moves between {root:?} and {tip:?}; 1 to {MAX_JOINTS} are needed: choose a link farther out"
+        "no joint moves between {root:?} and {tip:?}; 1 to {MAX_JOINTS} are needed: choose a tip farther out, or a root nearer to the base"
     )]
     NoMovingJoint {
         /// The chain's start.
@@ -193,7 +193,7 @@ pub enum Problem {
     },
     /// A joint of the chain has several degrees of freedom.
     #[error(
-        "joint {joint:?} is {kind}; a chain has revolute, continuous, prismatic and fixed joints: choose a root below it"
+        "joint {joint:?} is {kind}; a chain has revolute, continuous, prismatic and fixed joints: choose a root below it, or a tip above it"
     )]
     Kind {
         /// The joint.

@@ -19,7 +19,7 @@ pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> Strin
         cell.orientation = Some(pose.orientation);
         cell.normal = [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)];
     }
-    let packages = Packages::default();
+    let packages = Packages::beside();
     let described = drawing(file, skin, &packages);
     let mut picture = drawing(file, &found, &packages);
     for ((cell, old), result) in picture.cells.iter_mut().zip(&described.cells).zip(&calibration.cells) {

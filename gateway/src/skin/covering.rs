@@ -108,7 +108,7 @@ impl Covering {
         {
             let file = &urdf.file;
             return Err(Failure::usage(format!(
-                "--cover {bare}: {file} has no visual of this link: add one, or leave the link out"
+                "--cover {bare}: {file} has no visual of this link: add one, or take the link out of --cover"
             )));
         }
         let mut covered = Covered { cells: Vec::new(), figures: Vec::new() };
@@ -165,7 +165,7 @@ impl Covering {
         for (index, name) in self.cover.iter().enumerate() {
             let wrong = |why: String| Failure::usage(format!("--cover {name}: {why}"));
             if self.cover.iter().take(index).any(|before| before == name) {
-                return Err(wrong("this link is named twice".to_owned()));
+                return Err(wrong("this link is named twice: name it once".to_owned()));
             }
             urdf.pose(name, &|_| 0.0).map_err(|error| wrong(error.to_string()))?;
             let owner = chains.iter().position(|chain| chain.link(name).is_ok());
@@ -177,7 +177,7 @@ impl Covering {
             let wrong = |why: String| Failure::usage(format!("--leave-out {name}: {why}"));
             urdf.pose(name, &|_| 0.0).map_err(|error| wrong(error.to_string()))?;
             if self.cover.contains(name) {
-                return Err(wrong("--cover names this link".to_owned()));
+                return Err(wrong("--cover names this link: take it out of one of them".to_owned()));
             }
         }
         if let Some(lost) = self.keep_out.iter().find(|lost| !self.cover.contains(&lost.link)) {
@@ -224,12 +224,13 @@ impl Covering {
 /// Why a link has no cell, in a line.
 fn without_cells(Figures { name, outer_area, kept_out, .. }: &Figures) -> String {
     let why = if *outer_area <= 0.0 {
-        "other links hide it all: leave the link out".to_owned()
+        "other links hide it all: take it out of --cover, or add those to --leave-out".to_owned()
     } else if *kept_out >= 1.0 {
-        "the boxes of --keep-out leave nothing of it: make them smaller, or leave the link out".to_owned()
+        "the boxes of --keep-out leave nothing of it: make them smaller, or take the link out of --cover"
+            .to_owned()
     } else {
         format!(
-            "there is no room for a cell on its {outer_area:.4} m2: lower the pitch, or leave the link out"
+            "there is no room for a cell on its {outer_area:.4} m2: lower the pitch, or take the link out of --cover"
         )
     };
     format!("--cover {name}: {why}")

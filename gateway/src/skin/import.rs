@@ -70,7 +70,7 @@ impl Import {
         if let Some(twice) =
             self.tip.iter().enumerate().find(|(index, tip)| self.tip.iter().take(*index).any(|it| it == *tip))
         {
-            return Err(Failure::usage(format!("--tip {}: this tip is named twice", twice.1)));
+            return Err(Failure::usage(format!("--tip {}: this tip is named twice: name it once", twice.1)));
         }
         let Covered { cells, figures } = match &self.places {
             Some(path) => Covered { cells: cells(path)?, figures: Vec::new() },
@@ -187,7 +187,7 @@ fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
     }
     if cells.is_empty() {
         return Err(Failure::usage(format!(
-            "{file}: there is no cell in it: write a line for each, or leave --cells out"
+            "{file}: there is no cell in it: write a line for each, or leave --places out"
         )));
     }
     Ok(cells)

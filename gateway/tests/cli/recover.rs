@@ -377,7 +377,7 @@ fn what_is_no_recording_is_named() {
     let says = |bytes: &[u8]| recovered(bytes).unwrap_err().to_string();
     assert_eq!(
         says(b"PK\x03\x04 and so on"),
-        "it is no MCAP file: it begins with 50 4b 03 04 20 61 6e 64, an MCAP file with 89 4d 43 41 50"
+        "it is no MCAP file: it begins with 50 4b 03 04 20 61 6e 64, an MCAP file with 89 4d 43 41 50: name a recording"
     );
     assert_eq!(says(b""), "it ends within its first 0 bytes: there is nothing in it");
 }

@@ -114,10 +114,8 @@ fn ascii(name: &str, bytes: &[u8]) -> Result<Vec<Triangle>, MeshError> {
         return Ok(triangles);
     }
     let count = triangles.len();
-    Err(damaged(
-        name,
-        &format!("it ends without endsolid, after {count} triangles; if these are all, add that line"),
-    ))
+    let hint = if count > 0 { "; if these are all, add that line" } else { "" };
+    Err(damaged(name, &format!("it ends without endsolid, after {count} triangles{hint}")))
 }
 
 #[cfg(test)]
@@ -227,6 +225,7 @@ mod tests {
         assert!(refused(last.as_bytes()).contains(
             "it ends without endsolid, after 4 triangles; if these are all, add that line: it is cut off"
         ));
+        assert!(refused(b"solid arm\n").contains("after 0 triangles: it is cut off"));
         assert!(refused(whole.replace("vertex 0 1", "vertx 0 1").as_bytes()).contains("line 5: \"vertx\""));
         let line = "  vertex 2 1 1e1\n";
         assert!(whole.contains(line));

@@ -142,7 +142,7 @@ fn joints_that_a_chain_cannot_have() {
         assert_eq!(
             chain(&joined(kind, ""), "b"),
             format!(
-                "t.urdf:5: joint \"j\" is {kind}; a chain has revolute, continuous, prismatic and fixed joints: choose a root below it"
+                "t.urdf:5: joint \"j\" is {kind}; a chain has revolute, continuous, prismatic and fixed joints: choose a root below it, or a tip above it"
             )
         );
     }
@@ -171,7 +171,7 @@ fn joints_that_a_chain_cannot_have() {
     }
     assert_eq!(
         chain(&joined("fixed", ""), "b"),
-        "t.urdf: no joint moves between \"a\" and \"b\"; 1 to 14 are needed: choose a link farther out"
+        "t.urdf: no joint moves between \"a\" and \"b\"; 1 to 14 are needed: choose a tip farther out, or a root nearer to the base"
     );
     assert_eq!(chain(&joined("fixed", ""), "a"), chain(&joined("fixed", ""), "b").replace("\"b\"", "\"a\""));
 }

@@ -282,7 +282,7 @@ fn a_capture_is_shown_and_another_text_is_named_as_dump_names_it() {
     assert!(
         folder
             .refuses("skin dbc late.log", 2)
-            .ends_with("late.log is a capture (candump log), and a skin is needed")
+            .ends_with("late.log is a capture (candump log), and a skin is needed: name the skin's own file")
     );
     let mut view = folder.gateway("view late.log --skin skin.toml").stderr(Stdio::piped()).spawn().unwrap();
     let said = BufReader::new(view.stderr.take().unwrap()).lines().next().unwrap().unwrap();

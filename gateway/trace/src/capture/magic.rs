@@ -6,12 +6,13 @@ use std::os::unix::fs::FileExt;
 
 use ::mcap::records::op;
 
+use super::text_kinds::ASC;
 use crate::container::{self, read_some};
 
 /// Bytes among which a recording's first record is.
 const BEGINNING: usize = 4 << 10;
 const UNPACK: &str = "unpack it first";
-const EXPORT: &str = "write a candump log with python-can's can_logconvert";
+const EXPORT: &str = "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)";
 
 /// Files that are told by their first bytes. Anything else is text.
 const MAGIC: &[(&[u8], Kind)] = &[
@@ -31,7 +32,7 @@ const MAGIC: &[(&[u8], Kind)] = &[
     (b"LOGG", Kind::Other("a BLF file", EXPORT)),
     (b"MDF  ", MDF),
     (b"UnFinMF ", MDF),
-    (b"date ", Kind::Other("a Vector ASC log", EXPORT)),
+    (b"date ", Kind::Other(ASC.0, ASC.1)),
     (b";$FILEVERSION", TRC),
     (b"\xEF\xBB\xBF;$FILEVERSION", TRC),
     (b"timestamp,", CSV),
@@ -44,7 +45,7 @@ const MAGIC: &[(&[u8], Kind)] = &[
         b"#ROSBAG V",
         Kind::Other(
             "a ROS 1 bag",
-            "make an MCAP of it with `rosbags-convert --src FILE --dst NEW --dst-storage mcap` (pip install rosbags)",
+            "make an MCAP of it with `rosbags-convert --src FILE --dst NEW --dst-storage mcap` (pip install rosbags), and name NEW/NEW.mcap",
         ),
     ),
     (
@@ -52,18 +53,21 @@ const MAGIC: &[(&[u8], Kind)] = &[
         Kind::Other(
             "an SQLite database",
             "of a ROS 2 bag make an MCAP with `rosbags-convert --src FOLDER --dst NEW --dst-storage mcap` (pip install \
-             rosbags), of python-can's a candump log with can_logconvert",
+             rosbags), and name NEW/NEW.mcap; of python-can's a candump log with `can_logconvert FILE NEW.log`",
         ),
     ),
     (b"\xFF\xFE", UTF_16),
     (b"\xFE\xFF", UTF_16),
 ];
 
-const MDF: Kind = Kind::Other("an MDF file", EXPORT);
+const MDF: Kind = Kind::Other(
+    "an MDF file",
+    "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can[mf4])",
+);
 const TRC: Kind = Kind::Other("a PEAK trace", EXPORT);
 const CSV: Kind = Kind::Other(
     "a table in CSV",
-    "python-can's can_logconvert makes a candump log of its own tables; of others write lines like \
+    "`can_logconvert FILE NEW.log` makes a candump log of python-can's tables; of others write lines like \
      `(1700000000.123456) can0 123#00`",
 );
 const PCAP: Kind = Kind::Other(
@@ -71,7 +75,8 @@ const PCAP: Kind = Kind::Other(
     "write lines like `(1700000000.123456) can0 123#00` from what `tshark -T fields -e frame.time_epoch -e can.id \
      -e data.data -r FILE` shows (identifiers are decimal there), or take the capture with `candump -l`",
 );
-const UTF_16: Kind = Kind::Other("text in UTF-16", "save it as UTF-8");
+const UTF_16: Kind =
+    Kind::Other("text in UTF-16", "save it as UTF-8, as with `iconv -f utf-16 -t utf-8 FILE > NEW.log`");
 
 /// What is read as a capture.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -154,6 +159,19 @@ mod tests {
             assert_eq!(kind(magic).0 == Kind::Mcap, *magic == b"\x89MCAP");
             assert_ne!(kind(magic).0, Kind::Text, "{magic:?}");
         }
+    }
+
+    #[test]
+    fn hints_name_a_program_that_reads_the_kind() {
+        let hint = |bytes: &[u8]| match look(&mut Cursor::new(bytes)).unwrap().0 {
+            Kind::Other(_, hint) => hint,
+            other => panic!("{other:?}"),
+        };
+        // can_logconvert makes an empty log of a header that other programs wrote.
+        assert!(hint(b"date Mon Dec 6 11:21:13 am 2021\n").contains("asc2log"));
+        assert!(hint(b"MDF     4.11").contains("python-can[mf4]"));
+        assert!(hint(b"LOGG").contains("can_logconvert FILE NEW.log"));
+        assert!(hint(b"#ROSBAG V2.0").ends_with("name NEW/NEW.mcap"));
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 const EXPORT: &str =
     "no converter of it is known here: export it as a candump log from the program that wrote it";
-const ASC: (&str, &str) =
+pub(super) const ASC: (&str, &str) =
     ("a Vector ASC log", "write a candump log with can-utils' `asc2log -I FILE -O NEW.log`");
 
 /// Names the kind of a text, and what to do with it; `None` for an unknown one.
@@ -18,13 +18,16 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
         (
             any(&|line| line == "BS_:" || line == "NS_ :" || line == "NS_:" || line.starts_with("BO_ "))
                 || begins_with("VERSION \""),
-            ("a DBC file", "it describes signals and holds no frames"),
+            ("a DBC file", "it describes signals and holds no frames: name a capture"),
         ),
         (any(&|line| line.starts_with("base hex") || line.starts_with("base dec")), ASC),
         (any(&|line| line.starts_with("Begin Triggerblock") || line == "// version 7.0.0"), ASC),
         (
             any(&|line| is_trc(&words(line))),
-            ("a PEAK trace", "write a candump log with python-can's can_logconvert"),
+            (
+                "a PEAK trace",
+                "write a candump log with `can_logconvert FILE NEW.log` (pip install python-can)",
+            ),
         ),
         (
             any(&|line| words(line).get(..3).is_some_and(|head| head == ["Time", "ID", "DLC"])),
@@ -57,7 +60,7 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
             is_table(&lines),
             (
                 "a table in CSV",
-                "python-can's can_logconvert makes a candump log of its own tables; of others write lines like \
+                "`can_logconvert FILE NEW.log` makes a candump log of python-can's tables; of others write lines like \
                  `(1700000000.123456) can0 123#00`",
             ),
         ),

@@ -105,7 +105,10 @@ impl fmt::Display for Recovered {
 #[non_exhaustive]
 pub enum RecoverError {
     /// Something else.
-    #[error("it is no MCAP file: it begins with {}, an MCAP file with 89 4d 43 41 50", hex(got))]
+    #[error(
+        "it is no MCAP file: it begins with {}, an MCAP file with 89 4d 43 41 50: name a recording",
+        hex(got)
+    )]
     NoMcap {
         /// Its first bytes.
         got: Vec<u8>,
