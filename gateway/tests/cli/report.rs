@@ -216,7 +216,10 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
     write("words.log", "nothing\n");
     write("empty.log", "");
     for (arguments, said) in [
-        ("other.log", "other.log has no frame of the skin's buses (vcan0): its frames are of can7"),
+        (
+            "other.log",
+            "other.log has no frame of the skin's buses (vcan0): its frames are of can7; name the skin that has them",
+        ),
         (
             "untimed.log",
             "untimed.log has lines without times: a report needs them, as `candump -L` writes them",
@@ -233,6 +236,9 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
         let refused = refuses(&folder, &format!("{arguments} --skin sums.toml -o out.html"), 2);
         assert!(refused.starts_with(said), "{arguments}: {refused}");
     }
+    // The skin would not help.
+    write("a.dbc", "VERSION \"1.0\"\n\nNS_:\n\nBS_:\n");
+    assert!(refuses(&folder, "a.dbc -o out.html", 2).starts_with("a.dbc is a DBC file, "));
     let missing = refuses(&folder, "classic.log --skin nowhere.toml", 2);
     assert!(missing.starts_with("nowhere.toml: "), "{missing}");
     // The skin that it has is the same.

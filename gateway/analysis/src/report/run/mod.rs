@@ -168,13 +168,21 @@ pub fn check(paths: &[PathBuf], options: &Options) -> Result<(), ReportError> {
 
 /// Opens a recording; also how long its files are, if that is known.
 fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), ReportError> {
-    let items = Reader::open_with_others(paths).map_err(ReportError::Open)?;
+    let mut items = Reader::open_with_others(paths).map_err(ReportError::Open)?;
     let name = items.name().to_owned();
     let bytes =
         |path: &PathBuf| path.metadata().ok().filter(std::fs::Metadata::is_file).map(|about| about.len());
     let bytes = paths.iter().map(bytes).sum::<Option<u64>>();
     if items.format() == Format::Candump && (options.skin.is_none() || bytes == Some(0)) {
         let empty = bytes == Some(0);
+        // A text of another kind would be refused with a skin too.
+        if bytes.is_some()
+            && !items.has_frame()?
+            && let Some((kind, hint)) = items.text_kind()
+        {
+            let what = format!("is {kind}, and no candump log or MCAP recording: {hint}");
+            return Err(ReportError::Frames { name, what });
+        }
         return Err(if empty {
             ReportError::Foreign { name, what: "it is empty".to_owned() }
         } else {
@@ -433,7 +441,10 @@ impl Run {
         let buses: Vec<_> = self.skin.buses.iter().map(|bus| bus.name.as_str()).collect();
         Some(match (&self.other_bus, items.text_kind()) {
             (Some(other), _) => {
-                format!("has no frame of the skin's buses ({}): its frames are of {other}", buses.join(", "))
+                format!(
+                    "has no frame of the skin's buses ({}): its frames are of {other}; name the skin that has them",
+                    buses.join(", ")
+                )
             }
             (None, Some((what, hint))) => format!("is {what}, and no candump log or MCAP recording: {hint}"),
             (None, None) => "has no frame in it: a log is what `candump -L` writes".to_owned(),
