@@ -45,7 +45,8 @@ pub(crate) struct Check {
 /// What a file describes.
 enum Described {
     Skin(Box<Skin>),
-    Scenario,
+    /// As its text, until its skin is known.
+    Scenario(String),
 }
 
 impl Check {
@@ -56,7 +57,7 @@ impl Check {
         let named = self.skin.as_deref().map(Skin::read).transpose().map_err(Failure::usage)?;
         let mut skins = described.iter().filter_map(|(_, described)| match described {
             Described::Skin(skin) => Some(&**skin),
-            Described::Scenario => None,
+            Described::Scenario(_) => None,
         });
         let beside = (skins.next(), skins.next());
         let listed = match &self.cell {
@@ -68,13 +69,13 @@ impl Check {
         for (file, described) in &described {
             text += &match described {
                 Described::Skin(skin) => skin::summary(file, skin, listed, self.json)?,
-                Described::Scenario => {
+                Described::Scenario(text) => {
                     let skin = match (&named, beside) {
                         (Some(skin), _) | (None, (Some(skin), None)) => skin,
                         (None, (None, _)) => return Err(ambiguous(file, "no skin is")),
                         (None, (Some(_), Some(_))) => return Err(ambiguous(file, "several skins are")),
                     };
-                    let (text, refusal) = scenario::plan(file, skin, self.json)?;
+                    let (text, refusal) = scenario::plan(file, text, skin, self.json)?;
                     refused = refused.or(refusal);
                     text
                 }
@@ -107,7 +108,7 @@ fn described(file: &Path, has_skin: bool) -> Result<Described, Failure> {
         tables.map(name).any(|name| names.contains(&name.as_str()))
     };
     if !has(&OF_SKINS) && (has(&OF_SCENARIOS) || has_skin) {
-        return Ok(Described::Scenario);
+        return Ok(Described::Scenario(text));
     }
     let skin = Skin::parse(&file.display().to_string(), &text).map_err(Failure::usage)?;
     Ok(Described::Skin(Box::new(skin)))

@@ -11,6 +11,7 @@ use analysis::compare::{Both, Comparison, Options, Report, Which};
 use analysis::explain::NotFound;
 use clap::Args;
 use model::decode::Decoder;
+use protocol::input::{can_be_read_again, is_standard_input};
 use protocol::skin::Skin;
 use protocol::stop;
 use protocol::time::Micros;
@@ -161,7 +162,7 @@ impl Compare {
         let began = Instant::now();
         let read = [&self.a, &self.b].into_iter().chain(&self.skin).map(PathBuf::as_path);
         apart([("--junit", self.junit.as_deref())], read)?;
-        if [&self.a, &self.b].iter().all(|file| is_input(file)) {
+        if [&self.a, &self.b].iter().all(|file| is_standard_input(file)) {
             return Err(Failure::usage(
                 "- and -: standard input is read once: name a file for one of the two",
             ));
@@ -230,7 +231,8 @@ impl Compare {
         let (mut skin, mut name) = (named, self.skin.clone());
         for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
             // A log has none; of standard input it is compared at the end.
-            if !path.is_file() || Reader::open_all(files).map_err(Failure::usage)?.format() == Format::Candump
+            if !can_be_read_again(path)
+                || Reader::open_all(files).map_err(Failure::usage)?.format() == Format::Candump
             {
                 continue;
             }
@@ -281,10 +283,6 @@ impl Compare {
             )))
         })
     }
-}
-
-fn is_input(file: &Path) -> bool {
-    file.as_os_str() == "-"
 }
 
 /// Refuses two skins.

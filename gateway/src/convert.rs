@@ -13,6 +13,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use analysis::explain::series::SeriesError;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use protocol::input::can_be_read_again;
 use protocol::stop::{self, Stoppable};
 use protocol::usage::Failure;
 use trace::capture::convert::{ConvertError, Converted, Origin, Output, Shortened, Target, convert};
@@ -23,7 +24,7 @@ use trace::files::WholeFile;
 use self::live::Live;
 use super::arguments::{Word, one_of};
 use super::input::{captures, no_frame, others, place, skin_for};
-use super::output::{Overwrite, apart, note, refused};
+use super::output::{Overwrite, apart, is_standard_output, note, refused};
 
 /// Lines that cannot be read and are reported; further ones are counted.
 const NAMED: u64 = 100;
@@ -99,14 +100,14 @@ impl Convert {
             )));
         }
         let to = self.to.display();
-        if !is_standard(&self.to) {
+        if !is_standard_output(&self.to) {
             apart([("", Some(self.to.as_path()))], self.from.iter().map(PathBuf::as_path))?;
             self.overwrite.check("", &self.to)?;
             if !text && size(&self.from).is_none() {
                 live::check(&self.to).map_err(|error| refused("", &self.to, &error))?;
             }
         }
-        if is_standard(&self.to) {
+        if is_standard_output(&self.to) {
             self.check_frames()?;
         }
         let (mut reader, bar, live) = self.open()?;
@@ -179,7 +180,7 @@ impl Convert {
 
     /// Sees that files that are read have a frame, before their other lines are written to standard output.
     fn check_frames(&self) -> Result<(), Failure> {
-        if !self.from.iter().all(|file| file.is_file()) {
+        if !self.from.iter().all(|file| can_be_read_again(file)) {
             return Ok(());
         }
         let mut reader = captures(&self.from, |file| Box::new(file))?;
@@ -208,7 +209,7 @@ impl Convert {
 
     /// Tells a file that is created from a FIFO or a device, which is written to as it is.
     fn is_new(&self) -> bool {
-        !is_standard(&self.to) && fs::metadata(&self.to).map_or(true, |there| there.is_file())
+        !is_standard_output(&self.to) && fs::metadata(&self.to).map_or(true, |there| there.is_file())
     }
 
     fn not_written(&self, sink: &Sink, error: io::Error) -> Result<(), Failure> {
@@ -268,7 +269,7 @@ impl Convert {
         &self,
         stopped: &AtomicBool,
     ) -> Result<(Option<WholeFile>, BufWriter<Stoppable<File>>), Failure> {
-        let begun = if is_standard(&self.to) {
+        let begun = if is_standard_output(&self.to) {
             io::stdout().as_fd().try_clone_to_owned().map(|file| (None, file.into()))
         } else {
             WholeFile::create_unless(&self.to, self.overwrite.overwrite, stopped)
@@ -280,7 +281,7 @@ impl Convert {
 
     /// What OUT is to be, by its name.
     fn format(&self) -> Result<Format, Failure> {
-        if is_standard(&self.to) && io::stdout().is_terminal() {
+        if is_standard_output(&self.to) && io::stdout().is_terminal() {
             let why = "standard output is a terminal, and a log may have anything in it";
             return Err(Failure::usage(format!(
                 "-: {why}: pipe it on, name a file, or look at it with `skinbus dump`"
@@ -290,7 +291,7 @@ impl Convert {
         match self.to.extension().and_then(OsStr::to_str) {
             Some("mcap") => Ok(Format::Mcap),
             Some("log" | "txt") => Ok(Format::Candump),
-            _ if is_standard(&self.to) || other => Ok(Format::Candump),
+            _ if is_standard_output(&self.to) || other => Ok(Format::Candump),
             _ => Err(Failure::usage(format!(
                 "{}: a name that ends in .mcap is a recording, in .log or .txt a candump log, in .csv its torques, and - is \
                  standard output",
@@ -298,10 +299,6 @@ impl Convert {
             ))),
         }
     }
-}
-
-fn is_standard(path: &Path) -> bool {
-    path.as_os_str() == "-"
 }
 
 /// How many bytes the input has, when that is known.
@@ -312,7 +309,7 @@ fn size(from: &[PathBuf]) -> Option<u64> {
 
 /// An error of the output, and what is left of that; a closed pipe is none: its reader may have ended, as `head` does.
 fn written(to: &Path, left: &str, error: io::Error) -> Result<(), Failure> {
-    if is_standard(to) {
+    if is_standard_output(to) {
         return protocol::usage::written(Err(error));
     }
     Err(Failure::run(format!("{}: {error}; {left}", to.display())))

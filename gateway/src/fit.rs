@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use protocol::can::Format;
+use protocol::input::can_be_read_again;
 use protocol::usage::Failure;
 use protocol::wire_time::{BitRates, bit_rate};
 use trace::capture::{Format as CaptureFormat, Reader};
@@ -37,7 +38,7 @@ use super::print::list;
   skinbus fit vcan0 vcan1 --duration 10")]
 pub(crate) struct Fit {
     /// A skin's description; a candump log or MCAP recording, all parts of a split recording in any order; or buses; - for
-    /// standard input
+    /// standard input, which is traffic unless an option is for a skin
     #[arg(value_name = "SKIN|FILE|BUS", required = true)]
     sources: Vec<PathBuf>,
     /// The bit rate of identifiers, and of all of classic frames: bit/s, as 1000000, 500k or 1M
@@ -129,8 +130,11 @@ impl Fit {
     }
 }
 
-/// Returns whether a file is a capture, or is none of its kind to be read as a skin either.
+/// Returns whether a file is a capture, or is none of its kind to be read as a skin either. What can be read only once is.
 fn is_capture(file: &Path) -> bool {
+    if !can_be_read_again(file) {
+        return true;
+    }
     let Ok(mut reader) = Reader::open(file) else { return true };
     reader.format() == CaptureFormat::Mcap || reader.has_frame().unwrap_or(true)
 }

@@ -2,7 +2,6 @@
 
 use std::fs::File;
 use std::io::{self, Read};
-use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
@@ -12,12 +11,13 @@ use bench::listen::{self, Listener};
 use bench::signals::caught;
 use protocol::bus::{Bus, BusError, Choice, Options, Received};
 use protocol::can::{self, EXTENDED_MASK};
+use protocol::input::{can_be_read_again, is_standard_input};
 use protocol::skin::{Cell, Skin};
 use protocol::stop;
 use protocol::usage::Failure;
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use signal_hook::consts::{SIGINT, SIGTERM};
-use trace::capture::{CaptureError, Format, Note, NoteKind, ORIGIN, Reader};
+use trace::capture::{CaptureError, DESCRIPTION, Format, Note, NoteKind, ORIGIN, Reader};
 
 use super::output;
 use super::print::{count, some};
@@ -32,7 +32,7 @@ pub(crate) fn stopped() -> Result<Arc<AtomicBool>, Failure> {
 
 /// Whether it is the name of a capture, and not of a bus.
 pub(crate) fn is_file(source: &Path) -> bool {
-    source.as_os_str() == "-" || source.exists()
+    is_standard_input(source) || source.exists()
 }
 
 /// What is neither a file nor a bus that opens.
@@ -65,8 +65,7 @@ pub(crate) fn skin_for(files: &[PathBuf], named: Option<&Path>) -> Result<Skin, 
 
 /// Remarks that a skin is another than the one that a recording has with it, if that is found at its beginning.
 pub(crate) fn remark_another(files: &[PathBuf], path: &Path, skin: &Skin) {
-    // What is read once is not opened twice.
-    if !files.iter().all(|file| file.is_file()) {
+    if !files.iter().all(|file| can_be_read_again(file)) {
         return;
     }
     let Ok(reader) = Reader::open_all(files) else { return };
@@ -108,7 +107,8 @@ pub(crate) fn difference(one: &Skin, other: &Skin) -> Option<(String, String, St
 /// The skin in a file, which is its own or a recording that has it with it.
 pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
     // What is no capture either says so as a skin.
-    let is_recording = file.is_file() && Reader::open(file).is_ok_and(|it| it.format() == Format::Mcap);
+    let is_recording =
+        can_be_read_again(file) && Reader::open(file).is_ok_and(|it| it.format() == Format::Mcap);
     if !is_recording {
         return read_skin(file);
     }
@@ -120,9 +120,9 @@ pub(crate) fn read_skin(file: &Path) -> Result<Skin, Failure> {
     Skin::read(file).map_err(|error| as_capture(file).unwrap_or_else(|| Failure::usage(error)))
 }
 
-/// The error for a capture or another text in the place of a skin; `None` for a file that is called `.toml`.
+/// The error for a capture or another text in the place of a skin; `None` for a description, by its name or by what is in it.
 fn as_capture(file: &Path) -> Option<Failure> {
-    if file.extension().is_some_and(|end| end == "toml") || !file.is_file() {
+    if file.extension().is_some_and(|end| end == "toml") || !can_be_read_again(file) {
         return None;
     }
     let mut reader = match Reader::open(file) {
@@ -135,13 +135,14 @@ fn as_capture(file: &Path) -> Option<Failure> {
             "{name} is a capture ({}), and a skin is needed: name the skin's own file",
             format(&reader)
         )),
+        false if reader.text_kind().is_some_and(|(kind, _)| kind == DESCRIPTION) => return None,
         false => no_frame(&reader),
     })
 }
 
 /// The skin that a recording has with it.
 pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
-    if files.iter().any(|file| file.as_os_str() == "-") {
+    if files.iter().any(|file| is_standard_input(file)) {
         return Err(Failure::usage("standard input is read once: name the skin with --skin"));
     }
     if let Some(pipe) =
@@ -357,13 +358,6 @@ pub(crate) fn captures(
         let caught = || stopped().unwrap_or_else(|_| Arc::clone(stop::flag()));
         through(Interruptible { file, stopped: Arc::clone(flag.get_or_init(caught)) })
     };
-    if let [one] = sources
-        && one.as_os_str() == "-"
-    {
-        let input = io::stdin().as_fd().try_clone_to_owned();
-        let input = input.map_err(|error| Failure::run(format!("standard input: {error}")))?;
-        return Reader::from_read("standard input", interruptible(input.into())).map_err(Failure::usage);
-    }
     Reader::open_through(sources, Box::new(interruptible)).map_err(Failure::usage)
 }
 

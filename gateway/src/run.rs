@@ -17,6 +17,7 @@ use clap::Args;
 use model::scenario::{IDLE, Scenario};
 use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds};
 use protocol::document;
+use protocol::input::can_be_read_again;
 use protocol::skin::Skin;
 use protocol::time::Span;
 use protocol::usage::{Failure, command_line, quoted_os};
@@ -256,7 +257,7 @@ impl Run {
         let read = [Some(self.skin.clone()), self.scenario.clone(), urdf];
         let read: Vec<_> = read.into_iter().flatten().collect();
         // What can be read once only is read by the cells from memory.
-        let (_file, skin_file) = if self.skin.is_file() {
+        let (_file, skin_file) = if can_be_read_again(&self.skin) {
             (None, self.skin)
         } else {
             let (file, path) = in_memory(skin_text.as_bytes()).map_err(Failure::run)?;

@@ -6,19 +6,48 @@ use std::io::{self, Read};
 use std::os::fd::AsFd;
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt};
 use std::path::Path;
+use std::sync::{Mutex, PoisonError};
 
 use rustix::fs::{OFlags, fcntl_getfl, fcntl_setfl};
 
 /// The name of standard input; a file of this name is `./-`.
 pub const STANDARD_INPUT: &str = "-";
 
+/// The descriptors that were opened, of which what was read is gone.
+static TAKEN: Mutex<Vec<u32>> = Mutex::new(Vec::new());
+
+/// Takes a descriptor, the only time that this is possible.
+fn take(descriptor: u32) -> io::Result<()> {
+    let mut taken = TAKEN.lock().unwrap_or_else(PoisonError::into_inner);
+    if taken.contains(&descriptor) {
+        return Err(io::Error::other(
+            "it is read once, and was read already: name a file for one of the two",
+        ));
+    }
+    taken.push(descriptor);
+    Ok(())
+}
+
+/// Returns true for the name of standard input, `-`.
+#[must_use]
+pub fn is_standard_input(path: &Path) -> bool {
+    path == Path::new(STANDARD_INPUT)
+}
+
+/// Returns true for a regular file, which [`open`] opens as often as it is needed; anything else once.
+#[must_use]
+pub fn can_be_read_again(path: &Path) -> bool {
+    !is_standard_input(path) && path.is_file()
+}
+
 /// Opens a regular file for reading, or one of this program's own descriptors (`-`, `/dev/stdin`, and `<(...)` of a shell),
-/// whatever that is. Does not wait.
+/// whatever that is, but only once. Does not wait.
 ///
 /// # Errors
-/// When it is a folder, a named pipe, a socket or a device, or cannot be opened.
+/// When it is a folder, a named pipe, a socket or a device, a descriptor that was opened before, or cannot be opened.
 pub fn open(path: &Path) -> io::Result<File> {
-    if path == Path::new(STANDARD_INPUT) {
+    if is_standard_input(path) {
+        take(0)?;
         return Ok(io::stdin().as_fd().try_clone_to_owned()?.into());
     }
     let flags = (OFlags::NONBLOCK | OFlags::NOCTTY).bits().cast_signed();
@@ -30,9 +59,7 @@ pub fn open(path: &Path) -> io::Result<File> {
     let file = OpenOptions::new().read(true).custom_flags(flags).open(path)?;
     let kind = file.metadata()?.file_type();
     if !kind.is_file() {
-        if own_descriptor(path).is_none() {
-            return Err(refused(kind));
-        }
+        take(own_descriptor(path).ok_or_else(|| refused(kind))?)?;
         fcntl_setfl(&file, fcntl_getfl(&file)? - OFlags::NONBLOCK)?;
     }
     Ok(file)
@@ -114,7 +141,9 @@ mod tests {
     #[test]
     fn a_pipe_of_the_shell_is_read_and_waited_for() {
         let (reader, mut writer) = io::pipe().unwrap();
-        let mut file = open(Path::new(&format!("/dev/fd/{}", reader.as_raw_fd()))).unwrap();
+        let name = format!("/dev/fd/{}", reader.as_raw_fd());
+        let mut file = open(Path::new(&name)).unwrap();
+        assert!(error(Path::new(&name)).starts_with("it is read once, and was read already"));
         let writing = std::thread::spawn(move || {
             std::thread::sleep(std::time::Duration::from_millis(20));
             io::Write::write_all(&mut writer, b"late")

@@ -18,11 +18,16 @@ use crate::print::{count, decimals, json as pretty, list, or, table, words};
 /// Values of a list that are shown one by one.
 const LISTED: usize = 8;
 
-/// Checks a scenario that a file describes for a skin, and says what it will do.
+/// Checks a scenario for a skin, by the text of its file, and says what it will do.
 ///
 /// Returns also why a run would refuse it, if it would: a bench in virtual time may not.
-pub(super) fn plan(file: &Path, skin: &Skin, as_json: bool) -> Result<(String, Option<Failure>), Failure> {
-    let scenario = Description::read(file, skin).map_err(Failure::usage)?;
+pub(super) fn plan(
+    file: &Path,
+    text: &str,
+    skin: &Skin,
+    as_json: bool,
+) -> Result<(String, Option<Failure>), Failure> {
+    let scenario = Description::parse(&file.display().to_string(), text, skin).map_err(Failure::usage)?;
     let refused = RunError::bus_fault(&scenario, skin).map(Failure::usage);
     let plan = Plan::of(&scenario, skin);
     let text = if as_json { pretty(&plan)? } else { plan.text(&file.display().to_string()) };

@@ -4,12 +4,11 @@ use std::path::{Path, PathBuf};
 
 use analysis::compare::{self, Both, Trace};
 use model::decode::Decoder;
+use protocol::input::can_be_read_again;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use protocol::usage::Failure;
 use trace::capture::{Entry, Reader};
-
-use super::is_input;
 
 /// The parts of a recording that follow a file, which are called `run-1.mcap`, `run-2.mcap` behind `run.mcap`.
 pub(super) fn parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
@@ -20,8 +19,7 @@ pub(super) fn parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
         )));
     }
     let mut files = vec![first.to_owned()];
-    // A pipe is read once.
-    if is_input(first) || !first.is_file() {
+    if !can_be_read_again(first) {
         return Ok(files);
     }
     let Some((began, 0)) = part(first) else { return Ok(files) };
@@ -41,7 +39,7 @@ pub(super) fn parts(first: &Path) -> Result<Vec<PathBuf>, Failure> {
 
 /// When a recording began, as it says itself, and which part of it a file is.
 fn part(file: &Path) -> Option<(String, u32)> {
-    let reader = file.is_file().then(|| Reader::open(file).ok()).flatten()?;
+    let reader = can_be_read_again(file).then(|| Reader::open(file).ok()).flatten()?;
     let fact = |record, key| reader.extras().fact(record, key).map(str::to_owned);
     Some((fact("program", "began_ns")?, fact("part", "number")?.parse().ok()?))
 }
@@ -49,7 +47,7 @@ fn part(file: &Path) -> Option<(String, u32)> {
 /// The numbers of the first joints. Captures that began in the middle of a run are read for that, if they can be read twice.
 pub(super) fn starts(files: &Both<Vec<PathBuf>>, skin: &Skin) -> Result<Both<Option<u64>>, Failure> {
     let unknown = Both { a: None, b: None };
-    if ![&files.a, &files.b].iter().all(|files| files.iter().all(|file| file.is_file())) {
+    if ![&files.a, &files.b].iter().all(|files| files.iter().all(|file| can_be_read_again(file))) {
         return Ok(unknown);
     }
     let begins = |files: &[PathBuf]| {

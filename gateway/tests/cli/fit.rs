@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 use serde_json::Value;
 
@@ -106,5 +106,80 @@ fn what_can_does_not_allow_is_refused_in_one_line() {
         let (name, file) = (option.split(' ').next().unwrap(), skin);
         let expected = format!("skinbus: {name} is for traffic, and {file} is a skin: leave it out");
         assert_eq!(refusal(&format!("fit {skin} {option}")), expected);
+    }
+}
+
+/// The output with a file as standard input, as a pipe gives it.
+fn piped(text: &str, arguments: &str) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_skinbus"));
+    command.args(arguments.split_whitespace()).env("NO_COLOR", "1");
+    let mut child =
+        command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut stdin = child.stdin.take().unwrap();
+    let writing = std::thread::spawn({
+        let text = text.to_owned();
+        // One that is refused early closes it.
+        move || drop(std::io::Write::write_all(&mut stdin, text.as_bytes()))
+    });
+    let output = child.wait_with_output().unwrap();
+    writing.join().unwrap();
+    output
+}
+
+#[test]
+fn a_pipe_gives_what_a_file_gives() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    // More than a reader takes at once.
+    let log: String = (0..3_000).map(|at| format!("({at}.000000) can0 123#00\n")).collect();
+    let skin = output("skin generate --cells 90");
+    let scenario = "duration_s = 4.0\n[[touch]]\nat_s = 1.0\nfor_s = 1.0\ncells = [3]\nforce_n = 1.0\n";
+    for (name, text) in [("run.log", log.as_str()), ("skin", &skin), ("touches", scenario)] {
+        std::fs::write(path(name), text).unwrap();
+    }
+    for (name, text, command) in [
+        ("run.log", log.as_str(), "fit FILE --json"),
+        ("skin", &skin, "fit FILE --table --json"),
+        ("skin", &skin, "check FILE --json"),
+        ("touches", scenario, &format!("check FILE --skin {} --json", path("skin"))),
+    ] {
+        let of_file = output(&command.replace("FILE", &path(name)));
+        for input in ["-", "/dev/stdin"] {
+            let command = command.replace("FILE", input);
+            let Output { status, stdout, stderr } = piped(text, &command);
+            let said = String::from_utf8(stderr).unwrap();
+            assert_eq!((status.code(), said.as_str()), (Some(0), ""), "{command}");
+            let is_equal = String::from_utf8(stdout).unwrap() == of_file.replace(&path(name), input);
+            assert!(is_equal, "{command}");
+        }
+    }
+}
+
+#[test]
+fn standard_input_is_read_for_one_thing() {
+    let skin = output("skin generate --cells 3");
+    for command in
+        ["check - -", "check - /dev/stdin", "run - --scenario -", "run /dev/stdin --scenario - --duration 1"]
+    {
+        let Output { status, stderr, .. } = piped(&skin, command);
+        let said = String::from_utf8(stderr).unwrap();
+        let expected = "it is read once, and was read already: name a file for one of the two\n";
+        assert_eq!((status.code(), said.contains(expected)), (Some(2), true), "{command}: {said}");
+    }
+    let Output { status, stderr, .. } = piped(&skin, "fit -");
+    let said = String::from_utf8(stderr).unwrap();
+    assert_eq!(status.code(), Some(2), "{said}");
+    assert!(said.starts_with("skinbus: standard input is a skin or a scenario, "), "{said}");
+}
+
+#[test]
+fn what_is_wrong_with_a_skin_is_said_whatever_its_name_is() {
+    let folder = tempfile::tempdir().unwrap();
+    let wrong = output("skin generate --cells 3").replace("[timing]", "[timing]\nfast = true");
+    for name in ["skin.toml", "skin.txt"] {
+        let path = folder.path().join(name).display().to_string();
+        std::fs::write(&path, &wrong).unwrap();
+        let said = refusal(&format!("fit {path} --table"));
+        assert!(said.starts_with(&format!("skinbus: {path}:")) && said.contains("fast"), "{said}");
     }
 }

@@ -37,6 +37,7 @@ use std::time::Duration;
 
 use protocol::bus::Kinds;
 use protocol::id::CellId;
+use protocol::input::is_standard_input;
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
 use self::checks::Checks;
@@ -146,7 +147,7 @@ pub fn replay(options: &Options) -> Result<Summary, ReplayError> {
 
 /// Reads the capture once, from end to end; also what it is called.
 fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extras, String), ReplayError> {
-    if options.files.iter().any(|file| file.as_os_str() == "-") {
+    if options.files.iter().any(|file| is_standard_input(file)) {
         return Err(ReplayError::StandardInput);
     }
     let is_pipe = |file: &&PathBuf| file.metadata().is_ok_and(|it| !it.is_file() && !it.is_dir());

@@ -29,6 +29,7 @@ pub(crate) use mcap::is_foreign_frame;
 pub use parts::{Part, PartsError};
 pub use places::{Place, Places};
 pub use reader::{Format, Reader};
+pub use text_kinds::DESCRIPTION;
 
 pub use crate::note::{BusNote, Note, NoteKind};
 

@@ -163,10 +163,11 @@ impl Reader {
 
     fn open_parts(paths: &[PathBuf], through: Through, others: bool) -> Result<Self, CaptureError> {
         if let [one] = paths
-            && is_input(one)
+            && input::is_standard_input(one)
         {
             let name = "standard input".to_owned();
-            let source = Source::begin(&name, io::stdin(), State::new(others, None), None)?;
+            let file = input::open(one).map_err(|source| CaptureError::Io { name: name.clone(), source })?;
+            let source = Source::begin(&name, through(file), State::new(others, None), None)?;
             return Ok(Self::begin(name.clone(), (name, source), VecDeque::new(), through, others));
         }
         let ordered = Self::ordered(paths)?;
@@ -182,8 +183,7 @@ impl Reader {
     /// cannot be read report that when they are.
     fn survey<'a>(paths: impl Iterator<Item = &'a PathBuf> + Clone) -> Buses {
         let recording = |path: &&PathBuf| {
-            // A pipe is not opened twice.
-            let mut file = path.is_file().then(|| File::open(path).ok()).flatten()?;
+            let mut file = input::can_be_read_again(path).then(|| File::open(path).ok()).flatten()?;
             is_mcap(&mut file).is_ok_and(|is| is).then_some(file)
         };
         let mut survey = Survey::default();
@@ -202,7 +202,7 @@ impl Reader {
         if let [] | [_] = paths {
             return Ok(paths.to_vec());
         }
-        let named = |path: &PathBuf| match is_input(path) {
+        let named = |path: &PathBuf| match input::is_standard_input(path) {
             true => Err(CaptureError::from(PartsError::StandardInput)),
             false => {
                 let mut reader = Self::open(path)?;
@@ -479,10 +479,6 @@ impl Reader {
             Source::Mcap(mcap) => mcap.extras(),
         }
     }
-}
-
-fn is_input(path: &Path) -> bool {
-    path.as_os_str() == "-"
 }
 
 /// Files as they are.

@@ -5,6 +5,12 @@ const EXPORT: &str =
 pub(super) const ASC: (&str, &str) =
     ("a Vector ASC log", "write a candump log with can-utils' `asc2log -I FILE -O NEW.log`");
 
+/// The kind of a skin or a scenario.
+pub const DESCRIPTION: &str = "a skin or a scenario";
+/// Tables that skins and scenarios have, and other files hardly.
+const TABLES: [&str; 7] =
+    ["[robot]", "[[chain]]", "[[bus]]", "[[cell]]", "[motion]", "[[touch]]", "[[fault]]"];
+
 /// Names the kind of a text, and what to do with it; `None` for an unknown one.
 pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
     let text = String::from_utf8_lossy(text);
@@ -13,8 +19,12 @@ pub(super) fn kind_of(text: &[u8]) -> Option<(&'static str, &'static str)> {
     let all = |is: &dyn Fn(&str) -> bool| !lines.is_empty() && lines.iter().all(|line| is(line));
     let words = |line: &str| line.split_whitespace().map(str::to_owned).collect::<Vec<_>>();
     let begins_with = |begin: &'static str| any(&|line| line.starts_with(begin));
-    let kinds: [(bool, (&'static str, &'static str)); 15] = [
+    let kinds: [(bool, (&'static str, &'static str)); 16] = [
         (begins_with("***BUSMASTER"), ("a BUSMASTER log", EXPORT)),
+        (
+            any(&|line| TABLES.iter().any(|table| line.starts_with(table))),
+            (DESCRIPTION, "there are no frames in it: name a capture"),
+        ),
         (
             any(&|line| line == "BS_:" || line == "NS_ :" || line == "NS_:" || line.starts_with("BO_ "))
                 || begins_with("VERSION \""),
@@ -141,6 +151,8 @@ mod tests {
                 "Time   ID     DLC Data                    Comment\r\n00,000 00D00422 8 00 \r\n",
                 "a CANHacker trace",
             ),
+            ("# a skin\nname = \"arm\"\n\n[robot]\nname = \"UR5\"\n", DESCRIPTION),
+            ("duration_s = 4.0\n[[touch]] # one\ncells = [3]\n", DESCRIPTION),
             (";  Start time: 10.05.2016\n     1)      1841  0001  8  00 00 00\n", "a PEAK trace"),
             ("1) 2.5 Rx 0300 7 00 00\n", "a PEAK trace"),
             ("# Logger type: 29\n# HW rev: 00.01\nTimestamp ID Data\n", "a CSS Electronics CLX000 log"),
@@ -163,7 +175,14 @@ mod tests {
 
     #[test]
     fn words_are_no_kind() {
-        for text in ["", "# a comment\n", "hello\nthis is noise\n", "a, b, c\nd\n", "\u{1b}[31m\0\n"] {
+        for text in [
+            "",
+            "# a comment\n",
+            "hello\nthis is noise\n",
+            "a, b, c\nd\n",
+            "\u{1b}[31m\0\n",
+            "[[test]]\nname = \"a\"\n",
+        ] {
             assert_eq!(kind_of(text.as_bytes()), None, "{text}");
         }
     }
