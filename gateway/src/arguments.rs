@@ -1,13 +1,11 @@
 //! Arguments that several commands share, and how words become values.
 
-use std::fmt;
 use std::ops::RangeInclusive;
 
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use protocol::bus::{Choice, Kinds, OneKind};
 use protocol::can::Format;
-use protocol::id::CellId;
 use protocol::skin::{CellName, Skin};
 use protocol::usage::Failure;
 
@@ -56,7 +54,7 @@ pub(crate) fn nanos(text: &str) -> Result<u64, String> {
     nanos.ok_or_else(|| "a time from 0 s to 1e9 s (10, 500ms, 90s, 10min, 2h)".to_owned())
 }
 
-/// Of which kinds several buses are.
+/// The kinds of several buses.
 #[derive(Args, Clone, Debug)]
 pub(crate) struct BusKinds {
     /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus; for one bus of
@@ -113,64 +111,31 @@ pub(crate) fn bus_of(skin: &Skin, file: &str, name: &str) -> Result<usize, Failu
     })
 }
 
-/// A cell as given: on a bus, or on the only bus that has it.
-#[derive(Clone, Debug)]
-pub(crate) struct Named {
-    /// Its bus, if that is said.
-    pub(crate) bus: Option<String>,
-    /// Its node id there.
-    pub(crate) node: CellId,
-}
-
-/// Parses a cell: its node id, or BUS:NODE.
-pub(crate) fn cell(text: &str) -> Result<Named, String> {
-    let CellName { bus, node } = text.parse()?;
-    Ok(Named { bus, node })
-}
-
-/// Parses a node id.
-pub(crate) fn node(text: &str) -> Result<CellId, String> {
-    let number = text.parse().ok().and_then(|number| CellId::new(number).ok());
-    number.ok_or_else(|| format!("{text:?} is no node id: 1 to 254 are"))
-}
-
-impl fmt::Display for Named {
-    /// As it was given.
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if let Some(bus) = &self.bus {
-            write!(f, "{bus}:")?;
-        }
-        self.node.fmt(f)
+/// Finds the only cell of a name: its index into [`Skin::cells`]; `option` names it in errors.
+pub(crate) fn cell_of(skin: &Skin, name: &CellName, option: &str) -> Result<usize, Failure> {
+    let CellName { bus, node } = name;
+    let names = || list(bus_names(skin));
+    if bus.as_ref().is_some_and(|bus| skin.bus_named(bus).is_none()) {
+        return Err(Failure::usage(format!("{option} {name}: the skin's buses are {}", names())));
     }
-}
-
-impl Named {
-    /// The cell's index into [`Skin::cells`]; `option` names it in errors.
-    pub(crate) fn find(&self, skin: &Skin, option: &str) -> Result<usize, Failure> {
-        let Self { bus, node } = self;
-        let names = || list(bus_names(skin));
-        if bus.as_ref().is_some_and(|bus| skin.bus_named(bus).is_none()) {
-            return Err(Failure::usage(format!("{option} {self}: the skin's buses are {}", names())));
-        }
-        let on = |name: &str| bus.as_ref().is_none_or(|bus| bus == name);
-        let there: Vec<_> = skin
-            .cells
-            .iter()
-            .enumerate()
-            .filter(|(_, cell)| cell.node == *node)
-            .filter_map(|(index, cell)| Some((index, skin.buses.get(cell.bus)?)))
-            .filter(|(_, bus)| on(&bus.name))
-            .collect();
-        match there.as_slice() {
-            [(index, _)] => Ok(*index),
-            [] => Err(Failure::usage(format!(
-                "{option} {node}: the skin has no such cell on {}",
-                bus.clone().unwrap_or_else(names)
-            ))),
-            buses => {
-                let choices = list(buses.iter().map(|(_, bus)| format!("{}:{node}", bus.name)));
-                Err(Failure::usage(format!("{option} {node} is on several buses: choose one of {choices}")))
-            }
+    let there: Vec<_> = skin
+        .cells
+        .iter()
+        .enumerate()
+        .filter_map(|(index, cell)| {
+            let bus = skin.buses.get(cell.bus)?;
+            name.fits(&bus.name, cell.node).then_some((index, bus))
+        })
+        .collect();
+    match there.as_slice() {
+        [(index, _)] => Ok(*index),
+        [] => Err(Failure::usage(format!(
+            "{option} {node}: the skin has no such cell on {}",
+            bus.clone().unwrap_or_else(names)
+        ))),
+        buses => {
+            let choices = list(buses.iter().map(|(_, bus)| format!("{}:{node}", bus.name)));
+            Err(Failure::usage(format!("{option} {node} is on several buses: choose one of {choices}")))
         }
     }
 }

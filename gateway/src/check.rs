@@ -7,11 +7,10 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use protocol::document;
-use protocol::skin::Skin;
+use protocol::skin::{CellName, Skin};
 use protocol::usage::{Failure, print};
 
 use self::skin::Listed;
-use super::arguments::{Named, cell};
 
 /// Check skins and scenarios, and say what they describe
 ///
@@ -35,8 +34,8 @@ pub(crate) struct Check {
     #[arg(long)]
     list: bool,
     /// List this cell alone
-    #[arg(long, value_name = "[BUS:]NODE", value_parser = cell, conflicts_with = "list")]
-    cell: Option<Named>,
+    #[arg(long, value_name = "[BUS:]NODE", conflicts_with = "list")]
+    cell: Option<CellName>,
     /// One JSON object for each file; numbers have the names of the files' keys
     #[arg(long, short)]
     json: bool,

@@ -25,7 +25,7 @@ use super::input::{captures, difference, format, no_frame, place, skin_of};
 use super::output::{self, Overwrite, apart, print_beside};
 use super::print::{count, json};
 
-/// Compare two recordings or logs of one skin, epoch by epoch: joints, torques, sums, contacts, cells
+/// Compare two recordings or logs of one skin, epoch by epoch
 ///
 /// Joints and their replies are aligned by the number of their epoch. What one run has before the other begins or after it
 /// ends is not compared, and said. Times from joints to replies, late replies and lost packets are shown beside each other

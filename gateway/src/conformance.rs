@@ -13,11 +13,12 @@ use conformance::live::Live;
 use conformance::survey::Survey;
 use conformance::{Saved, Session};
 use protocol::can::Format;
+use protocol::skin::CellName;
 use protocol::time::Span;
 use protocol::usage::Failure;
 
 use self::show::Whole;
-use super::arguments::{BusKinds, FORMATS, Named, cell, one_of};
+use super::arguments::{BusKinds, FORMATS, one_of};
 use super::output::{Overwrite, print_beside};
 use super::{input, output};
 
@@ -41,8 +42,8 @@ pub(crate) struct Conformance {
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
     /// The cell
-    #[arg(long, value_name = "[BUS:]NODE", value_parser = cell)]
-    cell: Named,
+    #[arg(long, value_name = "[BUS:]NODE")]
+    cell: CellName,
     #[command(flatten)]
     kinds: BusKinds,
     /// The frame format of the bus [default: that of the cell's heartbeats]

@@ -156,11 +156,8 @@ impl Dump {
             // Signals are caught before it reports that it listens.
             let stopped = stopped()?;
             let kinds = self.kinds.of_any()?;
-            let open = |source: &PathBuf| {
-                let name = source.display().to_string();
-                ReceiveEnd::open(&name, kinds.of(&name), self.format, Options::default())
-            };
-            let mut receive_ends = self.sources.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+            let mut receive_ends =
+                input::receive_ends(&self.sources, &kinds, self.format, &Options::default())?;
             ("live", None, live(&mut receive_ends, &mut show, self.to, &stopped))
         };
         written(show.finish().and_then(|()| show.flush()))?;

@@ -5,15 +5,16 @@ mod torque;
 
 use std::path::PathBuf;
 
-use analysis::explain::{Explanation, Requested, explain, find};
+use analysis::explain::{CellExplained, Explanation, Requested, explain, find};
 use clap::Args;
+use protocol::id::CellId;
 use protocol::packet::Epoch;
-use protocol::skin::Skin;
+use protocol::skin::{CellName, Skin};
 use protocol::usage::{Failure, print};
 use serde::Serialize;
 use trace::capture::Reader;
 
-use super::arguments::{Named, cell, nanos};
+use super::arguments::{cell_of, nanos};
 use super::input::{no_frame, remark_another, skin_of};
 use super::output;
 use super::print::json;
@@ -55,8 +56,8 @@ pub(crate) struct Explain {
     #[arg(long, value_name = "K", default_value_t = 1, conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u32).range(1..))]
     occurrence: u32,
     /// One cell in every step
-    #[arg(long, value_name = "[BUS:]NODE", value_parser = cell)]
-    cell: Option<Named>,
+    #[arg(long, value_name = "[BUS:]NODE")]
+    cell: Option<CellName>,
     /// One joint, cell by cell
     #[arg(long, value_name = "J", conflicts_with_all = ["force", "batch"], value_parser = clap::value_parser!(u8).range(1..=32))]
     joint: Option<u8>,
@@ -114,10 +115,10 @@ impl Explain {
         }
         let mut explanation = explain(&skin, &moments);
         if let Some(target) = &self.cell {
-            let named = |bus: &str, node: u8| {
-                node == target.node.get() && target.bus.as_ref().is_none_or(|target| target == bus)
+            let is_named = |cell: &CellExplained| {
+                CellId::new(cell.node.into()).is_ok_and(|node| target.fits(&cell.bus, node))
             };
-            explanation.cells.retain(|cell| named(&cell.bus, cell.node));
+            explanation.cells.retain(is_named);
         }
         if let Some(joint) = self.joint {
             for cell in &mut explanation.cells {
@@ -146,6 +147,6 @@ impl Explain {
                 skin.robot.name
             )));
         }
-        self.cell.as_ref().map_or(Ok(()), |cell| cell.find(skin, "--cell").map(|_| ()))
+        self.cell.as_ref().map_or(Ok(()), |cell| cell_of(skin, cell, "--cell").map(|_| ()))
     }
 }

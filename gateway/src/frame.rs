@@ -22,7 +22,7 @@ use protocol::usage::{Failure, print};
 use super::arguments::{BusKinds, FORMATS, bus_of, one_of};
 use super::output;
 use super::print::list;
-use packets::{Addressee, What};
+use packets::{What, only_cell};
 
 /// Cells that are there send a heartbeat within this time, and answers.
 const ANSWER: Duration = Duration::from_secs(1);
@@ -112,7 +112,7 @@ impl Frame {
 
     /// Sends it on a bus, and waits for what it makes cells answer.
     fn send(&self, bus: Bus, format: Format, message: &Message) -> Result<(), Failure> {
-        let (name, only) = (bus.name().to_owned(), self.what.to().and_then(Addressee::cell));
+        let (name, only) = (bus.name().to_owned(), self.what.to().and_then(only_cell));
         if let What::Sensing(switch) = &self.what {
             return switch.send(bus, format);
         }

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use bench::listen::{self, Listener};
 use bench::signals::caught;
-use protocol::bus::{Bus, BusError, Choice, Options, Received};
+use protocol::bus::{Bus, BusError, Choice, Kinds, Options, Received};
 use protocol::can::{self, EXTENDED_MASK};
 use protocol::input::{can_be_read_again, is_standard_input};
 use protocol::skin::{Cell, Skin};
@@ -286,9 +286,20 @@ pub(crate) struct ReceiveEnd {
     is_down: bool,
 }
 
+/// Opens each of several buses, as [`ReceiveEnd::open`] does.
+pub(crate) fn receive_ends(
+    sources: &[PathBuf],
+    kinds: &Kinds,
+    format: Option<can::Format>,
+    options: &Options,
+) -> Result<Vec<ReceiveEnd>, Failure> {
+    let names = sources.iter().map(|source| source.display().to_string());
+    names.map(|name| ReceiveEnd::open(&name, kinds.of(&name), format, options.clone())).collect()
+}
+
 impl ReceiveEnd {
     /// Opens a bus to receive all of it, and reports its kind; with `None` a classic interface too.
-    pub(crate) fn open(
+    fn open(
         name: &str,
         kind: Choice,
         format: Option<can::Format>,

@@ -53,13 +53,17 @@ pub(crate) fn print_beside<'a>(
     print(text)
 }
 
-/// Prints a table, in colours where standard output takes them; else as [`print_beside`].
+/// Prints a table, as [`print_beside`], in colours where standard output takes them.
 pub(crate) fn print_table<'a>(
     files: impl IntoIterator<Item = Option<&'a Path>>,
     text: impl FnOnce(bool) -> String,
 ) -> Result<(), Failure> {
+    let mut files = files.into_iter();
+    if let Some(file) = files.find(|file| file.is_some_and(is_standard_output)) {
+        return print_beside([file], &text(false));
+    }
     if !is_coloured(&io::stdout()) {
-        return print_beside(files, &text(false));
+        return print(&text(false));
     }
     // A terminal is in place of a file too: its colours do no harm. Names in the text are escaped already.
     draw(&text(true))

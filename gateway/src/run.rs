@@ -18,12 +18,12 @@ use model::scenario::{IDLE, Scenario};
 use protocol::bus::{BusKind, Choice, GATEWAY_RECEIVE_BUFFER, Kinds};
 use protocol::document;
 use protocol::input::can_be_read_again;
-use protocol::skin::Skin;
+use protocol::skin::{CellName, Skin};
 use protocol::time::Span;
 use protocol::usage::{Failure, command_line, quoted_os};
 use trace::recording::series::{Attached, Split};
 
-use super::arguments::{BusKinds, Named, Processes, bus_names, cell, of_environment, seconds, time};
+use super::arguments::{BusKinds, Processes, bus_names, cell_of, of_environment, seconds, time};
 use super::buses;
 use super::output::{self, Overwrite, apart, note, print_table};
 use super::print::json;
@@ -195,8 +195,14 @@ pub(crate) struct Run {
     firmware: Option<PathBuf>,
     /// Cells that run the firmware in QEMU instead of a process, by node id or as BUS:NODE. They are commissioned, keep
     /// their flash in files as other cells do, and end with the run
-    #[arg(long, value_name = "[BUS:]N,...", requires = "firmware", conflicts_with = "no_spawn", value_delimiter = ',', value_parser = cell)]
-    emulate: Vec<Named>,
+    #[arg(
+        long,
+        value_name = "[BUS:]N,...",
+        requires = "firmware",
+        conflicts_with = "no_spawn",
+        value_delimiter = ','
+    )]
+    emulate: Vec<CellName>,
 }
 
 impl Demo {
@@ -285,11 +291,11 @@ impl Run {
 }
 
 /// The cells that are emulated, by which firmware.
-fn emulated(firmware: Option<PathBuf>, named: &[Named], skin: &Skin) -> Result<Option<Emulated>, Failure> {
+fn emulated(firmware: Option<PathBuf>, named: &[CellName], skin: &Skin) -> Result<Option<Emulated>, Failure> {
     let Some(firmware) = firmware else { return Ok(None) };
     let mut cells = Vec::new();
     for named in named {
-        let cell = named.find(skin, "--emulate")?;
+        let cell = cell_of(skin, named, "--emulate")?;
         if cells.contains(&cell) {
             return Err(Failure::usage(format!("--emulate {named} is there twice: name each cell once")));
         }

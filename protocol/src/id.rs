@@ -23,6 +23,11 @@ pub struct CellIdOutOfRange {
     pub got: i64,
 }
 
+/// A text that is no node id of a cell.
+#[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
+#[error("a node id is needed, 1 to 254")]
+pub struct NoNodeId;
+
 impl CellId {
     /// The largest node id of a cell.
     pub const MAX: Self = Self(254);
@@ -55,6 +60,15 @@ impl CellId {
     /// All node ids of cells, in order.
     pub fn all() -> impl Iterator<Item = Self> {
         (1..=Self::MAX.0).map(Self)
+    }
+}
+
+impl core::str::FromStr for CellId {
+    type Err = NoNodeId;
+
+    /// Parses a node id in decimal digits.
+    fn from_str(text: &str) -> Result<Self, NoNodeId> {
+        text.parse().ok().and_then(|number| Self::new(number).ok()).ok_or(NoNodeId)
     }
 }
 

@@ -11,6 +11,7 @@ use serde::Serialize;
 
 pub use self::cells::{CellSummary, RepliesSummary};
 pub use self::outcome::{CellError, ErrorCells, Halted, Outcome, TickBefore, cells_in_error};
+pub(crate) use self::verdict::many;
 pub use self::verdict::{CELL_ERROR_NM, Verdict};
 use model::quantiles::Quantiles;
 use model::table::{Accuracy, Contributions, Event, Status, SumCounts, Table};

@@ -6,11 +6,11 @@ use std::path::Path;
 
 use protocol::fixed::TorqueFormat;
 use protocol::packet::crc16;
-use protocol::skin::{Cell, ControllerKind, Reply, Skin};
+use protocol::skin::{Cell, CellName, ControllerKind, Reply, Skin};
 use protocol::usage::{Failure, shown};
 use serde_json::{Value, json};
 
-use crate::arguments::{Named, bus_names};
+use crate::arguments::bus_names;
 use crate::print::{count, list, or, words};
 use crate::robot_file::{RobotOfSkin, urdf_of};
 
@@ -20,7 +20,7 @@ pub(super) enum Listed<'a> {
     None,
     All,
     /// This one instead of the summary.
-    Only(&'a Named),
+    Only(&'a CellName),
 }
 
 /// Checks a skin that a file describes and its URDF, as a run that records does, and summarises it.
@@ -36,9 +36,7 @@ pub(super) fn summary(
     let is_listed = |cell: &&Cell| match listed {
         Listed::None => false,
         Listed::All => true,
-        Listed::Only(Named { bus, node }) => {
-            cell.node == *node && bus.as_deref().is_none_or(|bus| bus == bus_name(skin, cell))
-        }
+        Listed::Only(named) => named.fits(bus_name(skin, cell), cell.node),
     };
     let cells: Vec<_> = skin.cells.iter().filter(is_listed).collect();
     if let Listed::Only(named) = listed

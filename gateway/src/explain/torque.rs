@@ -9,12 +9,12 @@ use model::scenario::MAX_FORCE_N;
 use protocol::document;
 use protocol::fixed::{Q1_14, is_saturated};
 use protocol::parameters::MAX_JOINTS;
-use protocol::skin::{JointKind, Skin};
+use protocol::skin::{CellName, JointKind, Skin};
 use protocol::usage::{Failure, print};
 use reference::Reference;
 use serde::Serialize;
 
-use crate::arguments::{Named, cell};
+use crate::arguments::cell_of;
 use crate::columns::{Columns, Table};
 use crate::input::skin_in;
 use crate::print::{count, json_line, table};
@@ -57,7 +57,7 @@ impl Given {
     pub(super) fn compute(
         &self,
         files: &[PathBuf],
-        cell: Option<&Named>,
+        cell: Option<&CellName>,
         as_json: bool,
     ) -> Result<(), Failure> {
         let [file] = files else {
@@ -101,7 +101,10 @@ impl<'a> Calculator<'a> {
         let mut rows = Vec::new();
         while let Some(line) = table.row()? {
             let at = format!("{file}, row {}: cell", rows.len() + 1);
-            let named = cell(line.text("cell")).map_err(|error| Failure::usage(format!("{at} {error}")))?;
+            let named = line
+                .text("cell")
+                .parse::<CellName>()
+                .map_err(|error| Failure::usage(format!("{at} {error}")))?;
             let force = line.number("force_n")?;
             rows.push(self.row(&named, &at, force, line.text("q")).map_err(Failure::usage)?);
         }
@@ -112,8 +115,8 @@ impl<'a> Calculator<'a> {
     }
 
     /// Both computations of one row, or why there is none; `option` is what names the cell.
-    fn row(&self, named: &Named, option: &str, force: f64, positions: &str) -> Result<Row, String> {
-        let index = named.find(self.skin, option).map_err(|failure| failure.to_string())?;
+    fn row(&self, named: &CellName, option: &str, force: f64, positions: &str) -> Result<Row, String> {
+        let index = cell_of(self.skin, named, option).map_err(|failure| failure.to_string())?;
         self.row_of(index, force, positions).map_err(|why| format!("{option} {named}: {why}"))
     }
 

@@ -3,7 +3,6 @@
 mod show;
 
 use std::io::{self, BufWriter, Write};
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -127,12 +126,8 @@ impl Fit {
         stopped: &AtomicBool,
     ) -> Result<Taken, Failure> {
         let kinds = self.kinds.of_any()?;
-        let open = |source: &PathBuf| {
-            let options = Options { receive_buffer: RECEIVE_BUFFER, ..Options::default() };
-            let name = source.display().to_string();
-            ReceiveEnd::open(&name, kinds.of(&name), None, options)
-        };
-        let mut receive_ends = self.sources.iter().map(open).collect::<Result<Vec<_>, _>>()?;
+        let options = Options { receive_buffer: RECEIVE_BUFFER, ..Options::default() };
+        let mut receive_ends = input::receive_ends(&self.sources, &kinds, None, &options)?;
         let length = self.duration.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
         let end = length.map(|length| Instant::now() + length);
         let mut ended = Ok(());

@@ -2,6 +2,7 @@
 
 use clap::{Args, Subcommand};
 use model::decode::parameter;
+use model::decode::pick::Party;
 use model::scenario::contact_words;
 use protocol::fixed::{Q, Q1_14, Q5_10};
 use protocol::id::{CellId, Kind, Node};
@@ -11,30 +12,16 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::schema::packets;
 
 use super::sensing;
-use crate::arguments::node;
 
-/// Whom a packet is for.
-#[derive(Clone, Debug)]
-pub(super) struct Addressee {
-    pub(super) bus: Option<String>,
-    pub(super) node: Node,
+/// The cell that a packet is for; `None` is every cell.
+pub(super) const fn only_cell(addressee: &Party) -> Option<CellId> {
+    if let Node::Cell(cell) = addressee.node { Some(cell) } else { None }
 }
 
-impl Addressee {
-    /// The cell; `None` is every cell.
-    pub(super) const fn cell(&self) -> Option<CellId> {
-        if let Node::Cell(cell) = self.node { Some(cell) } else { None }
-    }
-}
-
-pub(super) fn addressee(text: &str) -> Result<Addressee, String> {
-    let (bus, name) = match text.rsplit_once(':') {
-        Some((bus, name)) => (Some(bus.to_owned()), name),
-        None => (None, text),
-    };
-    let found = if name == "everyone" { Ok(Node::Everyone) } else { node(name).map(Node::Cell) };
-    let node = found.map_err(|_| "a node id, 1 to 254, BUS:NODE, or everyone is possible".to_owned())?;
-    Ok(Addressee { bus, node })
+/// Parses whom a packet is for, which is never the gateway.
+pub(super) fn addressee(text: &str) -> Result<Party, String> {
+    let party = text.parse().ok().filter(|party: &Party| party.node != Node::Gateway);
+    party.ok_or_else(|| "a node id, 1 to 254, BUS:NODE, or everyone is possible".to_owned())
 }
 
 #[derive(Debug, Subcommand)]
@@ -93,7 +80,7 @@ struct Angles {
 pub(super) struct Stimulus {
     /// The cell, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
-    cell: Addressee,
+    cell: Party,
     /// The touch's force in N, shared by the three contact words
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     force: Option<String>,
@@ -148,7 +135,7 @@ pub(super) struct Stimulus {
 pub(super) struct Configure {
     /// The cell, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee)]
-    cell: Addressee,
+    cell: Party,
     #[command(flatten)]
     request: Requested,
     /// Copied into the answer
@@ -182,7 +169,7 @@ impl What {
     }
 
     /// Whom it is for; `None` is whoever listens.
-    pub(super) const fn to(&self) -> Option<&Addressee> {
+    pub(super) const fn to(&self) -> Option<&Party> {
         match self {
             Self::Halt | Self::Resume | Self::Sync | Self::Report | Self::Joints(_) => None,
             Self::Stimulus(Stimulus { cell, .. }) | Self::Configure(Configure { cell, .. }) => Some(cell),
@@ -325,7 +312,7 @@ mod tests {
             says("stimulus --cell 12 --temperature 20 512"),
             "--temperature 512: it must be in [-512, 512)"
         );
-        for wrong in ["0", "255", "gateway", "-1", "x", "vcan0:0", ""] {
+        for wrong in ["0", "255", "gateway", "-1", "x", "vcan0:0", ":3", ""] {
             assert_eq!(
                 addressee(wrong).unwrap_err(),
                 "a node id, 1 to 254, BUS:NODE, or everyone is possible"

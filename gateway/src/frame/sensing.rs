@@ -10,8 +10,9 @@ use protocol::parameters::{Parameter, Sensing};
 use protocol::skin::sensing::continuous;
 use protocol::usage::{Failure, print};
 
-use super::packets::{Addressee, addressee};
+use super::packets::{addressee, only_cell};
 use crate::arguments::{Word, one_of};
+use model::decode::pick::Party;
 
 /// Set when cells send their sensors: never, at a rate, or on changes
 ///
@@ -32,7 +33,7 @@ pub(super) struct Switch {
     hz: Option<f64>,
     /// The cell, or everyone
     #[arg(long, value_name = "[BUS:]NODE", value_parser = addressee, default_value = "everyone")]
-    pub(super) cell: Addressee,
+    pub(super) cell: Party,
 }
 
 /// When cells send their sensors.
@@ -59,7 +60,7 @@ impl Switch {
     pub(super) fn send(&self, bus: Bus, format: Format) -> Result<(), Failure> {
         let mode = self.sensing().map_err(Failure::usage)?;
         let on = format!("{} ({})", bus.name(), bus.kind());
-        let confirmed = switch(bus, format, self.cell.cell(), mode).map_err(Failure::run)?;
+        let confirmed = switch(bus, format, only_cell(&self.cell), mode).map_err(Failure::run)?;
         print(&format!("{confirmed} on {on}: {}\n", Words(Parameter::Sensing.number(), mode.words())))
     }
 

@@ -170,9 +170,8 @@ fn cells(path: &Path) -> Result<Vec<CellOnLink>, Failure> {
         let node = match row.text("node") {
             "" => None,
             text => {
-                let node = text.parse().ok().and_then(|node| CellId::new(node).ok());
-                let wrong = || row.wrong("node", "1 to 254 are possible; an empty one gets a free node");
-                Some(node.ok_or_else(wrong)?.get())
+                let wrong = |_| row.wrong("node", "1 to 254 are possible; an empty one gets a free node");
+                Some(text.parse::<CellId>().map_err(wrong)?.get())
             }
         };
         cells.push(CellOnLink {

@@ -22,16 +22,29 @@ impl FromStr for CellName {
     /// # Errors
     /// When there is no node id from 1 to 254 at its end, or nothing before the colon.
     fn from_str(text: &str) -> Result<Self, String> {
-        let (bus, number) = match text.rsplit_once(':') {
-            Some(("", _)) => {
-                return Err("no bus stands before the colon: a cell is NODE or BUS:NODE".to_owned());
-            }
-            Some((bus, number)) => (Some(bus.to_owned()), number),
-            None => (None, text),
-        };
-        let node = number.parse().ok().and_then(|number| CellId::new(number).ok());
-        let node = node.ok_or_else(|| format!("{number:?} is no node id: 1 to 254 are"))?;
-        Ok(Self { bus, node })
+        let (bus, number) = split_bus(text)?;
+        let node = number.parse().map_err(|_| format!("{number:?} is no node id: 1 to 254 are"))?;
+        Ok(Self { bus: bus.map(str::to_owned), node })
+    }
+}
+
+/// Splits `BUS:NODE`, or `NODE` alone, into bus and node; the name of a bus may have colons.
+///
+/// # Errors
+/// When nothing stands before the colon.
+pub fn split_bus(text: &str) -> Result<(Option<&str>, &str), String> {
+    match text.rsplit_once(':') {
+        Some(("", _)) => Err("no bus stands before the colon: a cell is NODE or BUS:NODE".to_owned()),
+        Some((bus, node)) => Ok((Some(bus), node)),
+        None => Ok((None, text)),
+    }
+}
+
+impl CellName {
+    /// Returns whether the name fits a cell, by its bus and its node id.
+    #[must_use]
+    pub fn fits(&self, bus: &str, node: CellId) -> bool {
+        self.node == node && self.bus.as_deref().is_none_or(|own| own == bus)
     }
 }
 

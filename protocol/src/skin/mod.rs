@@ -26,7 +26,7 @@ use crate::packet::Length;
 use crate::parameters::{Baseline, Contact, Events, Parameters, Pose, Row, Sensing};
 use crate::time::Span;
 
-pub use cell_name::CellName;
+pub use cell_name::{CellName, split_bus};
 pub use reach::{REACH, reach};
 pub use robot::{Base, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
 pub use wires::Wires;

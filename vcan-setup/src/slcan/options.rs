@@ -197,7 +197,7 @@ impl LineOptions {
         match key {
             "cell" => {
                 let (first, last) = value.split_once('-').unwrap_or((value, value));
-                let cell = |text: &str| text.parse().ok().and_then(|number| CellId::new(number).ok());
+                let cell = |text: &str| text.parse::<CellId>().ok();
                 let expected = "node ids are 1 to 254: cell=12, or cell=1-8";
                 let (first, last) = cell(first).zip(cell(last)).ok_or_else(|| wrong(&expected))?;
                 if first > last {

@@ -49,9 +49,9 @@ impl Which {
 /// Something of each capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Both<T> {
-    /// Of the first one.
+    /// The value of the first one.
     pub a: T,
-    /// Of the second one.
+    /// The value of the second one.
     pub b: T,
 }
 
@@ -74,7 +74,7 @@ impl<T> Both<T> {
     }
 }
 
-/// What does not count as a difference.
+/// Differences that do not count.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Options {
     /// Steps by which words of torques (1/4096 Nm) and sums (1/256 Nm) may differ.

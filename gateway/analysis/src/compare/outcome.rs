@@ -1,4 +1,4 @@
-//! What a comparison adds up to.
+//! Sums of a comparison over all epochs and cells.
 
 use model::quantiles::Quantiles;
 use protocol::id::CellId;

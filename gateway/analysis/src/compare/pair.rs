@@ -1,4 +1,4 @@
-//! The same joints in both captures.
+//! Pairs of the same joints in both captures.
 
 use model::tracker::PerCell;
 use protocol::fixed::{Q1_14, TorqueFormat};
@@ -24,7 +24,7 @@ pub(super) struct Tally {
     pub(super) cells: PerCell<Replies>,
 }
 
-/// What a difference is, before it is described.
+/// A difference before it is described.
 #[derive(Debug, Default)]
 pub(super) struct Found {
     what: &'static str,

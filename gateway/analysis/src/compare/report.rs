@@ -8,7 +8,7 @@ use super::Both;
 /// The outcome of a comparison.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
-    /// Whether nothing differs that counts.
+    /// True if nothing differs that counts.
     pub equal: bool,
     /// The aspects that differ, in the order of [`ASPECTS`].
     pub differs: Vec<&'static str>,
@@ -34,7 +34,7 @@ pub struct Report {
     pub first: Option<First>,
 }
 
-/// What is compared.
+/// The aspects that are compared.
 pub const ASPECTS: [&str; 7] = ["epochs", "joints", "halts", "contacts", "torques", "sums", "cells"];
 
 /// One capture.

@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::comparator::{Lacking, Tally};
 use super::difference::Difference;
 use super::player::BusLinkTally;
-use crate::summary::{CellError, cells_in_error};
+use crate::summary::{CellError, cells_in_error, many};
 use model::quantiles::Quantiles;
 
 /// A whole replay.
@@ -160,7 +160,7 @@ impl Summary {
             if expect.joints_skipped > 0 && self.lockstep.is_none() {
                 wrong.push(format!(
                     "cells came too late for joints {}: --lockstep waits for them",
-                    counted(expect.joints_skipped, "time", "times")
+                    many(expect.joints_skipped, "time", "times")
                 ));
             }
         }
@@ -169,12 +169,12 @@ impl Summary {
         }
         if self.lost > 0 {
             let were = if self.lost == 1 { "was" } else { "were" };
-            let frames = counted(self.lost, "frame", "frames");
+            let frames = many(self.lost, "frame", "frames");
             wrong.push(format!("{frames} {were} lost while a bus was down"));
         }
         if self.refused > 0 {
             let were = if self.refused == 1 { "was" } else { "were" };
-            let frames = counted(self.refused, "frame", "frames");
+            let frames = many(self.refused, "frame", "frames");
             wrong.push(format!("{frames} {were} refused: a bus stayed full"));
         }
         (!wrong.is_empty()).then(|| wrong.join("; "))
@@ -184,7 +184,7 @@ impl Summary {
     #[must_use]
     pub fn first_line(&self) -> (bool, String) {
         let until = if self.interrupted { " until it was interrupted" } else { "" };
-        let sent = format!("{} sent", counted(self.sent, "frame", "frames"));
+        let sent = format!("{} sent", many(self.sent, "frame", "frames"));
         match (self.verdict(true), &self.expect) {
             (Some(why), _) => (false, format!("look at: {why}")),
             (None, None) => {
@@ -194,15 +194,15 @@ impl Summary {
                 (false, format!("look at: no reply was compared, {sent}"))
             }
             (None, Some(expect)) => {
-                let equal = format!("{} as recorded", counted(expect.tally.equal, "reply", "replies"));
+                let equal = format!("{} as recorded", many(expect.tally.equal, "reply", "replies"));
                 let lacking = expect.tally.lacking.reasons().iter().map(|(_, count)| count).sum::<u64>();
                 let unread = self.buses.iter().map(|bus| bus.unheard).sum();
                 let unchecked = [
-                    (lacking, counted(lacking, "reply not compared", "replies not compared")),
-                    (unread, counted(unread, "reply not read in time", "replies not read in time")),
+                    (lacking, many(lacking, "reply not compared", "replies not compared")),
+                    (unread, many(unread, "reply not read in time", "replies not read in time")),
                     (
                         expect.recording_dropped,
-                        counted(
+                        many(
                             expect.recording_dropped,
                             "frame not in the recording",
                             "frames not in the recording",
@@ -210,11 +210,7 @@ impl Summary {
                     ),
                     (
                         expect.unchecked_cells,
-                        counted(
-                            expect.unchecked_cells,
-                            "configuration not known",
-                            "configurations not known",
-                        ),
+                        many(expect.unchecked_cells, "configuration not known", "configurations not known"),
                     ),
                 ];
                 let unchecked = unchecked.into_iter().filter(|(count, _)| *count > 0).map(|(_, text)| text);
@@ -226,11 +222,6 @@ impl Summary {
             }
         }
     }
-}
-
-/// Formats a count with its noun.
-fn counted(count: u64, one: &str, more: &str) -> String {
-    format!("{count} {}", if count == 1 { one } else { more })
 }
 
 #[cfg(test)]

@@ -89,7 +89,7 @@ impl Summary {
 }
 
 /// Formats a count with its noun.
-fn many(count: impl TryInto<u64>, one: &str, more: &str) -> String {
+pub(crate) fn many(count: impl TryInto<u64>, one: &str, more: &str) -> String {
     let count = count.try_into().unwrap_or(u64::MAX);
     format!("{count} {}", if count == 1 { one } else { more })
 }

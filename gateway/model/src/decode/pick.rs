@@ -3,8 +3,9 @@
 use core::str::FromStr;
 
 use protocol::can::{EXTENDED_MASK, Frame, STANDARD_MASK};
-use protocol::id::{CellId, Command, Id, Kind, Node};
+use protocol::id::{Command, Id, Kind, Node};
 use protocol::packet::data_id;
+use protocol::skin::split_bus;
 use thiserror::Error;
 
 use super::Decoded;
@@ -59,10 +60,10 @@ pub fn node(word: &str) -> Result<Node, String> {
     match word {
         "gateway" => Ok(Node::Gateway),
         "everyone" => Ok(Node::Everyone),
-        number => match number.parse().ok().and_then(|number| CellId::new(number).ok()) {
-            Some(cell) => Ok(Node::Cell(cell)),
-            None => Err(format!("{word:?} is no node: node ids are 1 to 254, or gateway, or everyone")),
-        },
+        number => number
+            .parse()
+            .map(Node::Cell)
+            .map_err(|_| format!("{word:?} is no node: node ids are 1 to 254, or gateway, or everyone")),
     }
 }
 
@@ -80,11 +81,8 @@ impl FromStr for Party {
 
     /// Parses `NODE` or `BUS:NODE`; as a node `gateway`, `everyone`, or a node id.
     fn from_str(word: &str) -> Result<Self, String> {
-        let (bus, name) = match word.rsplit_once(':') {
-            Some((bus, name)) => (Some(bus.to_owned()), name),
-            None => (None, word),
-        };
-        Ok(Self { bus, node: node(name)? })
+        let (bus, name) = split_bus(word)?;
+        Ok(Self { bus: bus.map(str::to_owned), node: node(name)? })
     }
 }
 
@@ -102,7 +100,7 @@ impl IdMask {
     pub fn takes(&self, frame: &Frame) -> bool {
         frame.is_extended() == self.is_extended
             && !frame.is_error()
-            && (frame.id() & EXTENDED_MASK ^ self.id) & self.mask == 0
+            && (frame.id() ^ self.id) & self.mask == 0
     }
 }
 
