@@ -70,16 +70,16 @@ pub(crate) struct Dump {
     /// or a proximity, heartbeats of active cells
     #[arg(long)]
     contact: bool,
-    /// Only from so many seconds after the first frame on
+    /// Only from this second of the run on, or after the first frame where there is no run
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     from: Option<u64>,
-    /// Only up to, and without, so many seconds after the first frame; ends a live dump
+    /// Only up to, and without, this second of the run, or after the first frame; ends a live dump
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     to: Option<u64>,
     /// End after so many frames that are shown or counted
     #[arg(long, short = 'n', value_name = "COUNT")]
     count: Option<u64>,
-    /// Without the raw frames: the time since the first frame, the bus, and the decoded frame
+    /// Without the raw frames: seconds of the run, or since the first frame; the bus, and the decoded frame
     #[arg(long, conflicts_with_all = ["json", "stats"])]
     brief: bool,
     /// One JSON object a line; with --stats, one in all
@@ -150,6 +150,7 @@ impl Dump {
                     show.describe(&skin);
                 }
             }
+            reader.extras().run_began().into_iter().for_each(|zero| show.count_from(zero));
             let done = captured(&mut reader, &mut show);
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {

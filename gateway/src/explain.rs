@@ -49,7 +49,7 @@ pub(crate) struct Explain {
     /// The number of the joints, modulo 256
     #[arg(long, value_name = "E", required_unless_present_any = ["force", "batch"])]
     epoch: Option<u8>,
-    /// Only joints from so many seconds after the first frame on
+    /// Only joints from this second of the run on, or after the first frame where there is no run
     #[arg(long, value_name = "S", value_parser = nanos, default_value = "0", conflicts_with_all = ["force", "batch"])]
     at: u64,
     /// Which joints of this epoch, when there are several
@@ -135,7 +135,7 @@ impl Explain {
             (false, Some(_)) => show::What::Joint,
             (false, None) => show::What::All,
         };
-        print(&show::text(&name, epoch, found.first_ns, &explanation, what))
+        print(&show::text(&name, epoch, (found.zero_ns, found.is_of_run), &explanation, what))
     }
 
     /// The cell and the joint must be the skin's.

@@ -105,10 +105,11 @@ struct Frames {
     /// else all are sent
     #[arg(long, value_parser = one_of(ONLY))]
     only: Option<Only>,
-    /// Begin so many seconds after the first frame; with inputs only, in the state that was latched there
-    #[arg(long, value_name = "S", default_value = "0", value_parser = nanos, allow_negative_numbers = true)]
-    from: u64,
-    /// End before the frame so many seconds after the first one
+    /// Begin at this second of the run, or after the first frame where there is no run; with inputs only, in the state that
+    /// was latched there
+    #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
+    from: Option<u64>,
+    /// End before this second of the run, or after the first frame
     #[arg(long, value_name = "S", value_parser = nanos, allow_negative_numbers = true)]
     to: Option<u64>,
 }

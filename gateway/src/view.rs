@@ -65,7 +65,7 @@ pub(crate) struct View {
     /// The skin of buses that are named, or of a recording; without it a recording's is the one in it
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    /// Stay at so many seconds after the first frame of a recording, instead of playing it
+    /// Stay at this second of the recorded run, or after the first frame of a log, instead of playing it
     #[arg(long, value_name = "S", value_parser = nanos)]
     at: Option<u64>,
     /// The address of the page; port 0 is any that is free

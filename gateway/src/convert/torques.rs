@@ -6,7 +6,7 @@ use std::path::Path;
 use analysis::explain::series::{EpochTorque, SeriesError, each_epoch, is_summed};
 use csv::{Writer, WriterBuilder};
 use protocol::skin::{Reply, Skin};
-use trace::capture::Reader;
+use trace::capture::{Reader, seconds_since};
 
 use crate::input::Missing;
 use crate::print::list;
@@ -66,11 +66,10 @@ struct Rows<W: Write> {
 }
 
 impl<W: Write> Rows<W> {
-    /// The numbers are those of `skinbus explain`; `first` is the time of the capture's first frame.
-    #[expect(clippy::cast_precision_loss, reason = "to a nanosecond within three months")]
-    fn write(&mut self, first: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
+    /// The numbers are those of `skinbus explain`; seconds count from `zero`, in ns since 1970.
+    fn write(&mut self, zero: u64, epoch: &EpochTorque) -> Result<(), csv::Error> {
         let EpochTorque { at_ns, epoch, positions, explanation } = epoch;
-        let seconds = at_ns.saturating_sub(first) as f64 / 1e9;
+        let seconds = seconds_since(zero, *at_ns);
         let mut row = vec![format!("{seconds:.9}"), epoch.to_string()];
         let joints = positions.iter().zip(&explanation.total).zip(&self.summed);
         for ((position, total), summed) in joints {

@@ -64,8 +64,8 @@ pub(super) struct Show<W> {
     how: How,
     /// Frames that may still be shown.
     left: u64,
-    /// When the first frame came.
-    first: Option<u64>,
+    /// The time that seconds count from; until it is known, or the first frame comes, `None`.
+    zero: Option<u64>,
     raw: String,
 }
 
@@ -81,9 +81,14 @@ impl<W: Write> Show<W> {
             contact,
             how,
             left: max,
-            first: None,
+            zero: None,
             raw: String::new(),
         }
+    }
+
+    /// Counts seconds from this time on; before the first frame.
+    pub(super) const fn count_from(&mut self, zero: u64) {
+        self.zero = Some(zero);
     }
 
     /// Takes the units of the skin's buses; of others they stay the default. Before the first frame.
@@ -160,8 +165,8 @@ impl<W: Write> Show<W> {
     /// Shows a frame if the filters select it.
     fn show(&mut self, record: &Record<'_>, decoded: &Decoded, units: Units) -> io::Result<()> {
         let nanos = record.time.nanos;
-        let first = *self.first.get_or_insert(nanos);
-        if !self.pick.takes(first, nanos, record.interface, &record.frame, decoded)
+        let zero = *self.zero.get_or_insert(nanos);
+        if !self.pick.takes(zero, nanos, record.interface, &record.frame, decoded)
             || self.contact && !decoded.is_contact()
         {
             return Ok(());
@@ -181,8 +186,8 @@ impl<W: Write> Show<W> {
                 }
             }
             How::Brief { colour } => {
-                // Where times run backwards a frame may be before the first one.
-                let (sign, since) = if nanos < first { ("-", first - nanos) } else { ("", nanos - first) };
+                // Before the run's loop began, and where times run backwards.
+                let (sign, since) = if nanos < zero { ("-", zero - nanos) } else { ("", nanos - zero) };
                 let (seconds, micros) = (since / 1_000_000_000, since / 1_000 % 1_000_000);
                 let (dim, of, plain) = if *colour { (DIM, of(decoded), PLAIN) } else { ("", "", "") };
                 writeln!(self.out, "{dim}{sign}{seconds}.{micros:06} {interface}{plain} {of}{said}{plain}")?;

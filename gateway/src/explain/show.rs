@@ -7,6 +7,7 @@ use analysis::explain::{
 };
 use protocol::fixed::TorqueFormat;
 use protocol::usage::shown;
+use trace::capture::seconds_since;
 
 use crate::print::{self, decimals, or};
 
@@ -21,17 +22,21 @@ pub(super) enum What {
     Joint,
 }
 
-/// All of it; `first` is the time of the capture's first frame.
-pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation, what: What) -> String {
+/// All of it; seconds count from `zero`, in ns since 1970, which is the begin of the run or the first frame.
+pub(super) fn text(
+    name: &str,
+    epoch: u8,
+    (zero, is_of_run): (u64, bool),
+    explanation: &Explanation,
+    what: What,
+) -> String {
     let mut text = String::new();
     let name = shown(name);
     for bus in &explanation.buses {
-        let at = seconds(bus.at_ns.saturating_sub(first));
+        let at = seconds_since(zero, bus.at_ns);
+        let at = if is_of_run { format!("at {at:.6} s") } else { format!("{at:.6} s after the first frame") };
         let halted = if bus.halted { ", halted" } else { "" };
-        text += &format!(
-            "{name}: joints of epoch {epoch} on {}, {at} s after the first frame{halted}\n",
-            bus.bus
-        );
+        text += &format!("{name}: joints of epoch {epoch} on {}, {at}{halted}\n", bus.bus);
         text += &positions(bus);
     }
     let cells = &explanation.cells;
@@ -42,7 +47,7 @@ pub(super) fn text(name: &str, epoch: u8, first: u64, explanation: &Explanation,
         (What::Joint, _) => text += &joint(cells),
         (What::Cells, _) | (What::All, [_]) => {
             for cell in cells {
-                text += &every_step(cell, first);
+                text += &every_step(cell, zero);
             }
         }
         (What::All, _) => text += &one_line_each(cells, is_finest),
@@ -100,11 +105,6 @@ fn spaced(
         column.set_padding((before, u16::from(!numbers(index) || index + 1 == count)));
     }
     format!("{table}\n")
-}
-
-#[expect(clippy::cast_precision_loss, reason = "to be read")]
-fn seconds(nanos: u64) -> String {
-    format!("{:.6}", nanos as f64 / 1e9)
 }
 
 #[expect(clippy::cast_precision_loss, reason = "to be read")]
@@ -238,10 +238,10 @@ fn legend(cells: &[CellExplained]) -> String {
     said.iter().filter_map(|(_, short, means)| Some(format!("  {short}: {}\n", means.as_ref()?))).collect()
 }
 
-fn every_step(cell: &CellExplained, first: u64) -> String {
+fn every_step(cell: &CellExplained, zero: u64) -> String {
     let mut text = format!("\n{}, on the link that joint {} moves\n", name(cell), cell.joint);
     match &cell.force {
-        Some(force) => text += &force_steps(force, first),
+        Some(force) => text += &force_steps(force, zero),
         None => text += "  contact    not known\n",
     }
     match cell.answered_after_ns {
@@ -251,7 +251,7 @@ fn every_step(cell: &CellExplained, first: u64) -> String {
     text + &rows(std::slice::from_ref(cell), false)
 }
 
-fn force_steps(force: &Force, first: u64) -> String {
+fn force_steps(force: &Force, zero: u64) -> String {
     let Force { contact_n: [a, b, c], proximity, touch_n, contact_threshold_n, proximity_threshold, .. } =
         *force;
     let Force { alpha_c, alpha_p_n, fused_n, force_threshold_n, force_steps, force_n, .. } = *force;
@@ -260,7 +260,7 @@ fn force_steps(force: &Force, first: u64) -> String {
     let touch = against(touch_n, contact_threshold_n);
     let near = against(proximity, proximity_threshold);
     let fused = against(fused_n, force_threshold_n);
-    let origin = origin(&force.origin, first);
+    let origin = origin(&force.origin, zero);
     let [touch_counts, near_counts] =
         [touch_n >= contact_threshold_n, proximity >= proximity_threshold].map(counts);
     format!(
@@ -273,12 +273,8 @@ fn force_steps(force: &Force, first: u64) -> String {
     )
 }
 
-fn origin(origin: &Origin, first: u64) -> String {
-    let at = |nanos: u64| match nanos.checked_sub(first) {
-        Some(after) => seconds(after),
-        // In an earlier part of the recording.
-        None => format!("-{}", seconds(first - nanos)),
-    };
+fn origin(origin: &Origin, zero: u64) -> String {
+    let at = |nanos: u64| format!("{:.6}", seconds_since(zero, nanos));
     match *origin {
         Origin::Start { at_ns } => format!("it started at {} s", at(at_ns)),
         Origin::Mode { at_ns } => format!("its mode was written at {} s", at(at_ns)),

@@ -45,6 +45,7 @@ impl Fit {
         let mut out = BufWriter::new(Stoppable::new(io::stdout()));
         let name = list(self.sources.iter().map(|source| source.display()));
         let mut title = name.clone();
+        let mut run_began = None;
         let (mut shadow, taken) = if self.are_captures(&name)? {
             let reader = captures(&self.sources, |file| Box::new(file))?;
             reader.name().clone_into(&mut title);
@@ -52,6 +53,7 @@ impl Fit {
             for before in &reader.extras().latched {
                 shadow.latched(&before.bus, before.nanos, &before.frame);
             }
+            run_began = reader.extras().run_began();
             let taken = captured(reader, &mut shadow, &mut out)?;
             (shadow, taken)
         } else {
@@ -63,7 +65,10 @@ impl Fit {
         shadow.finish();
         written(write_frames(&mut shadow, &mut out).and_then(|()| out.flush()))?;
         drop(out);
-        let report = shadow.report();
+        let mut report = shadow.report();
+        for bus in &mut report.buses {
+            bus.zero_ns = run_began.unwrap_or(bus.zero_ns);
+        }
         for (bus, _) in &self.rates {
             if report.buses.iter().all(|it| it.bus != *bus) {
                 output::note(format_args!("--rates {bus}=…: {name} has no frame of {bus}"));

@@ -38,7 +38,7 @@ pub enum Command {
     Pause,
     /// Goes to a position.
     Seek {
-        /// In s since the first frame.
+        /// In s of the run, or since the first frame.
         at_s: f64,
     },
     /// Goes by one epoch.

@@ -62,12 +62,12 @@ pub struct Progress {
 }
 
 impl Index {
-    /// Goes through a recording, until `stop`. Times are said since `origin`.
-    pub fn build(&self, mut reader: Reader, skin: Skin, origin: u64, stop: &AtomicBool) {
+    /// Goes through a recording from its first frame, until `stop`. Times are said since `zero`.
+    pub fn build(&self, mut reader: Reader, skin: Skin, (first, zero): (u64, u64), stop: &AtomicBool) {
         let count = BYTES / (skin.buses.len() * BUS_BYTES + skin.cells.len() * CELL_BYTES).max(1);
         let mut spacing = SPACING_NS;
-        let mut next = origin.saturating_add(spacing);
-        let mut tape = Tape::new(skin, origin);
+        let mut next = first.saturating_add(spacing);
+        let mut tape = Tape::new(skin, zero);
         tape.begin(reader.extras());
         let mut watcher = Watcher::default();
         while !tape.is_over() && !stop.load(Ordering::Relaxed) {

@@ -166,7 +166,7 @@ impl Live {
     /// | 4 | joints J of the robot, u32 |
     /// | 4 | cells, u32 |
     /// | 4 | 0: a snapshot |
-    /// | 8 | seconds since the first frame, f64 |
+    /// | 8 | seconds of the run, or since the first frame, f64 |
     /// | 12 J | of each joint position (rad or m), distributed torque, central torque (Nm or N), f32 |
     /// | 8 for each cell | status u8, flags u8, force mN u16, proximity 2^-15 u16, temperature 0.01 °C i16 |
     ///
@@ -200,7 +200,8 @@ impl Live {
 
     #[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
     fn seconds(&self, at: Micros) -> f64 {
-        self.began.map_or(0.0, |began| at.0.saturating_sub(began.0) as f64 * 1e-6)
+        let since = |began: Micros| at.0.saturating_sub(began.0) as f64 - began.0.saturating_sub(at.0) as f64;
+        self.began.map_or(0.0, |began| since(began) * 1e-6)
     }
 }
 

@@ -41,7 +41,7 @@ pub struct Options {
     pub listener: TcpListener,
     /// Who may use it.
     pub access: Access,
-    /// Where to stay at first, in s since the first frame; else it plays from there.
+    /// Where to stay at first, in s of the run, or since the first frame; else it plays from there.
     pub at_s: Option<f64>,
 }
 
@@ -64,12 +64,12 @@ pub fn play(
     let scene = serde_json::to_string(&Scene { shells, ..Scene::of(&skin, false) }).unwrap_or_default();
     let server = Server::start(listener, access, scene, corners).map_err(ServeError::Server)?;
     is_served();
-    let (index, origin) = (player.index(), player.origin());
+    let (index, times) = (player.index(), (player.first(), player.zero()));
     let name = reader.name().to_owned();
     thread::scope(|scope| {
         let (index, name, warns) = (&index, &name, &warns);
         let build = move || {
-            index.build(reader, skin, origin, stop);
+            index.build(reader, skin, times, stop);
             let Progress { failed, unfinished, .. } = index.progress();
             let unfinished = unfinished.map(|what| format!("{name}: {what}"));
             failed.iter().chain(&unfinished).for_each(|what| warns(what));

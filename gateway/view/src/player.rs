@@ -8,7 +8,7 @@ use std::time::Duration;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
-use trace::capture::{CaptureError, Entry, Place, Places, Reader};
+use trace::capture::{CaptureError, Entry, Place, Places, Reader, seconds_since};
 
 use crate::index::{Index, Kept};
 use crate::live::Live;
@@ -34,8 +34,10 @@ pub struct Player {
     index: Arc<Index>,
     reader: Reader,
     tape: Tape,
-    /// The time of the first frame, and of the last one as far as it is known, in ns since 1970.
-    origin: u64,
+    /// The time of the first frame, in ns since 1970.
+    first: u64,
+    /// The time that seconds count from, in ns since 1970.
+    zero: u64,
     /// The position, in ns since 1970.
     at: u64,
     /// Whether all counts are those since the beginning.
@@ -52,11 +54,13 @@ pub struct Player {
 /// What a page shows of a player.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Playback {
-    /// The position, in s since the first frame.
+    /// The position, in s of the run, or since the first frame where there is no run.
     pub at_s: f64,
     /// The position as ns since 1970.
     pub at_ns: String,
-    /// The length, in s.
+    /// The first frame, in the same s: before 0 where the loop began later.
+    pub from_s: f64,
+    /// The end, in the same s.
     pub of_s: f64,
     /// Whether it plays.
     pub playing: bool,
@@ -106,17 +110,18 @@ impl Player {
     /// # Errors
     /// When it cannot be read or gone back in, or has no frame.
     pub fn open(paths: &[PathBuf], skin: Skin) -> Result<Self, PlayError> {
-        let mut first = Reader::open_all(paths)?;
-        let origin = loop {
-            match first.next()? {
+        let mut beginning = Reader::open_all(paths)?;
+        let first = loop {
+            match beginning.next()? {
                 Some(Entry::Frame(record)) => break record.time.nanos,
                 Some(Entry::Note(_)) => {}
-                None => return Err(PlayError::Empty(first.name().to_owned())),
+                None => return Err(PlayError::Empty(beginning.name().to_owned())),
             }
         };
+        let zero = beginning.extras().run_began().unwrap_or(first);
         let places = Places::of(paths)?;
         let reader = Reader::open_all(paths)?;
-        let mut tape = Tape::new(skin.clone(), origin);
+        let mut tape = Tape::new(skin.clone(), zero);
         tape.begin(reader.extras());
         Ok(Self {
             skin,
@@ -124,8 +129,9 @@ impl Player {
             index: Arc::default(),
             reader,
             tape,
-            origin,
-            at: origin,
+            first,
+            zero,
+            at: first,
             is_exact: true,
             playing: false,
             speed: 1.0,
@@ -143,8 +149,14 @@ impl Player {
 
     /// The time of the first frame, in ns since 1970.
     #[must_use]
-    pub const fn origin(&self) -> u64 {
-        self.origin
+    pub const fn first(&self) -> u64 {
+        self.first
+    }
+
+    /// The time that seconds count from, in ns since 1970.
+    #[must_use]
+    pub const fn zero(&self) -> u64 {
+        self.zero
     }
 
     /// What is known at the position.
@@ -168,7 +180,7 @@ impl Player {
     fn last(&self) -> u64 {
         let progress = self.index.progress();
         let last = if progress.is_over { progress.at } else { self.places.latest().max(progress.at) };
-        last.max(self.origin)
+        last.max(self.first)
     }
 
     /// Plays at a speed from now on; what is no speed is held within the limits.
@@ -210,14 +222,14 @@ impl Player {
         Ok(true)
     }
 
-    /// Goes to a position, in s since the first frame, within the recording.
+    /// Goes to a position, in s of the run, or since the first frame, within the recording.
     ///
     /// # Errors
     /// When it cannot be read there.
     pub fn seek(&mut self, at_s: f64) -> Result<(), CaptureError> {
-        #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "saturates")]
-        let since = (at_s.max(0.0) * 1e9).round() as u64;
-        self.go_to(self.origin.saturating_add(since))
+        #[expect(clippy::cast_possible_truncation, reason = "saturates")]
+        let since = (at_s * 1e9).round() as i64;
+        self.go_to(self.zero.saturating_add_signed(since))
     }
 
     /// Goes to the next epoch, or the one before, and stays there.
@@ -254,7 +266,7 @@ impl Player {
     }
 
     fn go_to(&mut self, at: u64) -> Result<(), CaptureError> {
-        let at = at.clamp(self.origin, self.last());
+        let at = at.clamp(self.first, self.last());
         let near = self.tape.at() <= at && at - self.tape.at() <= HISTORY_NS;
         if near && self.is_exact {
             return self.advance(at, false);
@@ -264,7 +276,7 @@ impl Player {
 
     /// Goes to a position from what is kept before it.
     fn go_back(&mut self, at: u64) -> Result<(), CaptureError> {
-        self.is_exact = self.index_is_at(at) || at <= self.origin.saturating_add(HISTORY_NS);
+        self.is_exact = self.index_is_at(at) || at <= self.first.saturating_add(HISTORY_NS);
         let kept = self.index.before(at.saturating_sub(HISTORY_NS)).filter(|_| self.is_exact);
         let place = match kept.as_deref() {
             Some(Kept { tape, place }) => {
@@ -272,7 +284,7 @@ impl Player {
                 *place
             }
             None => {
-                self.tape = Tape::new(self.skin.clone(), self.origin);
+                self.tape = Tape::new(self.skin.clone(), self.zero);
                 match self.is_exact {
                     true => Place::default(),
                     false => self.places.before(at.saturating_sub(GLANCE_NS)),
@@ -324,7 +336,7 @@ impl Player {
     /// | 4 | joints J of the robot, u32 |
     /// | 4 | moments, u32 |
     /// | 4 | 1: a history |
-    /// | 8 + 8 J for each moment | s since the first frame f64; of each joint distributed and central torque f32 |
+    /// | 8 + 8 J for each moment | s of the run, or since the first frame f64; of each joint distributed and central torque f32 |
     #[must_use]
     pub fn history(&self) -> Vec<u8> {
         let joints = self.skin.robot.joints.len();
@@ -335,7 +347,7 @@ impl Player {
             bytes.extend(word.to_le_bytes());
         }
         for (at, torques) in &self.history {
-            bytes.extend(seconds(at.saturating_sub(self.origin)).to_le_bytes());
+            bytes.extend(self.seconds(*at).to_le_bytes());
             for value in torques.iter().flatten() {
                 #[expect(clippy::cast_possible_truncation, reason = "to be drawn")]
                 bytes.extend((*value as f32).to_le_bytes());
@@ -344,15 +356,21 @@ impl Player {
         bytes
     }
 
+    /// A time in s of the run, or since the first frame.
+    fn seconds(&self, at: u64) -> f64 {
+        seconds_since(self.zero, at)
+    }
+
     /// What a page shows of it.
     #[must_use]
     pub fn said(&self) -> Playback {
         let progress = self.index.progress();
-        let (of, read) = (self.last() - self.origin, progress.at.saturating_sub(self.origin));
+        let (of, read) = (self.last() - self.first, progress.at.saturating_sub(self.first));
         Playback {
-            at_s: seconds(self.at.saturating_sub(self.origin)),
+            at_s: self.seconds(self.at),
             at_ns: self.at.to_string(),
-            of_s: seconds(of),
+            from_s: self.seconds(self.first),
+            of_s: self.seconds(self.last()),
             playing: self.playing,
             speed: self.speed,
             exact: self.is_exact,
@@ -368,7 +386,7 @@ impl Player {
     /// In which of so many equal parts of the recording there are events of a kind.
     #[must_use]
     pub fn marks(&self, kind: EventKind, parts: u16) -> Vec<u16> {
-        self.index.marks(kind, (self.origin, self.last()), parts)
+        self.index.marks(kind, (self.first, self.last()), parts)
     }
 }
 

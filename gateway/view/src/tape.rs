@@ -76,11 +76,11 @@ struct Item {
 }
 
 impl Tape {
-    /// Before any entry. Times are said since `origin`, in ns since 1970.
+    /// Before any entry. Times are said since `zero`, in ns since 1970.
     #[must_use]
-    pub fn new(skin: Skin, origin: u64) -> Self {
+    pub fn new(skin: Skin, zero: u64) -> Self {
         let names: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
-        let mut live = Live::since(skin, Micros(origin / 1_000));
+        let mut live = Live::since(skin, Micros(zero / 1_000));
         (0..names.len()).for_each(|bus| live.set_bus(bus, true, 0));
         Self {
             live,

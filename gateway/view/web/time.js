@@ -7,11 +7,11 @@ const KINDS = { touch: "Touch", loss: "Loss", silence: "Silent cell", halt: "Hal
 const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 20];
 const PARTS = 600;
 
-// Minutes, seconds and thousandths of a time in s; hours where there are any.
+// Minutes, seconds and thousandths of a time in s; hours where there are any. Before the loop began it is negative.
 export function clock(seconds) {
-  const ms = Math.round(Math.max(0, seconds) * 1000), two = (v) => String(v).padStart(2, "0");
+  const ms = Math.round(Math.abs(seconds) * 1000), two = (v) => String(v).padStart(2, "0");
   const [h, m, s] = [Math.floor(ms / 3600000), Math.floor(ms / 60000) % 60, Math.floor(ms / 1000) % 60];
-  return `${h ? `${h}:${two(m)}` : m}:${two(s)}.${String(ms % 1000).padStart(3, "0")}`;
+  return `${seconds < 0 && ms > 0 ? "−" : ""}${h ? `${h}:${two(m)}` : m}:${two(s)}.${String(ms % 1000).padStart(3, "0")}`;
 }
 
 // What a fragment of the address asks for, as `#at=12.5`: a position in s, or none.
@@ -75,9 +75,9 @@ export class TimeBar {
   }
 
   toggle() {
-    const { playing, at_s, of_s } = this.playback;
+    const { playing, at_s, from_s, of_s } = this.playback;
     if (playing) return this.send({ do: "pause" });
-    if (at_s >= of_s) this.send({ do: "seek", at_s: 0 });
+    if (at_s >= of_s) this.send({ do: "seek", at_s: from_s });
     this.send({ do: "play", speed: Number(this.speed.value) });
   }
 
@@ -99,6 +99,7 @@ export class TimeBar {
     if (first) this.follow();
     this.play.textContent = playback.playing ? "Pause" : "Play";
     this.play.setAttribute("aria-label", playback.playing ? "Pause" : "Play");
+    this.slider.min = String(playback.from_s);
     this.slider.max = String(playback.of_s);
     if (this.dragged === null) this.slider.value = String(playback.at_s);
     this.words();

@@ -123,11 +123,29 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     let parts = parts(&place).join(" ");
     // Cell 1 is pressed from the beginning of the run on: more than half of all epochs ago.
     let ended = place.start("skinbus", "explain run-3.mcap --epoch 200 --cell 1").end().well();
-    assert!(ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus of -"), "{ended:#?}");
+    assert!(
+        ended.stdout.contains("contact    0.6") && ended.stdout.contains("stimulus of -0.0"),
+        "{ended:#?}"
+    );
     assert!(!ended.stdout.contains("not known"), "{ended:#?}");
     let whole = place.start("skinbus", &format!("explain {parts} --epoch 200 --cell 1")).end().well();
     let contact = |text: &str| text.lines().find(|line| line.contains("  contact  ")).unwrap().to_owned();
     assert_eq!(contact(&whole.stdout), contact(&ended.stdout));
+    // Seconds count from the first tick, also in a part without it.
+    let at = |text: &str| -> f64 {
+        text.split_once(" at ").unwrap().1.split_once(" s\n").unwrap().0.parse().unwrap()
+    };
+    let [of_all, of_part] = [&whole, &ended].map(|ended| at(&ended.stdout));
+    assert!((of_all - of_part).abs() < 1e-9 && of_part >= 200.0 * 0.016, "{of_all} {of_part}");
+    for files in [parts.as_str(), "run-3.mcap"] {
+        let dump = format!("dump {files} --brief --from {} --kind joints -n 1", of_part - 1e-5);
+        let first = place.start("skinbus", &dump).end().well().stdout;
+        assert!(first.contains("joints epoch 200:"), "{first}");
+    }
+    let beginning = place.start("skinbus", "dump run.mcap --brief").end().well().stdout;
+    let before = beginning.lines().filter(|line| line.starts_with('-')).count();
+    let joints = beginning.lines().position(|line| line.contains("joints epoch 0:")).unwrap();
+    assert!(before > 0 && before <= joints, "heartbeats come before the loop: {beginning}");
 
     let stats = |files: &str| -> Value {
         let ended = place.start("skinbus", &format!("dump {files} --stats --json")).end().well();

@@ -60,7 +60,10 @@ fn everything_that_a_run_knows_is_in_its_recording() {
         .into();
     assert_eq!(recorded.attachments, attached);
     let names: Vec<_> = recorded.metadata.keys().map(String::as_str).collect();
-    assert_eq!(names, ["configuration", "configuration_hashes", "machine", "part", "program", "recorder"]);
+    assert_eq!(
+        names,
+        ["configuration", "configuration_hashes", "machine", "part", "program", "recorder", "run"]
+    );
     assert!(recorded.metadata["program"]["command_line"].contains("--record run.mcap"));
     assert!(recorded.metadata["configuration"]["bus/vcan0"].starts_with("embedded, fd, receive buffer "));
 

@@ -13,8 +13,10 @@ use super::watch::{Moment, Requested, Watch};
 pub struct Found {
     /// What was sent on each bus until then.
     pub moments: Result<Vec<Option<Moment>>, NotFound>,
-    /// When its first frame came, in ns since 1970.
-    pub first_ns: u64,
+    /// The time that seconds count from, in ns since 1970.
+    pub zero_ns: u64,
+    /// True if that is the first tick of the run, not the first frame.
+    pub is_of_run: bool,
     /// Frames before that which the recorder lost.
     pub dropped: u64,
     /// Lines before that which cannot be read.
@@ -36,12 +38,16 @@ pub fn find(reader: &mut Reader, skin: &Skin, requested: Requested) -> Result<Fo
             watch.begin(before.nanos, &before.bus, &message);
         }
     }
-    let (mut first, mut dropped, mut unreadable) = (None, 0_u64, 0_u64);
+    let mut zero = reader.extras().run_began();
+    let is_of_run = zero.is_some();
+    zero.into_iter().for_each(|zero| watch.count_from(zero));
+    let (mut is_empty, mut dropped, mut unreadable) = (true, 0_u64, 0_u64);
     while let Some(entry) = reader.next()? {
         match entry {
             Entry::Frame(record) => {
                 let nanos = record.time.nanos;
-                first.get_or_insert(nanos);
+                zero.get_or_insert(nanos);
+                is_empty = false;
                 let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
                 let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
                 if watch.take(nanos, record.interface, message) {
@@ -55,6 +61,12 @@ pub fn find(reader: &mut Reader, skin: &Skin, requested: Requested) -> Result<Fo
             },
         }
     }
-    let is_empty = first.is_none();
-    Ok(Found { moments: watch.moments(), is_empty, first_ns: first.unwrap_or_default(), dropped, unreadable })
+    Ok(Found {
+        moments: watch.moments(),
+        is_empty,
+        zero_ns: zero.unwrap_or_default(),
+        is_of_run,
+        dropped,
+        unreadable,
+    })
 }

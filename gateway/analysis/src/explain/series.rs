@@ -56,7 +56,7 @@ pub struct Counted {
     /// Epochs.
     pub epochs: u64,
     /// When the first frame came, in ns since 1970.
-    pub first_ns: u64,
+    pub zero_ns: u64,
 }
 
 /// Reads a capture to its end, and gives out each epoch when nothing more can come of it, with the time of the capture's
@@ -79,7 +79,7 @@ pub fn each_epoch<E>(
         }
     }
     let mut counted = Counted::default();
-    let mut first = None;
+    let mut zero = reader.extras().run_began();
     while let Some(entry) = reader.next()? {
         let record = match entry {
             Entry::Frame(record) => record,
@@ -89,20 +89,20 @@ pub fn each_epoch<E>(
             }
         };
         let nanos = record.time.nanos;
-        counted.first_ns = *first.get_or_insert(nanos);
+        counted.zero_ns = *zero.get_or_insert(nanos);
         let decoded = decoder.decode(Micros(nanos / 1_000), record.interface, &record.frame);
         let message = if let Decoded::Message(message) = &decoded { Some(message) } else { None };
         series.watch.take(nanos, record.interface, message);
         series.collect(false);
         while let Some(epoch) = series.next(false) {
             counted.epochs += 1;
-            take(counted.first_ns, &epoch).map_err(SeriesError::Taken)?;
+            take(counted.zero_ns, &epoch).map_err(SeriesError::Taken)?;
         }
     }
     series.collect(true);
     while let Some(epoch) = series.next(true) {
         counted.epochs += 1;
-        take(counted.first_ns, &epoch).map_err(SeriesError::Taken)?;
+        take(counted.zero_ns, &epoch).map_err(SeriesError::Taken)?;
     }
     if counted.epochs == 0
         && let Err(source) = series.watch.moments()

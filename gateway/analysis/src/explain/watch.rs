@@ -12,6 +12,7 @@ use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
+use trace::capture::seconds_since;
 
 use super::not_found::NotFound;
 
@@ -55,7 +56,7 @@ pub enum Origin {
 pub struct Requested {
     /// Their epoch.
     pub epoch: Epoch,
-    /// Only from so many ns after the first frame on.
+    /// Only from so many ns after the time on that seconds count from.
     pub from_ns: u64,
     /// Which of them, from 1.
     pub occurrence: u32,
@@ -99,7 +100,8 @@ pub struct Watch<'a> {
     skin: &'a Skin,
     /// All joints, if none are requested.
     requested: Option<Requested>,
-    first: Option<u64>,
+    /// The time that seconds count from; else they count from the first frame.
+    zero: Option<u64>,
     /// By the skin's bus.
     bus_watches: Vec<LinkId>,
     /// Buses that are not the skin's.
@@ -166,7 +168,12 @@ impl<'a> Watch<'a> {
     fn of(skin: &'a Skin, requested: Option<Requested>) -> Self {
         let bus_watch = |bus| LinkId { cells_here: skin.cells_of(bus).next().is_some(), ..LinkId::default() };
         let bus_watches = (0..skin.buses.len()).map(bus_watch).collect();
-        Self { skin, requested, first: None, bus_watches, others: Vec::new() }
+        Self { skin, requested, zero: None, bus_watches, others: Vec::new() }
+    }
+
+    /// Counts seconds from this time on, in ns since 1970; else they count from the first frame.
+    pub const fn count_from(&mut self, zero: u64) {
+        self.zero = Some(zero);
     }
 
     /// Takes in a frame from before the capture that is latched when it begins.
@@ -186,7 +193,7 @@ impl<'a> Watch<'a> {
 
     /// Takes in the next frame; `message` is its meaning, if it has one. Whether all is known now.
     pub fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
-        let first = *self.first.get_or_insert(nanos);
+        let zero = *self.zero.get_or_insert(nanos);
         let at = self.skin.bus_named(bus);
         let Some(bus_watch) = at.and_then(|at| self.bus_watches.get_mut(at)) else {
             if self.others.len() < RUNS && !self.others.iter().any(|other| other == bus) {
@@ -198,7 +205,7 @@ impl<'a> Watch<'a> {
         if let Some(message) = message {
             bus_watch.take(
                 nanos,
-                nanos.saturating_sub(first),
+                nanos.saturating_sub(zero),
                 message,
                 self.requested,
                 at.map_or(0, |at| self.skin.joints_of(at).len()),
@@ -239,7 +246,7 @@ impl<'a> Watch<'a> {
             return Err(NotFound::Buses { capture, skin: names(false) });
         }
         if self.bus_watches.iter().all(|bus_watch| bus_watch.open.is_empty()) {
-            let first = self.first.unwrap_or_default();
+            let zero = self.zero.unwrap_or_default();
             let Some(bus_watch) = self.bus_watches.iter().find(|bus_watch| !bus_watch.runs.is_empty()) else {
                 for (index, (bus, watch)) in self.skin.buses.iter().zip(&self.bus_watches).enumerate() {
                     if let Some(came) = watch.other_joints {
@@ -259,7 +266,7 @@ impl<'a> Watch<'a> {
             if from_ns > 0 {
                 requested += &format!(" at {} s or later", seconds(from_ns));
             }
-            let mut runs: Vec<_> = bus_watch.runs.iter().map(|run| run.text(first)).collect();
+            let mut runs: Vec<_> = bus_watch.runs.iter().map(|run| run.text(zero)).collect();
             if bus_watch.further_runs > 0 {
                 runs.push(format!("{} further rows", bus_watch.further_runs));
             }
@@ -276,9 +283,9 @@ fn seconds(nanos: u64) -> String {
 }
 
 impl Run {
-    fn text(&self, began: u64) -> String {
+    fn text(&self, zero: u64) -> String {
         let Self { first, last, joints } = *self;
-        let [from, to] = [first, last].map(|(_, at)| seconds(at.saturating_sub(began)));
+        let [from, to] = [first, last].map(|(_, at)| format!("{:.3}", seconds_since(zero, at)));
         let (first, last) = (first.0, last.0);
         if joints == 1 {
             return format!("those of epoch {first} at {from} s");

@@ -280,6 +280,7 @@ impl LinkId {
             rates: self.known.rates,
             frames: self.frames,
             first_ns: first,
+            zero_ns: first,
             duration_s: (last - first) as f64 / 1e9,
             operation_s: span as f64 / 1e9,
             worst_case: self.known.worst_case.clone(),

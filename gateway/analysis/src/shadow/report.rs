@@ -37,6 +37,9 @@ pub struct BusShadow {
     pub frames: u64,
     /// The time of the first one, in ns of the capture's clock.
     pub first_ns: u64,
+    /// The time that seconds count from, in ns of the same clock: the first frame, if nothing else is known.
+    #[serde(skip)]
+    pub zero_ns: u64,
     /// From the first to the last one.
     pub duration_s: f64,
     /// How long it was in operation: load, stretches, delays and queues are of that time.

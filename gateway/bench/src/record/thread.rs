@@ -18,7 +18,7 @@ use super::text::Text;
 use super::topics::{OF_ROBOT, Topics};
 use super::{Outputs, Stop};
 use crate::run::realtime::wall;
-use trace::capture::{Note, NoteKind};
+use trace::capture::{Note, NoteKind, RUN, facts_of_run};
 use trace::recording::account::{Count, Recording};
 use trace::recording::layout::Layout;
 use trace::recording::series::{Head, Said, Series};
@@ -72,6 +72,8 @@ pub(super) struct Work {
     /// Joint positions at the last tick.
     q: Option<[f64; MAX_ROBOT_JOINTS]>,
     backlog: Option<u64>,
+    /// Whether the files say when the loop began.
+    has_began: bool,
     ticks: u64,
     ticks_skipped: u64,
     max_late_ns: u64,
@@ -114,6 +116,7 @@ impl Work {
             buses,
             q: None,
             backlog: backlog::dropped(),
+            has_began: false,
             ticks: 0,
             ticks_skipped: 0,
             max_late_ns: 0,
@@ -223,6 +226,12 @@ impl Work {
             self.max_late_ns = self.max_late_ns.max(timed.late_ns);
             let nanos = timed.due_ns.saturating_add_signed(offset);
             let layout = &self.layout;
+            if !mem::replace(&mut self.has_began, true)
+                && let Some(series) = &mut self.files.series
+            {
+                let since = timed.record.tick.number.saturating_mul(layout.tick_ns);
+                series.add(RUN, facts_of_run(nanos.saturating_sub(since)));
+            }
             let messages = 4 + u64::from(layout.poses_at(timed.record.tick.number));
             self.files
                 .put(Count::others(messages), |window, topics| topics.tick(window, layout, nanos, &timed));

@@ -43,15 +43,12 @@ pub enum ReplayError {
     #[error("{0}: there is no frame in it")]
     Empty(String),
     /// Nor in the requested part.
-    #[error(
-        "nothing remains to be sent: {name} lasts {seconds:.3} s from its first frame on, and --from and --to leave none \
-         of it"
-    )]
+    #[error("nothing remains to be sent: {name} ends at {ends_s:.3} s, and --from and --to leave none of it")]
     NothingLeft {
         /// What the capture is called.
         name: String,
-        /// How long it is.
-        seconds: f64,
+        /// When its last frame came, in s of the run, or after its first frame.
+        ends_s: f64,
     },
     /// An option names a bus that the capture does not have.
     #[error("{option}: {capture} has no bus {bus}; it has {buses}")]

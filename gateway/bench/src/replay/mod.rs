@@ -56,7 +56,7 @@ use crate::run::realtime::idle_lateness;
 use crate::setup::names;
 use crate::signals::caught;
 use model::decode::BUSES;
-use trace::capture::{CaptureError, Entry, Extras, NoteKind, Reader};
+use trace::capture::{CaptureError, Entry, Extras, NoteKind, Reader, seconds_since};
 
 /// The period of wake-ups for which lateness is measured, in ns.
 const GRID_NS: u64 = 2_000_000;
@@ -164,6 +164,7 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     let buses: BTreeSet<_> = latched.iter().map(|frame| frame.bus.as_str()).collect();
     few(buses.len())?;
     survey.begin(latched);
+    survey.run_began = reader.extras().run_began();
     let (mut unreadable, mut backwards) = (0_u64, None);
     while let Some(entry) = reader.next().map_err(ReplayError::Read)? {
         match entry {
@@ -216,8 +217,8 @@ fn look_through(options: &Options, progress: &Progress) -> Result<(Survey, Extra
     }
     let (from, to) = survey.bounds();
     if from > survey.last || from >= to {
-        let seconds = Duration::from_nanos(survey.last - survey.first.unwrap_or(0)).as_secs_f64();
-        return Err(ReplayError::NothingLeft { name, seconds });
+        let ends_s = seconds_since(survey.zero(), survey.last);
+        return Err(ReplayError::NothingLeft { name, ends_s });
     }
     Ok((survey, reader.extras().clone(), name))
 }

@@ -25,11 +25,11 @@ const STARTS_NS: u64 = 100_000_000;
 /// A page of counters is on its way for so many joints at most.
 const PASSED: usize = 64;
 
-/// A part of a capture, in ns after its first frame.
+/// A part of a capture, in ns of its run, or after its first frame where there is no run.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Part {
-    /// From here on.
-    pub from: u64,
+    /// From here on; else from the beginning.
+    pub from: Option<u64>,
     /// Up to, and without, here.
     pub to: Option<u64>,
 }
@@ -38,6 +38,8 @@ pub struct Part {
 #[derive(Debug)]
 pub struct Survey {
     part: Part,
+    /// When the run began, in ns since 1970, if that is known.
+    pub run_began: Option<u64>,
     /// When the first frame came, in ns since 1970.
     pub first: Option<u64>,
     /// The latest time.
@@ -157,7 +159,16 @@ impl Survey {
     #[must_use]
     pub const fn new(part: Part) -> Self {
         let decoder = Decoder::new(None);
-        Self { part, first: None, last: 0, frames: 0, dropped: 0, buses: Vec::new(), decoder }
+        Self {
+            part,
+            run_began: None,
+            first: None,
+            last: 0,
+            frames: 0,
+            dropped: 0,
+            buses: Vec::new(),
+            decoder,
+        }
     }
 
     /// Takes what was latched when the capture began, before its first frame.
@@ -226,13 +237,18 @@ impl Survey {
         }
     }
 
+    /// The time that seconds count from, in ns since 1970.
+    #[must_use]
+    pub fn zero(&self) -> u64 {
+        self.run_began.or(self.first).unwrap_or(0)
+    }
+
     /// The part, in ns since 1970: from, and up to and without. From the beginning on means all, also what is older
     /// than the first frame.
     #[must_use]
     pub fn bounds(&self) -> (u64, u64) {
-        let first = self.first.unwrap_or(0);
-        let end = self.part.to.map_or(u64::MAX, |to| first.saturating_add(to));
-        (if self.part.from == 0 { 0 } else { first.saturating_add(self.part.from) }, end)
+        let end = self.part.to.map_or(u64::MAX, |to| self.zero().saturating_add(to));
+        (self.part.from.map_or(0, |from| self.zero().saturating_add(from)), end)
     }
 
     /// Where a bus stands, by its name in the capture.

@@ -9,6 +9,8 @@ use analysis::shadow::{
     Stretches,
 };
 
+use trace::capture::seconds_since;
+
 use crate::print::{Rows, count, harmless, list, or};
 
 /// Writes the frames that have left the model, one object a line.
@@ -194,7 +196,7 @@ fn delays(delays: &Delays) -> String {
 }
 
 fn at(bus: &BusShadow, most: Most) -> String {
-    format!("at {:.3} s", most.at_ns.saturating_sub(bus.first_ns) as f64 / 1e9)
+    format!("at {:.3} s", seconds_since(bus.zero_ns, most.at_ns))
 }
 
 #[cfg(test)]

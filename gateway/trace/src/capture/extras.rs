@@ -1,5 +1,7 @@
 //! The contents of a recording beside frames and notes.
 
+use std::collections::BTreeMap;
+
 use protocol::can::Frame;
 use protocol::document::DocumentError;
 use protocol::skin::Skin;
@@ -20,6 +22,24 @@ pub struct Extras {
     pub unfinished: Option<String>,
 }
 
+/// The metadata that says when the loop of a run began.
+pub const RUN: &str = "run";
+/// Its key: the first tick, in ns since 1970.
+const BEGAN: &str = "began_ns";
+
+/// Makes the facts of the metadata [`RUN`]: the time of the first tick, in ns since 1970.
+#[must_use]
+pub fn facts_of_run(nanos: u64) -> BTreeMap<String, String> {
+    [(BEGAN.to_owned(), nanos.to_string())].into()
+}
+
+/// Returns the seconds from a time to another, both in ns since 1970; negative before it.
+#[must_use]
+#[expect(clippy::cast_precision_loss, reason = "to a nanosecond within three months")]
+pub const fn seconds_since(zero: u64, nanos: u64) -> f64 {
+    if nanos < zero { (zero - nanos) as f64 / -1e9 } else { (nanos - zero) as f64 / 1e9 }
+}
+
 /// What the skin in a recording of a run is called.
 pub const SKIN: &str = "skin.toml";
 
@@ -38,6 +58,13 @@ impl Extras {
     pub fn fact(&self, record: &str, key: &str) -> Option<&str> {
         let (_, facts) = self.metadata.iter().find(|(name, _)| name == record)?;
         facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
+    }
+
+    /// The time of the run's first tick, in ns since 1970, from which seconds count; where it is not known they count from the
+    /// capture's first frame. Of what is read only once it is not known before the first frame.
+    #[must_use]
+    pub fn run_began(&self) -> Option<u64> {
+        self.fact(RUN, BEGAN)?.parse().ok()
     }
 
     /// The skin that is attached; `None` when none is.

@@ -23,7 +23,7 @@ mod text_kinds;
 mod times;
 
 pub use error::CaptureError;
-pub use extras::{Extras, Latched, SKIN, Topic};
+pub use extras::{Extras, Latched, RUN, SKIN, Topic, facts_of_run, seconds_since};
 pub use mcap::ORIGIN;
 pub(crate) use mcap::is_foreign_frame;
 pub use parts::{Part, PartsError};

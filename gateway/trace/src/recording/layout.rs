@@ -46,6 +46,8 @@ pub struct Layout {
     pub central: Vec<Central>,
     /// From one of a patch's clouds of points to the next, in epochs.
     pub epochs_per_cloud: u64,
+    /// From one tick to the next, in ns.
+    pub tick_ns: u64,
     /// From one of the poses of links to the next, in ticks.
     pub ticks_per_poses: u64,
     /// What is known of the robot's links.
@@ -95,6 +97,7 @@ impl Layout {
             chains: (0..skin.buses.len()).map(|bus| skin.chain(bus).joints.clone()).collect(),
             patches,
             epochs_per_cloud,
+            tick_ns: skin.timing.tick_nanos(),
             ticks_per_poses: skin.timing.ticks_per_broadcast.into(),
             robot: None,
         }

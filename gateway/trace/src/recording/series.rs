@@ -231,6 +231,15 @@ impl<T> Series<T> {
         }
     }
 
+    /// Adds facts that are known only now, to the file that is open and to each that follows.
+    pub fn add(&mut self, name: &'static str, facts: BTreeMap<String, String>) {
+        let written = self.open.as_mut().map_or(Ok(()), |open| open.writer.metadata(name, &facts));
+        self.head.metadata.push((name, facts));
+        if let Err(error) = written {
+            self.break_off(&error);
+        }
+    }
+
     fn start(
         &mut self,
         part: Part,

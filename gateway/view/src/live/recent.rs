@@ -46,7 +46,7 @@ struct Kept {
 pub struct FrameSaid {
     /// Its number, by which the page asks for more.
     pub number: u64,
-    /// Seconds since the first frame.
+    /// Seconds of the run, or since the first frame.
     pub at_s: f64,
     /// The frame as candump writes it.
     pub frame: String,
@@ -100,7 +100,7 @@ impl Recent {
         }
     }
 
-    /// The newest frames from and to a cell, the newest first; `seconds` gives a time since the first frame.
+    /// The newest frames from and to a cell, the newest first; `seconds` gives a time in the run, or since the first frame.
     pub(super) fn of_cell(
         &self,
         skin: &Skin,

@@ -126,7 +126,7 @@ impl Bench {
 
     fn build(&self, player: &Player) {
         let reader = Reader::open_all(&self.paths).unwrap();
-        player.index().build(reader, self.skin.clone(), player.origin(), &false.into());
+        player.index().build(reader, self.skin.clone(), (player.first(), player.zero()), &false.into());
     }
 }
 

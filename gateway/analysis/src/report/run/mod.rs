@@ -255,8 +255,10 @@ struct Run {
     files: Vec<String>,
     /// When the first message was, in ns since 1970.
     began: Option<u64>,
-    /// When the first frame was, in s after the first message.
-    first_frame: Option<f64>,
+    /// The time that seconds of commands count from, in s after the first message: the run's first tick, or the first frame.
+    zero: Option<f64>,
+    /// When the loop began, in ns since 1970, if the recording says so.
+    run_began: Option<u64>,
     motion: Motion,
     bus_figures: Vec<LinkId>,
     shadow: Shadow,
@@ -322,7 +324,8 @@ impl Run {
             skin,
             files: Vec::new(),
             began: None,
-            first_frame: None,
+            zero: None,
+            run_began: extras.run_began(),
             bus_figures,
             shadow,
             backlog: 0,
@@ -338,7 +341,8 @@ impl Run {
         match item {
             Item::Entry(Entry::Frame(record)) => {
                 let at = self.seconds(record.time.nanos);
-                self.first_frame.get_or_insert(at);
+                let zero = self.run_began.map_or(at, |nanos| self.seconds(nanos));
+                self.zero.get_or_insert(zero);
                 let bus = self.skin.bus_named(record.interface);
                 match bus.and_then(|bus| Some((bus, self.bus_figures.get_mut(bus)?))) {
                     Some((bus, bus_figures)) => {

@@ -162,7 +162,7 @@ fn wire_messages_are_never_sent() {
 
 #[test]
 fn a_part_begins_and_ends_at_its_times_and_buses_are_mapped() {
-    let part = Part { from: MS, to: Some(6 * MS) };
+    let part = Part { from: Some(MS), to: Some(6 * MS) };
     let (due, plan_summary) = plan_summary(part, |selection| selection.bus_links = vec![None, Some(0)], 1);
     assert_eq!(shown(&due), [(0, 0, 1)]);
     let skipped = [(reason::BEFORE, 1), (reason::AFTER, 2), (reason::NOT_PICKED, 3), (reason::ERROR, 1)];

@@ -20,10 +20,9 @@ struct Moment {
 }
 
 impl Draft<'_> {
-    /// The command that shows the recording at a time, in s after its first message; `--at` counts from its first frame,
-    /// as that of `skinbus explain` does.
+    /// The command that shows the recording at a time, in s after its first message.
     pub(super) fn look(&self, at: f64) -> String {
-        let seconds = (at - self.run.first_frame.unwrap_or(0.0)).max(0.0);
+        let seconds = (at - self.run.zero.unwrap_or(0.0)).max(0.0);
         let files: Vec<_> = self.run.files.iter().map(|file| quoted(file)).collect();
         let skin = self.run.frames_only.as_ref().map(|it| format!(" --skin {}", quoted(&it.skin_file)));
         format!("skinbus view {}{} --at {seconds:.3}", files.join(" "), skin.unwrap_or_default())
