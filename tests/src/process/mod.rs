@@ -49,11 +49,11 @@ pub use running::{Ended, Running};
 pub use summary::Summary;
 
 /// How long anything may take that should happen at once.
-pub const TIMEOUT: Duration = Duration::from_secs(40);
+pub const TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Every cell is pressed, harder and softer, while the arm stands.
+/// Every cell is pressed, harder and softer, while the arm stands; longer than any machine needs for a test.
 pub const PRESSED: &str = r#"version = 1
-duration_s = 60.0
+duration_s = 600.0
 
 [motion]
 kind = "hold"
@@ -65,7 +65,7 @@ kind = "compare"
 
 [[touch]]
 at_s = 0.0
-for_s = 60.0
+for_s = 600.0
 all = true
 force_n = 1.5
 profile = "step"

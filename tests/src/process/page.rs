@@ -10,7 +10,7 @@ use tungstenite::{Error, Message, WebSocket, client};
 use super::{Place, Running, TIMEOUT, skin, until};
 
 /// Nothing happens by itself; the arm gives way.
-pub const QUIET: &str = "version = 1\nduration_s = 60.0\n\n[motion]\nkind = \"kinesthetic\"\n\
+pub const QUIET: &str = "version = 1\nduration_s = 600.0\n\n[motion]\nkind = \"kinesthetic\"\n\
                      start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
 
 /// A page, without the browser.

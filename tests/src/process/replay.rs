@@ -63,11 +63,11 @@ pub fn cell(node: i64) -> CellId {
 }
 
 /// What a test client sends while a run is recorded: every command, stimuli of both pages in both ways, parameters that are
-/// read, written, refused and taken into use.
+/// read, written, refused and taken into use. It needs 48 broadcasts, a fifth of those in four seconds at 62.5 Hz.
 pub fn says_everything(test_client: &TestClient, skin: &Path) {
     let configure = |to, tag, request| Message::Configure { to, tag, request };
     let write = |parameter: Parameter, words| Request::Write { number: parameter.number(), words };
-    test_client.waits_for_epoch(20);
+    test_client.waits_for_epoch(10);
     test_client.sends(&Message::Report);
     test_client.sends(&Message::Sync);
     let page = SensorPage::Acceleration([Q3_12::nearest(0.5), Q3_12::ZERO, Q3_12::nearest(-1.0)]);
@@ -78,7 +78,7 @@ pub fn says_everything(test_client: &TestClient, skin: &Path) {
         from: From::Next,
         page: SensorPage::Skin(skin_page),
     });
-    test_client.waits_for_epoch(40);
+    test_client.waits_for_epoch(20);
     // Cell 4 is moved by a hand's breadth: its torques change in the middle of a contact.
     let skin = Skin::read(skin).unwrap();
     let described = skin.cells.iter().find(|it| it.node.get() == 4).unwrap();
@@ -92,11 +92,11 @@ pub fn says_everything(test_client: &TestClient, skin: &Path) {
     let hash = [parameters.hash().cast_signed(), 0, 0, 0, 0, 0];
     test_client.sends(&configure(to, 4, write(Parameter::Commit, hash)));
     test_client.sends(&configure(Node::Everyone, 5, Request::Read { number: 99 }));
-    test_client.waits_for_epoch(70);
+    test_client.waits_for_epoch(30);
     test_client.sends(&Message::Halt);
-    test_client.waits_for_epoch(90);
+    test_client.waits_for_epoch(40);
     test_client.sends(&Message::Resume);
-    test_client.waits_for_epoch(110);
+    test_client.waits_for_epoch(48);
     // Writing the mode of a cell resets its contact state.
     test_client.sends(&configure(Node::Cell(cell(5)), 6, write(Parameter::Mode, [1, 0, 0, 0, 0, 0])));
 }

@@ -138,7 +138,7 @@ pub fn end(place: &Place, bench: Running) -> Ended {
 pub fn goes_round_a_cell(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(PRESSED);
-    let bench = unrecorded(place, 120.0, "");
+    let bench = unrecorded(place, 600.0, "");
     bench.hears_the_loop();
     let test_client = TestClient::on(place, "vcan0", format);
     holds(&test_client, 12);
@@ -172,7 +172,7 @@ pub fn goes_round_a_cell(place: &Place, format: Format) {
 pub fn keeps_ways_without_a_touch(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(PRESSED.split("[[touch]]").next().unwrap());
-    let bench = unrecorded(place, 120.0, "");
+    let bench = unrecorded(place, 600.0, "");
     bench.hears_the_loop();
     let test_client = TestClient::on(place, "vcan0", format);
     let mut cells: BTreeSet<u8> = (1..=CELLS).collect();
@@ -199,23 +199,23 @@ cells = [6, 5]
 one_way = true
 
 [[fault]]
-at_s = 5.0
+at_s = 8.0
 kind = "cut"
 cells = [3, 4]
-for_s = 8.0
+for_s = 12.0
 
 [[fault]]
-at_s = 5.0
+at_s = 8.0
 kind = "cut"
 cells = [8, 4]
-for_s = 8.0
+for_s = 12.0
 "#;
 
 /// An unreachable cell is named, and the rest finds another route.
 pub fn goes_on_without_a_wire(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(&format!("{PRESSED}{LINKS_DOWN}"));
-    let bench = unrecorded(place, 120.0, "");
+    let bench = unrecorded(place, 600.0, "");
     bench.hears_the_loop();
     let test_client = TestClient::on(place, "vcan0", format);
     bench.hears("scenario: link down from cell 6 to cell 5 on vcan0");

@@ -121,6 +121,12 @@ pub fn cansend(place: &Place, frame: &str) {
     }
 }
 
+/// Counts the frames for which an interface's queue had no room, which is what ENOBUFS means.
+pub fn refused(name: &str) -> u64 {
+    let shown = tool(&format!("tc -statistics -json qdisc show dev {name}")).stdout;
+    serde_json::from_slice::<serde_json::Value>(&shown).unwrap()[0]["drops"].as_u64().unwrap()
+}
+
 /// `vcan0`, which is as it should be again when this is dropped, however a test ends.
 pub struct Vcan0;
 

@@ -23,7 +23,7 @@ use protocol::slcan::{self, Decoder, Line};
 use tempfile::TempDir;
 
 const SERIAL: u32 = 100_012;
-const TIMEOUT: Duration = Duration::from_secs(40);
+const TIMEOUT: Duration = Duration::from_secs(60);
 
 /// An emulated cell without a bus.
 struct Alone {

@@ -48,7 +48,11 @@ fn four_emulated_and_eight_process_cells_lose_only_what_was_on_its_way_at_a_kill
     place.skin(12);
     place.scenario(&format!("{PRESSED}{}", kills(9..=12)));
     fs::create_dir(place.path("flash")).unwrap();
-    let ended = bench(&place, 10.0, "9,10,11,12", "--flash flash").end().well();
+    let bench = bench(&place, 600.0, "9,10,11,12", "--flash flash");
+    (9..=12).for_each(|cell| bench.hears(&format!("cell {cell} on vcan0 restarted")));
+    place.test_client().waits_for_torques(1..=12);
+    bench.signal(Signal::TERM);
+    let ended = bench.end().well();
     place.is_left_clean();
     let summary = place.summary();
     summary.adds_up();
@@ -64,14 +68,16 @@ fn four_emulated_and_eight_process_cells_lose_only_what_was_on_its_way_at_a_kill
         if node <= 8 {
             assert!(in_doubt == 0 && due <= broadcasts, "{cell:#}");
         } else {
-            assert!(due < broadcasts - 150 && due > 250, "{node} was dead for a while: {cell:#}");
+            let dead = broadcasts - due;
+            assert!(
+                dead * 8 > broadcasts && due > 0,
+                "{node} was dead for a while, of {broadcasts}: {cell:#}"
+            );
             // 600 ms of silence pass before it counts as dead.
-            assert!((1..60).contains(&in_doubt), "{node}, on its way and after the kill: {cell:#}");
+            assert!((1..=due).contains(&in_doubt), "{node}, on its way and after the kill: {cell:#}");
         }
     }
     for cell in 9..=12 {
-        let said = format!("cell {cell} on vcan0 restarted");
-        assert!(ended.stderr.contains(&said), "{said:?} in\n{}", ended.stderr);
         // Nobody commissions them in a run: their flash did it.
         assert_eq!(fs::read(place.path(&format!("flash/vcan0-{cell}.flash"))).unwrap().len(), 133);
     }
@@ -92,7 +98,8 @@ fn an_emulated_cell_answers_on_fd_and_on_classic_buses() {
         if format == SkinFormat::Fd {
             summary.adds_up();
         }
-        assert!(summary.cells()[1]["in_time"].as_u64().unwrap() > 60, "{:#}", summary.0);
+        let answered = ["in_time", "late"].map(|how| summary.cells()[1][how].as_u64().unwrap());
+        assert!(answered.iter().sum::<u64>() > 12, "{:#}", summary.0);
         assert_eq!(
             summary.of_bus("/uplink/unknown") + summary.of_bus("/uplink/rejected"),
             0,
@@ -116,7 +123,7 @@ fn an_emulated_cell_sums_with_processes_as_neighbours() {
         let is = |message: &Message| matches!(message, Message::Sum { from, count, .. } if is(*from, *count));
         log.messages.iter().filter(|(message, _)| is(message)).count()
     };
-    assert!(sums(&|from, _| from.get() == 6) > 30, "of the emulated cell, at 20 Hz");
+    assert!(sums(&|from, _| from.get() == 6) > 8, "of the emulated cell, at 20 Hz");
     // Both roots together have all cells.
     let largest = (1..=12).rev().find(|&size| sums(&|_, count| count == size) > 0);
     assert!(largest >= Some(6), "{largest:?}");
@@ -128,7 +135,7 @@ fn emulators_end_with_a_gateway_that_is_killed_or_interrupted() {
     for (signal, code) in [(Signal::KILL, None), (Signal::INT, Some(0))] {
         let place = Place::new();
         place.pressed();
-        let bench = bench(&place, 60.0, "8", "");
+        let bench = bench(&place, 600.0, "8", "");
         bench.hears_the_loop();
         bench.signal(signal);
         assert_eq!(bench.end().code(), code);

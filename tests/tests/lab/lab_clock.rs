@@ -31,7 +31,7 @@ fn what_253_processes_do_not_answer_at_20_hz_they_were_too_late_for_and_nothing_
     if busy < SATURATED {
         let missing = of("due") - of("in_time") - of("late");
         assert_eq!(missing, of("skipped") + of("too_late"), "{:#}", summary.0);
-        assert!(complete > 300, "{complete} of 600 with {busy:.2} of the processor: {:#}", summary.0);
+        assert!(complete > 60, "{complete} of 600 with {busy:.2} of the processor: {:#}", summary.0);
     }
 }
 
@@ -46,7 +46,7 @@ fn cells_and_gateway_live_through_steps_of_the_walls_clock() {
     let expected = Target { cells: 4, broadcast_hz: 20.0, ..Target::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
     place.scenario(PRESSED);
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     let test_client = place.test_client();
     test_client.waits_for_epoch(20);
     let back = tool("date +%s").stdout;

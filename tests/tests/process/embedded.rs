@@ -19,7 +19,7 @@ mod place;
 
 const BUS: &str = "vcan0";
 /// Longer than anything takes; nothing waits that long unless it fails.
-const LONG: Duration = Duration::from_secs(5);
+const LONG: Duration = Duration::from_secs(60);
 /// What marks the end of what a test waits for.
 const LAST: u32 = 0x7FF;
 /// What passes the time until the bus has seen to everything; not looked at.

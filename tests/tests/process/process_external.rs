@@ -25,30 +25,32 @@ fn python(place: &Place) -> Running {
 
 #[test]
 fn the_example_in_python_moves_the_arm() {
-    let place = place(500);
+    // A busy machine halts no robot.
+    let place = place(10_000);
     let python = python(&place);
     python.hears("waiting for a gateway at ");
-    let bench = place.running_bench(3.0, "");
+    let bench = place.running_bench(600.0, "");
     place.test_client().waits_for_motion();
+    python.prints(" 8 cells ");
+    bench.signal(Signal::TERM);
     bench.end().well();
     place.is_left_clean();
     assert_eq!(place.files(), ["run.json", "run.log", "scenario.toml", "skin.toml"], "no socket is left");
     let summary = place.summary();
     summary.adds_up();
-    assert!(summary.0["halted"].is_null() && summary.0["outcome"] == "done", "{:#}", summary.0);
+    assert!(summary.0["halted"].is_null() && summary.0["outcome"] == "interrupted", "{:#}", summary.0);
     // It is there when the loop begins; then it may be late, as the machine is.
     assert_eq!(summary.count("/loop/bad_cycles", NONSENSE), 0, "{:#}", summary.0);
-    assert!(summary.total("/loop/bad_cycles") < summary.number("/loop/ticks") / 2, "{:#}", summary.0);
-    python.prints(" 8 cells ");
+    assert!(summary.total("/loop/bad_cycles") < summary.number("/loop/ticks"), "{:#}", summary.0);
 }
 
 #[test]
 fn a_controller_that_begins_later_is_waited_for() {
     let place = place(250);
-    place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 20.0"));
-    let bench = place.running_bench(60.0, "");
-    // Three times as long as it may be missing once it has begun.
-    std::thread::sleep(Duration::from_millis(1_500));
+    place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 600.0"));
+    let bench = place.running_bench(600.0, "");
+    // More ticks than it may be missing once it has begun: each broadcast is in one of its own.
+    place.test_client().waits_for_joints(260);
     let python = python(&place);
     place.test_client().waits_for_motion();
     bench.signal(Signal::TERM);
@@ -64,10 +66,10 @@ fn a_controller_that_begins_later_is_waited_for() {
 
 #[test]
 fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_ack() {
-    let place = place(250);
+    let place = place(1_000);
     let first = python(&place);
     first.hears("waiting for a gateway at ");
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     place.test_client().waits_for_motion();
     first.signal(Signal::KILL);
     assert_eq!(first.end().signal(), Some(9));
@@ -85,7 +87,7 @@ fn a_controller_that_is_killed_halts_the_robot_and_another_one_takes_over_after_
     bench.end().well();
     place.is_left_clean();
     let summary = place.summary();
-    assert!(summary.count("/loop/bad_cycles", NOBODY) >= 250 - 1, "{:#}", summary.0);
+    assert!(summary.count("/loop/bad_cycles", NOBODY) >= 1_000 - 1, "{:#}", summary.0);
     summary.adds_up();
 }
 
@@ -95,7 +97,7 @@ fn a_controllers_nonsense_is_counted_and_ignored() {
     let gateway = place.path("controller.sock");
     let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
     own.set_read_timeout(Some(Duration::from_secs(1))).unwrap();
-    let bench = place.bench(60.0, "");
+    let bench = place.bench(600.0, "");
     until("the gateway's socket", || gateway.exists().then_some(()));
     own.send_to(&[b"SKBC".as_slice(), &[1, 0, 3, 0]].concat(), &gateway).unwrap();
 
@@ -142,7 +144,7 @@ fn a_controllers_nonsense_is_counted_and_ignored() {
 fn ends_without_controller(control: impl FnOnce(&Place), why: &str) {
     let place = place(25);
     place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 600.0"));
-    let bench = place.bench(60.0, "--quiet");
+    let bench = place.bench(600.0, "--quiet");
     let gateway = place.path("controller.sock");
     until("the gateway's socket", || gateway.exists().then_some(()));
     control(&place);
@@ -167,7 +169,7 @@ fn ends_without_controller(control: impl FnOnce(&Place), why: &str) {
 fn a_run_to_which_no_controller_comes_has_an_outcome_of_its_own() {
     let place = place(25);
     place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 600.0"));
-    let ended = place.bench(0.5, "--quiet").end();
+    let ended = place.bench(2.0, "--quiet").end();
     assert_eq!((ended.code(), ended.stderr.lines().count()), (Some(4), 1), "{ended:#?}");
     assert!(ended.stderr.contains("no external controller said hello on "), "{ended:#?}");
     let summary = place.summary();

@@ -51,7 +51,7 @@ fn kill_again_and_again(seed: u64, times_killed: u32) -> Vec<f64> {
     let mut older = Vec::new();
     for number in 0..times_killed {
         let log = place.path(&format!("{number}.log"));
-        let bench = place.start("skinbus", &format!("{RUN} --duration 60 --candump {number}.log"));
+        let bench = place.start("skinbus", &format!("{RUN} --duration 600 --candump {number}.log"));
         until("the first line", || fs::metadata(&log).is_ok_and(|log| log.len() > 0).then_some(()));
         std::thread::sleep(Duration::from_millis(random.random_range(0..2_000)));
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos();
@@ -98,7 +98,7 @@ fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
         assert!(Log::read(&place.read(name), Format::Fd).frames.len() >= seen);
     };
     for (name, force) in [("new.log", ""), ("run.log", "--overwrite")] {
-        let words = format!("{RUN} --duration 60 --summary {name}.json --candump {name} {force}");
+        let words = format!("{RUN} --duration 600 --summary {name}.json --candump {name} {force}");
         let bench = place.start("skinbus", &words);
         bench.hears_the_loop();
         follow(name);
@@ -202,7 +202,7 @@ fn a_log_into_a_pipe_whose_reader_stops_does_not_keep_a_run_from_ending() {
     mknodat(CWD, &fifo, FileType::Fifo, Mode::from_raw_mode(0o600), 0).unwrap();
     let reader = fs::OpenOptions::new().read(true).write(true).open(&fifo).unwrap();
     for (signal, summary) in [(Signal::INT, "int.json"), (Signal::TERM, "term.json")] {
-        let words = format!("{RUN} --duration 60 --quiet --candump log.fifo --summary {summary}");
+        let words = format!("{RUN} --duration 600 --quiet --candump log.fifo --summary {summary}");
         let bench = place.start("skinbus", &words);
         // Nothing has room any more: for a second nothing came.
         let (mut there, mut same) = (0, 0);
@@ -256,7 +256,7 @@ fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
     let run = format!("{RUN} --duration 0.3 --quiet --summary /dev/null --candump /dev/stdout");
     let ended = place.start("skinbus", &run).end().well();
     let (frames, table): (Vec<_>, Vec<_>) = ended.stdout.lines().partition(|line| line.starts_with('('));
-    assert!(frames.len() > 50 && table.len() > 10, "{ended:#?}");
+    assert!(frames.len() > 16 && table.len() > 10, "{ended:#?}");
     // A file that the shell has opened is not truncated, whatever is in it.
     let mut command = place.command_of(Path::new("/bin/sh"), "");
     let gateway = process::program("skinbus");
@@ -267,7 +267,7 @@ fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
     command.args(["-c", &script]);
     Running::start(command).end().well();
     let both = place.read("both");
-    assert!(both.starts_with("before\n(") && both.lines().count() > 60, "{both}");
+    assert!(both.starts_with("before\n(") && both.lines().count() > 26, "{both}");
     assert!(both.lines().last().unwrap().starts_with('└'), "the table comes after the frames: {both}");
     place.is_left_clean();
 }
@@ -292,7 +292,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     assert_eq!(failed(&place, &ended).number("/loop/ticks"), 0);
 
     // While it runs: another gateway.
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     let test_client = place.test_client();
     test_client.waits_for_epoch(10);
     let positions = [Q1_14::ZERO; WORDS];
@@ -309,19 +309,21 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     let lines = Log::read(&place.read("run.log"), Format::Fd).frames.len() as u64;
     assert_eq!(summary.number("/recording/frames"), lines);
 
-    // Its log breaks off, and it goes on to its end.
+    // Its log breaks off, and it goes on until it is ended.
     let mut command = place.command_of(Path::new("/bin/sh"), "");
-    let run = format!("{RUN} --duration 2 --candump run.log --summary run.json --overwrite");
+    let run = format!("{RUN} --duration 600 --candump run.log --summary run.json --overwrite");
     command.args(["-c", &format!("ulimit -f 64; exec {} {run}", process::program("skinbus").display())]);
-    let ended = Running::start(command).end();
-    let summary = failed(&place, &ended);
-    assert!(ended.stderr.contains("run.log: File too large"), "{ended:#?}");
+    let bench = Running::start(command);
+    bench.hears("run.log: File too large");
+    place.test_client().waits_for_joints(20);
+    bench.signal(Signal::TERM);
+    let summary = failed(&place, &bench.end());
     let frames = times(&place.path("run.log")).len() as u64;
     assert_eq!(summary.number("/recording/frames"), frames);
-    assert!(frames > 100 && summary.number("/recording/lost_write") > 100, "{:#}", summary.0);
+    assert!(frames > 100 && summary.number("/recording/lost_write") >= 20, "{:#}", summary.0);
 
     // Whoever signals twice gets it too.
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     for signal in [Signal::INT, Signal::INT, Signal::TERM] {
         bench.signal(signal);
     }
@@ -335,7 +337,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
 fn any_number_of_demonstrations_go_on_side_by_side() {
     let place = Place::new();
     let run = |quiet: &str| {
-        let words = format!("demo --duration 60 SKINBUS_CELLS_PER_PROCESS=64 {quiet}");
+        let words = format!("demo --duration 600 SKINBUS_CELLS_PER_PROCESS=64 {quiet}");
         let mut command = place.command("skinbus", &words);
         command.env_remove("SKINBUS_DIR").env("TMPDIR", place.path(""));
         Running::start(command)

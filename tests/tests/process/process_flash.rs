@@ -111,7 +111,7 @@ fn a_cell_without_parameters_reports_it_and_sends_no_torque() {
                 && !heartbeat.state.has(State::CONFIGURED)
                 && heartbeat.configuration == 0)
     });
-    let bench = place.running_bench(60.0, "--no-spawn");
+    let bench = place.running_bench(600.0, "--no-spawn");
     bench.hears("cells that have no parameters, the run goes on without them: 3 on vcan0");
     place.test_client().waits_for_epoch(20);
     bench.signal(Signal::TERM);
@@ -168,7 +168,7 @@ fn two_programs_do_not_use_one_cells_file_at_a_time() {
     let place = written();
     let other = Place::new();
     other.pressed();
-    let running = place.running_bench(60.0, "--flash flash");
+    let running = place.running_bench(600.0, "--flash flash");
     let flash = place.path("flash").display().to_string();
     // Another bench, whose bus has the same name, in a directory of its own.
     let before = images(&place);

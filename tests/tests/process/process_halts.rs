@@ -76,7 +76,7 @@ fn before<'a>(summary: &'a Summary, halted: &Value) -> &'a [Value] {
 fn a_controller_that_stops_answering_ends_a_run_with_3_and_its_last_ticks_are_told() {
     const BAD: usize = 100;
     let place = place(100);
-    let bench = place.bench(60.0, "--quiet");
+    let bench = place.bench(600.0, "--quiet");
     control(&place, &bench, 300);
     bench.signal(Signal::TERM);
     let ended = bench.end();
@@ -126,7 +126,7 @@ fn a_lost_bus_that_halts_is_named_and_the_exit_code_is_that_of_the_halt() {
     place.scenario(PRESSED.replace("hold", "kinesthetic").as_str());
     let server = place.start("vcan-setup", "serve vcan1");
     server.prints("serving vcan1 at ");
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     process::test_client::TestClient::on(&place, "vcan1", protocol::can::Format::Fd).waits_for_epoch(20);
     server.signal(Signal::TERM);
     server.end().well();
@@ -148,7 +148,7 @@ fn a_lost_bus_that_halts_is_named_and_the_exit_code_is_that_of_the_halt() {
 fn a_resumed_halt_is_reported_and_the_run_succeeds() {
     let place = Place::new();
     place.pressed();
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     let test_client = place.test_client();
     test_client.waits_for_epoch(10);
     place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
@@ -188,7 +188,7 @@ fn an_incomplete_recording_takes_precedence_over_a_halt() {
 fn cells_that_are_halted_at_the_end_of_a_run_are_no_halt_of_the_robot() {
     let place = Place::new();
     place.pressed();
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     place.test_client().waits_for_epoch(5);
     bench.signal(Signal::INT);
     let ended = bench.end().well();

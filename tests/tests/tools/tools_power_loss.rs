@@ -10,10 +10,8 @@ use skinbus_tests::process::recorded;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::thread::sleep;
-use std::time::Duration;
 
-use process::Place;
+use process::{Place, until};
 use recorded::Recorded;
 use rustix::process::Signal;
 
@@ -73,10 +71,11 @@ fn a_recordings_file_that_has_its_name_is_whole_after_a_loss_of_power() {
     place.pressed();
     let disk = Disk::new(&place.path(""));
     let record = disk.mounted.join("run.mcap");
-    let bench = place.running_bench(7.0, &format!("--record {} --record-split 1s", record.display()));
+    let bench = place.running_bench(600.0, &format!("--record {} --record-split 1s", record.display()));
     let mut whole = 0;
-    for number in 0..4 {
-        sleep(Duration::from_millis(1_300));
+    for number in 0..4_u32 {
+        let names = || disk.files().iter().filter(|name| name.ends_with(".mcap")).count();
+        until("another file", || (names() > number as usize).then_some(()));
         // Another program syncs a file of its own, and with it the names of all.
         File::create(disk.mounted.join("others")).unwrap().sync_all().unwrap();
         bench.signal(Signal::STOP);
@@ -90,6 +89,7 @@ fn a_recordings_file_that_has_its_name_is_whole_after_a_loss_of_power() {
         }
     }
     assert!(whole >= 4, "{whole} files had their names");
+    bench.signal(Signal::TERM);
     bench.end();
     let after = disk.after_a_power_loss(9);
     let there: Vec<_> = disk.files();

@@ -9,6 +9,7 @@ use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Inbox, Options};
 use protocol::can::{FD_FORMAT, Frame};
 
 use skinbus_tests::can_raw as cases;
+use skinbus_tests::process::TIMEOUT;
 use skinbus_tests::process::vcan::own_network;
 
 const LAST: u32 = 0x7FF;
@@ -25,7 +26,7 @@ fn sender() -> Bus {
 fn read(bus: &Bus, inbox: &mut Inbox) -> Vec<Frame> {
     let mut frames = Vec::new();
     loop {
-        assert!(bus.wait(Some(Duration::from_secs(5))).unwrap(), "the last frame comes");
+        assert!(bus.wait(Some(TIMEOUT)).unwrap(), "the last frame comes");
         bus.receive(inbox).unwrap();
         for received in inbox.frames() {
             if received.frame.id() == LAST {
@@ -150,7 +151,7 @@ fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
     let [a, b, c] = [(); 3].map(|()| open().unwrap());
     let mut inbox = Inbox::new();
     ip("link set vcan9 down");
-    assert!(a.wait(Some(Duration::from_secs(5))).unwrap(), "going down can be waited for");
+    assert!(a.wait(Some(TIMEOUT)).unwrap(), "going down can be waited for");
     let error = a.receive(&mut inbox).unwrap_err();
     assert!(matches!(error, BusError::Down { .. }) && error.may_pass(), "{error}");
     assert_eq!(a.receive(&mut inbox).unwrap(), 0, "and is told once");
@@ -163,11 +164,11 @@ fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
     assert!(errors.iter().all(|error| matches!(error.cause, BusError::Down { .. })), "{errors:?}");
     ip("link set vcan9 up");
     b.send(&[frame]).unwrap();
-    assert!(a.wait(Some(Duration::from_secs(5))).unwrap());
+    assert!(a.wait(Some(TIMEOUT)).unwrap());
     assert_eq!(a.receive(&mut inbox).unwrap(), 1, "the same socket goes on");
 
     ip("link del vcan9");
-    assert!(a.wait(Some(Duration::from_secs(5))).unwrap());
+    assert!(a.wait(Some(TIMEOUT)).unwrap());
     let error = std::iter::repeat_with(|| a.receive(&mut inbox)).take(3).find_map(Result::err).unwrap();
     assert!(matches!(error, BusError::Gone { .. } | BusError::Down { .. }), "{error}");
     let error = std::iter::repeat_with(|| b.send(&[frame])).take(3).find_map(Result::err).unwrap();

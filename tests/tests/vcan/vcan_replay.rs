@@ -9,9 +9,9 @@ use std::fs;
 use std::time::Duration;
 
 use model::generate::{Target, generate};
-use process::Place;
 use process::replay::{Replayed, says_everything};
-use process::vcan::{Candump, Vcan0, tool};
+use process::vcan::{Candump, Vcan0, refused, tool};
+use process::{Place, until};
 use protocol::candump::{Line, parse};
 
 /// Fresh cells of the skin of the recording.
@@ -29,7 +29,7 @@ fn prepare(place: &Place, cells: usize) {
 fn a_run_on_vcan_comes_back_bit_for_bit() {
     let place = Place::on_vcan();
     prepare(&place, 8);
-    let bench = place.running_bench(7.0, "");
+    let bench = place.running_bench(12.0, "");
     says_everything(&place.test_client(), &place.path("skin.toml"));
     bench.end().well();
     let mut counts = Vec::new();
@@ -42,7 +42,7 @@ fn a_run_on_vcan_comes_back_bit_for_bit() {
         });
         assert_eq!(replayed.text("/buses/0/kind"), "socketcan");
     }
-    assert!(counts[0] > 100 && counts.iter().all(|count| *count == counts[0]), "{counts:?}");
+    assert!(counts[0] > 24 && counts.iter().all(|count| *count == counts[0]), "{counts:?}");
 }
 
 #[test]
@@ -60,7 +60,7 @@ fn two_hundred_and_fifty_three_fresh_cells_on_vcan_answer_as_the_others_did_twic
         let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
         counts.push(replayed.all_came_back(&ended));
     }
-    assert!(counts[0] > 100 && counts[0] == counts[1], "{counts:?}");
+    assert!(counts[0] > 24 && counts[0] == counts[1], "{counts:?}");
 }
 
 #[test]
@@ -94,19 +94,22 @@ fn an_outage_costs_what_was_due_and_is_said_once() {
 #[ignore = "needs vcan"]
 fn a_transmit_queue_without_room_refuses_and_is_waited_for() {
     let place = Place::on_vcan();
-    place.write("some.log", "(1.000000) vcan0 123#00\n(1.001000) vcan0 123#01\n(3.000000) vcan0 123#02\n");
+    // For five seconds.
+    let frames: String = (0..500).fold(String::new(), |mut text, at| {
+        writeln!(text, "({}.{:02}0000) vcan0 123#{:02X}", 1 + at / 100, at % 100, at % 256).unwrap();
+        text
+    });
+    place.write("some.log", &frames);
     let vcan0 = Vcan0;
     vcan0.fill();
     let replay = place.replay("some.log", "SKINBUS_SEND_TIMEOUT_MS=50");
-    // Until the second frame has timed out, which the third one reports.
-    replay.hears("vcan0 is socketcan");
-    std::thread::sleep(Duration::from_millis(1_000));
+    // A frame is tried every half millisecond: after so many tries the first one at least has timed out.
+    until("a frame that is refused", || (refused("vcan0") > 110).then_some(()));
     vcan0.empty();
     let ended = replay.end();
     let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());
     let [sent, refused] = ["/sent", "/refused"].map(|what| replayed.number(what));
-    // A machine that was away for two seconds may have sent all three at once.
-    assert!(refused >= 1 && sent + refused == 3, "{:#} {ended:#?}", replayed.0);
+    assert!(refused >= 1 && sent >= 1 && sent + refused == 500, "{:#} {ended:#?}", replayed.0);
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
 }
 

@@ -90,7 +90,7 @@ fn passes(from: &Bus, to: &Bus) {
     let frame = Frame::fd(0x123, 1, &[7; 16]).unwrap();
     from.send(&[frame]).unwrap();
     let mut inbox = Inbox::new();
-    assert!(to.wait(Some(Duration::from_secs(20))).unwrap(), "a frame comes");
+    assert!(to.wait(Some(Duration::from_secs(60))).unwrap(), "a frame comes");
     to.receive(&mut inbox).unwrap();
     assert_eq!(inbox.frames().next().unwrap().frame.data(), frame.data());
 }

@@ -102,7 +102,7 @@ impl Bench {
     }
 
     fn open(&self) -> Bus {
-        let (directory, send_timeout) = (Some(self.directory()), Duration::from_secs(10));
+        let (directory, send_timeout) = (Some(self.directory()), Duration::from_secs(60));
         let options = Options { directory, send_timeout, ..Options::default() };
         Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap()
     }
@@ -340,7 +340,7 @@ fn a_skin_tells_ack_its_buses_and_formats() {
     let mut inbox = Inbox::new();
     let mut frames = Vec::new();
     while frames.len() < 2 {
-        assert!(bus.wait(Some(Duration::from_secs(5))).unwrap(), "{frames:?}");
+        assert!(bus.wait(Some(Duration::from_secs(60))).unwrap(), "{frames:?}");
         bus.receive(&mut inbox).unwrap();
         frames.extend(inbox.frames().map(|received| received.frame));
     }

@@ -158,7 +158,7 @@ fn run(seconds: u64, with_intruders: bool) -> Outcome {
     let place = Place::new();
     // Intruders that take the processors' time halt no robot.
     place.write("skin.toml", &(skin(12) + "\n[safety]\nbad_cycles = 10000\n"));
-    place.scenario(&PRESSED.replace("60.0", "3600.0"));
+    place.scenario(&PRESSED.replace("600.0", "3600.0"));
     let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --view --duration 3600 --summary run.json --quiet";
     let run = place.start("skinbus", words);
     let address = address(&run);
