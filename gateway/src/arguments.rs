@@ -90,6 +90,11 @@ pub(crate) fn of_environment(name: &str, allowed: RangeInclusive<u32>) -> Result
     })
 }
 
+/// The cells that share a process, from the environment, for what few set.
+pub(crate) fn cells_per_process() -> Result<usize, Failure> {
+    Ok(of_environment("SKINBUS_CELLS_PER_PROCESS", 1..=254)?.unwrap_or(1) as usize)
+}
+
 /// How many cells share a process.
 #[derive(Args, Clone, Copy, Debug)]
 pub(crate) struct Processes {

@@ -3,14 +3,14 @@
 mod show;
 
 use std::io::{self, IsTerminal};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use bench::cells::Watch;
 use clap::Args;
 use protocol::skin::Skin;
-use protocol::usage::{Failure, draw, print, shown_lines};
+use protocol::usage::{Failure, print, put, shown_lines, written};
 
 use self::show::{Known, Shown};
 use super::arguments::{BusKinds, bus_of, seconds};
@@ -58,6 +58,12 @@ impl Cells {
         let kind = self.kinds.of([self.bus.as_str()])?.of(&self.bus);
         let stopped = input::stopped()?;
         let format = known.as_ref().map(|known| known.format);
+        if Path::new(&self.bus).is_file() {
+            return Err(Failure::usage(format!(
+                "{} is a file: name a bus, and a skin with --skin",
+                self.bus
+            )));
+        }
         let mut watch = Watch::open(&self.bus, kind, format).map_err(Failure::usage)?;
         let seconds = self.duration.or_else(|| (!self.watch).then_some(LISTEN_S));
         let show = |watch: &Watch| {
@@ -77,7 +83,10 @@ impl Cells {
             if self.watch && drawn.elapsed() >= DRAW {
                 drawn = Instant::now();
                 let text = show(&watch)?;
-                if terminal { draw(&show::screen(&shown_lines(&text))) } else { print(&text) }?;
+                let shown = if terminal { put(&show::screen(&shown_lines(&text))) } else { put(&text) };
+                if shown.is_err() {
+                    return written(shown);
+                }
             }
         }
         if self.watch {

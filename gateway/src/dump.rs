@@ -100,6 +100,9 @@ pub(crate) struct Dump {
     /// Without one, torques are read as Q3.12, and joints as revolute.
     #[arg(long, value_name = "SKIN", conflicts_with = "stats")]
     skin: Option<PathBuf>,
+    /// Wait for buses that are not there yet
+    #[arg(long)]
+    wait: bool,
     #[command(flatten)]
     kinds: BusKinds,
 }
@@ -133,6 +136,19 @@ impl Dump {
             from: self.from,
             to: self.to,
         };
+        pick.check().map_err(Failure::usage)?;
+        if !is_capture {
+            let names: Vec<_> = self.sources.iter().map(|source| source.display().to_string()).collect();
+            if let Some(other) = pick.bus_names().find(|bus| !names.iter().any(|name| name == bus)) {
+                let names = list(&names);
+                return Err(Failure::usage(format!("{other} is not shown: name it beside {names}")));
+            }
+            if self.wait && names.iter().any(|name| name.contains('/')) {
+                return Err(Failure::usage(format!("--wait is for buses, and {} is a file", list(&names))));
+            }
+        } else if self.wait {
+            return Err(Failure::usage(format!("--wait is for buses, and {title} is a file")));
+        }
         let max = self.count.unwrap_or(u64::MAX);
         let to_out = BufWriter::new(Stoppable::new(&out));
         let mut show = Show::new(to_out, self.format, pick, self.contact, how, max);
@@ -152,13 +168,17 @@ impl Dump {
             }
             reader.extras().run_began().into_iter().for_each(|zero| show.count_from(zero));
             let done = captured(&mut reader, &mut show);
+            if let (Ok(()), Some(absent)) = (&done, show.absent_buses()) {
+                output::note(format_args!("{title}: no frame is of {absent}"));
+            }
             (input::format(&reader), Some(reader.extras().clone()), done)
         } else {
             // Signals are caught before it reports that it listens.
             let stopped = stopped()?;
             let kinds = self.kinds.of_any()?;
+            let until = self.wait.then_some(&*stopped);
             let mut receive_ends =
-                input::receive_ends(&self.sources, &kinds, self.format, &Options::default())?;
+                input::receive_ends(&self.sources, &kinds, self.format, &Options::default(), until)?;
             ("live", None, live(&mut receive_ends, &mut show, self.to, &stopped))
         };
         written(show.finish().and_then(|()| show.flush()))?;
@@ -277,11 +297,13 @@ fn live(
         match received(receive_ends, show) {
             // Frames lost until then are reported all the same.
             Err(failure) => break Err(failure),
-            Ok(true) => {
+            // A reader that has enough ends it, without an error.
+            Ok(Err(error)) => break written(Err(error)),
+            Ok(Ok(true)) => {
                 // The end also comes when no more frames do.
                 end = end.or_else(|| Some(Instant::now() + Duration::from_nanos(to?)));
             }
-            Ok(false) => {}
+            Ok(Ok(false)) => {}
         }
         if show.has_enough() {
             break Ok(());
@@ -296,8 +318,11 @@ fn live(
     done
 }
 
-/// Waits for frames, and shows those that have come; whether there were any.
-fn received(receive_ends: &mut [ReceiveEnd], show: &mut Show<impl Write>) -> Result<bool, Failure> {
+/// Waits for frames, and shows those that have come: whether there were any, or why they cannot be written.
+fn received(
+    receive_ends: &mut [ReceiveEnd],
+    show: &mut Show<impl Write>,
+) -> Result<io::Result<bool>, Failure> {
     let wait = if show.is_waiting() { SETTLE } else { LOOK };
     // A bus that is alone is waited for where it is received from: one system call instead of two.
     let is_alone = receive_ends.len() == 1;
@@ -318,9 +343,10 @@ fn received(receive_ends: &mut [ReceiveEnd], show: &mut Show<impl Write>) -> Res
             let interface = receive_end.bus().name();
             show.frame(&Record { time, interface, frame: received.frame, direction: None })
         });
-        written(shown)?;
+        if let Err(error) = shown {
+            return Ok(Err(error));
+        }
     }
     let settled = if any { Ok(()) } else { show.handle_time(now()) };
-    written(settled.and_then(|()| show.flush()))?;
-    Ok(any)
+    Ok(settled.and_then(|()| show.flush()).map(|()| any))
 }

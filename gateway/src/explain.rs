@@ -3,11 +3,12 @@
 mod show;
 mod torque;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use analysis::explain::{CellExplained, Explanation, Requested, explain, find};
 use clap::Args;
 use protocol::id::CellId;
+use protocol::input::is_standard_input;
 use protocol::packet::Epoch;
 use protocol::skin::{CellName, Skin};
 use protocol::usage::{Failure, print};
@@ -80,11 +81,22 @@ struct Whole<'a> {
     explanation: &'a Explanation,
 }
 
+/// Whether this is the name of a bus rather than of a file.
+fn is_bus(file: &Path) -> bool {
+    !is_standard_input(file) && !file.exists() && file.extension().is_none() && file.components().count() == 1
+}
+
 impl Explain {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let Some(epoch) = self.epoch else {
             return self.given.compute(&self.files, self.cell.as_ref(), self.json);
         };
+        if let Some(bus) = self.files.iter().find(|file| is_bus(file)) {
+            let bus = bus.display();
+            return Err(Failure::usage(format!(
+                "there is no file {bus}; of a live bus record one first: `skinbus convert {bus} run.log`"
+            )));
+        }
         let skin = match &self.skin {
             Some(path) => Skin::read(path).map_err(Failure::usage)?,
             None => skin_of(&self.files)?,

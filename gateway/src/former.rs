@@ -50,7 +50,7 @@ pub(crate) fn option(words: &[String], option: &str) -> Option<String> {
         ("demo", "--record-split" | "--address-file" | "--token-file") => "skinbus run",
         ("run", "--receive-buffer") => "the environment variable SKINBUS_RECEIVE_BUFFER",
         ("calibrate", "--from") => "--recording",
-        ("demo", "--cells-per-process") => "the environment variable SKINBUS_CELLS_PER_PROCESS",
+        ("demo" | "replay", "--cells-per-process") => "the environment variable SKINBUS_CELLS_PER_PROCESS",
         ("calibrate", "--package") => "a skin whose URDF is beside its packages",
         ("calibrate", "--seed") | ("calibrate" | "experiment", "--cells-per-process") => {
             "nothing: it has a fixed value now"

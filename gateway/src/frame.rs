@@ -12,14 +12,15 @@ use bench::listen::{self, Listener};
 use bench::sensing as switching;
 use clap::Args;
 use model::decode::Decoded;
+use model::decode::pick::Party;
 use protocol::bus::{Bus, BusError, Choice, Kinds, Options};
 use protocol::can::{BIT_RATE_SWITCH, Format, Frame as CanFrame};
 use protocol::id::CellId;
 use protocol::message::{Answer, Message};
-use protocol::skin::Skin;
+use protocol::skin::{CellName, Skin};
 use protocol::usage::{Failure, print};
 
-use super::arguments::{BusKinds, FORMATS, bus_of, one_of};
+use super::arguments::{BusKinds, FORMATS, bus_of, cell_of, one_of};
 use super::output;
 use super::print::list;
 use packets::{What, only_cell};
@@ -29,8 +30,8 @@ const ANSWER: Duration = Duration::from_secs(1);
 
 /// Print a frame for cansend, with the right CRC; or send it
 ///
-/// Prints one line for a CAN FD bus, two for a classic one. With --bus or --skin it is sent instead, also on an embedded bus,
-/// to which cansend cannot attach. Then what a configure asks for is waited for and printed, and exit code 1 says that no
+/// Prints one line for a CAN FD bus, two for a classic one. With --bus, --skin or a bus in --cell it is sent instead, also on an
+/// embedded bus, to which cansend cannot attach. Then what a configure asks for is waited for and printed, and exit code 1 says that no
 /// cell for which a stimulus or a configure is meant was heard, or that one refused.
 #[derive(Args, Debug)]
 #[command(mut_args(|arg| arg.global(true)), after_help = "Examples, of which the first three press cell 12 with 3 N from the next joints on:
@@ -77,22 +78,39 @@ impl Frame {
     /// The buses on which it is sent, with their formats, and their kinds; none prints it.
     fn targets(&self) -> Result<(Vec<(String, Format)>, Kinds), Failure> {
         let format = |of_skin: Format| self.format.unwrap_or(of_skin);
+        let to = self.what.to();
+        let of_cell = to.and_then(|to| to.bus.as_ref());
         let mut targets: Vec<_> = match &self.skin {
             Some(path) => {
                 let skin = Skin::read(path).map_err(Failure::usage)?;
                 let file = path.display().to_string();
-                self.bus.iter().try_for_each(|name| bus_of(&skin, &file, name).map(drop))?;
-                let buses = skin.buses.into_iter().map(|bus| (bus.name, format(bus.format)));
+                self.bus.iter().chain(of_cell).try_for_each(|name| bus_of(&skin, &file, name).map(drop))?;
+                // A node id of several buses is of several cells.
+                let only = match to.filter(|_| self.bus.is_empty() && of_cell.is_none()).and_then(only_cell) {
+                    Some(node) => {
+                        let index = cell_of(&skin, &CellName { bus: None, node }, "--cell")?;
+                        skin.cells.get(index).map(|cell| cell.bus)
+                    }
+                    None => None,
+                };
+                let buses = skin.buses.into_iter().enumerate();
+                let buses = buses.filter(|(index, _)| only.is_none_or(|only| only == *index));
+                let buses = buses.map(|(_, bus)| (bus.name, format(bus.format)));
                 buses.filter(|(name, _)| self.bus.is_empty() || self.bus.contains(name)).collect()
             }
-            None => self.bus.iter().map(|name| (name.clone(), format(Format::Fd))).collect(),
+            None => {
+                let of_cell = of_cell.filter(|_| self.bus.is_empty());
+                self.bus.iter().chain(of_cell).map(|name| (name.clone(), format(Format::Fd))).collect()
+            }
         };
         let names = list(targets.iter().map(|(name, _)| name));
         let kinds = self.kinds.of(targets.iter().map(|(name, _)| name.as_str()))?;
-        if let Some(bus) = self.what.to().and_then(|to| to.bus.as_ref()).filter(|_| !targets.is_empty()) {
+        if let Some(Party { bus: Some(bus), node }) = to {
             targets.retain(|(name, _)| name == bus);
             if targets.is_empty() {
-                return Err(Failure::usage(format!("--cell {bus}:...: it is sent on {names} alone")));
+                return Err(Failure::usage(format!(
+                    "--cell {bus}:{node} is not on --bus {names}: name one of the two"
+                )));
             }
         }
         Ok((targets, kinds))

@@ -5,6 +5,7 @@ use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, OnceLock};
+use std::thread;
 use std::time::Duration;
 
 use bench::listen::{self, Listener};
@@ -21,6 +22,9 @@ use trace::capture::{CaptureError, DESCRIPTION, Format, Note, NoteKind, ORIGIN, 
 
 use super::output;
 use super::print::{count, some};
+
+/// How often a bus that is waited for is looked for.
+const AGAIN: Duration = Duration::from_millis(20);
 
 /// How long a signal to end may wait, when nothing comes.
 pub(crate) const LOOK: Duration = Duration::from_millis(200);
@@ -286,15 +290,28 @@ pub(crate) struct ReceiveEnd {
     is_down: bool,
 }
 
-/// Opens each of several buses, as [`ReceiveEnd::open`] does.
+/// Opens each of several buses, as [`ReceiveEnd::open`] does; with a flag those that are not there are waited for until it
+/// is set.
 pub(crate) fn receive_ends(
     sources: &[PathBuf],
     kinds: &Kinds,
     format: Option<can::Format>,
     options: &Options,
+    until: Option<&AtomicBool>,
 ) -> Result<Vec<ReceiveEnd>, Failure> {
-    let names = sources.iter().map(|source| source.display().to_string());
-    names.map(|name| ReceiveEnd::open(&name, kinds.of(&name), format, options.clone())).collect()
+    let mut opened = Vec::new();
+    for source in sources {
+        let name = source.display().to_string();
+        loop {
+            match (ReceiveEnd::open(&name, kinds.of(&name), format, options.clone()), until) {
+                (Ok(receive_end), _) => break opened.push(receive_end),
+                (Err(_), Some(stopped)) if stopped.load(Ordering::Relaxed) => return Ok(opened),
+                (Err(error), Some(_)) if error.may_open_later() => thread::sleep(AGAIN),
+                (Err(error), _) => return Err(neither(&name, &error)),
+            }
+        }
+    }
+    Ok(opened)
 }
 
 impl ReceiveEnd {
@@ -304,9 +321,8 @@ impl ReceiveEnd {
         kind: Choice,
         format: Option<can::Format>,
         options: Options,
-    ) -> Result<Self, Failure> {
-        let bus = listen::open(name, kind, format, Options { error_mask: EXTENDED_MASK, ..options })
-            .map_err(|error| neither(name, &error))?;
+    ) -> Result<Self, BusError> {
+        let bus = listen::open(name, kind, format, Options { error_mask: EXTENDED_MASK, ..options })?;
         output::note(format_args!("{} is {}", bus.name(), bus.kind()));
         Ok(Self { listener: Listener::new(bus, format), is_down: false })
     }

@@ -12,7 +12,7 @@ use bench::replay::{Options, ReplayError, Spawn, replay};
 use clap::Args;
 use protocol::usage::{Failure, shown, shown_lines};
 
-use super::arguments::{BusKinds, Processes, Word, nanos, of_environment, one_of};
+use super::arguments::{BusKinds, Word, cells_per_process, nanos, of_environment, one_of};
 use super::output::{self, Overwrite, apart, print_table};
 use super::print::{GREEN, PLAIN, Rows, YELLOW, count, hanging, json, list, or, quantiles};
 
@@ -70,8 +70,6 @@ pub(crate) struct Replay {
     /// The skin of the cells that are started; else the recording's own
     #[arg(long, value_name = "SKIN")]
     skin: Option<PathBuf>,
-    #[command(flatten)]
-    processes: Processes,
     /// Let cells that measure obey stimuli while the replay lasts, and measure again afterwards
     #[arg(long)]
     test_mode: bool,
@@ -182,10 +180,9 @@ impl Replay {
             spin: SPIN,
             lockstep: self.lockstep || (self.expect && matches!(self.speed, Pace::Max)),
             expect: self.expect.then_some(self.tolerance),
-            spawn: self.spawn.then(|| Spawn {
-                skin: self.skin.clone(),
-                cells_per_process: self.processes.cells_per_process.into(),
-            }),
+            spawn: self
+                .spawn
+                .then_some(Spawn { skin: self.skin.clone(), cells_per_process: cells_per_process()? }),
             test_mode: self.test_mode,
             timeout: Duration::from_millis(timeout_ms.unwrap_or(SEND_TIMEOUT_MS).into()),
             receive_buffer: RECEIVE_BUFFER as usize,

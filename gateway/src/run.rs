@@ -23,7 +23,9 @@ use protocol::time::Span;
 use protocol::usage::{Failure, command_line, quoted_os};
 use trace::recording::series::{Attached, Split};
 
-use super::arguments::{BusKinds, Processes, bus_names, cell_of, of_environment, seconds, time};
+use super::arguments::{
+    BusKinds, Processes, bus_names, cell_of, cells_per_process, of_environment, seconds, time,
+};
 use super::buses;
 use super::output::{self, Overwrite, apart, note, print_table};
 use super::print::json;
@@ -212,8 +214,7 @@ impl Demo {
         let scenario =
             Scenario::parse("the demonstration's scenario", SCENARIO, &skin).map_err(Failure::usage)?;
         let mut options = self.common.options(skin_file, skin, scenario);
-        let per_process = of_environment("SKINBUS_CELLS_PER_PROCESS", 1..=254)?;
-        options.cells_per_process = per_process.unwrap_or(1) as usize;
+        options.cells_per_process = cells_per_process()?;
         options.kinds = self
             .kinds
             .or(Choice::Only(BusKind::Embedded))?

@@ -94,6 +94,11 @@ pub(crate) struct View {
     kinds: BusKinds,
 }
 
+/// What keeps a page from listening.
+fn not_bound(listen: SocketAddr, error: &io::Error) -> Failure {
+    Failure::usage(format!("--listen {listen}: {error}; name another port, or leave it out for a free one"))
+}
+
 /// The options of a run's page.
 #[derive(Args, Debug, Default)]
 pub(crate) struct PageOptions {
@@ -124,7 +129,7 @@ impl View {
             let listen = self.listen;
             let token = token::chosen(self.token_file.as_deref())?;
             let bound = TcpListener::bind(listen);
-            let listener = bound.map_err(|error| Failure::usage(format!("--listen {listen}: {error}")))?;
+            let listener = bound.map_err(|error| not_bound(listen, &error))?;
             (listener, token::needed(token, may_act, listen)?)
         };
         let address = listener.local_addr().map_err(|error| failed(&error))?;
@@ -313,11 +318,7 @@ impl Page {
             Some(token) => command.env(token::VARIABLE, token.as_str()),
             None => command.env_remove(token::VARIABLE),
         };
-        let listener = TcpListener::bind(listen).map_err(|error| {
-            Failure::usage(format!(
-                "--listen {listen}: {error}; name another port, or leave it out for a free one"
-            ))
-        })?;
+        let listener = TcpListener::bind(listen).map_err(|error| not_bound(listen, &error))?;
         let address = listener.local_addr().map_err(|error| failed(&error))?;
         let url = url(address, token.as_ref());
         let address_file = options.address_file.as_deref();

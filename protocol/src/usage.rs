@@ -89,7 +89,15 @@ pub fn print(text: &str) -> Result<(), Failure> {
 /// # Errors
 /// As [`written`].
 pub fn draw(text: &str) -> Result<(), Failure> {
-    written(Stoppable::new(io::stdout()).write_all(text.as_bytes()))
+    written(put(text))
+}
+
+/// Writes a text to standard output as it is, for who goes on writing only while somebody reads.
+///
+/// # Errors
+/// When it cannot be written; also when its reader has left.
+pub fn put(text: &str) -> io::Result<()> {
+    Stoppable::new(io::stdout()).write_all(text.as_bytes())
 }
 
 /// A name or a line as a terminal shows it and does not obey it: controls, and what turns the direction of text, are

@@ -215,12 +215,28 @@ impl Shown<'_> {
             };
             let _ = writeln!(text, "  {inputs}");
         }
+        if let Some(hint) = self.tolerance(first) {
+            let _ = writeln!(text, "  {hint}");
+        }
         for which in [Which::A, Which::B] {
             if let Some(line) = self.explain(first, which) {
                 let _ = writeln!(text, "  {line}");
             }
         }
         text
+    }
+
+    /// The options that take such a difference for none.
+    fn tolerance(&self, first: &First) -> Option<&'static str> {
+        match (first.what, first.steps) {
+            ("joints", Some(_)) => Some(
+                "a motion depends on when ticks ran: kind = \"hold\" has none, --joints-tolerance and --tolerance allow steps",
+            ),
+            ("torque" | "sum" | "joints", None) if first.how.starts_with("missing") => Some(
+                "a cell leaves out joints that it took too late, on a busy machine: --allow-missing allows some",
+            ),
+            _ => None,
+        }
     }
 
     /// The command that shows more of some joints.

@@ -20,7 +20,7 @@ use protocol::time::Micros;
 use protocol::usage::shown;
 
 use crate::output::note;
-use crate::print::{GREEN, PLAIN, RED, YELLOW, harmless};
+use crate::print::{GREEN, PLAIN, RED, YELLOW, harmless, list};
 
 /// Colours of a terminal.
 const DIM: &str = "\x1b[2m";
@@ -64,6 +64,8 @@ pub(super) struct Show<W> {
     how: How,
     /// Frames that may still be shown.
     left: u64,
+    /// Buses that the filters name, as long as none of their frames came.
+    absent: Vec<String>,
     /// The time that seconds count from; until it is known, or the first frame comes, `None`.
     zero: Option<u64>,
     raw: String,
@@ -71,9 +73,11 @@ pub(super) struct Show<W> {
 
 impl<W: Write> Show<W> {
     pub(super) fn new(out: W, format: Option<Format>, pick: Pick, contact: bool, how: How, max: u64) -> Self {
+        let absent = pick.bus_names().map(str::to_owned).collect();
         Self {
             out,
             settler: Settler::new(format),
+            absent,
             bus: Arc::from(""),
             units: Units::default(),
             described: Vec::new(),
@@ -104,6 +108,7 @@ impl<W: Write> Show<W> {
         let Record { time, interface, frame, direction } = *record;
         if *self.bus != *interface {
             self.bus = Arc::from(interface);
+            self.absent.retain(|name| name != interface);
             let described = self.described.iter().find(|(name, ..)| name == interface);
             self.units = described.map_or_else(Units::default, |(_, units, _)| *units);
         }
@@ -140,6 +145,11 @@ impl<W: Write> Show<W> {
             self.show(&Record { time, interface: &bus, frame, direction }, &decoded, units)?;
         }
         Ok(())
+    }
+
+    /// Buses that the options name and of which no frame came, in words.
+    pub(super) fn absent_buses(&self) -> Option<String> {
+        (!self.absent.is_empty() && self.left > 0).then(|| list(&self.absent))
     }
 
     /// Whether no more frames are to be shown.

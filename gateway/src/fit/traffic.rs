@@ -132,7 +132,7 @@ impl Fit {
     ) -> Result<Taken, Failure> {
         let kinds = self.kinds.of_any()?;
         let options = Options { receive_buffer: RECEIVE_BUFFER, ..Options::default() };
-        let mut receive_ends = input::receive_ends(&self.sources, &kinds, None, &options)?;
+        let mut receive_ends = input::receive_ends(&self.sources, &kinds, None, &options, None)?;
         let length = self.duration.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
         let end = length.map(|length| Instant::now() + length);
         let mut ended = Ok(());

@@ -140,8 +140,8 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
         text.split_once(" at ").unwrap().1.split_once(" s\n").unwrap().0.parse().unwrap()
     };
     let [of_all, of_part] = [&whole, &ended].map(|ended| at(&ended.stdout));
-    let least = epoch.as_f64().unwrap() * 0.016;
-    assert!((of_all - of_part).abs() < 1e-9 && of_part >= least, "{of_all} {of_part}");
+    let earliest = epoch.as_f64().unwrap() * 0.016;
+    assert!((of_all - of_part).abs() < 1e-9 && of_part >= earliest, "{of_all} {of_part}");
     for files in [&parts, last] {
         let dump = format!("dump {files} --brief --from {} --kind joints -n 1", of_part - 1e-5);
         let first = place.start("skinbus", &dump).end().well().stdout;

@@ -25,7 +25,7 @@ fn a_run_comes_back_bit_for_bit_at_its_own_times_in_lockstep_and_as_fast_as_it_c
     place.records(8);
     let mut counts = Vec::new();
     for route in
-        ["", "--lockstep --speed 4", "--speed max", "--speed max --cells-per-process 8", "--speed max"]
+        ["", "--lockstep --speed 4", "--speed max", "--speed max SKINBUS_CELLS_PER_PROCESS=8", "--speed max"]
     {
         let (ended, replayed) = place.replayed("run.log", &format!("{FRESH} {route}"));
         place.is_left_clean();

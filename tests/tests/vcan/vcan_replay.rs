@@ -54,7 +54,7 @@ fn two_hundred_and_fifty_three_fresh_cells_on_vcan_answer_as_the_others_did_twic
     place.bench(4.0, "--cells-per-process 16").end_after(Duration::from_secs(60)).well();
     let mut counts = Vec::new();
     for _ in 0..2 {
-        let replay = place.replay("run.log", &format!("{FRESH} --speed max --cells-per-process 16"));
+        let replay = place.replay("run.log", &format!("{FRESH} --speed max SKINBUS_CELLS_PER_PROCESS=16"));
         let ended = replay.end_after(Duration::from_secs(120));
         eprintln!("{}{}", ended.stdout, ended.stderr);
         let replayed = Replayed(serde_json::from_str(&place.read("replay.json")).unwrap());

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::process::ExitStatus;
 
-use protocol::bus::KindsError;
+use protocol::bus::{BusError, KindsError};
 use thiserror::Error;
 
 use super::checks::Mismatch;
@@ -42,6 +42,9 @@ pub enum ReplayError {
     /// There is nothing to be sent.
     #[error("{0}: there is no frame in it")]
     Empty(String),
+    /// The bus whose cells are to answer is not there.
+    #[error("{0}; or start fresh cells on an embedded bus with --spawn")]
+    NotThere(BusError),
     /// Nor in the requested part.
     #[error("nothing remains to be sent: {name} ends at {ends_s:.3} s, and --from and --to leave none of it")]
     NothingLeft {
@@ -141,6 +144,7 @@ impl ReplayError {
         match self {
             Self::Run(error) => error.exit_code(),
             Self::Kinds(_)
+            | Self::NotThere(_)
             | Self::StandardInput
             | Self::Pipe(_)
             | Self::Open(_)

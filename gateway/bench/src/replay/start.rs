@@ -188,7 +188,12 @@ pub(super) fn open(
         };
         let (bus, of_ours) = match skin_override {
             Some(_) => open_or_serve(name, options.kinds.of(name), &bus_options, Absent::Made)?,
-            None => (Bus::open(name, options.kinds.of(name), &bus_options)?, None),
+            None => match Bus::open(name, options.kinds.of(name), &bus_options) {
+                Err(error) if options.expect.is_some() && error.may_open_later() => {
+                    return Err(ReplayError::NotThere(error));
+                }
+                opened => (opened?, None),
+            },
         };
         // On a real bus the wires are real.
         let has_wires = options.hears() && (bus.kind() == BusKind::Embedded || bus.is_virtual()?);

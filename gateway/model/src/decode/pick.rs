@@ -165,6 +165,29 @@ impl Pick {
             && self.takes_party(id, bus)
     }
 
+    /// The buses that the filters name, each as often as it is named.
+    pub fn bus_names(&self) -> impl Iterator<Item = &str> {
+        let of_parties = self.parties.iter().filter_map(|party| party.bus.as_deref());
+        self.buses.iter().map(String::as_str).chain(of_parties)
+    }
+
+    /// Sees that each party can be on the buses that are picked.
+    ///
+    /// # Errors
+    /// What contradicts.
+    pub fn check(&self) -> Result<(), String> {
+        let is_out = |party: &&Party| party.bus.as_ref().is_some_and(|bus| !self.buses.contains(bus));
+        match self.parties.iter().find(is_out).filter(|_| !self.buses.is_empty()) {
+            Some(Party { bus: Some(bus), node }) => {
+                let buses = self.buses.join(", ");
+                Err(format!(
+                    "{bus}:{node} is on no bus that is picked: {buses} are; leave one of the two out"
+                ))
+            }
+            _ => Ok(()),
+        }
+    }
+
     fn takes_time(&self, origin: u64, nanos: u64) -> bool {
         let after_from = self.from.is_none_or(|from| nanos >= origin.saturating_add(from));
         let before_to = self.to.is_none_or(|to| nanos < origin.saturating_add(to));

@@ -263,6 +263,102 @@ fn a_signal_ends_a_dump_cleanly() {
 }
 
 #[test]
+fn what_shows_a_live_bus_ends_when_its_reader_has_enough() {
+    let bench = Bench::new();
+    for command in ["dump vcan0", "dump vcan0 --json", "dump vcan0 --brief", "cells vcan0 --watch"] {
+        let mut child = bench.gateway(command).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut said = [0; 1];
+        if command.starts_with("dump") {
+            child.stderr.as_mut().unwrap().read_exact(&mut said).unwrap();
+        }
+        drop(child.stdout.take());
+        let (bus, resume) = (bench.open(), Message::Resume);
+        let began = std::time::Instant::now();
+        let status = loop {
+            if let Some(status) = child.try_wait().unwrap() {
+                break status;
+            }
+            assert!(began.elapsed() < Duration::from_secs(60), "{command} goes on");
+            send(&bus, &resume, Format::Fd).unwrap();
+            std::thread::sleep(Duration::from_millis(5));
+        };
+        assert_eq!(status.code(), Some(0), "{command}");
+    }
+}
+
+#[test]
+fn a_bus_that_comes_later_is_waited_for() {
+    let parent = TempDir::new().unwrap();
+    let directory = parent.path().join("skinbus");
+    let dump = |arguments: &str| {
+        let mut command = gateway(&format!("dump vcan0 {arguments} --bus-kind embedded"));
+        command.env("SKINBUS_DIR", &directory).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+    };
+    assert_eq!(dump("").wait().unwrap().code(), Some(2));
+    let mut waits = dump("--wait -n 1");
+    let gives_up = dump("--wait");
+    std::thread::sleep(Duration::from_millis(300));
+    kill_process(Pid::from_child(&gives_up), Signal::INT).unwrap();
+    assert_eq!(gives_up.wait_with_output().unwrap().status.code(), Some(0));
+    assert!(waits.try_wait().unwrap().is_none());
+    let bench = Bench { _served: Served::start_in(&directory, "vcan0").unwrap(), parent };
+    let mut line = [0; 18];
+    waits.stderr.as_mut().unwrap().read_exact(&mut line).unwrap();
+    bench.send("frame sync --bus vcan0");
+    let Output { status, stdout, .. } = waits.wait_with_output().unwrap();
+    assert!(status.success() && text(&stdout).contains("sync"), "{}", text(&stdout));
+}
+
+#[test]
+fn the_bus_of_a_cell_is_where_a_frame_is_sent() {
+    let bench = Bench::new();
+    bench.beside(Format::Fd, || bench.send("frame stimulus --cell vcan0:12 --force 3"));
+    let skin = bench.parent.path().join("skin.toml");
+    output(gateway(&format!("skin generate --cells 6 --buses 2 -o {}", skin.display())));
+    let skin = skin.display().to_string();
+    let node = output(gateway(&format!("check {skin} --list --json")));
+    let both: serde_json::Value = serde_json::from_str(&node).unwrap();
+    assert!(both.to_string().contains("vcan1"), "{both}");
+    for (arguments, expected) in [
+        ("--cell vcan1:5 --bus vcan0", "--cell vcan1:5 is not on --bus vcan0: name one of the two"),
+        (&format!("--cell 1 --skin {skin}"), "--cell 1 is on several buses: choose one of vcan0:1, vcan1:1"),
+        (&format!("--cell 99 --skin {skin}"), "--cell 99: the skin has no such cell on vcan0, vcan1"),
+        (&format!("--cell vcan7:1 --skin {skin}"), "bus vcan7 is not in "),
+    ] {
+        let Output { status, stderr, .. } =
+            bench.gateway(&format!("frame stimulus {arguments}")).output().unwrap();
+        let said = text(&stderr);
+        assert!(status.code() == Some(2) && said.starts_with(&format!("skinbus: {expected}")), "{said}");
+    }
+}
+
+#[test]
+fn what_the_options_of_a_dump_leave_out_is_said() {
+    let bench = Bench::new();
+    for (arguments, expected) in [
+        ("vcan0 --bus vcan1", "skinbus: vcan1 is not shown: name it beside vcan0\n"),
+        ("vcan0 --cell vcan1:3", "skinbus: vcan1 is not shown: name it beside vcan0\n"),
+        (
+            "vcan0 --bus vcan0 --cell vcan1:3",
+            "skinbus: vcan1:3 is on no bus that is picked: vcan0 are; leave one of the two out\n",
+        ),
+    ] {
+        let Output { status, stderr, .. } = bench.gateway(&format!("dump {arguments}")).output().unwrap();
+        assert_eq!((status.code(), text(&stderr)), (Some(2), expected));
+    }
+    let log = bench.parent.path().join("run.log");
+    std::fs::write(&log, "(1.000000) vcan0 003##500000000000000000000000000004782\n").unwrap();
+    let log = log.display().to_string();
+    for (arguments, expected) in
+        [("--bus vcan3", "no frame is of vcan3"), ("--cell vcan3:1", "no frame is of vcan3")]
+    {
+        let Output { status, stdout, stderr } = gateway(&format!("dump {log} {arguments}")).output().unwrap();
+        let expected = format!("{log}: {expected}\n");
+        assert_eq!((status.code(), text(&stdout), text(&stderr)), (Some(0), "", expected.as_str()));
+    }
+}
+
+#[test]
 fn a_live_bus_is_counted_until_the_end_that_was_requested_or_a_signal() {
     let bench = Bench::new();
     let counted = |child: Child| {
