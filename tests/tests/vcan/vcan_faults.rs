@@ -39,13 +39,14 @@ fn all_answer(place: &Place) {
     }
 }
 
-/// Checks that everything is accounted for, but for what cells tried to send on a bus that took nothing: they count that
-/// as sent.
-fn adds_up_but_for_what_the_bus_did_not_take(summary: &Summary) {
+/// Checks that everything is accounted for, whether cells could send what they tried on a bus that took nothing, or not.
+fn adds_up_though_the_bus_took_nothing(summary: &Summary) {
     let of = |pointer: &str| summary.of_bus(pointer);
     let reasons = ["in_time", "late", "too_late", "skipped", "not_heard", "lost", "in_doubt", "unknown"];
     let replies: u64 = reasons.map(|reason| of(&format!("/replies/{reason}"))).iter().sum();
-    assert_eq!((replies, of("/replies/unknown")), (of("/replies/due"), 0), "{:#}", summary.0);
+    assert_eq!(replies, of("/replies/due"), "{:#}", summary.0);
+    // Those to the joints at which the bus began to take nothing: their cells could not send them.
+    assert!(of("/replies/unknown") <= CELLS as u64, "{:#}", summary.0);
     let [dropped, backlog, outage, unknown] =
         ["dropped", "backlog", "outage", "unknown"].map(|why| of(&format!("/uplink/{why}")));
     let arrived = of("/uplink/delivered") + of("/uplink/rejected");
@@ -55,7 +56,7 @@ fn adds_up_but_for_what_the_bus_did_not_take(summary: &Summary) {
         "{:#}",
         summary.0
     );
-    assert!(dropped == 0 && outage + unknown > 0, "{:#}", summary.0);
+    assert_eq!(dropped, 0, "{:#}", summary.0);
 }
 
 /// Waits until a cell reports that the robot is halted, acknowledges, and checks that the same cells answer again.
@@ -76,7 +77,7 @@ fn ends_well_after_a_pause(place: &Place, bench: Running) {
     bench.end().well();
     place.is_left_clean();
     let summary = place.summary();
-    adds_up_but_for_what_the_bus_did_not_take(&summary);
+    adds_up_though_the_bus_took_nothing(&summary);
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
     assert!(summary.number("/loop/unsent") > 0, "{:#}", summary.0);
     assert!(summary.count("/loop/bad_cycles", INVALID) >= 25, "{:#}", summary.0);
@@ -118,7 +119,7 @@ fn a_bus_that_goes_down_halts_the_robot_and_works_again_when_it_is_up() {
     }
     let refused = place.start("skinbus", "frame resume --bus vcan0 --bus-kind socketcan").end();
     let said = refused.refusal(2);
-    assert!(said.starts_with(&format!("skinbus: there is no file vcan0, and as a bus: {DOWN}")), "{said}");
+    assert!(said.starts_with(&format!("skinbus: {DOWN}")), "{said}");
     vcan0.up();
     bench.hears("vcan0 works again");
     for cell in 1..=6 {
@@ -198,8 +199,12 @@ fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept()
     // And cells that are started by hand report it themselves.
     let vcan5 = Vcan::make("vcan5");
     let cells = place.start("cell-node", "--bus vcan5 --nodes 1-6 --skin skin.toml");
-    let lists =
-        || std::fs::read_to_string("/proc/net/can/rcvlist_sff").is_ok_and(|list| list.contains("  vcan5  "));
+    let lists = || {
+        let list = |of: &str| {
+            std::fs::read_to_string(format!("/proc/thread-self/net/can/rcvlist_{of}")).unwrap_or_default()
+        };
+        ["sff", "fil", "all"].into_iter().any(|of| list(of).contains("vcan5 "))
+    };
     until("cells on vcan5", || lists().then_some(()));
     vcan5.remove();
     assert_eq!(cells.end().refusal(1), format!("cell-node: {removed}"));
@@ -213,7 +218,7 @@ fn a_bus_that_cannot_be_used_is_refused_with_its_hint() {
         place.write("skin.toml", &small_skin(CELLS).replace("vcan0", bus));
         let gateway = place.bench(1.0, "--quiet").end().refusal(2).to_owned();
         let cell = place
-            .start("cell-node", &format!("--bus {bus} --node 1 --skin skin.toml"))
+            .start("cell-node", &format!("--bus {bus} --bus-kind socketcan --node 1 --skin skin.toml"))
             .end()
             .refusal(2)
             .to_owned();
