@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use protocol::usage::{Failure, draw, print, say, say_lines, written};
-use trace::files::{STANDARD_OUTPUT, WholeFile, check, folder_of};
+use trace::files::{STANDARD_OUTPUT, WholeFile, check, folder_of, with_hint};
 
 /// Whether files that exist may be overwritten.
 #[derive(Args, Clone, Copy, Debug)]
@@ -76,7 +76,7 @@ pub(crate) fn finish(option: &str, whole: WholeFile, mut file: File, text: &str)
     }
     let name = named(option, whole.path());
     let written = file.write_all(text.as_bytes()).and_then(|()| whole.finish());
-    written.map_err(|error: io::Error| Failure::run(format!("{name}: {error}")))
+    written.map_err(|error: io::Error| Failure::run(format!("{name}: {}", with_hint(error))))
 }
 
 /// A name that cannot be written to is wrong use.

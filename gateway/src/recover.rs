@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 use protocol::input;
 use protocol::usage::{Failure, shown};
+use trace::files::with_hint;
 use trace::recording::recover::RecoverError;
 use trace::recording::{names, repair};
 
@@ -43,7 +44,7 @@ impl Recover {
         self.overwrite.check("-o", &output)?;
         let failure = |error| {
             if let RecoverError::Write(error) = error {
-                return Failure::run(format!("-o {out}: {error}"));
+                return Failure::run(format!("-o {out}: {}", with_hint(error)));
             }
             Failure::run(format!("{name}: {error}"))
         };
@@ -51,7 +52,11 @@ impl Recover {
             repair::copy_unless_sound(&file, &output, self.overwrite.overwrite).map_err(failure)?;
         let line = match bytes {
             None if recovered.is_sound() => {
-                format!("{name} is whole, there is nothing to recover: {} messages", recovered.messages)
+                let rename = if names::goal_of(&self.file) == self.file { "" } else { "; rename it" };
+                format!(
+                    "{name} is whole, there is nothing to recover: {} messages{rename}",
+                    recovered.messages
+                )
             }
             None => return Err(Failure::run(format!("{name}: no message came back: {recovered}"))),
             Some(bytes) => format!("{out}, {bytes} bytes: {recovered}"),

@@ -138,11 +138,16 @@ impl Summary {
         let Recording { errors, lost_write, files, .. } = self.recording.as_ref()?;
         let first = errors.first().map_or("", String::as_str);
         let parts = files.iter().map(|file| &file.path).filter(|path| path.ends_with(".part"));
-        let parts: String = parts
-            .map(|path| format!("; what was recorded is in {path}: repair it with `skinbus recover {path}`"))
-            .collect();
-        (!errors.is_empty() || *lost_write > 0).then(|| {
-            format!("the recording is incomplete, {lost_write} frames were not written: {first}{parts}")
+        // The error of such a file says what to do with it.
+        let hint = |path: &String| match errors.iter().find(|error| error.contains(path.as_str())) {
+            Some(error) if error == first => String::new(),
+            Some(error) => format!("; {error}"),
+            None => format!("; what was recorded is in {path}: repair it with `skinbus recover {path}`"),
+        };
+        let parts: String = parts.map(hint).collect();
+        (!errors.is_empty() || *lost_write > 0).then(|| match lost_write {
+            0 => format!("the recording is not as it should be: {first}{parts}"),
+            _ => format!("the recording is incomplete, {lost_write} frames were not written: {first}{parts}"),
         })
     }
 }

@@ -33,7 +33,9 @@ impl AddressFile {
             let why = "it exists, and is no page's address: name another file";
             return Err(refused(io::Error::new(io::ErrorKind::AlreadyExists, why)));
         }
-        let (whole, mut file) = WholeFile::create(path, is_file).map_err(refused)?;
+        // Of a symlink the refusal would else name an option that there is not.
+        let is_there = is_file || path.is_symlink();
+        let (whole, mut file) = WholeFile::create(path, is_there).map_err(refused)?;
         let is_stream = whole.is_stream();
         let written = || -> io::Result<()> {
             if !is_stream {

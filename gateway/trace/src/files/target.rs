@@ -52,7 +52,10 @@ impl Target {
             return if streams || own_descriptor(path).is_some() {
                 Ok(Self::Stream)
             } else {
-                let why = "it is a symlink, which is not followed: name the file itself, or another one";
+                let itself = if !force && path.exists() { " and add --overwrite" } else { "" };
+                let why = format!(
+                    "it is a symlink, which is not followed: name the file itself{itself}, or another one"
+                );
                 Err(io::Error::new(io::ErrorKind::AlreadyExists, why))
             };
         }
@@ -272,6 +275,9 @@ pub fn sync_folder(path: &Path) {
 /// Why a file cannot be begun, and what to do when it is because of where it is to be.
 #[must_use]
 pub fn with_hint(error: io::Error) -> io::Error {
+    if matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded) {
+        return io::Error::new(error.kind(), format!("{error}; make room, or name a file on another disk"));
+    }
     let place = matches!(
         error.kind(),
         io::ErrorKind::NotFound

@@ -54,8 +54,12 @@ fn what_is_there_is_not_overwritten_and_no_symlink_is_followed_to_a_file() {
     assert_eq!(refusals(&file, false), [exists; 2]);
     for force in [false, true] {
         for path in [&link, &dangling] {
-            let why = "it is a symlink, which is not followed: name the file itself, or another one";
-            assert_eq!(refusals(path, force), [why; 2]);
+            // What it leads to is there, and would be refused too.
+            let itself = if path == &link && !force { " and add --overwrite" } else { "" };
+            let why = format!(
+                "it is a symlink, which is not followed: name the file itself{itself}, or another one"
+            );
+            assert_eq!(refusals(path, force), [why.clone(), why]);
         }
         let why = "is a directory; name a file in a folder that can be written";
         assert_eq!(refusals(&directory, force), [why; 2]);
@@ -63,6 +67,14 @@ fn what_is_there_is_not_overwritten_and_no_symlink_is_followed_to_a_file() {
     }
     assert_eq!(names(folder.path()), before);
     assert_eq!(fs::read_to_string(&file).unwrap(), "mine");
+}
+
+#[test]
+fn of_a_full_disk_the_hint_is_another_one() {
+    // Another folder may be as full.
+    let full = with_hint(io::ErrorKind::StorageFull.into());
+    assert!(full.to_string().ends_with("; make room, or name a file on another disk"), "{full}");
+    assert_eq!(full.kind(), io::ErrorKind::StorageFull);
 }
 
 #[test]
@@ -77,8 +89,6 @@ fn who_names_a_place_for_no_file_is_told_what_to_do() {
         let why = format!("{why}; name a file in a folder that can be written");
         assert_eq!(refusals(&path, false), [why.clone(), why]);
     }
-    let full = with_hint(io::ErrorKind::StorageFull.into());
-    assert_eq!(full.to_string(), "no storage space", "another folder may be as full");
 }
 
 #[test]

@@ -157,6 +157,11 @@ impl Part {
     }
 }
 
+/// The error for a name that another program has given to a file while a recording was written.
+pub(super) fn taken_meanwhile(goal: &Path) -> String {
+    format!("{}: another program made a file of this name meanwhile", goal.display())
+}
+
 /// Why a recording cannot begin under a name.
 fn why_taken(path: &Path) -> String {
     let name = path.display();
@@ -168,7 +173,7 @@ fn why_taken(path: &Path) -> String {
         Ok(file) if !is_held(&file) => format!(
             "{name} is there, and no run that was killed has left it: move it away, or record to another name"
         ),
-        _ => format!("{name} is there: another run records to this name now"),
+        _ => format!("{name} is there: another run records to this name now: record to another name"),
     }
 }
 
@@ -338,7 +343,10 @@ mod tests {
         let (part, file) = Part::create(goal.clone()).unwrap();
         assert_eq!(orphans(&goal).len(), 0, "somebody writes it");
         let error = Part::create(goal.clone()).unwrap_err().to_string();
-        assert!(error.ends_with("run.mcap.part is there: another run records to this name now"), "{error}");
+        assert!(
+            error.ends_with("part is there: another run records to this name now: record to another name"),
+            "{error}"
+        );
         drop(file);
         let found = orphans(&goal);
         assert_eq!(found[0].0, part.path);

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::sync::mpsc::{self, Receiver, Sender};
 use std::thread::{self, JoinHandle};
 
-use super::names::Part;
+use super::names::{self, Part};
 use crate::files::sync_folder;
 
 /// A file that has ended, and what is told of it once it has its name.
@@ -103,8 +103,31 @@ fn publish<T>(Ended { file, part, about }: Ended<T>, force: bool) -> Published<T
                 );
                 return Published { path: None, about, error: Some(error) };
             }
-            let error = Some(format!("{goal}: {error}; the recording is {there}"));
+            let error = if error.kind() == io::ErrorKind::AlreadyExists {
+                names::taken_meanwhile(&part.goal)
+            } else {
+                format!("{goal}: {error}")
+            };
+            let error = Some(format!("{error}; {there} is the whole recording: rename it"));
             Published { path: Some(part.path), about, error }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_whole_file_whose_name_is_taken_is_not_to_be_repaired() {
+        let folder = tempfile::tempdir().unwrap();
+        let goal = folder.path().join("run.mcap");
+        let (part, file) = Part::create(goal.clone()).unwrap();
+        std::fs::write(&goal, "another program's").unwrap();
+        let published = publish(Ended { file, part, about: () }, false);
+        let error = published.error.unwrap();
+        assert!(error.contains("run.mcap: another program made a file of this name meanwhile; "), "{error}");
+        assert!(error.ends_with("run.mcap.part is the whole recording: rename it"), "{error}");
+        assert_eq!(published.path, Some(folder.path().join("run.mcap.part")));
     }
 }

@@ -7,8 +7,9 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::{Gid, fchown};
 
-use super::names;
+use super::names::{self, Part};
 use super::recover::{RecoverError, Recovered, recover};
+use super::sink::is_full;
 use crate::files::{WholeFile, folder_of, nameless};
 
 /// Names that are tried for a new file, when somebody else takes one after the other.
@@ -59,6 +60,19 @@ pub fn repair(
     }
     let original = Some(names::keep_damaged(part, from).map_err(RecoverError::Write)?);
     Ok(Repaired { original, ..repaired })
+}
+
+/// The line for a file that broke off and could not be repaired either.
+pub(super) fn unrepaired(Part { path, goal, .. }: &Part, error: &RecoverError) -> String {
+    let path = path.display();
+    let is = |kind: fn(&io::Error) -> bool| matches!(error, RecoverError::Write(error) if kind(error));
+    let why = if is(|error| error.kind() == io::ErrorKind::AlreadyExists) {
+        names::taken_meanwhile(goal)
+    } else {
+        format!("{path}: {error}")
+    };
+    let more = if is(is_full) { " -o FILE`, a file on another disk" } else { "`" };
+    format!("{why}; what was recorded is in {path}: repair it with `skinbus recover {path}{more}")
 }
 
 /// Makes a whole file of another one, unless that is whole itself or no message comes of it. What it came to, and the new
@@ -153,5 +167,22 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
             }
             Err(error) => say(&format!("{name} {leftover} and cannot be repaired: {error}")),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_repaired_where_it_is_is_repaired_elsewhere() {
+        let folder = tempfile::tempdir().unwrap();
+        let (part, _file) = Part::create(folder.path().join("run.mcap")).unwrap();
+        let line = |kind: io::ErrorKind| unrepaired(&part, &RecoverError::Write(kind.into()));
+        let full = line(io::ErrorKind::StorageFull);
+        assert!(full.ends_with("run.mcap.part -o FILE`, a file on another disk"), "{full}");
+        let taken = line(io::ErrorKind::AlreadyExists);
+        assert!(taken.contains("run.mcap: another program made a file of this name meanwhile; "), "{taken}");
+        assert!(taken.ends_with("run.mcap.part`") && !taken.contains("--overwrite"), "{taken}");
     }
 }

@@ -459,10 +459,7 @@ impl<T> Series<T> {
                 }
                 Ok(Repaired { new: None, .. }) => self.lost.add(kept),
                 Err(error) => {
-                    let path = part.path.display();
-                    self.said.push(Said::Else(format!(
-                        "{path}: {error}; what was recorded is in it: repair it with `skinbus recover {path}`"
-                    )));
+                    self.said.push(Said::Else(repair::unrepaired(&part, &error)));
                     let bytes = file.metadata().map_or(0, |about| about.len());
                     self.written.push(kept.in_file(&part.path, bytes));
                 }

@@ -8,7 +8,7 @@ use crate::summary::{
     CellError, ErrorCells, Halted, HostSummary, NetworkSummary, OutagesSummary, SumsSummary, UplinkSummary,
 };
 use model::table::{Contributions, Errors};
-use trace::recording::account::Recording;
+use trace::recording::account::{Recording, Written};
 
 /// A run of 253 cells that is well.
 fn well() -> Summary {
@@ -234,6 +234,25 @@ fn the_most_important_fault_comes_first() {
             assert!(first == Some(0) && is_named, "{begin}, {after}: {found:?}");
         }
     }
+}
+
+#[test]
+fn the_error_of_a_file_says_what_to_do_with_it_and_no_other_hint_does() {
+    let failure = |lost_write, errors: &[&str]| {
+        let path = "r.mcap.part".to_owned();
+        let file = Written { path, format: "mcap", frames: 0, messages: 0, bytes: 0 };
+        let errors = errors.iter().map(|&error| error.to_owned()).collect();
+        let recording = Recording { lost_write, errors, files: vec![file], ..Recording::default() };
+        Summary { recording: Some(recording), ..well() }.lost_frames().unwrap()
+    };
+    let taken = "r.mcap: taken; r.mcap.part is the whole recording: rename it";
+    assert_eq!(failure(0, &[taken]), format!("the recording is not as it should be: {taken}"));
+    let both = failure(2, &["r.mcap: no room", taken]);
+    assert_eq!(
+        both,
+        format!("the recording is incomplete, 2 frames were not written: r.mcap: no room; {taken}")
+    );
+    assert!(failure(2, &["r.mcap: no room"]).ends_with("repair it with `skinbus recover r.mcap.part`"));
 }
 
 #[test]
