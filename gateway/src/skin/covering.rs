@@ -6,7 +6,7 @@ use std::path::Path;
 use clap::Args;
 use cover::{Figures, KeepOut, Link, MAX_NODES, MAX_PITCH, MIN_PITCH, Options, cover};
 use protocol::usage::Failure;
-use robots::{CellOnLink, Chain, Urdf};
+use robots::{CellOnLink, Chain, Isometry3, Urdf};
 
 use super::super::print::{count, list};
 use super::super::visuals::{Packages, Visuals};
@@ -137,7 +137,8 @@ impl Covering {
             let skin = cover(&own, &others, &self.options(&own))
                 .map_err(|error| Failure::usage(format!("--cover: {error}")))?;
             if let Some(bare) = skin.links.iter().find(|figures| figures.cells == 0) {
-                return Err(Failure::usage(without_cells(bare)));
+                let is_flat = own.iter().any(|link| link.name == bare.name && !has_area(link));
+                return Err(Failure::usage(without_cells(bare, is_flat)));
             }
             covered.cells.extend(skin.cells.iter().map(|cell| CellOnLink {
                 link: own.get(cell.link).map_or_else(String::new, |link| link.name.clone()),
@@ -221,9 +222,17 @@ impl Covering {
     }
 }
 
+/// Returns true if a link has a triangle with an area.
+fn has_area(link: &Link) -> bool {
+    let triangles = link.parts.iter().flat_map(|part| part.triangles(&Isometry3::identity()));
+    triangles.into_iter().any(|[a, b, c]| (b - a).cross(&(c - a)).norm() > 0.0)
+}
+
 /// Why a link has no cell, in a line.
-fn without_cells(Figures { name, outer_area, kept_out, .. }: &Figures) -> String {
-    let why = if *outer_area <= 0.0 {
+fn without_cells(Figures { name, outer_area, kept_out, .. }: &Figures, is_flat: bool) -> String {
+    let why = if is_flat {
+        "its triangles have no area: correct its meshes, or take it out of --cover".to_owned()
+    } else if *outer_area <= 0.0 {
         "other links hide it all: take it out of --cover, or add those to --leave-out".to_owned()
     } else if *kept_out >= 1.0 {
         "the boxes of --keep-out leave nothing of it: make them smaller, or take the link out of --cover"

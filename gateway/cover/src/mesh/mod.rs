@@ -1,6 +1,7 @@
 //! Triangle meshes: STL, COLLADA (DAE) and OBJ files, and primitives.
 
 mod collada;
+mod misnamed;
 mod obj;
 mod polygon;
 mod primitive;
@@ -15,8 +16,7 @@ use std::io;
 use std::path::Path;
 
 use nalgebra::{Matrix3, Point3, Vector3};
-use protocol::xml::{Foreign, foreign, kind_of_root};
-use roxmltree::Document;
+use protocol::xml::{Fault, Foreign, foreign};
 use thiserror::Error;
 
 pub use simplify::simplify;
@@ -61,7 +61,10 @@ pub enum MeshError {
         source: io::Error,
     },
     /// The file's name has an extension that is not known.
-    #[error("mesh {file}: extension {extension:?} is none of stl, dae and obj; convert the file")]
+    #[error(
+        "mesh {file}: extension {extension:?} is none of stl, dae and obj; {}",
+        if extension.is_empty() { "add the one that it is" } else { "convert the file" }
+    )]
     Extension {
         /// The file.
         file: String,
@@ -75,6 +78,14 @@ pub enum MeshError {
         file: String,
         /// What the parser says, in one line.
         reason: String,
+    },
+    /// The file is no XML that is read: what there is, and what to do.
+    #[error("mesh {file}: {fault}")]
+    Xml {
+        /// The file.
+        file: String,
+        /// The fault, with its hint.
+        fault: Fault,
     },
     /// The file is another one, or stands for another one.
     #[error("mesh {file}{}: {what}: {hint}", line.map_or_else(String::new, |line| format!(":{line}")))]
@@ -97,7 +108,7 @@ pub enum MeshError {
         reason: String,
     },
     /// The file has no triangle.
-    #[error("mesh {file}: it has no triangle; export it again, or take it out of the description")]
+    #[error("mesh {file}: it has no triangle; export it again, with its surface")]
     Empty {
         /// The file.
         file: String,
@@ -192,18 +203,21 @@ impl Mesh {
             return Err(MeshError::Foreign { file: name.to_owned(), line, what: what.to_owned(), hint });
         }
         let extension = Path::new(name).extension().and_then(OsStr::to_str).unwrap_or_default();
-        let read = |triangles: Result<Vec<Triangle>, MeshError>| match triangles {
-            Err(_) => triangles.map_err(|error| xml(name, bytes).unwrap_or(error)),
-            Ok(none) if none.is_empty() => xml(name, bytes).map_or(Ok(none), Err),
-            found => found,
-        };
-        let triangles = match extension.to_ascii_lowercase().as_str() {
-            "stl" => read(stl::triangles(name, bytes))?,
-            "obj" => read(obj::triangles(name, bytes))?,
-            "dae" => collada::triangles(name, bytes, up)?,
+        let known = extension.to_ascii_lowercase();
+        let triangles = match known.as_str() {
+            "stl" => stl::triangles(name, bytes),
+            "obj" => obj::triangles(name, bytes),
+            "dae" => collada::triangles(name, bytes, up),
             _ => return Err(MeshError::Extension { file: name.to_owned(), extension: extension.to_owned() }),
         };
-        Self::new(name, triangles)
+        triangles.and_then(|all| Self::new(name, all)).map_err(|error| {
+            let is_of_content = matches!(
+                error,
+                MeshError::Syntax { .. } | MeshError::Damaged { .. } | MeshError::Empty { .. }
+            );
+            let other = if is_of_content { misnamed::error(name, &known, bytes) } else { None };
+            other.unwrap_or(error)
+        })
     }
 
     /// The triangles, in m.
@@ -211,21 +225,6 @@ impl Mesh {
     pub fn triangles(&self) -> &[Triangle] {
         &self.triangles
     }
-}
-
-/// The error for XML in a file that has another format by its name.
-fn xml(file: &str, bytes: &[u8]) -> Option<MeshError> {
-    if !bytes.trim_ascii_start().starts_with(b"<") {
-        return None;
-    }
-    let text = protocol::xml::text(bytes).ok()?;
-    let prepared = protocol::xml::prepare(&text).ok()?;
-    let document = Document::parse(&prepared.text).ok()?;
-    let name = document.root_element().tag_name().name();
-    let what =
-        kind_of_root(name).map_or_else(|| format!("XML with the outermost element {name}"), str::to_owned);
-    let hint = if name == "COLLADA" { "rename it to .dae" } else { "name the mesh itself" };
-    Some(MeshError::Foreign { file: file.to_owned(), line: None, what, hint })
 }
 
 fn too_many(file: &str, count: usize) -> MeshError {

@@ -213,7 +213,7 @@ fn what_is_no_mesh_is_refused_in_one_line() {
     assert!(parse("a.obj", "v 0 0 0\nf 1 2 3\n").starts_with("mesh a.obj: "));
     assert!(parse("a.stl", "not an STL").starts_with("mesh a.stl: "));
     assert!(parse("a.dae", "<COLLADA>").starts_with("mesh a.dae: "));
-    assert!(parse("a.dae", "<svg/>").contains("its first element is svg (an SVG drawing), not COLLADA"));
+    assert_eq!(parse("a.dae", "<svg/>"), "mesh a.dae: an SVG drawing: name the mesh itself");
     assert!(parse("a.dae", "\n\n<COLLADA>\n&</COLLADA>").contains(": line 4: "));
     assert!(parse("a.dae", &dae("", "")).contains("it has no triangle"));
     assert!(parse("a.dae", &dae("<unit meter=\"0\"/>", PLAIN)).contains("its unit is \"0\" m"));
@@ -243,7 +243,7 @@ fn files_that_stand_for_others_are_named() {
         assert!(sdf.contains("an SDF file, of Gazebo"), "{sdf}");
     }
     let renamed = parse("a.stl", "<COLLADA/>");
-    assert_eq!(renamed, "mesh a.stl: a COLLADA mesh: rename it to .dae");
+    assert_eq!(renamed, "mesh a.stl: a COLLADA mesh: rename it to .dae, in the URDF too");
     let both = parse("a.obj", "v 0 0 0\n<<<<<<< HEAD\nv 1 0 0\n=======\nv 2 0 0\n>>>>>>> main\n");
     assert!(both.starts_with("mesh a.obj:2: a merge conflict of git: keep one side"), "{both}");
 }

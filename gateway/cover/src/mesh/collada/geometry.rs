@@ -184,9 +184,11 @@ impl<'a, 'i, 'n> Mesh<'a, 'i, 'n> {
         let mut stride = 0;
         let mut vertex = None;
         for input in children(element, "input") {
-            let offset = input.attribute("offset").map_or(Some(0), |offset| offset.trim().parse().ok());
-            let offset = offset.filter(|offset| *offset < MAX_OFFSET);
-            let offset = offset.ok_or_else(|| self.error("an input has a wrong offset"))?;
+            let text = input.attribute("offset").unwrap_or("0");
+            let offset = text.trim().parse().ok().filter(|offset| *offset < MAX_OFFSET);
+            let offset = offset.ok_or_else(|| {
+                self.error(&format!("an input has the offset {text:?}, not one of 0 to {}", MAX_OFFSET - 1))
+            })?;
             stride = stride.max(offset + 1);
             if input.attribute("semantic") == Some("VERTEX") {
                 vertex = Some((offset, self.referred("vertices", input)?));

@@ -13,7 +13,7 @@ use std::collections::HashMap;
 
 use nalgebra::{Matrix3, Rotation3, Unit, Vector3};
 use protocol::usage::shown;
-use protocol::xml::{Fault, kind_of_root};
+use protocol::xml::Fault;
 use roxmltree::{Document, Node};
 
 use super::{Affine, MAX_TRIANGLES, MeshError, Triangle, UpAxis, syntax, too_many};
@@ -27,7 +27,7 @@ const MAX_NODES: usize = 100_000;
 
 /// The triangles of a file's scene, in m.
 pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Triangle>, MeshError> {
-    let wrong = |fault: Fault| syntax(name, &fault.to_string());
+    let wrong = |fault: Fault| MeshError::Xml { file: name.to_owned(), fault };
     let text = protocol::xml::text(bytes).map_err(wrong)?;
     let prepared = protocol::xml::prepare(&text).map_err(wrong)?;
     let document = Document::parse(&prepared.text).map_err(|error| {
@@ -37,9 +37,7 @@ pub(super) fn triangles(name: &str, bytes: &[u8], up: UpAxis) -> Result<Vec<Tria
     })?;
     let root = document.root_element();
     if root.tag_name().name() != "COLLADA" {
-        let found = root.tag_name().name();
-        let kind = kind_of_root(found).map(|kind| format!(" ({kind})")).unwrap_or_default();
-        return Err(syntax(name, &format!("its first element is {found}{kind}, not COLLADA")));
+        return Err(syntax(name, &format!("its first element is {}, not COLLADA", root.tag_name().name())));
     }
     let names = Names::of(name, root.descendants());
     let mut reader = Reader { name, names, geometry: HashMap::new(), visited: 0, triangles: Vec::new() };
@@ -220,7 +218,15 @@ impl<'a, 'i> Reader<'a, 'i> {
                 let turn = axis.map(|axis| Rotation3::from_axis_angle(&axis, degrees.to_radians()));
                 turn.map_or(identity, |turn| Affine { linear: turn.into_inner(), ..identity })
             }
-            _ => return Err(self.error(&format!("a {kind} has {} numbers", numbers.len()))),
+            _ => {
+                let expected = match kind {
+                    "matrix" => 16,
+                    "rotate" => 4,
+                    _ => 3,
+                };
+                let got = numbers.len();
+                return Err(self.error(&format!("a {kind} has {got} numbers, not {expected}")));
+            }
         }))
     }
 
