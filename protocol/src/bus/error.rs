@@ -69,7 +69,7 @@ pub enum BusError {
     },
     /// Nobody serves this embedded bus.
     #[error(
-        "no embedded bus {name} is served in {}: start `vcan-setup serve {name}`, or the gateway, which \
+        "no embedded bus {name} is served in {}: start `vcan-setup serve {name}`, or `skinbus run`, which \
          serves it", directory.display()
     )]
     NotServed {

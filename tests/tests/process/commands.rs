@@ -221,7 +221,11 @@ fn status_shows_embedded_buses_and_which_are_served() {
     drop(served);
     let (code, embedded, err) = status("nosuchcan1");
     assert_eq!((code, embedded), (1, expected(false)), "its server was killed");
-    assert_eq!(err, "vcan-setup: not there: nosuchcan1; `vcan-setup doctor nosuchcan1` says how to get it\n");
+    assert_eq!(
+        err,
+        "vcan-setup: not there: nosuchcan1; `vcan-setup serve nosuchcan1` serves an embedded bus, `vcan-setup doctor \
+         nosuchcan1` says what an interface needs\n"
+    );
     assert_eq!(status("nosuchcan2").1, serde_json::json!([]));
 }
 

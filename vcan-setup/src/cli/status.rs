@@ -67,7 +67,11 @@ impl Status {
             return Ok(());
         }
         let (names, words) = (absent.join(", "), absent.join(" "));
-        Err(Failure::run(format!("not there: {names}; `vcan-setup doctor {words}` says how to get it")))
+        let first = absent.first().unwrap_or(&"vcan0");
+        Err(Failure::run(format!(
+            "not there: {names}; `vcan-setup serve {first}` serves an embedded bus, `vcan-setup doctor {words}` says what \
+             an interface needs"
+        )))
     }
 }
 

@@ -118,14 +118,24 @@ impl Drop for Place {
     }
 }
 
+/// The most attempts at a directory that is gone again when it has been made.
+const MOST_ABSENT: u32 = 1_000;
+
 /// Makes the directory unless it is there, and locks it.
 fn lock(path: &Path) -> Result<OwnedFd, PlaceError> {
     let failed = |errno: Errno| PlaceError::Io { path: path.to_owned(), doing: "lock", source: errno.into() };
+    let mut absent = 0;
     loop {
         let directory = match make_directory(path) {
             Ok(directory) => directory,
-            // A server that ended removed it between the two looks; but a missing parent stays missing.
-            Err(error) if error.is_absent() && path.parent().is_some_and(Path::exists) => continue,
+            // A server that ended removed it between the two looks; but a missing parent stays missing, and where a file
+            // system has no directories to make, as in /proc, it stays absent.
+            Err(error)
+                if error.is_absent() && absent < MOST_ABSENT && path.parent().is_some_and(Path::exists) =>
+            {
+                absent += 1;
+                continue;
+            }
             Err(error) => return Err(error.into()),
         };
         rustix::io::retry_on_intr(|| rustix::fs::flock(&directory, FlockOperation::LockExclusive))
@@ -137,5 +147,16 @@ fn lock(path: &Path) -> Result<OwnedFd, PlaceError> {
         {
             return Ok(directory);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_directory_that_cannot_be_made_is_refused_and_not_tried_forever() {
+        let error = Place::take(Path::new("/proc/skinbus"), "vcan0").unwrap_err().to_string();
+        assert!(error.ends_with("; set SKINBUS_DIR to a directory of your own"), "{error}");
     }
 }

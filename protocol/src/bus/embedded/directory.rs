@@ -65,7 +65,7 @@ pub enum DirectoryError {
     #[error("{} is too long for a socket, whose path has at most 107 bytes: set SKINBUS_DIR to a shorter one", .0.display())]
     TooLong(PathBuf),
     /// It cannot be opened or made; a link is not followed.
-    #[error("cannot use {} as the directory of embedded buses: {source}", path.display())]
+    #[error("cannot use {} as the directory of embedded buses: {source}; set SKINBUS_DIR to a directory of your own", path.display())]
     Io {
         /// The directory.
         path: PathBuf,
