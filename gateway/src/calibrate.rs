@@ -32,6 +32,7 @@ use trace::capture::{Entry, Reader};
 use trace::recording::series::{Attached, Split};
 
 use super::arguments::{BusKinds, bus_names, seconds};
+use super::input::no_frame;
 use super::output::{Overwrite, apart, note, print_beside};
 use super::print::{count, json};
 use super::robot_file::{RobotOfSkin, urdf_of};
@@ -278,14 +279,19 @@ fn read(files: &[PathBuf], skin: &Skin, settings: &Settings) -> Result<Calibrati
     }
     let mut seen = Observations::new(skin);
     let mut decoder = Decoder::new(None);
+    let mut has_frames = false;
     while let Some(entry) = reader.next().map_err(Failure::run)? {
         let Entry::Frame(record) = entry else { continue };
+        has_frames = true;
         let at = Micros(record.time.nanos / 1_000);
         if let (Decoded::Message(message), Some(bus)) =
             (decoder.decode(at, record.interface, &record.frame), skin.bus_named(record.interface))
         {
             seen.take(bus, at, &message);
         }
+    }
+    if !has_frames {
+        return Err(no_frame(&reader));
     }
     if seen.cells.iter().all(Vec::is_empty) {
         return Err(Failure::usage(format!(

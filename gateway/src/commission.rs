@@ -16,7 +16,7 @@ use protocol::skin::Skin;
 use protocol::usage::Failure;
 
 use super::arguments::{BusKinds, bus_names, bus_of};
-use super::output::{Overwrite, print_beside};
+use super::output::{Overwrite, apart, print_beside};
 use super::print::{list, some};
 use super::{input, output};
 
@@ -69,6 +69,7 @@ impl Commission {
             Some(name) => vec![bus_of(&skin, &file, name)?],
             None => (0..skin.buses.len()).collect(),
         };
+        apart([("--node-ids", self.node_ids.as_deref())], [self.skin.as_path()])?;
         // Before cells are written, so that a file that cannot be written is reported first.
         let begun =
             self.node_ids.as_ref().map(|path| self.overwrite.create("--node-ids", path)).transpose()?;

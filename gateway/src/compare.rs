@@ -21,7 +21,7 @@ use trace::capture::{Entry, Format, NoteKind, Reader};
 
 use self::files::{parts, starts};
 use super::input;
-use super::input::{captures, difference, format, no_frame, place, skin_of};
+use super::input::{captures, difference, format, needs_frames, no_frame, place, skin_of};
 use super::output::{self, Overwrite, apart, print_beside};
 use super::print::{count, json};
 
@@ -245,10 +245,17 @@ impl Compare {
                 _ => (skin, name) = (Some(own), Some(path.clone())),
             }
         }
-        skin.ok_or_else(|| {
-            let (a, b) = (self.a.display(), self.b.display());
-            Failure::usage(format!("neither {a} nor {b} has a skin in it: name one with --skin"))
-        })
+        if let Some(skin) = skin {
+            return Ok(skin);
+        }
+        // What has no frames would be refused with a skin too.
+        for (path, files) in [(&self.a, &files.a), (&self.b, &files.b)] {
+            if can_be_read_again(path) {
+                needs_frames(files)?;
+            }
+        }
+        let (a, b) = (self.a.display(), self.b.display());
+        Err(Failure::usage(format!("neither {a} nor {b} has a skin in it: name one with --skin")))
     }
 
     /// Refuses a capture without frames or joints, and one of another skin.

@@ -41,7 +41,7 @@ pub(crate) fn option(words: &[String], option: &str) -> Option<String> {
         ("cells", "--for") => "--duration",
         ("replay", "--max") => "--speed max",
         ("replay", "--json") => "--summary -",
-        ("skin", "--robot") => "nothing: it is a UR5",
+        ("skin", "--robot") if words.get(1).is_some_and(|word| word == "generate") => "nothing: it is a UR5",
         ("replay", "--view" | "--address-file" | "--token-file") => "skinbus view SKIN beside it",
         ("replay", "--kind" | "--node") => {
             "--only, or skinbus dump to choose frames and canplayer to send them"
@@ -55,7 +55,7 @@ pub(crate) fn option(words: &[String], option: &str) -> Option<String> {
         ("calibrate", "--seed") | ("calibrate" | "experiment", "--cells-per-process") => {
             "nothing: it has a fixed value now"
         }
-        ("skin", "--cells") => "--places",
+        ("skin", "--cells") if words.get(1).is_some_and(|word| word == "import") => "--places",
         _ => return None,
     };
     Some(format!("there is no option {name} in {command}; use {now}"))
@@ -85,5 +85,7 @@ mod tests {
         );
         assert_eq!(of_option("dump b --max=3", "--max"), "there is no option --max in dump; use -n, --count");
         assert_eq!(of_option("explain s.toml --force", "--force"), "");
+        assert!(of_option("skin import r.urdf --cells c.csv", "--cells").ends_with("use --places"));
+        assert_eq!(of_option("skin generate --cells x", "--cells"), "", "it has this option");
     }
 }

@@ -116,7 +116,7 @@ pub(crate) fn skin_in(file: &Path) -> Result<Skin, Failure> {
     if !is_recording {
         return read_skin(file);
     }
-    attached(&[file.to_owned()], "name the skin's own file")
+    attached(&[file.to_owned()], "name the skin's own file", || Ok(()))
 }
 
 /// Reads a skin's own file. The error for another text says what that is as a capture.
@@ -157,10 +157,11 @@ pub(crate) fn skin_of(files: &[PathBuf]) -> Result<Skin, Failure> {
             pipe.display()
         )));
     }
-    attached(files, "name one with --skin")
+    attached(files, "name one with --skin", || needs_frames(files))
 }
 
-fn attached(files: &[PathBuf], hint: &str) -> Result<Skin, Failure> {
+/// The skin that a recording has with it; `check` comes before the error for one without.
+fn attached(files: &[PathBuf], hint: &str, check: impl Fn() -> Result<(), Failure>) -> Result<Skin, Failure> {
     let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
     // It may stand behind the frames.
     while reader.format() == Format::Mcap
@@ -170,11 +171,20 @@ fn attached(files: &[PathBuf], hint: &str) -> Result<Skin, Failure> {
     let name = reader.name();
     match reader.extras().skin() {
         Some(skin) => skin.map_err(|error| Failure::usage(format!("{name}, {error}"))),
-        None => Err(match &reader.extras().unfinished {
-            Some(why) => Failure::run(format!("{name} has no skin in it, and {why}: {hint}")),
-            None => Failure::usage(format!("{name} has no skin in it: {hint}")),
-        }),
+        None => {
+            check()?;
+            Err(match &reader.extras().unfinished {
+                Some(why) => Failure::run(format!("{name} has no skin in it, and {why}: {hint}")),
+                None => Failure::usage(format!("{name} has no skin in it: {hint}")),
+            })
+        }
     }
+}
+
+/// Refuses a capture without frames, for which no skin helps.
+pub(crate) fn needs_frames(files: &[PathBuf]) -> Result<(), Failure> {
+    let mut reader = Reader::open_all(files).map_err(Failure::usage)?;
+    if reader.has_frame().map_err(Failure::run)? { Ok(()) } else { Err(no_frame(&reader)) }
 }
 
 /// The skin that a reader has found so far; without one that can be read, `instead` is said.

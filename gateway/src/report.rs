@@ -71,8 +71,14 @@ impl Report {
         let mut files = vec![("-o", output.clone(), page::html(&report.page))];
         if let Some(folder) = &self.svg {
             for (name, drawing) in drawings(&report.page) {
-                let path = folder.join(name);
+                let path = folder.join(&name);
                 if folder.is_dir() {
+                    if path.is_file() && !self.overwrite.overwrite {
+                        return Err(Failure::usage(format!(
+                            "--svg {}: {name} is in it: name another folder, or overwrite it with --overwrite",
+                            folder.display()
+                        )));
+                    }
                     self.is_free(&path, "--svg")?;
                 }
                 files.push(("--svg", path, drawing));

@@ -94,11 +94,6 @@ pub(crate) struct View {
     kinds: BusKinds,
 }
 
-/// What keeps a page from listening.
-fn not_bound(listen: SocketAddr, error: &io::Error) -> Failure {
-    Failure::usage(format!("--listen {listen}: {error}; name another port, or leave it out for a free one"))
-}
-
 /// The options of a run's page.
 #[derive(Args, Debug, Default)]
 pub(crate) struct PageOptions {
@@ -129,7 +124,7 @@ impl View {
             let listen = self.listen;
             let token = token::chosen(self.token_file.as_deref())?;
             let bound = TcpListener::bind(listen);
-            let listener = bound.map_err(|error| not_bound(listen, &error))?;
+            let listener = bound.map_err(|error| unbound(listen, &error))?;
             (listener, token::needed(token, may_act, listen)?)
         };
         let address = listener.local_addr().map_err(|error| failed(&error))?;
@@ -267,6 +262,21 @@ fn simplified(surface: &Surface) -> Vec<Shell> {
 }
 
 /// Prints where the page is.
+/// The error for an address that no page can have.
+fn unbound(listen: SocketAddr, error: &io::Error) -> Failure {
+    let is = |kind| error.kind() == kind;
+    let hint = if is(io::ErrorKind::AddrNotAvailable) {
+        "name an address of this machine"
+    } else if is(io::ErrorKind::PermissionDenied) {
+        "name a port from 1024 on"
+    } else {
+        "name another port"
+    };
+    Failure::usage(format!(
+        "--listen {listen}: {error}; {hint}, or leave it out for a free port of this machine"
+    ))
+}
+
 fn say(url: Option<String>) {
     url.iter().for_each(|url| note(format_args!("view: {url}")));
 }
@@ -318,7 +328,7 @@ impl Page {
             Some(token) => command.env(token::VARIABLE, token.as_str()),
             None => command.env_remove(token::VARIABLE),
         };
-        let listener = TcpListener::bind(listen).map_err(|error| not_bound(listen, &error))?;
+        let listener = TcpListener::bind(listen).map_err(|error| unbound(listen, &error))?;
         let address = listener.local_addr().map_err(|error| failed(&error))?;
         let url = url(address, token.as_ref());
         let address_file = options.address_file.as_deref();

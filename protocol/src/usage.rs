@@ -167,6 +167,8 @@ pub fn one_line(text: &str) -> String {
     let text = text.strip_prefix("error: ").unwrap_or(text);
     let wrong = text.split("\n\nUsage:").flat_map(|text| text.split("\n\nFor more information")).next();
     let lines = wrong.unwrap_or(text).lines().map(str::trim).filter(|line| !line.is_empty());
+    // An option has no value of that kind, and rarely a file has that name.
+    let lines = lines.filter(|line| !line.starts_with("tip: to pass '"));
     let lines = lines.collect::<Vec<_>>().join(" ").replace(" tip: ", "; ");
     format!("{lines}; try '--help'")
 }
@@ -236,6 +238,9 @@ mod tests {
         assert_eq!(one_line(said), expected.replace(" ; ", "; "));
         let said = "error: invalid value 'x' for '--node'\n\nFor more information, try '--help'.\n";
         assert_eq!(one_line(said), "invalid value 'x' for '--node'; try '--help'");
+        let said = "error: unexpected argument '-1' found\n\n  tip: to pass '-1' as a value, use '-- -1'\n\n\
+                    Usage: x [OPTIONS]\n\nFor more information, try '--help'.\n";
+        assert_eq!(one_line(said), "unexpected argument '-1' found; try '--help'");
     }
     #[test]
     fn a_terminal_is_shown_controls_and_obeys_none() {

@@ -102,7 +102,7 @@ pub enum Refusal {
     },
     /// The motion is known too seldom.
     #[error(
-        "{bus}: {disturbance}: too little is left to calibrate with; record again with a loop that skips no ticks"
+        "{bus}: {disturbance}: too little is left to calibrate with; record longer, with a loop that skips no ticks"
     )]
     Disturbed {
         /// The bus.

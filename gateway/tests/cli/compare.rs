@@ -218,6 +218,7 @@ fn two_skins_and_what_is_no_capture_are_refused_in_one_line() {
         ("fd.mcap fd.log --skin sums.toml", 2, "sums.toml and fd.mcap have two skins: "),
         ("fd.log fd.log --skin moved.toml", 2, "fd.log is of another skin than "),
         ("fd.log fd.log", 2, "neither fd.log nor fd.log has a skin in it: name one with --skin"),
+        ("fd.toml fd.log", 2, "fd.toml is a skin or a scenario, and no candump log or MCAP recording: "),
         ("fd.mcap other.log", 2, "other.log: none of its buses (can7) is one of the skin's (vcan0)"),
         ("fd.mcap quiet.log", 1, "quiet.log: there are no joints on vcan0"),
         ("fd.mcap empty.log", 1, "empty.log: it is empty: there is no frame in it"),

@@ -352,3 +352,25 @@ fn the_skin_is_the_one_in_the_recording() {
     let log = output(folder, "explain run.log --skin skin.toml --epoch 7 --json");
     assert_eq!(mcap.replace("run.mcap", "run.log"), log);
 }
+
+#[test]
+fn a_hint_does_not_lead_to_the_next_refusal() {
+    let folder = pressed();
+    let folder = folder.path();
+    std::fs::write(folder.join("words.txt"), "nothing\n").unwrap();
+    // No skin, sensing or option would help here.
+    let description = "skinbus: skin.toml is a skin or a scenario, and no candump log or MCAP recording: there are no frames in \
+                       it: name a capture";
+    let nothing = "skinbus: words.txt: there is no frame in 1 line; ";
+    let read = "skinbus: --node-ids skin.toml is a file that this command reads: name another file";
+    for (arguments, code, begin) in [
+        ("calibrate skin.toml --recording skin.toml", 2, description),
+        ("calibrate skin.toml --recording words.txt", 1, nothing),
+        ("explain words.txt --epoch 7", 1, nothing),
+        ("commission skin.toml --node-ids skin.toml --overwrite", 2, read),
+        ("calibrate skin.toml --within -1", 2, "skinbus: unexpected argument '-1' found; try '--help'"),
+    ] {
+        let said = refusal(folder, arguments, code);
+        assert!(said.starts_with(begin), "{arguments}: {said}");
+    }
+}

@@ -225,7 +225,10 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
             "untimed.log has lines without times: a report needs them, as `candump -L` writes them",
         ),
         ("words.log", "words.log has no frame in it: a log is what `candump -L` writes"),
-        ("empty.log", "empty.log holds no run: it is empty"),
+        (
+            "empty.log",
+            "empty.log holds no run: it is empty; `skinbus run SKIN --record run.mcap` makes what a report needs",
+        ),
         ("nowhere.log", "nowhere.log: "),
         (
             "fd.mcap",
@@ -235,6 +238,7 @@ fn a_log_of_something_else_and_another_skin_than_the_recorded_one_are_refused() 
     ] {
         let refused = refuses(&folder, &format!("{arguments} --skin sums.toml -o out.html"), 2);
         assert!(refused.starts_with(said), "{arguments}: {refused}");
+        assert!(!refused.ends_with("need their --skin"), "it was given: {refused}");
     }
     // The skin would not help.
     write("a.dbc", "VERSION \"1.0\"\n\nNS_:\n\nBS_:\n");

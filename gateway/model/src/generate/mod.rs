@@ -85,7 +85,7 @@ pub enum GenerateError {
         buses: usize,
     },
     /// More cells than there is room for.
-    #[error("{cells} cells do not fit on the arm, not even {min_mm} mm apart")]
+    #[error("{cells} cells do not fit on the arm, not even {min_mm} mm apart: ask for fewer")]
     NoRoom {
         /// Requested cells.
         cells: usize,
@@ -108,6 +108,8 @@ pub fn generate(target: &Target) -> Result<String, GenerateError> {
     }
     let needed = cells.div_ceil(CellId::COUNT);
     if needed > buses {
+        // What would be refused with so many buses too is reported first.
+        generate(&Target { buses: needed, ..*target })?;
         return Err(GenerateError::TooMany { cells, buses, needed });
     }
     let arm = match target.robot {

@@ -141,7 +141,11 @@ fn errors_name_what_is_allowed() {
         "1000 cells do not fit on 3 buses: a bus has 254 node ids; use --buses 4"
     );
     assert_eq!(says(target(0, 1)), "0 cells on 1 buses: every bus needs at least one");
-    assert_eq!(says(target(100_000, 400)), "100000 cells do not fit on the arm, not even 3 mm apart");
+    assert_eq!(
+        says(target(100_000, 400)),
+        "100000 cells do not fit on the arm, not even 3 mm apart: ask for fewer"
+    );
+    assert_eq!(says(target(100_000, 1)), says(target(100_000, 400)), "more buses would not help");
     assert_eq!(
         says(Target { broadcast_hz: 60.0, ..Target::default() }),
         "generated skin:23:22: timing.joint_broadcast_hz = 60: must divide control_hz = 500 evenly"

@@ -71,14 +71,16 @@ pub enum ReportError {
     },
     /// Of another program, or of nothing.
     #[error(
-        "{name} holds no run: {what}; `skinbus run SKIN --record run.mcap` makes what a report needs, and frames alone need \
-         their --skin"
+        "{name} holds no run: {what}; `skinbus run SKIN --record run.mcap` makes what a report needs{}",
+        if *.has_skin { "" } else { ", and frames alone need their --skin" }
     )]
     Foreign {
         /// Its name.
         name: String,
         /// What is missing.
         what: String,
+        /// Whether a skin was named.
+        has_skin: bool,
     },
     /// It ends before there is anything to report.
     #[error("{name} holds no run that can be shown: {what}")]
@@ -89,7 +91,7 @@ pub enum ReportError {
         what: String,
     },
     /// Bit rates that CAN does not have.
-    #[error("{bus}: {source}; give others with --nominal and --data")]
+    #[error("{bus}: {source}; correct --nominal or --data")]
     Rates {
         /// The bus.
         bus: String,
@@ -184,7 +186,7 @@ fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), R
             return Err(ReportError::Frames { name, what });
         }
         return Err(if empty {
-            ReportError::Foreign { name, what: "it is empty".to_owned() }
+            ReportError::Foreign { name, what: "it is empty".to_owned(), has_skin: options.skin.is_some() }
         } else {
             ReportError::Log { name }
         });
@@ -222,7 +224,7 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bo
             Some(error) => error.into(),
             None => match unfinished {
                 Some(what) => ReportError::Unfinished { name, what },
-                None => ReportError::Foreign { name, what: nothing() },
+                None => ReportError::Foreign { name, what: nothing(), has_skin: options.skin.is_some() },
             },
         });
     }
@@ -282,7 +284,8 @@ impl Run {
         (format, extras): (Format, &Extras),
         options: &Options,
     ) -> Result<Self, ReportError> {
-        let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what };
+        let has_skin = options.skin.is_some();
+        let foreign = |what: String| ReportError::Foreign { name: name.to_owned(), what, has_skin };
         let recorded = extras.skin();
         let skin_file = options.skin.as_ref().map_or("", |(file, _)| file);
         let is_log = format == Format::Candump;
