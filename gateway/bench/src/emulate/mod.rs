@@ -19,6 +19,8 @@ use protocol::bus::{Filter, Kinds};
 use protocol::factory::Factory;
 use protocol::id::{Id, Kind, Node};
 use protocol::skin::{Cell, Reply, Skin};
+use rustix::fs::{FlockOperation, flock};
+use rustix::io::Errno;
 use tempfile::TempDir;
 use thiserror::Error;
 use vcan_setup::slcan::BridgeError;
@@ -58,6 +60,11 @@ pub enum EmulateError {
     /// A path has what the emulator's command line cannot carry.
     #[error("--flash {0}: paths of emulated cells have at most 240 bytes, UTF-8 and no spaces")]
     Path(PathBuf),
+    /// Cells of another run keep their flash there.
+    #[error(
+        "--flash {0}: emulated cells of another run use it: end that one first, or name another directory"
+    )]
+    FlashInUse(PathBuf),
     /// A line or a process does not start.
     #[error(transparent)]
     Launch(#[from] LaunchError),
@@ -103,6 +110,7 @@ impl EmulateError {
             | Self::NoEmulator
             | Self::Files(_)
             | Self::Path(_)
+            | Self::FlashInUse(_)
             | Self::Launch(_)
             | Self::Bridge(_)
             | Self::Bus(_) => 2,
@@ -129,6 +137,8 @@ pub(crate) struct Emulation {
     /// The lines hang up before their sockets go away.
     _lines: Lines,
     _files: TempDir,
+    /// Locked as long as it is open.
+    _flash: Option<File>,
 }
 
 /// What emulated cells share.
@@ -163,6 +173,7 @@ impl<'a> Emulator<'a> {
     ) -> Result<Emulation, EmulateError> {
         let files =
             tempfile::Builder::new().prefix("skinbus-cells-").tempdir().map_err(EmulateError::Files)?;
+        let _flash = bench.flash.map(hold).transpose()?;
         let mut planned = Planned::default();
         for cell in self.cells.iter().filter_map(|&cell| bench.skin.cells.get(cell)) {
             let place = Place::of(bench, files.path(), cell)?;
@@ -174,7 +185,7 @@ impl<'a> Emulator<'a> {
             planned.add(name, bench.kinds.of(name), place.socket, filters(cell, &factory));
         }
         let _lines = planned.join(bench.directory)?;
-        Ok(Emulation { _lines, _files: files })
+        Ok(Emulation { _lines, _files: files, _flash })
     }
 
     /// Starts an emulator. It waits for its line.
@@ -272,6 +283,15 @@ impl Place {
     }
 }
 
+/// Locks a directory of flash files; where the file system has no locks, it stays without.
+fn hold(directory: &Path) -> Result<File, EmulateError> {
+    let opened = File::open(directory).map_err(EmulateError::Files)?;
+    match flock(&opened, FlockOperation::NonBlockingLockExclusive) {
+        Err(Errno::WOULDBLOCK) => Err(EmulateError::FlashInUse(directory.to_owned())),
+        _ => Ok(opened),
+    }
+}
+
 /// What the factory would write into a cell.
 fn factory(skin: &Skin, cell: &Cell) -> Factory {
     let bus = skin.buses.get(cell.bus);
@@ -295,4 +315,20 @@ fn filters(cell: &Cell, &Factory { link_ids, .. }: &Factory) -> Vec<Filter> {
         filters.extend(sums.map(Filter::exact));
     }
     filters
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_directory_of_flash_files_is_of_one_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let held = hold(folder.path()).unwrap();
+        let error = hold(folder.path()).unwrap_err();
+        assert!(error.to_string().contains("emulated cells of another run use it"), "{error}");
+        assert_eq!(error.exit_code(), 2);
+        drop(held);
+        hold(folder.path()).unwrap();
+    }
 }
