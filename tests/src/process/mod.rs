@@ -21,6 +21,7 @@ pub mod external;
 pub mod log;
 pub mod page;
 mod place;
+pub mod readme;
 pub mod recorded;
 pub mod replay;
 mod running;

@@ -6,3 +6,4 @@ mod lab_icount;
 mod lab_icount_record;
 mod lab_kvaser;
 mod lab_kvaser_rates;
+mod lab_readme;

@@ -141,7 +141,7 @@ fn a_joint_that_slides_has_its_own_units() {
     let (log, mcap) = ("run.log --skin skin.toml", "run.mcap");
     let shown: Vec<Vec<Value>> = [log, mcap]
         .iter()
-        .map(|source| objects(&place, &format!("dump {source} --json --kind joints,torque --from 1")))
+        .map(|source| objects(&place, &format!("dump {source} --json --kind joints,torque")))
         .collect();
     let values = |of: &[Value]| of.iter().map(|object| object["values"].clone()).collect::<Vec<_>>();
     assert!(shown[0].len() > 20, "{}", shown[0].len());

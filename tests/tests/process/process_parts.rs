@@ -37,7 +37,7 @@ fn all_come_back(place: &Place, min: u64) {
     place.is_left_clean();
     let parts = parts(place);
     assert!(parts.len() >= 3, "{parts:?}");
-    let route = "--expect --spawn --speed max --quiet --cells-per-process 8";
+    let route = "--expect --spawn --speed max --quiet SKINBUS_CELLS_PER_PROCESS=8";
     let mut equal = 0;
     for part in &parts {
         let (ended, replayed) = place.replayed(part, route);

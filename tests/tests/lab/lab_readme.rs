@@ -1,0 +1,18 @@
+//! Every command of README.md works in a machine whose kernel has CAN, too.
+
+#![allow(clippy::unwrap_used, reason = "a test may stop")]
+
+use skinbus_tests::process;
+
+use process::Place;
+use process::readme::{README, commands, run};
+
+/// The built programs run there; how well 253 processes keep time is what the machine makes of it.
+#[test]
+#[ignore = "needs the lab machine"]
+fn every_command_works_where_the_kernel_has_can() {
+    let place = Place::on_vcan();
+    let ended = run(&place, &commands(README)).well();
+    assert!(ended.stdout.contains("\n+ skinbus replay run.mcap "), "{ended:#?}");
+    place.is_left_clean();
+}
