@@ -17,7 +17,7 @@ fn a_bus_that_nobody_serves_says_how_to_serve_it() {
     let options = Options { directory: Some("/nowhere/skinbus".into()), ..Options::default() };
     let error = Bus::open("vcan7", Choice::Only(BusKind::Embedded), &options).unwrap_err();
     let expected = "no embedded bus vcan7 is served in /nowhere/skinbus: start `vcan-setup serve vcan7`, or \
-                    the gateway, which serves it";
+                    `skinbus run`, which serves it";
     assert_eq!(error.to_string(), expected);
 }
 
