@@ -45,6 +45,17 @@ fn connected(path: &Path) -> UnixStream {
     }
 }
 
+fn heartbeat(message: &Message, claiming: bool) -> Option<Heartbeat> {
+    match message {
+        Message::Network { page: NetworkPage::Heartbeat(it), .. }
+            if it.state.has(State::CLAIMING) == claiming =>
+        {
+            Some(*it)
+        }
+        _ => None,
+    }
+}
+
 impl Alone {
     /// Starts cell 12 with its flash in `flash` of a folder, if anybody has written who it is.
     fn start(folder: &Path, named: bool) -> Self {
@@ -106,24 +117,35 @@ impl Alone {
 
     /// Waits for something, and drops what comes before it.
     fn waits<T>(&mut self, what: &str, look: impl Fn(&Message) -> Option<T>) -> T {
-        let give_up = Instant::now() + TIMEOUT;
-        loop {
-            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} for {what}");
+        let found = self.looks(TIMEOUT, look);
+        found.unwrap_or_else(|| panic!("waited {TIMEOUT:?} for {what}"))
+    }
+
+    /// The same for so long.
+    fn looks<T>(&mut self, within: Duration, look: impl Fn(&Message) -> Option<T>) -> Option<T> {
+        let give_up = Instant::now() + within;
+        while Instant::now() < give_up {
             if let Some(found) = self.next(Duration::from_millis(50)).as_ref().and_then(&look) {
-                return found;
+                return Some(found);
             }
         }
+        None
     }
 
     fn heartbeat(&mut self, claiming: bool) -> Heartbeat {
-        self.waits("a heartbeat", |message| match message {
-            Message::Network { page: NetworkPage::Heartbeat(it), .. }
-                if it.state.has(State::CLAIMING) == claiming =>
-            {
-                Some(*it)
+        self.waits("a heartbeat", |message| heartbeat(message, claiming))
+    }
+
+    /// Presses the button until its first heartbeat is received: a reset ends a line in its middle, and what comes at once
+    /// behind that is no frame.
+    fn reset(&mut self) -> Heartbeat {
+        for _ in 0..12 {
+            self.tell_monitor("system_reset");
+            if let Some(claims) = self.looks(Duration::from_secs(5), |message| heartbeat(message, true)) {
+                return claims;
             }
-            _ => None,
-        })
+        }
+        panic!("no heartbeat after twelve resets");
     }
 
     /// Writes and commits parameters, as commissioning does; returns as soon as the commit is answered.
@@ -192,8 +214,7 @@ fn what_a_commit_has_answered_survives_a_kill_at_once_and_a_reset() {
     assert!(cell.heartbeat(false).state.has(State::CONFIGURED));
     cell.takes_joints(7);
     // The button: the program starts again, in the middle of its work.
-    cell.tell_monitor("system_reset");
-    let again = cell.heartbeat(true);
+    let again = cell.reset();
     assert_eq!((again.sent, again.configuration), (0, parameters.hash()));
     assert!(cell.heartbeat(false).state.has(State::CONFIGURED));
     cell.takes_joints(7);
@@ -293,8 +314,7 @@ fn the_stack_has_at_most_8_kib_and_the_cells_state_is_no_part_of_it() {
     cell.heartbeat(false);
     cell.commission(&parameters());
     // The emulator keeps the RAM at a reset: what the first start wrote counts too.
-    cell.tell_monitor("system_reset");
-    cell.heartbeat(true);
+    cell.reset();
     cell.heartbeat(false);
     cell.commission(&parameters());
     cell.takes_joints(9);
