@@ -81,7 +81,7 @@ struct Whole<'a> {
     explanation: &'a Explanation,
 }
 
-/// Whether this is the name of a bus rather than of a file.
+/// Tells the name of a bus from that of a file.
 fn is_bus(file: &Path) -> bool {
     !is_standard_input(file) && !file.exists() && file.extension().is_none() && file.components().count() == 1
 }

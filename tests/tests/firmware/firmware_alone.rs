@@ -121,7 +121,7 @@ impl Alone {
         found.unwrap_or_else(|| panic!("waited {TIMEOUT:?} for {what}"))
     }
 
-    /// The same for so long.
+    /// Waits for something for so long, and drops what comes before it.
     fn looks<T>(&mut self, within: Duration, look: impl Fn(&Message) -> Option<T>) -> Option<T> {
         let give_up = Instant::now() + within;
         while Instant::now() < give_up {

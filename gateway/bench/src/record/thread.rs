@@ -72,7 +72,7 @@ pub(super) struct Work {
     /// Joint positions at the last tick.
     q: Option<[f64; MAX_ROBOT_JOINTS]>,
     backlog: Option<u64>,
-    /// Whether the files say when the loop began.
+    /// True once the files say when the loop began.
     has_began: bool,
     ticks: u64,
     ticks_skipped: u64,
