@@ -24,7 +24,8 @@ use trace::capture::{Entry, Extras, NoteKind, Reader, Topic};
 use self::show::{How, Show};
 use super::arguments::{BusKinds, Word, nanos, one_of};
 use super::input::{
-    self, LOOK, Missing, ReceiveEnd, captures, is_file, no_frame, place, remark_another, skin_beside, stopped,
+    self, LOOK, Missing, ReceiveEnd, captures, is_file, is_path, no_frame, place, remark_another,
+    skin_beside, stopped,
 };
 use super::output;
 use super::print::{json, list};
@@ -143,8 +144,9 @@ impl Dump {
                 let names = list(&names);
                 return Err(Failure::usage(format!("{other} is not shown: name it beside {names}")));
             }
-            if self.wait && names.iter().any(|name| name.contains('/')) {
-                return Err(Failure::usage(format!("--wait is for buses, and {} is a file", list(&names))));
+            if let Some(file) = self.sources.iter().find(|source| self.wait && is_path(source)) {
+                let file = file.display();
+                return Err(Failure::usage(format!("--wait is for buses, and there is no file {file}")));
             }
         } else if self.wait {
             return Err(Failure::usage(format!("--wait is for buses, and {title} is a file")));

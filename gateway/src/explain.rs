@@ -3,12 +3,11 @@
 mod show;
 mod torque;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use analysis::explain::{CellExplained, Explanation, Requested, explain, find};
 use clap::Args;
 use protocol::id::CellId;
-use protocol::input::is_standard_input;
 use protocol::packet::Epoch;
 use protocol::skin::{CellName, Skin};
 use protocol::usage::{Failure, print};
@@ -16,7 +15,7 @@ use serde::Serialize;
 use trace::capture::Reader;
 
 use super::arguments::{cell_of, nanos};
-use super::input::{no_frame, remark_another, skin_of};
+use super::input::{is_file, is_path, no_frame, remark_another, skin_of};
 use super::output;
 use super::print::json;
 
@@ -81,20 +80,15 @@ struct Whole<'a> {
     explanation: &'a Explanation,
 }
 
-/// Tells the name of a bus from that of a file.
-fn is_bus(file: &Path) -> bool {
-    !is_standard_input(file) && !file.exists() && file.extension().is_none() && file.components().count() == 1
-}
-
 impl Explain {
     pub(crate) fn run(self) -> Result<(), Failure> {
         let Some(epoch) = self.epoch else {
             return self.given.compute(&self.files, self.cell.as_ref(), self.json);
         };
-        if let Some(bus) = self.files.iter().find(|file| is_bus(file)) {
+        if let Some(bus) = self.files.iter().find(|file| !is_file(file) && !is_path(file)) {
             let bus = bus.display();
             return Err(Failure::usage(format!(
-                "there is no file {bus}; of a live bus record one first: `skinbus convert {bus} run.log`"
+                "there is no file {bus}; of a live bus record one first: `skinbus dump {bus} | cut -f1 > run.log`"
             )));
         }
         let skin = match &self.skin {

@@ -39,9 +39,13 @@ pub(crate) fn is_file(source: &Path) -> bool {
     is_standard_input(source) || source.exists()
 }
 
+/// Returns true for a name that is a file's by its look: it has a folder or an extension, as no bus has.
+pub(crate) fn is_path(name: &Path) -> bool {
+    name.components().count() > 1 || name.extension().is_some()
+}
+
 /// What is neither a file nor a bus that opens.
 pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
-    let is_path = name.contains('/') || Path::new(name).extension().is_some();
     let is_absent = matches!(
         error,
         BusError::Name(_)
@@ -50,7 +54,7 @@ pub(crate) fn neither(name: &str, error: &BusError) -> Failure {
             | BusError::NoInterface(_)
             | BusError::NoSocketCan(_)
     );
-    if is_path && is_absent {
+    if is_path(Path::new(name)) && is_absent {
         return Failure::usage(format!(
             "there is no file {name}, and no bus of that name: say where the file is"
         ));

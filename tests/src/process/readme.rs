@@ -36,7 +36,7 @@ fn quoted(text: &str) -> String {
     format!("'{}'", text.replace('\'', r"'\''"))
 }
 
-/// Whether a command leaves something behind it that runs.
+/// Returns true for a command that leaves something behind it that runs.
 fn in_background(command: &str) -> bool {
     let command = command.split(" #").next().unwrap().trim_end();
     command.ends_with(" &") || command.contains(" & ")

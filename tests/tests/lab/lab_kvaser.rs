@@ -174,7 +174,7 @@ fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
     place.start("skinbus", &words)
 }
 
-/// How many packets a log has, beside comments of the recorder, and how many segments that found no other in time.
+/// Counts the packets that a log has, beside comments of the recorder, and the segments that found no other in time.
 fn pairs(log: &str) -> (u64, u64) {
     let (mut segments, mut whole, mut incomplete) = (vec![Segment::NONE; 1 << 11], 0, 0);
     for line in log.lines().filter(|line| !line.starts_with("# ")) {

@@ -55,12 +55,12 @@ pub enum SeriesError<E> {
 pub struct Counted {
     /// Epochs.
     pub epochs: u64,
-    /// When the first frame came, in ns since 1970.
+    /// The time that seconds count from, in ns since 1970: the first tick of the run, else the first frame.
     pub zero_ns: u64,
 }
 
-/// Reads a capture to its end, and gives out each epoch when nothing more can come of it, with the time of the capture's
-/// first frame. Bounded memory.
+/// Reads a capture to its end, and gives out each epoch when nothing more can come of it, with the time that
+/// seconds count from. Bounded memory.
 ///
 /// # Errors
 /// When it cannot be read, or has no joints of the skin; the first error of `take`.

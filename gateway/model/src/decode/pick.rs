@@ -174,7 +174,7 @@ impl Pick {
     /// Sees that each party can be on the buses that are picked.
     ///
     /// # Errors
-    /// What contradicts.
+    /// The contradiction.
     pub fn check(&self) -> Result<(), String> {
         let is_out = |party: &&Party| party.bus.as_ref().is_some_and(|bus| !self.buses.contains(bus));
         match self.parties.iter().find(is_out).filter(|_| !self.buses.is_empty()) {

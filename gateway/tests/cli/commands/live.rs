@@ -295,6 +295,11 @@ fn a_bus_that_comes_later_is_waited_for() {
         command.env("SKINBUS_DIR", &directory).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
     };
     assert_eq!(dump("").wait().unwrap().code(), Some(2));
+    for missing in ["missing.log", "folder/run"] {
+        let Output { status, stderr, .. } = gateway(&format!("dump {missing} --wait")).output().unwrap();
+        let expected = format!("skinbus: --wait is for buses, and there is no file {missing}\n");
+        assert_eq!((status.code(), text(&stderr)), (Some(2), expected.as_str()));
+    }
     let mut waits = dump("--wait -n 1");
     let gives_up = dump("--wait");
     std::thread::sleep(Duration::from_millis(300));

@@ -79,7 +79,7 @@ pub enum ReportError {
         name: String,
         /// What is missing.
         what: String,
-        /// Whether a skin was named.
+        /// True if a skin was named.
         has_skin: bool,
     },
     /// It ends before there is anything to report.
