@@ -8,8 +8,8 @@ use protocol::time::{Micros, Span};
 #[derive(Debug)]
 pub(crate) struct Agenda<E> {
     pub(crate) now: Micros,
-    /// By time, and of one time in the order in which they were entered.
-    events: BTreeMap<(Micros, u64), E>,
+    /// By time, and of one time in the order in which they were entered; boxed, since a tree moves what it holds.
+    events: BTreeMap<(Micros, u64), Box<E>>,
     entered: u64,
 }
 
@@ -23,7 +23,7 @@ impl<E> Agenda<E> {
     /// Something happens at a time; now, where that has passed.
     pub(crate) fn enter(&mut self, at: Micros, event: E) {
         self.entered += 1;
-        self.events.insert((at.max(self.now), self.entered), event);
+        self.events.insert((at.max(self.now), self.entered), Box::new(event));
     }
 
     /// Something happens in a while.
@@ -41,6 +41,6 @@ impl<E> Agenda<E> {
         let entry = self.events.first_entry().filter(|entry| entry.key().0 <= until)?;
         let ((at, _), event) = entry.remove_entry();
         self.now = self.now.max(at);
-        Some(event)
+        Some(*event)
     }
 }

@@ -347,7 +347,10 @@ impl Bench {
     fn wake(&mut self, cell_slot: usize) {
         let now = self.agenda.now;
         let Some(there) = self.cell_slots.get_mut(cell_slot) else { return };
-        there.wake = None;
+        // A timer that has moved since wakes nobody: it would set the current one a second time, and so for ever.
+        if there.wake.take_if(|at| *at == now).is_none() {
+            return;
+        }
         let packets = there.time(now);
         self.sends(cell_slot, &packets);
     }

@@ -349,7 +349,8 @@ fn what_cannot_be_covered_is_refused_in_one_line() {
     let wide = refused(single(cube(2.0)), options());
     let (_, hint) = wide.rsplit_once("or raise the pitch to ").unwrap();
     let pitch = hint.strip_suffix(" m").unwrap().parse().unwrap();
-    assert!(cover(&[single(cube(2.0))], &[], &Options { pitch, ..options() }).is_ok(), "{wide}");
+    let raised = Options { pitch, ..options() };
+    assert!(Surface::new(0, &[single(cube(2.0))], &[], &raised).is_ok(), "{wide}");
     let infinite = link("l", vec![Part { scale: [1.0, f64::INFINITY, 1.0], ..Part::new(cube(1.0)) }]);
     assert!(refused(infinite, options()).starts_with("link l, part 0: coordinates are not finite"));
     let overflowing = link("l", vec![Part { scale: [1e200; 3], ..Part::new(cube(1.0)) }]);
