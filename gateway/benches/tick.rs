@@ -8,7 +8,7 @@ use std::hint::black_box;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bench::run::realtime;
+use bench::bus::realtime;
 use control::controller::Kinesthetic;
 use control::cycle::turn::{Line, Shared, Timed, Turn};
 use control::cycle::{Cycle, Tick};

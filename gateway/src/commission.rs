@@ -7,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::Instant;
 
 use bench::commission::{Done, commission, open};
-use bench::run::progress::Progress as Line;
+use bench::progress::Progress as Line;
 use clap::Args;
 use model::commission::node_ids::{NodeIds, renumbered};
 use model::commission::{Outcome, Progress, Wish};

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use analysis::stats::Report;
-use bench::listen::now;
+use bench::bus::listen::now;
 use clap::Args;
 use model::decode::pick::{IdMask, Party, Pick, Selector};
 use protocol::bus::Options;

@@ -12,8 +12,8 @@ use std::time::Duration;
 
 use analysis::report::figure::{Finding, Page, Section, Verdict};
 use analysis::report::{page, svg};
+use bench::bus::realtime;
 use bench::record::facts;
-use bench::run::realtime;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use model::quantiles::Quantiles;

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use bench::answers::Answers;
-use bench::listen::{self, Listener};
+use bench::bus::listen::{self, Listener};
 use bench::sensing as switching;
 use clap::Args;
 use model::decode::Decoded;

@@ -8,7 +8,7 @@ use std::sync::{Arc, OnceLock};
 use std::thread;
 use std::time::Duration;
 
-use bench::listen::{self, Listener};
+use bench::bus::listen::{self, Listener};
 use bench::signals::caught;
 use protocol::bus::{Bus, BusError, Choice, Kinds, Options, Received};
 use protocol::can::{self, EXTENDED_MASK};

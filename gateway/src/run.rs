@@ -8,9 +8,9 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use bench::emulate::Emulated;
+use bench::processes::in_memory;
 use bench::record::{self, Candump};
 use bench::remote::Lines;
-use bench::run::launch::in_memory;
 use bench::run::{self, Options};
 use bench::summary::Summary;
 use clap::Args;

@@ -20,6 +20,8 @@ mod architecture;
 pub mod bench;
 pub mod can_raw;
 pub mod cell_slot;
+#[cfg(test)]
+mod circles;
 pub mod fault;
 pub mod fuzz;
 pub mod gateway;

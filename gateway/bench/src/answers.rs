@@ -8,7 +8,7 @@ use protocol::bus::BusError;
 use protocol::id::CellId;
 use protocol::message::{Answer, Message, NetworkPage, State};
 
-use crate::listen::Listener;
+use crate::bus::listen::Listener;
 
 /// What was received of the cells that a packet is for.
 #[derive(Debug)]

@@ -11,7 +11,7 @@ use protocol::id::{Command, Id, Kind};
 use protocol::message::Message;
 use protocol::time::Micros;
 
-use crate::listen::{self, Listener, passing, send};
+use crate::bus::listen::{self, Listener, passing, send};
 use crate::setup::since;
 
 /// Cells send four heartbeats a second, which show their frames' format.

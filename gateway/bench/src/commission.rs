@@ -13,8 +13,8 @@ use protocol::id::{Command, Id, Kind};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-use crate::listen::{self, Listener, passing, send};
-use crate::run::roots::Roots;
+use crate::bus::listen::{self, Listener, passing, send};
+use crate::bus::roots::Roots;
 use crate::setup::since;
 
 /// How long a signal to end may wait if nothing comes.

@@ -2,7 +2,8 @@
 //!
 //! | module | what |
 //! |---|---|
-//! | [`listen`] | an open bus on which others send |
+//! | [`bus`] | buses: opened, served, received from |
+//! | [`processes`] | processes of cells |
 //! | [`cells`], [`commission`], [`sensing`] | querying cells, writing their parameters, switching what they report |
 //! | [`emulate`] | cells that run a microcontroller's machine code in an emulator |
 //! | [`run`] | a run: processes, buses, loop, and its result ([`summary`]) |
@@ -13,10 +14,13 @@
 //! | [`signals`] | signals that end a command |
 
 pub mod answers;
+pub mod bus;
 pub mod cells;
 pub mod commission;
 pub mod emulate;
-pub mod listen;
+mod error;
+pub mod processes;
+pub mod progress;
 pub mod record;
 pub mod remote;
 pub mod replay;
@@ -25,6 +29,9 @@ pub mod sensing;
 mod setup;
 pub mod signals;
 pub mod summary;
+#[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
+mod system_calls;
+pub mod threads;
 pub mod view;
 
 #[cfg(test)]

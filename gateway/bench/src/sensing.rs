@@ -13,7 +13,7 @@ use protocol::time::Span;
 use thiserror::Error;
 
 use crate::answers::Answers;
-use crate::listen::{self, Listener, send};
+use crate::bus::listen::{self, Listener, send};
 use crate::setup::since;
 
 /// How long cells are listened for: two heartbeats and a margin.

@@ -1,12 +1,9 @@
 //! What a run and a replay share until their cells are ready.
 
-use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use protocol::id::CellId;
 use protocol::time::Micros;
-
-use crate::run::RunError;
 
 /// A timeout that restarts with each progress.
 #[derive(Clone, Copy, Debug)]
@@ -40,15 +37,6 @@ pub(crate) fn names(cells: &[CellId], place: &str) -> String {
         }
         _ => numbers.join(", ") + place,
     }
-}
-
-/// Starts a thread of this name.
-pub(crate) fn spawn<T: Send + 'static>(
-    name: &str,
-    work: impl FnOnce() -> T + Send + 'static,
-) -> Result<JoinHandle<T>, RunError> {
-    let named = thread::Builder::new().name(name.to_owned());
-    named.spawn(work).map_err(|source| RunError::Thread { name: name.to_owned(), source })
 }
 
 /// The time since then.

@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
+use bench::processes::groups;
 use bench::run::RunError;
-use bench::run::launch::groups;
 use model::scenario::{
     BusFault, FaultKind, ForceErrors, MotionKind, Profile, Scenario as Description, SensorFault,
 };

@@ -10,8 +10,8 @@ use std::cell::Cell;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
-use bench::run::link::Link;
-use bench::run::realtime;
+use bench::bus::link::Link;
+use bench::bus::realtime;
 use control::controller::Kinesthetic;
 use control::cycle::turn::{BusState, Line, Shared, Turn};
 use control::cycle::{Cycle, Tick};

@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use bench::listen::{now, open, send};
+use bench::bus::listen::{now, open, send};
 use bench::remote::{Lines, State};
 use protocol::bus::batch::BATCH;
 use protocol::bus::{self, Bus, BusError, Inbox, Kinds};

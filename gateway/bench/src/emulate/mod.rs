@@ -26,7 +26,7 @@ use thiserror::Error;
 use vcan_setup::slcan::BridgeError;
 
 use crate::commission;
-use crate::run::launch::{LaunchError, Processes, STARTING};
+use crate::processes::{LaunchError, Processes, STARTING};
 use crate::setup::Timeout;
 
 pub use firmware::{Firmware, FirmwareError};

@@ -33,9 +33,8 @@ use trace::recording::repair;
 use trace::recording::robot::Robot;
 use trace::recording::series::{Attached, Head, Series, Split};
 
-use crate::run::RunError;
-use crate::run::realtime::wall;
-use crate::setup::spawn;
+use crate::bus::realtime::wall;
+use crate::threads::{ThreadError, spawn};
 use trace::files::check_regular;
 
 /// What is to be recorded where.
@@ -156,7 +155,7 @@ impl Outputs {
     ///
     /// # Errors
     /// When there is no thread for it.
-    pub fn start(self, feed: Feed, layout: Layout, head: Head) -> Result<Recorder, RunError> {
+    pub fn start(self, feed: Feed, layout: Layout, head: Head) -> Result<Recorder, ThreadError> {
         let stop = Arc::new(Stop::default());
         let (tell, said) = mpsc::channel();
         let (notes, noted) = mpsc::channel();

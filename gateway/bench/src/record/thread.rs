@@ -17,7 +17,7 @@ use super::force::Latched;
 use super::text::Text;
 use super::topics::{OF_ROBOT, Topics};
 use super::{Outputs, Stop};
-use crate::run::realtime::wall;
+use crate::bus::realtime::wall;
 use trace::capture::{Note, NoteKind, RUN, facts_of_run};
 use trace::recording::account::{Count, Recording};
 use trace::recording::layout::Layout;

@@ -6,10 +6,52 @@ use std::process::ExitStatus;
 use protocol::bus::{BusError, KindsError};
 use thiserror::Error;
 
-use super::checks::Mismatch;
-use crate::run::{RunError, why};
+use crate::error::{RunError, why};
 use model::decode::BUSES;
 use trace::capture::CaptureError;
+
+/// Cells that are not as they were in the recording.
+#[derive(Clone, Debug, Eq, Error, PartialEq)]
+pub enum Mismatch {
+    /// All of them.
+    #[error(
+        "the recording is of another skin: all {count} cells have another configuration than then, {cells}; {}",
+        hint(*.spawned)
+    )]
+    Skin {
+        /// How many there are.
+        count: usize,
+        /// Which, with their configurations.
+        cells: String,
+        /// Whether they were started here.
+        spawned: bool,
+    },
+    /// Some.
+    #[error("cells have another configuration than in the recording: {cells}; {}", hint(*.spawned))]
+    Cells {
+        /// Which, with their configurations.
+        cells: String,
+        /// Whether they were started here.
+        spawned: bool,
+    },
+    /// Some are not there.
+    #[error("cells of the recording are absent: {0}; start them with cell-node, or all with --spawn")]
+    Absent(String),
+    /// The recording has no heartbeat.
+    #[error(
+        "nothing can be compared: the recording has no heartbeat of a cell, so its skin is unknown; record \
+         for half a second at least"
+    )]
+    Unknown,
+}
+
+fn hint(spawned: bool) -> &'static str {
+    if spawned {
+        "name the recording's skin with --skin"
+    } else {
+        "configure them for the recording's skin, or start them from it with --spawn"
+    }
+}
 
 /// Why a replay cannot begin, or could not go on.
 #[derive(Debug, Error)]

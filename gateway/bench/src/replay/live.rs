@@ -11,14 +11,13 @@ use protocol::can::Frame;
 use protocol::message::{Message, State as Flags};
 use protocol::packet::Epoch;
 
-use super::meet::mode;
 use super::player::{Pace, Stage};
 use super::replay_plan::Open;
 use super::report::Lockstep;
 use super::shared_state::SharedState;
-use super::start::BusLink;
+use super::start::{BusLink, mode};
 use super::{Options, ReplayError};
-use crate::run::realtime;
+use crate::bus::realtime;
 use crate::setup::names;
 
 /// How often the stop flag is read.

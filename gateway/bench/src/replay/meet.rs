@@ -6,16 +6,15 @@ use std::sync::atomic::Ordering;
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::id::{CellId, Node};
-use protocol::message::{Message, Request, State};
-use protocol::parameters::Parameter;
+use protocol::id::CellId;
+use protocol::message::{Message, State};
 
 use super::ReplayError;
 use super::comparator::Comparator;
 use super::session::Session;
-use super::start::SkinOverride;
-use crate::run::RunError;
-use crate::run::launch::STARTING;
+use super::start::{SkinOverride, mode};
+use crate::error::RunError;
+use crate::processes::STARTING;
 use crate::setup::{Timeout, names};
 
 /// Cells that were there before send at least a heartbeat within this time.
@@ -178,11 +177,4 @@ impl Session {
         }
         Ok(())
     }
-}
-
-/// The message that makes a cell obey stimuli, or measure; either way it drops all stimuli.
-pub(super) fn mode(cell: CellId, obeys: bool) -> Message {
-    let words = core::array::from_fn(|place| i16::from(obeys && place == 0));
-    let request = Request::Write { number: Parameter::Mode.number(), words };
-    Message::Configure { to: Node::Cell(cell), tag: 0, request }
 }

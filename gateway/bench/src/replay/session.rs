@@ -21,10 +21,11 @@ use super::shared_state::SharedState;
 use super::source::{self, AHEAD};
 use super::start::{Buses, SkinOverride};
 use super::survey::Bus;
-use crate::run::progress::Progress;
-use crate::run::realtime::{self, Granted};
-use crate::run::{EndedProcesses, RunError};
-use crate::setup::spawn;
+use crate::bus::realtime::{self, Granted};
+use crate::error::RunError;
+use crate::processes::ended::EndedProcesses;
+use crate::progress::Progress;
+use crate::threads::spawn;
 use model::quantiles::Quantiles;
 
 /// The main thread's rhythm.

@@ -11,8 +11,8 @@ use protocol::time::Micros;
 use super::checks::Checks;
 use super::comparator::Comparator;
 use super::start::BusLink;
-use crate::run::realtime;
-use crate::run::roots::Roots;
+use crate::bus::realtime;
+use crate::bus::roots::Roots;
 use model::decode::{Decoded, Decoder};
 
 /// How often the stop flag is read.

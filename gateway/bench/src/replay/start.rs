@@ -9,16 +9,17 @@ use std::time::{Duration, Instant};
 use protocol::bus::{Bus, BusError, BusKind, Choice, Filter, Kinds, Options as BusOptions};
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Command, Id, Kind, Node};
-use protocol::message::Message;
+use protocol::message::{Message, Request};
+use protocol::parameters::Parameter;
 use protocol::skin::Skin;
 
 use super::replay_plan::Only;
 use super::survey::Survey;
 use super::{Options, ReplayError, Spawn};
-use crate::listen::{self, Listener};
-use crate::run::launch::{LISTEN, Plan, Processes, in_memory, program};
-use crate::run::roots::{ReceiveFilter, Roots};
-use crate::run::served::{Absent, ServedBus, open_or_serve};
+use crate::bus::listen::{self, Listener};
+use crate::bus::roots::{ReceiveFilter, Roots};
+use crate::bus::served::{Absent, ServedBus, open_or_serve};
+use crate::processes::{LISTEN, Plan, Processes, in_memory, program};
 use crate::setup::names;
 use model::decode::Decoded;
 use trace::capture::{Extras, SKIN};
@@ -284,4 +285,11 @@ impl Options {
     pub(super) fn hears(&self) -> bool {
         self.expect.is_some() || self.lockstep || self.only == Only::Inputs
     }
+}
+
+/// The message that makes a cell obey stimuli, or measure; either way it drops all stimuli.
+pub(super) fn mode(cell: CellId, obeys: bool) -> Message {
+    let words = core::array::from_fn(|place| i16::from(obeys && place == 0));
+    let request = Request::Write { number: Parameter::Mode.number(), words };
+    Message::Configure { to: Node::Cell(cell), tag: 0, request }
 }

@@ -12,10 +12,10 @@ use protocol::parameters::{Parameter, Sensing};
 use protocol::time::Span;
 use protocol::usage::say;
 
-use super::RunError;
 use super::bench::{Bench, LOOK};
-use super::launch::{LISTEN, Plan, STARTING, program};
 use super::receiver::BusEvent;
+use crate::error::RunError;
+use crate::processes::{LISTEN, Plan, STARTING, program};
 use crate::setup::{Timeout, names};
 use crate::view::View;
 use model::repeat::Repeats;

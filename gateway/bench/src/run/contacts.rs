@@ -6,10 +6,10 @@ use protocol::id::{CellId, Node};
 use protocol::parameters::Parameter;
 use protocol::usage::say;
 
-use super::RunError;
 use super::begin::SHOWING;
 use super::bench::Bench;
 use super::watch::Script;
+use crate::error::RunError;
 use crate::view::CellView;
 
 /// How long cells may take to report their counters and to clear their contact; they need milliseconds.

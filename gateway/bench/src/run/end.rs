@@ -9,11 +9,11 @@ use protocol::message::Message;
 use protocol::skin::Cell;
 use protocol::usage::say;
 
-use super::RunError;
 use super::bench::{Bench, BusLink};
 use super::measured::Measured;
 use super::receiver::ReceiverResult;
 use super::watch::LOOK;
+use crate::error::RunError;
 use crate::record::feed::Unrecorded;
 use crate::record::{Recorder, backlog};
 use crate::summary::{BusSummary, CellSummary, Loop, NetworkSummary, OutagesSummary, Summary};

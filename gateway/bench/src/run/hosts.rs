@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use protocol::id::CellId;
 use vcan_setup::hosts::report::{Host, Report, Reports};
 
-use super::link::{Link, Outages};
+use crate::bus::link::{Link, Outages};
 use crate::setup::names;
 use crate::summary::HostSummary;
 

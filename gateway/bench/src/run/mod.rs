@@ -15,29 +15,19 @@ mod accelerations;
 mod begin;
 mod bench;
 mod commanded;
+mod commander;
 mod contacts;
 mod end;
-mod ended;
-mod error;
 mod halts;
 mod hosts;
-#[expect(unsafe_code, reason = "scheduling class and timer slack have no safe wrapper")]
-mod io;
-pub mod launch;
-pub mod link;
 mod measured;
 mod network;
 mod organise;
-pub mod progress;
-pub mod realtime;
 pub mod receiver;
-pub mod roots;
-pub mod served;
 mod start;
 mod status_line;
 mod usage;
 mod watch;
-mod words;
 
 use std::path::PathBuf;
 
@@ -45,12 +35,10 @@ use calibration::motion::Motion;
 use protocol::bus::Kinds;
 use protocol::skin::Skin;
 
-use self::commanded::Remote;
-pub(crate) use self::ended::EndedProcesses;
-pub use self::error::RunError;
-pub(crate) use self::error::why;
+use self::commander::Remote;
 pub use self::network::TooDeep;
 use crate::emulate::Emulated;
+pub use crate::error::RunError;
 use crate::remote::Lines;
 use crate::summary::Summary;
 use model::scenario::Scenario;

@@ -8,10 +8,10 @@ use protocol::message::Message;
 use protocol::time::Micros;
 use protocol::usage::say;
 
-use super::RunError;
 use super::begin::SHOWING;
 use super::bench::Bench;
 use super::network::Network;
+use crate::error::RunError;
 use crate::view::View;
 
 /// Differences that last so long are real: a hello and a heartbeat come four times a second.

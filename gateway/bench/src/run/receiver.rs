@@ -13,9 +13,9 @@ use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
-use super::link::{Outages, ReceiveEnd};
-use super::realtime::wall;
-use super::roots::Roots;
+use crate::bus::link::{Outages, ReceiveEnd};
+use crate::bus::realtime::wall;
+use crate::bus::roots::Roots;
 use crate::record::feed::{Outlet, Touched, Unrecorded};
 use crate::record::force::Seen;
 use crate::view::{CellView, View};
@@ -124,7 +124,7 @@ impl Receiver {
     /// Receives until it is stopped. A lost bus is waited for, and reopened if it is gone.
     #[must_use]
     pub fn run(mut self) -> ReceiverResult {
-        super::realtime::prepare_receiver();
+        crate::bus::realtime::prepare_receiver();
         let mut inbox = Inbox::new();
         let mut account = Account::default();
         let mut looked = Instant::now();

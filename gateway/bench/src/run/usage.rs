@@ -5,8 +5,8 @@ use std::fs;
 
 use rustix::time::{ClockId, clock_gettime};
 
-use super::launch::Processes;
-use super::served::ServedBus;
+use crate::bus::served::ServedBus;
+use crate::processes::Processes;
 use crate::summary::Processor;
 
 /// Processor time of this process so far, in s.

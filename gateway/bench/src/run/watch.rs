@@ -14,20 +14,20 @@ use protocol::message::{From, Message, SensorPage};
 use protocol::skin::Cell;
 use protocol::time::Span;
 
-use super::RunError;
 use super::accelerations::{Accelerations, Moved};
 use super::begin::{Announced, SWITCH_AGAIN};
 use super::bench::Bench;
 use super::commanded::serve;
-use super::link::Slot;
 use super::measured::Measured;
-use super::progress::Progress;
-use super::realtime::{self, Granted};
 use super::receiver::BusEvent;
 use super::usage::{Spent, private_kib};
+use crate::bus::link::Slot;
+use crate::bus::realtime::{self, Granted};
+use crate::error::RunError;
+use crate::progress::Progress;
 use crate::record::Recorder;
-use crate::setup::spawn;
 use crate::summary::{Memory, Summary};
+use crate::threads::{ThreadError, spawn};
 use control::cycle::turn::{Timed, Turn};
 use control::external::Absence;
 use model::scenario::{FaultKind, Stimulus, Touches};
@@ -137,7 +137,7 @@ impl Bench<'_> {
     }
 
     /// The loop's thread.
-    fn start_loop(&self, mut turn: Turn, mut slots: Vec<Slot>) -> Result<JoinHandle<LoopEnd>, RunError> {
+    fn start_loop(&self, mut turn: Turn, mut slots: Vec<Slot>) -> Result<JoinHandle<LoopEnd>, ThreadError> {
         let period_ns = self.options.skin.timing.tick_nanos();
         let ticks = self.options.scenario.duration.0 * 1_000 / period_ns;
         let shared = Arc::clone(&self.shared);

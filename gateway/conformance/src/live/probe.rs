@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use bench::listen::now;
+use bench::bus::listen::now;
 use protocol::time::Span;
 
 /// How long it sleeps.

@@ -6,7 +6,7 @@ use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use bench::listen::{Listener, send};
+use bench::bus::listen::{Listener, send};
 use model::decode::Decoded;
 use protocol::bus::{Bus, BusKind, Choice, Inbox, Options};
 use protocol::can::{Format, Frame};

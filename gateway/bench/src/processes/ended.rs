@@ -4,7 +4,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::{Duration, Instant};
 
-use super::launch::Ended;
+use super::Ended;
 use crate::summary::{CellError, ErrorCells};
 
 /// Processes that end within this time are noted together.

@@ -12,7 +12,7 @@ use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::thread::{ClockId, clock_nanosleep_absolute};
 use rustix::time::{Timespec, clock_gettime};
 
-use super::io;
+use crate::system_calls;
 use control::cycle::Tick;
 use control::cycle::turn::{Shared, Turn};
 use model::quantiles::histogram;
@@ -37,17 +37,17 @@ pub struct Granted {
 /// Makes the calling thread as punctual as the machine allows.
 pub fn prepare() -> Granted {
     let granted = Granted {
-        fifo: io::set_fifo(PRIORITY),
+        fifo: system_calls::set_fifo(PRIORITY),
         // Only touched pages are locked, or every thread's whole stack would count.
         locked: mlockall(MlockAllFlags::CURRENT | MlockAllFlags::FUTURE | MlockAllFlags::ONFAULT).is_ok(),
     };
-    io::set_timer_slack(1);
+    system_calls::set_timer_slack(1);
     granted
 }
 
 /// The same for a receiver's thread, which may be a little late.
 pub(crate) fn prepare_receiver() {
-    io::set_fifo(RECEIVER_PRIORITY);
+    system_calls::set_fifo(RECEIVER_PRIORITY);
 }
 
 /// The monotonic clock in ns.

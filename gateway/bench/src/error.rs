@@ -11,11 +11,13 @@ use protocol::skin::Skin;
 use protocol::time::Span;
 use thiserror::Error;
 
-use super::launch::LaunchError;
-use super::network::TooDeep;
+use crate::bus::served::ServeError;
 use crate::emulate::EmulateError;
+use crate::processes::{LaunchError, MemoryError};
 use crate::record::OutputError;
+use crate::run::TooDeep;
 use crate::signals::SignalError;
+use crate::threads::ThreadError;
 use control::external::SocketError;
 
 /// How benches on embedded buses avoid each other.
@@ -72,16 +74,11 @@ pub enum RunError {
     #[error("interrupted while starting")]
     Interrupted,
     /// The system gives no thread.
-    #[error("cannot start the thread {name}: {source}")]
-    Thread {
-        /// What it is for.
-        name: String,
-        /// Why not.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Thread(#[from] ThreadError),
     /// The system gives no file in memory.
-    #[error("a file in memory: {0}")]
-    Memory(#[source] std::io::Error),
+    #[error(transparent)]
+    Memory(#[from] MemoryError),
     /// A bus is lost.
     #[error(transparent)]
     Lost(BusError),
@@ -185,7 +182,7 @@ impl RunError {
             | Self::RealWires(_) => 2,
             Self::Signal(_)
             | Self::Interrupted
-            | Self::Thread { .. }
+            | Self::Thread(_)
             | Self::Memory(_)
             | Self::Lost(_)
             | Self::OtherGateway(_)
@@ -198,6 +195,15 @@ impl RunError {
             | Self::NoSums(_)
             | Self::Panicked(_)
             | Self::ReceiverEnded => 1,
+        }
+    }
+}
+
+impl From<ServeError> for RunError {
+    fn from(error: ServeError) -> Self {
+        match error {
+            ServeError::Bus(error) => Self::Bus(error),
+            ServeError::Launch(error) => Self::Launch(error),
         }
     }
 }

@@ -1,5 +1,8 @@
-//! The processes of a bench: cells here, embedded buses in [`super::served`]. All of them end with the gateway, however it
+//! The processes of a bench: cells here, embedded buses in [`crate::bus::served`]. All of them end with the gateway, however it
 //! ends: each ends at its parent's death by itself, and a [`Processes`] that is dropped ends them.
+
+pub(crate) mod ended;
+mod standard_error;
 
 use std::fmt::{self, Display, Formatter};
 use std::fs::File;
@@ -19,10 +22,9 @@ use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, setrlimit};
 use thiserror::Error;
 
-use super::RunError;
-use super::io::end_with_parent;
-use super::words::StandardError;
+use self::standard_error::StandardError;
 use crate::remote::{Phase, ProcessState};
+use crate::system_calls::end_with_parent;
 use model::scenario::ProcessAction;
 
 /// Two gateways on one bus notice each other in this time.
@@ -85,6 +87,11 @@ pub enum LaunchError {
     },
 }
 
+/// The system gives no file in memory.
+#[derive(Debug, Error)]
+#[error("a file in memory: {0}")]
+pub struct MemoryError(#[source] std::io::Error);
+
 /// Sees that as many files may be open as the gateway needs for so many buses and as who serves one of them needs for
 /// so many clients; raises the limit as far as that is allowed, for all that are started from here on.
 ///
@@ -121,12 +128,12 @@ pub fn program(name: &'static str) -> Result<PathBuf, LaunchError> {
 ///
 /// # Errors
 /// When the system gives none.
-pub fn in_memory(bytes: &[u8]) -> Result<(File, PathBuf), RunError> {
+pub fn in_memory(bytes: &[u8]) -> Result<(File, PathBuf), MemoryError> {
     let memory = || {
         let mut file = File::from(memfd_create("skin.toml", MemfdFlags::CLOEXEC)?);
         file.write_all(bytes).map(|()| file)
     };
-    let file = memory().map_err(RunError::Memory)?;
+    let file = memory().map_err(MemoryError)?;
     let path = PathBuf::from(format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd()));
     Ok((file, path))
 }
@@ -396,7 +403,7 @@ impl Plan<'_> {
     }
 }
 
-pub(super) fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
+pub(crate) fn spawn(command: &mut Command) -> Result<Child, LaunchError> {
     command.spawn().map_err(|source| LaunchError::Start { path: command.get_program().into(), source })
 }
 
@@ -421,7 +428,7 @@ fn last_line(log: &Path) -> Option<String> {
 
 /// Ctrl-C on a terminal signals the whole process group, and is meant for the gateway alone: cells and buses
 /// have to outlive it until the final reports. They find embedded buses where it does.
-pub(super) fn apart(command: &mut Command, directory: Option<&Path>) {
+pub(crate) fn apart(command: &mut Command, directory: Option<&Path>) {
     command.process_group(0);
     if let Some(directory) = directory {
         command.env("SKINBUS_DIR", directory);
@@ -442,7 +449,7 @@ pub fn groups(nodes: &[u8], size: usize) -> Vec<(u8, u8)> {
 }
 
 /// Waits for processes that were asked to end, and kills those that do not.
-pub(super) fn end(children: &mut [&mut Child]) {
+pub(crate) fn end(children: &mut [&mut Child]) {
     let give_up = Instant::now() + TIMEOUT;
     loop {
         let running = children

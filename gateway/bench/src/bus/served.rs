@@ -5,9 +5,9 @@ use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 
 use protocol::bus::{Bus, BusError, BusKind, Choice, Options};
+use thiserror::Error;
 
-use super::RunError;
-use super::launch::{LaunchError, apart, end, program, spawn};
+use crate::processes::{LaunchError, apart, end, program, spawn};
 
 /// An embedded bus in a process of its own, so that it takes its socket away even when the gateway is
 /// killed.
@@ -74,6 +74,18 @@ impl ServedBus {
     }
 }
 
+/// A bus that is neither opened nor served.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ServeError {
+    /// It does not open.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// Its server does not start.
+    #[error(transparent)]
+    Launch(#[from] LaunchError),
+}
+
 /// A bus to be opened: its name, its kind, and how.
 pub type Target<'a> = (&'a str, Choice, Options);
 
@@ -96,7 +108,7 @@ pub fn open_or_serve(
     kind: Choice,
     target: &Options,
     absent: Absent,
-) -> Result<(Bus, Option<ServedBus>), RunError> {
+) -> Result<(Bus, Option<ServedBus>), ServeError> {
     let (opened, mut served) = open_or_serve_all(&[(name, kind, target.clone())], absent)?;
     let bus = opened.into_iter().next().ok_or_else(|| BusError::Name(name.to_owned()))?;
     Ok((bus, served.pop()))
@@ -109,7 +121,7 @@ pub fn open_or_serve(
 pub fn open_or_serve_all(
     buses: &[Target<'_>],
     absent: Absent,
-) -> Result<(Vec<Bus>, Vec<ServedBus>), RunError> {
+) -> Result<(Vec<Bus>, Vec<ServedBus>), ServeError> {
     let mut begun = Vec::with_capacity(buses.len());
     for (name, kind, target) in buses {
         let opened = Bus::open(name, *kind, target);

@@ -8,7 +8,7 @@ use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::time::Micros;
 
-use crate::run::realtime::wall;
+use crate::bus::realtime::wall;
 
 /// Opens a bus for frames of this format; with `None` for FD frames, or for classic frames alone where its interface
 /// takes no others.

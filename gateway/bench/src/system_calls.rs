@@ -6,20 +6,20 @@ use std::process::Command;
 use rustix::process::{Signal, getpid, getppid, set_parent_process_death_signal};
 
 /// Asks for `SCHED_FIFO` for the calling thread; returns whether it was granted.
-pub(super) fn set_fifo(priority: i32) -> bool {
+pub(crate) fn set_fifo(priority: i32) -> bool {
     let parameters = libc::sched_param { sched_priority: priority };
     // SAFETY: the pointer is to a live, initialised struct, which the call only reads.
     unsafe { libc::sched_setscheduler(0, libc::SCHED_FIFO, &raw const parameters) == 0 }
 }
 
 /// Sets how much later than asked the kernel may wake the calling thread, in ns.
-pub(super) fn set_timer_slack(nanos: u64) {
+pub(crate) fn set_timer_slack(nanos: u64) {
     // SAFETY: this option takes one integer and touches no memory of ours.
     let _ = unsafe { libc::prctl(libc::PR_SET_TIMERSLACK, nanos) };
 }
 
 /// Has a program be killed when the thread that starts it ends. Programs of this project see to that themselves.
-pub(super) fn end_with_parent(command: &mut Command) {
+pub(crate) fn end_with_parent(command: &mut Command) {
     let parent = getpid();
     let before_exec = move || {
         set_parent_process_death_signal(Some(Signal::KILL))?;
