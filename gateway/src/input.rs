@@ -8,7 +8,8 @@ use std::sync::{Arc, OnceLock};
 use std::thread;
 use std::time::Duration;
 
-use bench::bus::listen::{self, Listener};
+use bench::bus::follow::{Follower, Once, Step};
+use bench::bus::listen;
 use bench::signals::caught;
 use protocol::bus::{Bus, BusError, Choice, Kinds, Options, Received};
 use protocol::can::{self, EXTENDED_MASK};
@@ -300,8 +301,8 @@ impl Missing {
 /// A live bus. That it is down is reported once, until it works again.
 #[derive(Debug)]
 pub(crate) struct ReceiveEnd {
-    listener: Listener,
-    is_down: bool,
+    bus: Bus,
+    follower: Follower,
 }
 
 /// Opens each of several buses, as [`ReceiveEnd::open`] does; with a flag those that are not there are waited for until it
@@ -338,42 +339,43 @@ impl ReceiveEnd {
     ) -> Result<Self, BusError> {
         let bus = listen::open(name, kind, format, Options { error_mask: EXTENDED_MASK, ..options })?;
         output::note(format_args!("{} is {}", bus.name(), bus.kind()));
-        Ok(Self { listener: Listener::new(bus, format), is_down: false })
+        Ok(Self { bus, follower: Follower::default() })
     }
 
-    /// Takes what is there or comes within this time; whether there is anything.
+    /// Receives what is there or comes within this time; returns whether there is anything.
+    ///
+    /// # Errors
+    /// When the bus is gone.
     pub(crate) fn hear(&mut self, wait: Duration) -> Result<bool, BusError> {
-        let heard = self.listener.hear(wait);
-        match heard {
-            Ok(heard) => self.is_down &= !heard,
-            Err(ref error) if error.may_pass() => {
-                if !std::mem::replace(&mut self.is_down, true) {
-                    output::note(format_args!("skinbus: {error}; waiting"));
-                }
+        match self.follower.step(&mut Once(&self.bus), wait) {
+            Step::Frames(_) | Step::Leftover(_) => Ok(true),
+            Step::Nothing | Step::Drained | Step::Refused(_) => Ok(false),
+            Step::Down(error) => {
+                output::note(format_args!("skinbus: {error}; waiting"));
+                Ok(false)
             }
-            Err(_) => {}
+            Step::Gone(error) => Err(error),
         }
-        listen::passing(heard, LOOK).map(Option::unwrap_or_default)
     }
 
-    /// What was taken last.
+    /// The frames that were received last.
     pub(crate) fn frames(&self) -> impl Iterator<Item = Received> + '_ {
-        self.listener.frames()
+        self.follower.frames()
     }
 
-    pub(crate) fn bus(&self) -> &Bus {
-        self.listener.bus()
+    pub(crate) const fn bus(&self) -> &Bus {
+        &self.bus
     }
 
     /// Reports at the end how many frames are missing because they came faster than they were processed.
     pub(crate) fn missing(&self, done: &str) -> u64 {
-        let (name, missing) = (self.bus().name(), self.listener.dropped());
+        let (name, missing) = (self.bus().name(), self.follower.dropped());
         if missing > 0 {
             output::note(format_args!(
                 "{name}: {missing} frames are missing: they came faster than they were {done}"
             ));
         }
-        missing.into()
+        missing
     }
 }
 

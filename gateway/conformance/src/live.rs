@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use bench::bus::follow::fill;
 use bench::bus::listen;
 use protocol::bus::{Bus as Socket, BusError, Choice, GATEWAY_RECEIVE_BUFFER, Inbox, Options};
 use protocol::can::{Format, Frame};
@@ -93,24 +94,24 @@ impl Bus for Live {
             }
             let before = self.now();
             let wait = until.since(before).min(LOOK);
-            let is_there = self.socket.wait(Some(Duration::from_micros(wait.0))).map_err(lost)?;
+            let wait_time = Duration::from_micros(wait.0);
+            let count = fill(&self.socket, &mut self.inbox, wait_time).map_err(lost)?;
             let now = self.now();
-            if !is_there {
+            if self.inbox.dropped() > 0 {
+                let name = self.socket.name();
+                return Err(Stop::Bus(format!("{name}: frames came faster than they were read")));
+            }
+            if count == 0 {
                 self.late = self.late.max(now.since(before + wait));
                 if now >= until {
                     return Ok(None);
                 }
                 continue;
             }
-            self.socket.receive(&mut self.inbox).map_err(lost)?;
             for received in self.inbox.frames() {
                 let at = if received.at_nanos == 0 { now } else { Micros(received.at_nanos / 1_000) };
                 self.late = self.late.max(now.since(at));
                 self.waiting.push_back(Seen { at, frame: received.frame, own: received.own });
-            }
-            if self.inbox.dropped() > 0 {
-                let name = self.socket.name();
-                return Err(Stop::Bus(format!("{name}: frames came faster than they were read")));
             }
         }
     }

@@ -10,6 +10,7 @@ use std::cell::Cell;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 
+use bench::bus::follow::Source;
 use bench::bus::link::Link;
 use bench::bus::realtime;
 use control::controller::Kinesthetic;

@@ -9,10 +9,11 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use bench::bus::follow::{Follower, Part, Source, Step};
 use bench::bus::listen::{now, open, send};
 use bench::remote::{Lines, State};
 use protocol::bus::batch::BATCH;
-use protocol::bus::{self, Bus, BusError, Inbox, Kinds};
+use protocol::bus::{self, Bus, BusError, Kinds};
 use protocol::can::Format;
 use protocol::id::Node;
 use protocol::message::{From, Message, SensorPage};
@@ -36,8 +37,6 @@ const SAID_EVERY: u64 = 6;
 const WAIT: Duration = Duration::from_millis(50);
 /// How long frames gather after the first one, so that one wake-up reads many.
 const GATHER: Duration = Duration::from_millis(8);
-/// A bus that cannot be opened is tried again after so long.
-const AGAIN: Duration = Duration::from_millis(200);
 
 /// No frame waits to be read.
 const UP_TO_DATE: u64 = u64::MAX;
@@ -137,7 +136,27 @@ pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> R
     Ok(server.counts())
 }
 
-/// Receives on a bus, which is opened again when it is lost.
+/// A bus that may come later, and is opened again when it is lost.
+struct Reopened<'a, O> {
+    shared: &'a Shared,
+    opened: &'a O,
+    bus: Option<Arc<Bus>>,
+}
+
+impl<O: Fn(&str, Format) -> Result<Arc<Bus>, BusError>> Source for Reopened<'_, O> {
+    fn bus(&self) -> Option<&Bus> {
+        self.bus.as_deref()
+    }
+
+    fn reopen(&mut self) -> Result<(), BusError> {
+        let bus = (self.opened)(&self.shared.name, self.shared.format)?;
+        self.bus = Some(Arc::clone(&bus));
+        *locked(&self.shared.bus) = Some(bus);
+        Ok(())
+    }
+}
+
+/// Receives on a bus until `stop`.
 fn receive(
     index: usize,
     shared: &Shared,
@@ -145,57 +164,23 @@ fn receive(
     stop: &AtomicBool,
     opened: &impl Fn(&str, Format) -> Result<Arc<Bus>, BusError>,
 ) {
-    let mut inbox = Inbox::new();
-    // An interface that went down reports it once, and has frames from before; later ones show that it works again.
-    let mut lost = None;
+    let mut source = Reopened { shared, opened, bus: locked(&shared.bus).clone() };
+    let mut follower = Follower::new(None, GATHER);
     while !stop.load(Ordering::Relaxed) {
-        let bus = locked(&shared.bus).clone();
-        let Some(bus) = bus else {
-            match opened(&shared.name, shared.format) {
-                Ok(bus) => {
-                    lost = None;
-                    *locked(&shared.bus) = Some(bus);
-                }
-                Err(_) => {
-                    locked(live).set_bus(index, false, inbox.dropped().into());
-                    thread::sleep(AGAIN);
-                }
-            }
-            continue;
-        };
-        inbox.clear();
-        let heard = match bus.wait(Some(WAIT)) {
-            Ok(true) => {
-                // After a full batch more may wait.
-                if shared.read_to.load(Ordering::Relaxed) == UP_TO_DATE {
-                    thread::sleep(GATHER);
-                }
-                bus.receive(&mut inbox).map(|_| ())
-            }
-            other => other.map(|_| ()),
-        };
-        let last = inbox.frames().last().filter(|_| inbox.frames().len() == BATCH);
+        if let Step::Gone(_) = follower.step(&mut source, WAIT) {
+            *locked(&shared.bus) = None;
+        }
+        // After a full batch more may wait.
+        let last = follower.frames().last().filter(|_| follower.frames().len() == BATCH);
         let read_to = last.map_or(UP_TO_DATE, |last| last.at_nanos / 1_000);
         shared.read_to.store(read_to, Ordering::Relaxed);
-        match heard {
-            Ok(()) => {
-                let mut live = locked(live);
-                for received in inbox.frames() {
-                    let at = Micros(received.at_nanos / 1_000);
-                    lost = lost.filter(|lost| at <= *lost);
-                    live.frame(index, at, &received.frame);
-                }
-                live.set_bus(index, lost.is_none(), inbox.dropped().into());
+        let mut live = locked(live);
+        follower.parts(|part| {
+            if let Part::Frame(received) = part {
+                live.frame(index, Micros(received.at_nanos / 1_000), &received.frame);
             }
-            Err(error) => {
-                lost = Some(now());
-                locked(live).set_bus(index, false, inbox.dropped().into());
-                if !error.may_pass() {
-                    *locked(&shared.bus) = None;
-                }
-                thread::sleep(AGAIN);
-            }
-        }
+        });
+        live.set_bus(index, !follower.is_lost(), follower.dropped());
     }
 }
 

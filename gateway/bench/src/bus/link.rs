@@ -12,6 +12,7 @@ use protocol::bus::{Bus, BusError, BusKind, Choice, Options, SendError};
 use protocol::can::Frame;
 use vcan_setup::hosts::report::Reports;
 
+use super::follow::Source;
 use control::cycle::turn::BusState;
 
 /// One bus.
@@ -103,12 +104,15 @@ impl ReceiveEnd {
     pub fn regain(&self) -> bool {
         !self.link.state.works.swap(true, Ordering::Relaxed)
     }
+}
+
+impl Source for ReceiveEnd {
+    fn bus(&self) -> Option<&Bus> {
+        Some(&self.bus)
+    }
 
     /// Reopens a bus that is gone, and hands it to all threads.
-    ///
-    /// # Errors
-    /// When it does not open yet.
-    pub fn reopen(&mut self) -> Result<(), BusError> {
+    fn reopen(&mut self) -> Result<(), BusError> {
         let Link { name, kind, target, .. } = &*self.link;
         self.bus = Arc::new(Bus::open(name, Choice::Only(*kind), target)?);
         *self.link.bus.lock().unwrap_or_else(PoisonError::into_inner) = Arc::clone(&self.bus);

@@ -8,7 +8,8 @@ use protocol::can::{Format, Frame};
 use protocol::message::Message;
 use protocol::time::Micros;
 
-use crate::bus::realtime::wall;
+use super::follow::fill;
+use super::realtime::wall;
 
 /// Opens a bus for frames of this format; with `None` for FD frames, or for classic frames alone where its interface
 /// takes no others.
@@ -72,8 +73,7 @@ impl Listener {
     /// # Errors
     /// When the bus is down, gone or closed.
     pub fn hear(&mut self, wait: Duration) -> Result<bool, BusError> {
-        self.inbox.clear();
-        Ok(self.bus.wait(Some(wait))? && self.bus.receive(&mut self.inbox)? > 0)
+        fill(&self.bus, &mut self.inbox, wait).map(|count| count > 0)
     }
 
     /// The frames that were taken last.

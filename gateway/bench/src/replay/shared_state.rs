@@ -2,24 +2,20 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread;
 use std::time::Duration;
 
-use protocol::bus::Inbox;
 use protocol::time::Micros;
 
 use super::checks::Checks;
 use super::comparator::Comparator;
 use super::start::BusLink;
+use crate::bus::follow::{Follower, Once, Part, Step};
 use crate::bus::realtime;
 use crate::bus::roots::Roots;
 use model::decode::{Decoded, Decoder};
 
 /// How often the stop flag is read.
 const LOOK: Duration = Duration::from_millis(50);
-/// The pause while an interface is down.
-const DOWN: Duration = Duration::from_millis(20);
-
 /// What all threads of a replay share.
 #[derive(Debug)]
 pub(super) struct SharedState {
@@ -88,44 +84,38 @@ impl SharedState {
     /// than they were read.
     pub(super) fn hear(&self, index: usize, bus_link: &BusLink, mut roots: Option<Roots>) -> u64 {
         realtime::prepare_receiver();
-        let (bus, mut inbox, mut decoder) =
-            (&bus_link.bus, Inbox::new(), Decoder::new(Some(bus_link.format)));
+        let mut decoder = Decoder::new(Some(bus_link.format));
         // Its cells may be there already, and organise themselves as they come.
         roots.iter_mut().for_each(Roots::explore);
+        let (mut follower, mut end) = (Follower::new(roots, Duration::ZERO), Once(&bus_link.bus));
         while !self.deaf.load(Ordering::Relaxed) {
-            if let Some(roots) = &mut roots {
-                roots.speak(bus);
-            }
-            let timeout = roots.as_ref().map_or(LOOK, |roots| LOOK.min(roots.timeout()));
-            match bus
-                .wait(Some(timeout))
-                .and_then(|ready| if ready { bus.receive(&mut inbox) } else { Ok(0) })
-            {
-                Ok(0) => continue,
-                Ok(_) => {}
-                Err(error) => {
+            match follower.step(&mut end, LOOK) {
+                Step::Nothing | Step::Drained | Step::Refused(_) => continue,
+                Step::Frames(_) | Step::Leftover(_) => {}
+                Step::Down(_) => {
                     self.is_down(index);
-                    if !error.may_pass() {
-                        // The next sender gets the same error, and reports it.
-                        break;
-                    }
-                    thread::sleep(DOWN);
                     continue;
+                }
+                Step::Gone(_) => {
+                    self.is_down(index);
+                    // The next sender gets the same error, and reports it.
+                    break;
                 }
             }
             let mut comparator = self.comparator();
-            for received in inbox.frames().filter(|received| !received.own) {
-                if roots.as_mut().is_some_and(|roots| roots.take(&received.frame)) {
-                    continue;
-                }
+            follower.parts(|part| {
+                let Part::Frame(received) = part else { return };
                 let at = Micros(received.at_nanos / 1_000);
-                if let Decoded::Message(message) = decoder.decode(at, bus.name(), &received.frame) {
+                if !received.own
+                    && let Decoded::Message(message) =
+                        decoder.decode(at, bus_link.bus.name(), &received.frame)
+                {
                     comparator.hear(index, &message);
                 }
-            }
+            });
             drop(comparator);
             self.has_heard();
         }
-        inbox.dropped().into()
+        follower.dropped()
     }
 }

@@ -6,13 +6,13 @@ use std::sync::mpsc::{self, Sender};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use protocol::bus::batch::BATCH;
-use protocol::bus::{BusError, Inbox, Received};
+use protocol::bus::{BusError, Received};
 use protocol::id::{CellId, Kind};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Micros;
 
+use crate::bus::follow::{Follower, Part, Step};
 use crate::bus::link::{Outages, ReceiveEnd};
 use crate::bus::realtime::wall;
 use crate::bus::roots::Roots;
@@ -36,10 +36,6 @@ pub fn look_at(cells: usize) -> Duration {
     let times = u32::try_from(cells / CELLS_A_LOOK).unwrap_or(u32::MAX);
     LOOK.saturating_mul(times.max(1)).min(LONGEST_LOOK)
 }
-/// The pause while an interface is down.
-const DOWN: Duration = Duration::from_millis(50);
-/// From one try to open a bus that is gone to the next.
-const REOPEN: Duration = Duration::from_millis(100);
 
 /// What a receiver reports to the main thread at once.
 #[derive(Debug)]
@@ -63,14 +59,12 @@ pub struct Receiver {
     pub index: usize,
     /// The bus.
     pub receive_end: ReceiveEnd,
-    /// How long frames gather, so that one wake-up takes many: a tick, as the loop reads no more often.
-    pub gather: Duration,
+    /// Follows it: frames gather for a tick, as the loop reads no more often.
+    pub follower: Follower,
     /// How often timeouts are checked and the view is renewed while the loop runs.
     pub look: Duration,
     /// What is known of it.
     pub table: Table,
-    /// The wires to its roots, where cells answer with sums.
-    pub roots: Option<Roots>,
     /// Where snapshots go.
     pub snapshots: triple_buffer::Input<Snapshot>,
     /// Unrounded positions of the broadcasts.
@@ -102,22 +96,16 @@ pub struct ReceiverResult {
     pub ended: Micros,
 }
 
-/// What came through the sockets of a bus so far.
+/// What was reported of a bus so far.
 #[derive(Debug, Default)]
 struct Account {
-    /// Frames that the bus dropped on sockets before this one.
-    dropped_before: u64,
-    /// What this socket had dropped at the last report to the recorder.
-    announced: u32,
+    /// Dropped frames that the recorder knows of.
+    announced: u64,
     /// The newest joints whose contact states the recorder has.
     newest: Option<u64>,
     outages: Outages,
     /// Commands that the bus took and did not carry, because it was lost.
     unread: u64,
-    /// When a bus that is gone is to be opened again.
-    retry: Option<Instant>,
-    /// Why it could not be, as text.
-    refused: String,
 }
 
 impl Receiver {
@@ -125,47 +113,30 @@ impl Receiver {
     #[must_use]
     pub fn run(mut self) -> ReceiverResult {
         crate::bus::realtime::prepare_receiver();
-        let mut inbox = Inbox::new();
         let mut account = Account::default();
         let mut looked = Instant::now();
         while !self.shared.stop.load(Ordering::Relaxed) {
-            let count = if let Some(retry) = account.retry {
-                inbox.clear();
-                self.retry(&mut inbox, &mut account, retry);
-                0
-            } else {
-                self.take(&mut inbox, &mut account)
-            };
-            if count > 0 && self.receive_end.regain() {
-                account.outages.end(Instant::now());
-                self.note(BusNote::Back);
-                self.tell(BusEvent::Up);
-            }
+            let wait = self.look_now();
+            let step = self.follower.step(&mut self.receive_end, wait);
+            self.take(step, &mut account);
             for cells in self.in_doubt.try_iter() {
                 self.table.interrupt_cells(|cell| cells.contains(&cell));
             }
-            self.hear(&inbox);
-            if let Some(roots) = &mut self.roots {
-                if self.shared.explore.load(Ordering::Relaxed) {
-                    roots.explore();
-                }
-                roots.speak(&self.receive_end.bus);
+            self.hear();
+            if self.shared.explore.load(Ordering::Relaxed) {
+                self.follower.roots.iter_mut().for_each(Roots::explore);
             }
-            self.record(&inbox, &mut account);
+            self.record(&mut account);
             if looked.elapsed() >= self.look_now() {
                 looked = Instant::now();
                 self.look(&mut account);
             }
             self.publish();
-            // A full inbox has more behind it.
-            if (1..BATCH).contains(&count) {
-                std::thread::sleep(self.gather);
-            }
         }
         let ended = Micros(wall() / 1_000);
         self.table.finish();
         let unrecorded = self.outlet.as_mut().map_or_else(Unrecorded::default, last_words);
-        let dropped = account.dropped_before + u64::from(inbox.dropped());
+        let dropped = self.follower.dropped();
         ReceiverResult { table: self.table, dropped, unrecorded, outages: account.outages, ended }
     }
 
@@ -174,17 +145,33 @@ impl Receiver {
         if self.shared.broadcasts.load(Ordering::Relaxed) == 0 { LOOK } else { self.look }
     }
 
-    /// Waits for frames and takes them; how many.
-    fn take(&mut self, inbox: &mut Inbox, account: &mut Account) -> usize {
-        let bus = &self.receive_end.bus;
-        inbox.clear();
-        let look = self.look_now();
-        let timeout = self.roots.as_ref().map_or(look, |roots| look.min(roots.timeout()));
-        let came = bus.wait(Some(timeout)).and_then(|ready| if ready { bus.receive(inbox) } else { Ok(0) });
-        came.unwrap_or_else(|error| {
-            self.lose(inbox, account, error);
-            0
-        })
+    /// Notes and reports what a step says of the bus itself.
+    fn take(&mut self, step: Step, account: &mut Account) {
+        match step {
+            Step::Frames(_) => {
+                if self.receive_end.regain() {
+                    account.outages.end(Instant::now());
+                    self.note(BusNote::Back);
+                    self.tell(BusEvent::Up);
+                }
+            }
+            Step::Nothing | Step::Leftover(_) => {}
+            Step::Down(error) => self.lose(false, BusEvent::Down(error), account),
+            Step::Drained => self.table.interrupt(),
+            Step::Gone(error) => {
+                self.lose(true, BusEvent::Lost(error), account);
+                self.table.interrupt();
+            }
+            Step::Refused(error) => self.tell(BusEvent::Refused(error)),
+        }
+    }
+
+    fn lose(&mut self, gone: bool, bus_event: BusEvent, account: &mut Account) {
+        if self.receive_end.lose(gone) {
+            account.outages.begin(Instant::now());
+            self.note(BusNote::Lost);
+            self.tell(bus_event);
+        }
     }
 
     /// Notes in the recording what has become of the bus.
@@ -194,92 +181,31 @@ impl Receiver {
         }
     }
 
-    /// The bus is lost, for a while or until it is opened again.
-    fn lose(&mut self, inbox: &mut Inbox, account: &mut Account, error: BusError) {
-        let gone = !error.may_pass();
-        if gone {
-            account.retry = Some(Instant::now());
-            account.refused.clear();
-        }
-        if self.receive_end.lose(gone) {
-            account.outages.begin(Instant::now());
-            self.note(BusNote::Lost);
-            self.tell(if gone { BusEvent::Lost(error) } else { BusEvent::Down(error) });
-        }
-        if gone {
-            inbox.clear();
-            return self.table.interrupt();
-        }
-        std::thread::sleep(DOWN);
-        // Frames from before are no sign that it works again.
-        loop {
-            match self.receive_end.bus.receive(inbox) {
-                Ok(1..) => {
-                    self.hear(inbox);
-                    self.record(inbox, account);
-                }
-                // An interface goes down before it is removed, and each is reported once.
-                Err(error) if !error.may_pass() => return self.lose(inbox, account, error),
-                Ok(0) | Err(_) => break,
-            }
-        }
-        inbox.clear();
-        self.table.interrupt();
-    }
-
-    /// Tries to open a bus that is gone, when it is time; the cells' timeouts run all the same.
-    fn retry(&mut self, inbox: &mut Inbox, account: &mut Account, retry: Instant) {
-        let now = Instant::now();
-        if now < retry {
-            return std::thread::sleep(LOOK.min(retry - now));
-        }
-        match self.receive_end.reopen() {
-            Ok(()) => {
-                account.dropped_before += u64::from(inbox.dropped());
-                *inbox = Inbox::new();
-                (account.announced, account.retry) = (0, None);
-            }
-            Err(error) => {
-                account.retry = Some(now + REOPEN);
-                let why = error.to_string();
-                if !is_absent(&error) && account.refused != why {
-                    self.tell(BusEvent::Refused(error));
-                }
-                account.refused = why;
-            }
-        }
-    }
-
     /// Takes what came.
-    fn hear(&mut self, inbox: &Inbox) {
+    fn hear(&mut self) {
         self.table.set_comparing(self.shared.comparing.load(Ordering::Relaxed));
-        for received in inbox.frames() {
-            if let Some(roots) = &mut self.roots
-                && roots.take(&received.frame)
-            {
-                for (root, feeds) in roots.changes() {
-                    self.table.set_feeds(root, feeds);
+        let Self { follower, table, positions: queue, outlet, .. } = self;
+        follower.parts(|part| match part {
+            Part::Feeds(root, feeds) => table.set_feeds(root, feeds),
+            Part::Frame(received) => {
+                let at = Micros(received.at_nanos / 1_000);
+                let mut positions = |epoch| positions_of(queue, epoch);
+                table.handle_frame(at, received.own, &received.frame, &mut positions);
+                if let Some(outlet) = outlet {
+                    let Received { frame, at_nanos, own } = received;
+                    outlet.frame(Seen { at_nanos, own, frame });
                 }
-                continue;
             }
-            let at = Micros(received.at_nanos / 1_000);
-            let queue = &mut self.positions;
-            let mut positions = |epoch| positions_of(queue, epoch);
-            self.table.handle_frame(at, received.own, &received.frame, &mut positions);
-            if let Some(outlet) = &mut self.outlet {
-                let Received { frame, at_nanos, own } = received;
-                outlet.frame(Seen { at_nanos, own, frame });
-            }
-        }
+        });
     }
 
     /// Hands on what is no frame: what the bus dropped, and once an epoch the contact states.
-    fn record(&mut self, inbox: &Inbox, account: &mut Account) {
+    fn record(&mut self, account: &mut Account) {
         let Some(outlet) = &mut self.outlet else { return };
-        let more = inbox.dropped().wrapping_sub(account.announced);
-        if more > 0 {
-            account.announced = inbox.dropped();
-            outlet.dropped(wall(), more.into());
+        let dropped = self.follower.dropped();
+        if dropped > account.announced {
+            outlet.dropped(wall(), dropped - account.announced);
+            account.announced = dropped;
         }
         let Some((number, epoch, at)) = self.table.newest() else { return };
         if outlet.wants_touched() && account.newest.replace(number) != Some(number) {
@@ -310,7 +236,8 @@ impl Receiver {
                 self.receive_end.link.state.commands.load(Ordering::Relaxed).saturating_sub(read);
         }
         let commands = read + account.unread;
-        let network = if self.roots.is_some() { self.table.network(now).collect() } else { Vec::new() };
+        let network =
+            if self.follower.roots.is_some() { self.table.network(now).collect() } else { Vec::new() };
         if let Ok(mut view) = self.view.lock() {
             *view = View::new(cells, commands, network);
         }
@@ -320,20 +247,6 @@ impl Receiver {
         // At the end of the run there is no receiver any more.
         let _ = self.bus_event.send((self.index, bus_event));
     }
-}
-
-/// Whether a bus that does not open is just not there.
-const fn is_absent(error: &BusError) -> bool {
-    matches!(
-        error,
-        BusError::NoInterface { .. }
-            | BusError::Down { .. }
-            | BusError::Gone { .. }
-            | BusError::NotServed { .. }
-            | BusError::Absent { .. }
-            | BusError::Closed { .. }
-            | BusError::HungUp { .. }
-    )
 }
 
 /// Reports what did not fit; the recorder makes room as long as a receiver runs.

@@ -21,6 +21,7 @@ use super::commander::SwitchedBuses;
 use super::hosts::Hosts;
 use super::network::Network;
 use super::receiver::{BusEvent, Receiver, look_at};
+use crate::bus::follow::Follower;
 use crate::bus::link::{Link, ReceiveEnd, Slot};
 use crate::bus::realtime;
 use crate::bus::roots::{ReceiveFilter, Roots};
@@ -288,10 +289,12 @@ fn listen(
     let receiver = Receiver {
         index,
         receive_end,
-        gather: Duration::from_nanos(skin.timing.tick_nanos()).min(GATHER),
+        follower: Follower::new(
+            Roots::of(skin, index),
+            Duration::from_nanos(skin.timing.tick_nanos()).min(GATHER),
+        ),
         look: look_at(skin.cells.len()),
         table,
-        roots: Roots::of(skin, index),
         snapshots,
         positions: of_broadcasts,
         outlet,

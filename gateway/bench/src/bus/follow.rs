@@ -1,0 +1,345 @@
+//! Following a bus: waiting, receiving, counting what was dropped, noticing a loss, opening it again, and keeping the
+//! gateway's ends of the wires to its roots.
+//!
+//! | state | event | next | returned |
+//! |---|---|---|---|
+//! | `Works`, `Lost` | frames | `Works` | [`Step::Frames`] |
+//! | `Works`, `Lost` | nothing in time | unchanged | [`Step::Nothing`] |
+//! | `Works` | the bus is down | `Drains` | [`Step::Down`], once |
+//! | `Lost` | the bus is still down | unchanged, after a pause | [`Step::Nothing`] |
+//! | `Drains` | frames from before the loss | unchanged | [`Step::Leftover`] |
+//! | `Drains` | nothing is left | `Lost` | [`Step::Drained`] |
+//! | any but `Gone` | the bus is gone | `Gone` | [`Step::Gone`], once |
+//! | `Gone` | it opens | `Works` | [`Step::Nothing`] |
+//! | `Gone` | it is absent | unchanged | [`Step::Nothing`] |
+//! | `Gone` | it is there and does not open | unchanged | [`Step::Refused`], once for each reason |
+
+use std::thread;
+use std::time::{Duration, Instant};
+
+use protocol::bus::batch::BATCH;
+use protocol::bus::{Bus, BusError, Inbox, Received};
+use protocol::id::CellId;
+
+use super::roots::Roots;
+
+/// The pause while an interface is down.
+const DOWN_PAUSE: Duration = Duration::from_millis(50);
+/// The interval between attempts to open a bus that is gone.
+const REOPEN_INTERVAL: Duration = Duration::from_millis(100);
+
+/// An end of a bus that frames are received from.
+pub trait Source {
+    /// The open bus; absent before it was opened for the first time.
+    fn bus(&self) -> Option<&Bus>;
+
+    /// Opens it again after it has gone.
+    ///
+    /// # Errors
+    /// When it does not open yet.
+    fn reopen(&mut self) -> Result<(), BusError>;
+}
+
+/// A bus that is opened once: when it is gone, its follower ends.
+#[derive(Debug)]
+pub struct Once<'a>(pub &'a Bus);
+
+impl Source for Once<'_> {
+    fn bus(&self) -> Option<&Bus> {
+        Some(self.0)
+    }
+
+    fn reopen(&mut self) -> Result<(), BusError> {
+        Err(BusError::Gone(self.0.name().to_owned()))
+    }
+}
+
+/// The outcome of one [`Follower::step`].
+#[derive(Debug)]
+pub enum Step {
+    /// Frames came: how many are in the inbox.
+    Frames(usize),
+    /// No frame came in time.
+    Nothing,
+    /// The bus is down for now.
+    Down(BusError),
+    /// Frames came that were received before the bus went down: how many are in the inbox.
+    Leftover(usize),
+    /// All frames from before the loss are read; the next ones show that the bus works again.
+    Drained,
+    /// The bus is gone, and has to be opened again.
+    Gone(BusError),
+    /// The bus is there and does not open.
+    Refused(BusError),
+}
+
+/// Part of what came with a step.
+#[derive(Debug)]
+pub enum Part {
+    /// A frame of a cell, of the gateway or of another program.
+    Frame(Received),
+    /// A root begins or ceases to feed its sum to the gateway.
+    Feeds(CellId, bool),
+}
+
+#[derive(Debug, Default)]
+enum State {
+    #[default]
+    Works,
+    Drains,
+    Lost,
+    Gone {
+        retry: Option<Instant>,
+    },
+}
+
+/// What is known of a bus that is followed.
+#[derive(Debug, Default)]
+pub struct Follower {
+    /// The gateway's ends of the wires to the roots, where cells reply with sums.
+    pub roots: Option<Roots>,
+    /// How long frames gather after some came, so that one wake-up reads many.
+    gather: Duration,
+    inbox: Inbox,
+    state: State,
+    /// Frames dropped on sockets before the present one.
+    dropped_before: u64,
+    /// The reason reported last for which the bus does not open.
+    refused: String,
+}
+
+/// Waits for frames, at most for `wait`, and reads one batch; returns how many came. Replaces what is in the inbox.
+///
+/// # Errors
+/// When the bus is down, gone or closed.
+pub fn fill(bus: &Bus, inbox: &mut Inbox, wait: Duration) -> Result<usize, BusError> {
+    inbox.clear();
+    if bus.wait(Some(wait))? { bus.receive(inbox) } else { Ok(0) }
+}
+
+impl Follower {
+    /// Follows a bus with these wires to roots; lets frames gather for a time after some came.
+    #[must_use]
+    pub fn new(roots: Option<Roots>, gather: Duration) -> Self {
+        Self { roots, gather, ..Self::default() }
+    }
+
+    /// Sends what the wires to roots need, then receives, or goes on with what a loss needs; waits for at most about
+    /// `wait` beside the time to gather.
+    pub fn step(&mut self, source: &mut impl Source, wait: Duration) -> Step {
+        if matches!(self.state, State::Gone { .. }) || source.bus().is_none() {
+            return self.reopen(source, wait);
+        }
+        let Some(bus) = source.bus() else { return Step::Nothing };
+        let mut timeout = wait;
+        if let Some(roots) = &mut self.roots {
+            roots.speak(bus);
+            timeout = wait.min(roots.timeout());
+        }
+        if matches!(self.state, State::Drains) {
+            return self.drain(|inbox| bus.receive(inbox));
+        }
+        // More is behind a full inbox.
+        if (1..BATCH).contains(&self.inbox.frames().len()) {
+            thread::sleep(self.gather);
+        }
+        self.receive(|inbox| fill(bus, inbox, timeout))
+    }
+
+    /// Hands on what came with the last step, in its order; frames of the wires to roots stay here.
+    pub fn parts(&mut self, mut each: impl FnMut(Part)) {
+        for received in self.inbox.frames() {
+            if let Some(roots) = &mut self.roots
+                && roots.take(&received.frame)
+            {
+                roots.changes().for_each(|(root, feeds)| each(Part::Feeds(root, feeds)));
+                continue;
+            }
+            each(Part::Frame(received));
+        }
+    }
+
+    /// The frames that came with the last step, those of the wires to roots too.
+    pub fn frames(&self) -> impl ExactSizeIterator<Item = Received> + '_ {
+        self.inbox.frames()
+    }
+
+    /// Counts the frames that all sockets of this bus dropped because they were not read in time.
+    #[must_use]
+    pub fn dropped(&self) -> u64 {
+        self.dropped_before + u64::from(self.inbox.dropped())
+    }
+
+    /// Tells whether the bus has failed, and was neither opened again nor has shown by a frame that it works.
+    #[must_use]
+    pub const fn is_lost(&self) -> bool {
+        !matches!(self.state, State::Works)
+    }
+
+    fn receive(&mut self, fill: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> Step {
+        match fill(&mut self.inbox) {
+            Ok(0) => Step::Nothing,
+            Ok(count) => {
+                self.state = State::Works;
+                Step::Frames(count)
+            }
+            Err(error) if !error.may_pass() => self.gone(error),
+            Err(_) if matches!(self.state, State::Lost) => {
+                thread::sleep(DOWN_PAUSE);
+                Step::Nothing
+            }
+            Err(error) => {
+                self.inbox.clear();
+                self.state = State::Drains;
+                Step::Down(error)
+            }
+        }
+    }
+
+    /// Reads frames from before a loss, which are no sign that the bus works again.
+    fn drain(&mut self, receive: impl FnOnce(&mut Inbox) -> Result<usize, BusError>) -> Step {
+        // A pause before the first of them: what was on its way is there then.
+        if self.inbox.frames().len() == 0 {
+            thread::sleep(DOWN_PAUSE);
+        }
+        self.inbox.clear();
+        match receive(&mut self.inbox) {
+            Ok(count @ 1..) => Step::Leftover(count),
+            // An interface goes down before it is removed, and each is reported once.
+            Err(error) if !error.may_pass() => self.gone(error),
+            Ok(0) | Err(_) => {
+                self.state = State::Lost;
+                Step::Drained
+            }
+        }
+    }
+
+    fn gone(&mut self, error: BusError) -> Step {
+        self.inbox.clear();
+        self.refused.clear();
+        self.state = State::Gone { retry: None };
+        Step::Gone(error)
+    }
+
+    fn reopen(&mut self, source: &mut impl Source, wait: Duration) -> Step {
+        self.inbox.clear();
+        let now = Instant::now();
+        if let State::Gone { retry: Some(retry) } = self.state
+            && now < retry
+        {
+            thread::sleep(wait.min(retry - now));
+            return Step::Nothing;
+        }
+        match source.reopen() {
+            Ok(()) => {
+                self.dropped_before += u64::from(self.inbox.dropped());
+                self.inbox = Inbox::new();
+                self.state = State::Works;
+                Step::Nothing
+            }
+            Err(error) => {
+                self.state = State::Gone { retry: Some(now + REOPEN_INTERVAL) };
+                let why = error.to_string();
+                let is_new = !is_absent(&error) && self.refused != why;
+                self.refused = why;
+                if is_new { Step::Refused(error) } else { Step::Nothing }
+            }
+        }
+    }
+}
+
+/// Tells a bus that is not there from one that is there and does not open.
+const fn is_absent(error: &BusError) -> bool {
+    matches!(
+        error,
+        BusError::NoInterface { .. }
+            | BusError::Down { .. }
+            | BusError::Gone { .. }
+            | BusError::NotServed { .. }
+            | BusError::Absent { .. }
+            | BusError::Closed { .. }
+            | BusError::HungUp { .. }
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn down() -> BusError {
+        BusError::Down("vcan0".to_owned())
+    }
+
+    fn gone() -> BusError {
+        BusError::Gone("vcan0".to_owned())
+    }
+
+    /// A bus that opens as told.
+    struct Scripted(Vec<Result<(), BusError>>);
+
+    impl Source for Scripted {
+        fn bus(&self) -> Option<&Bus> {
+            None
+        }
+
+        fn reopen(&mut self) -> Result<(), BusError> {
+            self.0.pop().unwrap_or_else(|| Err(gone()))
+        }
+    }
+
+    #[test]
+    fn a_loss_is_reported_once_and_frames_from_before_do_not_end_it() {
+        let mut follower = Follower::default();
+        assert!(matches!(follower.receive(|_| Ok(0)), Step::Nothing));
+        assert!(matches!(follower.receive(|_| Ok(3)), Step::Frames(3)));
+        assert!(!follower.is_lost());
+        assert!(matches!(follower.receive(|_| Err(down())), Step::Down(_)));
+        assert!(matches!(follower.drain(|_| Ok(2)), Step::Leftover(2)));
+        assert!(follower.is_lost());
+        assert!(matches!(follower.drain(|_| Ok(0)), Step::Drained));
+        assert!(matches!(follower.receive(|_| Err(down())), Step::Nothing), "it was reported");
+        assert!(matches!(follower.receive(|_| Ok(0)), Step::Nothing));
+        assert!(follower.is_lost(), "silence is no sign that it works");
+        assert!(matches!(follower.receive(|_| Ok(1)), Step::Frames(1)));
+        assert!(!follower.is_lost());
+        assert!(matches!(follower.receive(|_| Err(down())), Step::Down(_)), "another loss");
+    }
+
+    #[test]
+    fn an_interface_that_is_removed_goes_down_before() {
+        let mut follower = Follower::default();
+        assert!(matches!(follower.receive(|_| Err(down())), Step::Down(_)));
+        assert!(matches!(follower.drain(|_| Err(gone())), Step::Gone(_)));
+        let mut follower = Follower::default();
+        assert!(matches!(follower.receive(|_| Err(down())), Step::Down(_)));
+        assert!(matches!(follower.drain(|_| Err(down())), Step::Drained));
+        assert!(matches!(follower.receive(|_| Err(gone())), Step::Gone(_)), "after it is down as well");
+    }
+
+    #[test]
+    fn a_bus_that_is_gone_is_opened_again_and_each_reason_against_it_reported_once() {
+        let refused = || Err(BusError::Name("a reason".to_owned()));
+        let other = || Err(BusError::Name("another".to_owned()));
+        // From the last to the first.
+        let mut source =
+            Scripted(vec![Ok(()), other(), refused(), Err(gone()), refused(), refused(), Err(gone())]);
+        let mut follower = Follower::default();
+        let mut steps = Vec::new();
+        let began = Instant::now();
+        assert!(matches!(follower.receive(|_| Err(gone())), Step::Gone(_)));
+        while follower.is_lost() {
+            match follower.step(&mut source, Duration::from_millis(30)) {
+                Step::Nothing => {}
+                Step::Refused(error) => steps.push(error.to_string()),
+                Step::Frames(_) | Step::Down(_) | Step::Leftover(_) | Step::Drained | Step::Gone(_) => {
+                    panic!("a bus that is gone has neither frames nor a loss")
+                }
+            }
+        }
+        assert!(began.elapsed() >= 6 * REOPEN_INTERVAL, "it is not tried all the time");
+        let reasons: Vec<_> = steps.iter().map(|step| step.contains("another")).collect();
+        assert_eq!(reasons, [false, false, true], "an absence in between makes a reason new");
+        assert_eq!(source.0.len(), 0);
+        assert!(matches!(follower.receive(|_| Err(gone())), Step::Gone(_)), "it may be lost again");
+    }
+}
