@@ -18,9 +18,9 @@ use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use bench::record::feed::{self, Feed};
-use bench::record::force::Seen;
 use bench::record::{Mcap, Options, Outputs};
 use model::central::Central;
+use model::latched::Seen;
 use protocol::can::Format;
 use protocol::candump::{self, Direction, Line, Record, Timestamp};
 use protocol::fixed::{Q1_14, Q3_12};

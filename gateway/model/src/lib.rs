@@ -5,6 +5,7 @@
 //! | [`decode`] | frames into packets, and packets into text and JSON |
 //! | [`tracker`] | the state of a cell from its packets: identity, restarts, losses |
 //! | [`table`] | the state of a live bus: each cell, and sums |
+//! | [`latched`] | what the cells of a bus were told and still hold |
 //! | [`central`] | torques computed centrally, in double precision |
 //! | [`network`] | the tree of cells, compared with the skin |
 //! | [`commission`], [`listing`] | which cells are on a bus; node ids and configuration for them |
@@ -18,6 +19,7 @@ pub mod central;
 pub mod commission;
 pub mod decode;
 pub mod generate;
+pub mod latched;
 pub mod listing;
 pub mod network;
 pub mod quantiles;

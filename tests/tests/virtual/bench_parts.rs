@@ -4,7 +4,6 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use analysis::explain::{Requested, Watch};
-use bench::record::force::{Latched, Seen};
 use bench::replay::comparator::{Comparator, Tally};
 use bench::replay::replay_plan::{Only, ReplayPlan, Role, Selection, Step};
 use bench::replay::survey::{Part, Survey};
@@ -12,6 +11,7 @@ use cell_node::flash::Flash;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
 use model::decode::{Decoded, Decoder};
+use model::latched::{Latched, Seen};
 use model::table::{Replies, Table};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Direction, Record, Timestamp};

@@ -8,11 +8,11 @@
     reason = "a test may stop"
 )]
 
-use bench::replay::state::State;
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
 use cell_node::node::Node;
 use model::generate::{Target, generate};
+use model::latched::State;
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node as Address};

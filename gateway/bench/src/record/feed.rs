@@ -5,9 +5,9 @@ use std::sync::{Arc, Mutex};
 
 use protocol::message::SkinSensors;
 
-use super::force::Seen;
 use crate::view::View;
 use control::cycle::turn::{BusState, Timed};
+use model::latched::Seen;
 use model::table::Status;
 use trace::capture::BusNote;
 

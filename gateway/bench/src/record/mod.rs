@@ -12,7 +12,6 @@
 pub(crate) mod backlog;
 pub mod facts;
 pub mod feed;
-pub mod force;
 pub mod text;
 mod thread;
 pub mod topics;

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use protocol::candump::{Record, Timestamp, write_record};
 
 use super::Candump;
-use super::force::Seen;
+use model::latched::Seen;
 use trace::files::LogFile;
 use trace::recording::account::Written;
 

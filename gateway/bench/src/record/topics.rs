@@ -6,10 +6,10 @@ use protocol::candump::{Direction, Record, Timestamp};
 use protocol::skin::MAX_ROBOT_JOINTS;
 
 use super::feed::Touched;
-use super::force::Seen;
 use control::controller::BadCycle;
 use control::cycle::Halt;
 use control::cycle::turn::Timed;
+use model::latched::Seen;
 use model::table::Status;
 use trace::capture::Note;
 use trace::recording::NOTES;

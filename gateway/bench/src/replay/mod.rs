@@ -10,8 +10,8 @@
 //!                                                  └─ receiver (one a bus) <──────────┘
 //! ```
 //!
-//! The logic is pure: [`survey`], [`state`], [`trace::order`], [`replay_plan`], [`player`] (its clock and buses are a
-//! [`player::Stage`]), [`comparator`] and [`difference`]. The rest is threads, sockets and the clock.
+//! The logic is pure: [`survey`], [`model::latched::state`], [`trace::order`], [`replay_plan`], [`player`] (its clock and
+//! buses are a [`player::Stage`]), [`comparator`] and [`difference`]. The rest is threads, sockets and the clock.
 
 mod checks;
 pub mod comparator;
@@ -26,9 +26,7 @@ mod session;
 mod shared_state;
 mod source;
 mod start;
-pub mod state;
 pub mod survey;
-pub mod touched;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;

@@ -12,8 +12,8 @@ use protocol::packet::{Epoch, data_id};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
-use super::state::State;
 use model::decode::{Decoded, Decoder};
+use model::latched::State;
 use trace::capture::{BusNote, Latched, Note};
 
 /// A cell that sends nothing for so long is absent, in ns.

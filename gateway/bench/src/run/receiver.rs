@@ -17,9 +17,9 @@ use crate::bus::link::{Outages, ReceiveEnd};
 use crate::bus::realtime::wall;
 use crate::bus::roots::Roots;
 use crate::record::feed::{Outlet, Touched, Unrecorded};
-use crate::record::force::Seen;
 use crate::view::{CellView, View};
 use control::cycle::turn::Shared;
+use model::latched::Seen;
 use model::table::{Notice, Snapshot, Table};
 use trace::capture::BusNote;
 

@@ -3,9 +3,9 @@
 use std::collections::VecDeque;
 
 use analysis::explain::{CellExplained, Requested, Watch, explain};
-use bench::record::force::{Latched, Seen};
 use model::decode::settle::Settler;
 use model::decode::{Decoded, Decoder};
+use model::latched::{Latched, Seen};
 use protocol::can::Frame;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::Message;

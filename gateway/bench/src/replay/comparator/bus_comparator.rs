@@ -13,9 +13,9 @@ use super::WINDOW;
 use super::sums::{Sums, Trees};
 use super::tally::Lacking;
 use crate::replay::difference::What;
-use crate::replay::state::State;
 use crate::replay::survey::Cell as Surveyed;
-use crate::replay::touched::Touched;
+use model::latched::State;
+use model::latched::Touched;
 
 /// Unanswered requests of a cell that are remembered.
 const ANNOUNCED: usize = 256;

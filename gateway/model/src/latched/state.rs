@@ -10,7 +10,6 @@
 //! those that waited then; halt, if the cells were halted; the last joints; and all inputs since then, as they were
 //! sent.
 
-use model::tracker::{Claim, Contact, PerCell, Word};
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node};
 use protocol::message::{From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
@@ -19,6 +18,7 @@ use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
 use super::touched::Touched;
+use crate::tracker::{Claim, Contact, PerCell, Word};
 
 /// Messages since the last joints that are kept as they were sent.
 const SINCE: usize = 16_384;

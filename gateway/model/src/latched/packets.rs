@@ -1,4 +1,4 @@
-//! The latched state of a bus: the packets that a reader needs who begins in the middle of a recording.
+//! The packets of a bus that a reader needs who begins in the middle of a recording.
 //!
 //! ```text
 //!   frames of a bus ──> take ──> [ Latched ] ──> frames that still count, in the bus' order
@@ -13,13 +13,14 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use model::tracker::{Claim, Contact, PerCell, Word};
 use protocol::can::{Format, Frame};
 use protocol::id::{Id, Kind};
 use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
 use protocol::packet::{self, Epoch, Lengths, Packet, Reassembly, Segment};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
+
+use crate::tracker::{Claim, Contact, PerCell, Word};
 
 /// A frame that was received.
 #[derive(Clone, Copy, Debug, PartialEq)]
