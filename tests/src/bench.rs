@@ -16,7 +16,7 @@ mod wire;
 
 use std::collections::HashMap;
 
-use analysis::bus_model::Attempt;
+use bus_model::Attempt;
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
 use model::scenario::{Scenario, contact_words};

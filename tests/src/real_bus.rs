@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use analysis::bus_model::{Attempt, BusModel, Priority, Request};
+use bus_model::{Attempt, BusModel, Priority, Request};
 use protocol::can::Frame;
 use protocol::time::Micros;
 use protocol::wire_time::{BitRates, Bits};

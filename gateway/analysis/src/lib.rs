@@ -5,12 +5,11 @@
 //! | [`stats`] | counts of each bus and each cell |
 //! | [`explain`] | where a torque comes from |
 //! | [`compare`] | two captures of one skin, side by side |
-//! | [`bus_model`], [`fit`], [`shadow`] | timing of buses: the model, a bench before it is built, a capture on its bus |
+//! | [`fit`], [`shadow`] | timing of buses: a bench before it is built, a capture on its bus |
 //! | [`report`] | pages with figures |
 //! | [`dbc`] | packets for other tools |
 //! | [`paper`] | figures of the paper |
 
-pub mod bus_model;
 pub mod compare;
 pub mod dbc;
 pub mod explain;

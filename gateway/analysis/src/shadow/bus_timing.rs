@@ -11,10 +11,10 @@ use super::phase::{Each, Figures, Phase, Phases};
 use super::report::{BusShadow, Counts, Delays, Loads, Most, Stretches};
 use super::reported::Reported;
 use super::{SATURATED_NS, WINDOW_FRAMES, WINDOW_NS};
-use crate::bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 use crate::fit;
 use crate::fit::traffic::{Says, Sorted, Traffic};
 use crate::fit::verdict::{Answer, Cells};
+use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 
 /// Frames that may wait on a bus: some minutes of a full one. Beyond them frames are refused, as by a full transmit queue.
 pub const MAX_QUEUE: usize = 1 << 22;

@@ -24,9 +24,9 @@ use protocol::can::{ERROR, Frame};
 use protocol::skin::Skin;
 use protocol::wire_time::{BitRates, Bits};
 
-use crate::bus_model::{BitErrors, BitErrorsError};
 use crate::fit;
 use crate::fit::verdict::Answer;
+use bus_model::{BitErrors, BitErrorsError};
 use bus_timing::{Known, LinkId};
 use reported::Reported;
 

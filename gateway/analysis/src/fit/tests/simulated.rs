@@ -10,7 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::{Answers, COMPUTATION_NS, Case};
-use crate::bus_model::{BusModel, Priority, Request};
+use bus_model::{BusModel, Priority, Request};
 
 /// How long the cells of an epoch compute.
 #[derive(Clone, Copy, Debug)]
