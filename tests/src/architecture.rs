@@ -51,15 +51,17 @@ fn metadata() -> serde_json::Value {
     serde_json::from_slice(&cargo.stdout).unwrap()
 }
 
-/// Lists the crates of the workspace, and what each uses of the others, its tests included.
+/// Lists the crates of the workspace, and what each uses of the others, its tests included. One may be its own, so that its
+/// tests have features that its programs have not.
 fn used() -> BTreeMap<String, BTreeSet<String>> {
     let metadata = metadata();
     let packages = metadata["packages"].as_array().unwrap();
     let name = |value: &serde_json::Value| value["name"].as_str().unwrap().to_owned();
     let ours: BTreeSet<_> = packages.iter().map(name).collect();
     let of = |package: &serde_json::Value| {
-        let dependencies = package["dependencies"].as_array().unwrap().iter();
-        (name(package), dependencies.map(name).filter(|name| ours.contains(name)).collect())
+        let (of, dependencies) = (name(package), package["dependencies"].as_array().unwrap().iter());
+        let others = dependencies.map(name).filter(|name| *name != of && ours.contains(name)).collect();
+        (of, others)
     };
     packages.iter().map(of).collect()
 }
