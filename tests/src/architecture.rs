@@ -96,6 +96,24 @@ fn crates_use_what_the_documents_arrows_lead_to_only() {
     }
 }
 
+/// The feature `oracle` of `cell-node` is what cells are compared with, and nothing that they compute with.
+#[test]
+fn only_the_papers_experiments_and_tests_have_the_cells_oracle() {
+    let metadata = metadata();
+    let packages = metadata["packages"].as_array().unwrap();
+    let lists = |features: &serde_json::Value| features.as_array().unwrap().iter().any(|it| it == "oracle");
+    let cell = packages.iter().find(|package| package["name"] == "cell-node").unwrap();
+    let mut features = cell["features"].as_object().unwrap().iter();
+    assert_eq!(features.find(|(_, enabled)| lists(enabled)), None, "no other feature has it");
+    let is_program = |it: &serde_json::Value| it["name"] == "cell-node" && it["kind"].is_null();
+    let has = |package: &&serde_json::Value| {
+        let mut dependencies = package["dependencies"].as_array().unwrap().iter();
+        dependencies.any(|it| is_program(it) && lists(&it["features"]))
+    };
+    let having: Vec<_> = packages.iter().filter(has).map(|package| &package["name"]).collect();
+    assert_eq!(having, ["paper"]);
+}
+
 /// Rust sources of the workspace, each with its path from the top.
 fn sources() -> Vec<(String, String)> {
     fn walk(folder: &Path, found: &mut Vec<PathBuf>) {
