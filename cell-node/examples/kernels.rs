@@ -6,8 +6,8 @@
 
 #![expect(clippy::print_stdout, clippy::unwrap_used, reason = "it prints, and stops where it cannot")]
 
-use cell_node::kernel::oracle::Counted;
-use cell_node::kernel::{Kernel, Operations, PaperWord, Projection, Scalar, Word, Wrench};
+use cell_node::kernel::oracle::{Counted, PaperWord, Projection};
+use cell_node::kernel::{Kernel, Operations, Scalar, Word, Wrench};
 use cell_node::sine::{cosine, paper_cosine, paper_sine, sine};
 use protocol::fixed::{Q1_14, Q3_12};
 

@@ -1,5 +1,5 @@
 #![doc = include_str!("../README.md")]
-#![cfg_attr(not(any(feature = "oracle", test)), no_std)]
+#![cfg_attr(not(feature = "std"), no_std)]
 
 pub mod baseline;
 pub mod contact;

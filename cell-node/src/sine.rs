@@ -1,21 +1,28 @@
 //! Sine and cosine of an angle in quarter turns, integers only.
 //!
 //! An angle is a Q1.14 word in quarter turns (paper, Eq. 11), so 16 bits hold exactly one turn and
-//! wrap by themselves; the period of the paper's Eq. 12 is 4 of these units, not 2. Both polynomials
-//! are evaluated on [-1, 1] and continued by `sin(z) = sin(2 - z)` (Eq. 18), which in wrapping words
-//! also holds below -1. All products stay within 32 bits.
+//! wrap by themselves; the period of the paper's Eq. 12 is 4 of these units, not 2. A polynomial is
+//! evaluated on [-1, 1] and continued by `sin(z) = sin(2 - z)` (Eq. 18), which in wrapping words also
+//! holds below -1. All products stay within 32 bits.
 //!
 //! | function | order | mean error | max error |
 //! |---|---|---|---|
 //! | [`sine`], [`cosine`] | 7 | 1.6e-5 | 6.1e-5 |
-//! | [`paper_sine`], [`paper_cosine`] | 5 | 1.9e-4 | 4.4e-4 |
+//! | `paper_sine`, `paper_cosine` | 5 | 1.9e-4 | 4.4e-4 |
 //!
 //! over all 65 536 angles; rounding to Q1.14 alone costs 1.5e-5 in the mean. All four are exact at 0
-//! and at the quarter turns, exactly odd (or even), and never beyond 1. Never panics, bounded work.
+//! and at the quarter turns, exactly odd (or even), and never beyond 1. Never panics, bounded work. Cells
+//! compute with the seventh order; the paper's fifth is there with the feature `oracle`, to compare with.
 
 use core::f64::consts::FRAC_PI_2;
 
 use protocol::fixed::Q1_14;
+
+#[cfg(feature = "oracle")]
+pub(crate) mod paper;
+
+#[cfg(feature = "oracle")]
+pub use paper::{paper_cosine, paper_sine};
 
 /// One, in the 16 fraction bits in which the polynomials are evaluated.
 const ONE: i32 = 1 << 16;
@@ -27,19 +34,6 @@ pub(crate) const QUARTER: Q1_14 = Q1_14::from_bits(1 << 14);
 /// Of the integers whose sum is one (so that the sine of a quarter turn is one) these have the smallest
 /// mean error when every intermediate result is truncated, not rounded; found by search.
 const SEVENTH: [i32; 4] = [ONE + 42_330 - 5_214 + 291, -42_330, 5_214, -291];
-
-/// The paper's polynomial (Eq. 13, 16): `a z - b z^3 + c z^5` with a = pi/2, c = pi/2 - 3/2, and b such
-/// that the sum is one.
-const FIFTH: [i32; 3] = {
-    let (a, c) = (nearest(FRAC_PI_2), nearest(FRAC_PI_2 - 1.5));
-    [a, ONE - a - c, c]
-};
-
-/// A constant above zero with 16 fraction bits.
-#[expect(clippy::cast_possible_truncation, reason = "the constants above are below 2")]
-const fn nearest(constant: f64) -> i32 {
-    (constant * 65_536.0 + 0.5) as i32
-}
 
 /// The sine of an angle in quarter turns; in [-1, 1].
 ///
@@ -55,31 +49,10 @@ pub fn cosine(angle: Q1_14) -> Q1_14 {
     sine(angle.wrapping_add(QUARTER))
 }
 
-/// The paper's sine (Eq. 17, 18), fifth order; in [-1, 1].
-///
-/// The mean error over all angles is below 1.9e-4 and no error is above 4.6e-4: coarser than
-/// [`sine`] by a factor of ten, and one multiplication cheaper.
-#[must_use]
-pub fn paper_sine(angle: Q1_14) -> Q1_14 {
-    odd_polynomial(angle, FIFTH)
-}
-
-/// The paper's cosine (Eq. 19): [`paper_sine`] a quarter turn later.
-#[must_use]
-pub fn paper_cosine(angle: Q1_14) -> Q1_14 {
-    paper_sine(angle.wrapping_add(QUARTER))
-}
-
 /// [`sine`] and [`cosine`] of one angle together, in steps of 2^-14: bit for bit the same, in less time.
 #[inline]
 pub(crate) fn sine_cosine(angle: Q1_14) -> [i32; 2] {
     both(angle, SEVENTH)
-}
-
-/// [`paper_sine`] and [`paper_cosine`] of one angle.
-#[inline]
-pub(crate) fn paper_sine_cosine(angle: Q1_14) -> [i32; 2] {
-    both(angle, FIFTH)
 }
 
 /// Sine and cosine by the odd polynomial whose coefficients sum up to one. With |z| folded into one quarter turn, |sin z|
@@ -162,6 +135,7 @@ const TAYLOR: [i64; 8] = {
 
 #[cfg(test)]
 mod tests {
+    use super::paper::paper_sine_cosine;
     use super::*;
     use protocol::fixed::Acc;
 

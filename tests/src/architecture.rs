@@ -51,15 +51,17 @@ fn metadata() -> serde_json::Value {
     serde_json::from_slice(&cargo.stdout).unwrap()
 }
 
-/// Lists the crates of the workspace, and what each uses of the others, its tests included.
+/// Lists the crates of the workspace, and what each uses of the others, its tests included. One may be its own, so that its
+/// tests have features that its programs have not.
 fn used() -> BTreeMap<String, BTreeSet<String>> {
     let metadata = metadata();
     let packages = metadata["packages"].as_array().unwrap();
     let name = |value: &serde_json::Value| value["name"].as_str().unwrap().to_owned();
     let ours: BTreeSet<_> = packages.iter().map(name).collect();
     let of = |package: &serde_json::Value| {
-        let dependencies = package["dependencies"].as_array().unwrap().iter();
-        (name(package), dependencies.map(name).filter(|name| ours.contains(name)).collect())
+        let (of, dependencies) = (name(package), package["dependencies"].as_array().unwrap().iter());
+        let others = dependencies.map(name).filter(|name| *name != of && ours.contains(name)).collect();
+        (of, others)
     };
     packages.iter().map(of).collect()
 }
@@ -92,6 +94,24 @@ fn crates_use_what_the_documents_arrows_lead_to_only() {
         let round = arrows[from].iter().any(|&other| other != to && reach(&arrows, other).contains(to));
         assert!(!round, "{from} --> {to}: other arrows lead there");
     }
+}
+
+/// The feature `oracle` of `cell-node` is what cells are compared with, and nothing that they compute with.
+#[test]
+fn only_the_papers_experiments_and_tests_have_the_cells_oracle() {
+    let metadata = metadata();
+    let packages = metadata["packages"].as_array().unwrap();
+    let lists = |features: &serde_json::Value| features.as_array().unwrap().iter().any(|it| it == "oracle");
+    let cell = packages.iter().find(|package| package["name"] == "cell-node").unwrap();
+    let mut features = cell["features"].as_object().unwrap().iter();
+    assert_eq!(features.find(|(_, enabled)| lists(enabled)), None, "no other feature has it");
+    let is_program = |it: &serde_json::Value| it["name"] == "cell-node" && it["kind"].is_null();
+    let has = |package: &&serde_json::Value| {
+        let mut dependencies = package["dependencies"].as_array().unwrap().iter();
+        dependencies.any(|it| is_program(it) && lists(&it["features"]))
+    };
+    let having: Vec<_> = packages.iter().filter(has).map(|package| &package["name"]).collect();
+    assert_eq!(having, ["paper"]);
 }
 
 /// Rust sources of the workspace, each with its path from the top.

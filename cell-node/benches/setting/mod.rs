@@ -4,7 +4,8 @@
 mod oracle;
 mod peer;
 
-use cell_node::kernel::{Kernel, Projection, Wrench};
+use cell_node::kernel::oracle::Projection;
+use cell_node::kernel::{Kernel, Wrench};
 use protocol::fixed::Q1_14;
 use protocol::parameters::MAX_JOINTS;
 

@@ -1,6 +1,6 @@
-//! What one newton on the cell does to each joint: two kernels behind one interface.
+//! What one newton on the cell does to each joint: the cell's kernel.
 //!
-//! Both compute the paper's Eq. 8 for a cell on the link that joint k moves,
+//! It computes the paper's Eq. 8 for a cell on the link that joint k moves,
 //!
 //! ```text
 //! J_l = (z_(l-1) x (t_i - t_(l-1))) . f      for l = 1..k,   0 beyond; of a prismatic joint z_(l-1) . f,
@@ -12,21 +12,11 @@
 //! J is in m, so a newton on the cell makes J_l newton metres in joint l; of a prismatic joint it is a number, and
 //! makes newtons.
 //!
-//! - [`Wrench`] carries the contact's force and moment from the cell's link down to the base. It is the
-//!   one to use: fewer than half of the operations, and the smaller error.
-//! - [`Projection`] carries the frames from the base up to the cell, as the paper does (Eq. 20 to 25).
-//!   It is the oracle in tests, and what the wrench kernel is compared with.
-//!
-//! | UR5, cell on the last link | mul | add | sin | cos | mean torque error | max |
-//! |---|---|---|---|---|---|---|
-//! | [`Wrench`] | 40 | 24 | 5 | 5 | 1.2e-4 Nm | 1.5e-3 Nm |
-//! | [`Projection`] | 103 | 56 | 6 | 6 | 1.4e-4 Nm | 1.5e-3 Nm |
-//! | the paper (Eq. 27) | 103 | 57 | 6 | 6 | 5.4e-3 Nm | |
-//!
-//! The operations are counted by running the code on numbers that count (`oracle::Counted`). The
-//! errors, of Q3.12 words against Eq. 8 in double precision, are bounds over 300 poses with up to 6 N.
-//! J is at most 2 steps of 2^-14 m from the nearest word on a UR5, and on arms of any shape that reach
-//! less than 2 m within the 8 steps that every cell of up to 6 rows is allowed; each further row adds one. `cargo run -p cell-node --example kernels` prints what was measured.
+//! [`Wrench`] carries the contact's force and moment from the cell's link down to the base. J is at most 2 steps of
+//! 2^-14 m from the nearest word on a UR5, and on arms of any shape that reach less than 2 m within the 8 steps that every
+//! cell of up to 6 rows is allowed; each further row adds one. With the feature `oracle` there is a second kernel, the
+//! paper's, `oracle::Projection`, which has 2.5 times the operations and a larger mean error: tests, benchmarks and the
+//! paper's experiments compare the two.
 //!
 //! Any chain of 1 to 14 joints in up to 32 rows of standard Denavit-Hartenberg form will do: revolute, prismatic and
 //! fixed ones. Angles are words that wrap, `theta_l = q_l + theta_offset_l`. Twists of whole quarter turns cost no multiplication, other
@@ -34,15 +24,13 @@
 //! [`Parameters::check`] refuses are safe: with a joint k that does not exist, every J is zero.
 
 mod joint;
-#[cfg(any(feature = "oracle", test))]
+#[cfg(feature = "oracle")]
 pub mod oracle;
-mod projection;
 mod rounding;
 mod scalar;
 mod wrench;
 
-pub use projection::Projection;
-pub use scalar::{Number, Operations, PaperWord, Scalar, Steps, Word};
+pub use scalar::{Number, Operations, Scalar, Steps, Word};
 pub use wrench::Wrench;
 
 use protocol::fixed::Q1_14;

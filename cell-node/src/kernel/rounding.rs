@@ -14,12 +14,6 @@ pub(super) trait Rounding {
     fn less<N: Number>(number: N, product: N::Wide) -> N;
     /// A number and a product, less another one.
     fn more_and_less<N: Number>(number: N, more: N::Wide, less: N::Wide) -> N;
-    /// A number and two products.
-    fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N;
-    /// The sum of any two products, not rounded.
-    fn plus<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N::Wide;
-    /// Any sum, rounded.
-    fn round<N: Number>(sum: N::Wide) -> N;
     /// The negative.
     fn negative<N: Number>(number: N) -> N;
 }
@@ -51,21 +45,6 @@ impl Rounding for Held {
     #[inline(always)]
     fn more_and_less<N: Number>(number: N, more: N::Wide, less: N::Wide) -> N {
         N::round(N::minus(N::plus(number.widen(), more), less))
-    }
-
-    #[inline(always)]
-    fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N {
-        N::round(N::plus(N::plus(number.widen(), first), second))
-    }
-
-    #[inline(always)]
-    fn plus<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N::Wide {
-        N::plus(lhs, rhs)
-    }
-
-    #[inline(always)]
-    fn round<N: Number>(sum: N::Wide) -> N {
-        N::round(sum)
     }
 
     #[inline(always)]
@@ -101,21 +80,6 @@ impl Rounding for Bounded {
     #[inline(always)]
     fn more_and_less<N: Number>(number: N, more: N::Wide, less: N::Wide) -> N {
         number.bounded_more(N::bounded_minus(more, less))
-    }
-
-    #[inline(always)]
-    fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N {
-        number.bounded_more(N::bounded_plus(first, second))
-    }
-
-    #[inline(always)]
-    fn plus<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N::Wide {
-        N::bounded_plus(lhs, rhs)
-    }
-
-    #[inline(always)]
-    fn round<N: Number>(sum: N::Wide) -> N {
-        N::bounded(sum)
     }
 
     #[inline(always)]

@@ -6,7 +6,7 @@ use core::ops::{Add, Mul, Neg, Sub};
 
 use protocol::fixed::{Acc, Q1_14};
 
-use crate::sine::{FINE, QUARTER, fine_sine_cosine, paper_sine_cosine, sine_cosine};
+use crate::sine::{FINE, fine_sine_cosine, sine_cosine};
 
 /// What a kernel returns, and by which numbers it computes it.
 pub trait Scalar: Copy {
@@ -37,11 +37,6 @@ pub trait Number: Copy + Debug + PartialEq {
     #[must_use]
     fn zero() -> Self {
         Self::word(Q1_14::ZERO)
-    }
-    /// One.
-    #[must_use]
-    fn one() -> Self {
-        Self::word(QUARTER)
     }
     /// The product.
     fn times(self, rhs: Self) -> Self::Wide;
@@ -155,24 +150,6 @@ impl Word for Q1_14 {
 
     fn to_word(self) -> Q1_14 {
         self
-    }
-}
-
-/// The same words with the paper's fifth-order sine (Eq. 17 to 19).
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub struct PaperWord(pub Q1_14);
-
-impl Word for PaperWord {
-    fn from_word(word: Q1_14) -> Self {
-        Self(word)
-    }
-
-    fn to_word(self) -> Q1_14 {
-        self.0
-    }
-
-    fn sine_cosine(angle: Q1_14) -> [i32; 2] {
-        paper_sine_cosine(angle)
     }
 }
 

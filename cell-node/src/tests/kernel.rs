@@ -4,8 +4,8 @@
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use crate::contact::{Force, MAX_J, Torque};
-use crate::kernel::oracle::Counted;
-use crate::kernel::{Kernel, Operations, PaperWord, Projection, Wrench};
+use crate::kernel::oracle::{Counted, PaperWord, Projection};
+use crate::kernel::{Kernel, Operations, Wrench};
 use proptest::prelude::*;
 use protocol::fixed::{Q1_14, Q3_12, TorqueFormat};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};

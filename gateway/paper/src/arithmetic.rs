@@ -1,7 +1,7 @@
 //! The cells' arithmetic: the sine's error over the whole circle, and what one Jacobian costs.
 
-use cell_node::kernel::oracle::Counted;
-use cell_node::kernel::{Kernel, Operations, Projection, Wrench};
+use cell_node::kernel::oracle::{Counted, Projection};
+use cell_node::kernel::{Kernel, Operations, Wrench};
 use cell_node::sine::{paper_sine, sine};
 use protocol::fixed::Q1_14;
 use protocol::packet::padded;

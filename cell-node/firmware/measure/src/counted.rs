@@ -3,7 +3,8 @@
 use cell_node::contact::{Force, Torque, TorqueRounding};
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
-use cell_node::kernel::{Kernel, Projection, Wrench};
+use cell_node::kernel::oracle::Projection;
+use cell_node::kernel::{Kernel, Wrench};
 use cell_node::node::Node;
 use protocol::can::{Format, Frame};
 use protocol::fixed::{Q1_14, Q5_10};

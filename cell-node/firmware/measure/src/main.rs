@@ -11,7 +11,8 @@ mod machine;
 
 use cases::CASES;
 use cell_node::contact::{MAX_J, TorqueRounding};
-use cell_node::kernel::{Kernel, Projection, Wrench};
+use cell_node::kernel::oracle::Projection;
+use cell_node::kernel::{Kernel, Wrench};
 use cell_node::node::Node;
 use machine::Machine;
 use protocol::fixed::{Q1_14, TorqueFormat};

@@ -42,8 +42,8 @@ mod tests {
     use protocol::fixed::Q1_14;
     use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Pose, Row, RowKind};
 
-    use crate::kernel::oracle::Counted;
-    use crate::kernel::{Kernel, Operations, Projection};
+    use crate::kernel::oracle::{Counted, Projection};
+    use crate::kernel::{Kernel, Operations};
 
     /// An arm of so many rows, with quarter turns and zeros more often than by chance, some rows fixed.
     fn arm(rows: usize, words: &[i16]) -> Parameters {

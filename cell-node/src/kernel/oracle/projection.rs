@@ -19,15 +19,18 @@
 
 mod axes;
 mod range;
+mod sums;
 
 use protocol::fixed::Q1_14;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 
 use self::axes::{Axis, Frame, Height, Level, Mix, ToBase, Turn, Vector, negate};
 use self::range::is_bounded;
-use super::joint::Joint;
-use super::rounding::{Bounded, Held, Rounding};
-use super::{Kernel, Number, Scalar, Twist, chain, seldom};
+use self::sums::Sums;
+use crate::kernel::joint::Joint;
+use crate::kernel::rounding::{Bounded, Held};
+use crate::kernel::{Kernel, Number, Scalar, Twist, chain, seldom};
+use crate::sine::QUARTER;
 
 /// The projection kernel, of one cell.
 ///
@@ -130,7 +133,7 @@ impl<S: Scalar> Kernel<S> for Projection<S> {
     #[inline(always)]
     fn write_jacobian(&self, joints: &[Q1_14; MAX_JOINTS], jacobian: &mut [S; MAX_JOINTS]) {
         let mut kept = Kept::new();
-        let [zero, one] = [S::Number::zero(), S::Number::one()];
+        let [zero, one] = [S::Number::zero(), S::Number::word(QUARTER)];
         let mut axes = [[one, zero, zero], [zero, one, zero], [zero, zero, one]];
         let axes = self.axes(joints, axes.each_mut(), &mut kept);
         if self.bounded {
@@ -184,7 +187,7 @@ impl<S: Scalar> Projection<S> {
 
     /// J, from the cell down to the base; with the positions of joints where some may slide.
     #[inline(always)]
-    fn down<R: Rounding>(
+    fn down<R: Sums>(
         &self,
         axes: [&Vector<S::Number>; 3],
         kept: &Kept<S::Number>,
@@ -230,7 +233,7 @@ impl<S: Scalar> Projection<S> {
 
     /// The force and the cell's position in the base frame.
     #[inline(always)]
-    fn in_base<R: Rounding>(&self, [x, y, z]: [&Vector<S::Number>; 3]) -> [Vector<S::Number>; 2] {
+    fn in_base<R: Sums>(&self, [x, y, z]: [&Vector<S::Number>; 3]) -> [Vector<S::Number>; 2] {
         let ([x0, x1, x2], [y0, y1, y2], [z0, z1, z2]) = (*x, *y, *z);
         let vectors = [self.force, self.position];
         let two = |a: S::Number, x, b: S::Number, y| R::round(R::plus::<S::Number>(a.times(x), b.times(y)));
@@ -329,7 +332,7 @@ impl<N: Number> Link<N> {
 
     /// p_(l-1) from p_l (Eq. 24), and J of a joint that turns: (z x p) . f (Eq. 8).
     #[inline(always)]
-    fn step_down<'a, R: Rounding>(
+    fn step_down<'a, R: Sums>(
         &self,
         p: &mut Vector<N>,
         &[f0, f1, f2]: &Vector<N>,
@@ -401,7 +404,7 @@ impl<N: Number> Link<N> {
     }
 
     /// z . f, of a prismatic joint.
-    fn along<R: Rounding>(&self, &[z0, z1, z2]: &Vector<N>, &[f0, f1, f2]: &Vector<N>) -> N {
+    fn along<R: Sums>(&self, &[z0, z1, z2]: &Vector<N>, &[f0, f1, f2]: &Vector<N>) -> N {
         match self.axis {
             Axis::Up => f2,
             Axis::Down => R::negative(f2),
@@ -413,7 +416,7 @@ impl<N: Number> Link<N> {
 
 /// A component of the position with the product of a, and with that of d.
 #[inline(always)]
-fn shift<R: Rounding, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N) {
+fn shift<R: Sums, N: Number>(position: &mut N, by_a: N::Wide, d: Option<N>, z: N) {
     *position = match d {
         None => R::more(*position, by_a),
         Some(d) => R::more_and_more(*position, by_a, d.times(z)),

@@ -1,0 +1,102 @@
+//! Numbers of kernels: real ones, and words that count the operations on them.
+
+use std::cell::Cell;
+
+use protocol::fixed::Q1_14;
+
+use crate::kernel::{Number, Operations, Scalar, Word};
+
+impl Scalar for f64 {
+    type Number = Self;
+
+    fn from_number(number: Self) -> Self {
+        number
+    }
+}
+
+/// The oracle: real numbers, the library's sine and cosine, no rounding.
+impl Number for f64 {
+    type Wide = Self;
+    type Fine = Self;
+
+    fn word(word: Q1_14) -> Self {
+        word.to_f64()
+    }
+
+    fn times(self, rhs: Self) -> Self {
+        self * rhs
+    }
+
+    fn widen(self) -> Self {
+        self
+    }
+
+    fn plus(lhs: Self, rhs: Self) -> Self {
+        lhs + rhs
+    }
+
+    fn minus(lhs: Self, rhs: Self) -> Self {
+        lhs - rhs
+    }
+
+    fn round(sum: Self) -> Self {
+        sum
+    }
+
+    fn negative(self) -> Self {
+        -self
+    }
+
+    fn norm(_: [Self; 3]) -> Option<u32> {
+        None
+    }
+
+    fn sine_cosine(angle: Q1_14) -> [Self; 2] {
+        [angle.to_radians().sin(), angle.to_radians().cos()]
+    }
+
+    fn fine(word: Q1_14) -> Self {
+        word.to_f64()
+    }
+
+    fn fine_turn(angle: Q1_14) -> [Self; 3] {
+        [angle.to_radians().sin(), angle.to_radians().cos(), 1.0]
+    }
+
+    fn settle<const F: u32>(constant: Self) -> Self {
+        constant
+    }
+}
+
+std::thread_local! {
+    static DONE: Cell<Operations> = Cell::default();
+}
+
+impl Operations {
+    /// Runs a computation on [`Counted`] numbers and returns its operation count.
+    pub fn count<T>(computation: impl FnOnce() -> T) -> (T, Self) {
+        DONE.set(Self::default());
+        let result = computation();
+        (result, DONE.take())
+    }
+}
+
+/// A Q1.14 word whose operations [`Operations::count`] counts.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub struct Counted(pub Q1_14);
+
+impl Word for Counted {
+    fn from_word(word: Q1_14) -> Self {
+        Self(word)
+    }
+
+    fn to_word(self) -> Q1_14 {
+        self.0
+    }
+
+    fn note(operation: impl FnOnce(&mut Operations)) {
+        let mut done = DONE.get();
+        operation(&mut done);
+        DONE.set(done);
+    }
+}

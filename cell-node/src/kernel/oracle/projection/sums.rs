@@ -1,0 +1,48 @@
+//! How sums of more than two products become words.
+
+use crate::kernel::Number;
+use crate::kernel::rounding::{Bounded, Held, Rounding};
+
+/// What else a kernel needs that multiplies vectors of three components.
+pub(super) trait Sums: Rounding {
+    /// A number and two products.
+    fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N;
+    /// The sum of any two products, not rounded.
+    fn plus<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N::Wide;
+    /// Any sum, rounded.
+    fn round<N: Number>(sum: N::Wide) -> N;
+}
+
+impl Sums for Held {
+    #[inline(always)]
+    fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N {
+        N::round(N::plus(N::plus(number.widen(), first), second))
+    }
+
+    #[inline(always)]
+    fn plus<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N::Wide {
+        N::plus(lhs, rhs)
+    }
+
+    #[inline(always)]
+    fn round<N: Number>(sum: N::Wide) -> N {
+        N::round(sum)
+    }
+}
+
+impl Sums for Bounded {
+    #[inline(always)]
+    fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N {
+        number.bounded_more(N::bounded_plus(first, second))
+    }
+
+    #[inline(always)]
+    fn plus<N: Number>(lhs: N::Wide, rhs: N::Wide) -> N::Wide {
+        N::bounded_plus(lhs, rhs)
+    }
+
+    #[inline(always)]
+    fn round<N: Number>(sum: N::Wide) -> N {
+        N::bounded(sum)
+    }
+}
