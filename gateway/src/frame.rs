@@ -1,5 +1,6 @@
 //! `skinbus frame`: packets by hand.
 
+mod addressee;
 mod packets;
 mod sensing;
 
@@ -23,7 +24,8 @@ use protocol::usage::{Failure, print};
 use super::arguments::{BusKinds, FORMATS, bus_of, cell_of, one_of};
 use super::output;
 use super::print::list;
-use packets::{What, only_cell};
+use addressee::only_cell;
+use packets::What;
 
 /// Cells that are there send a heartbeat within this time, and answers.
 const ANSWER: Duration = Duration::from_secs(1);

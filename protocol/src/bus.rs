@@ -34,11 +34,12 @@ use socketcan::CanFdSocket;
 
 use crate::can::{Format, Frame};
 use batch::{BATCH, Batch, SMALL};
-use kinds::Carrier;
+use carrier::Carrier;
 
 pub mod batch;
 #[expect(unsafe_code, reason = "recvmmsg and sendmmsg have no safe wrapper")]
 mod calls;
+mod carrier;
 pub mod embedded;
 mod error;
 mod filter;
@@ -47,6 +48,7 @@ mod kernel;
 mod kinds;
 mod link;
 pub mod netlink;
+mod slot;
 
 pub use error::{BusError, SendError};
 pub use filter::Filter;

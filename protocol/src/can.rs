@@ -365,12 +365,6 @@ impl Frame {
     }
 }
 
-impl core::fmt::Debug for Frame {
-    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        crate::candump::write_frame(f, self)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

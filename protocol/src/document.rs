@@ -38,6 +38,9 @@ pub struct Fault {
     why: String,
 }
 
+/// What was checked, or what is wrong with it.
+pub type Checked<T> = Result<T, Fault>;
+
 /// Where a value stands in a file, or a table of them; what is wrong there, and what is not.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Place(Vec<Step>);

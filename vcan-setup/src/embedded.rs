@@ -16,10 +16,12 @@ pub mod queue;
 pub mod routing;
 mod served;
 pub mod server;
+mod totals;
 
 pub use place::PlaceError;
 pub use served::Served;
-pub use server::{ServeError, Server, Totals};
+pub use server::{ServeError, Server};
+pub use totals::Totals;
 
 #[cfg(test)]
 #[allow(unreachable_pub, reason = "the tests on a real kernel have the same table")]

@@ -19,8 +19,10 @@ pub mod options;
 pub mod outgoing;
 mod participant;
 pub mod refusals;
+mod settings;
 
 pub use account::Account;
-pub use bridge::{Bridge, BridgeError, Settings};
+pub use bridge::{Bridge, BridgeError};
 pub use event::Event;
 pub use options::{Address, LineError, LineOptions};
+pub use settings::Settings;

@@ -3,7 +3,7 @@
 use protocol::message::{Heartbeat, NetworkPage, Refused, State};
 use protocol::time::{Micros, Span};
 
-use super::{Node, Summing};
+use super::Node;
 use crate::identity::Identity;
 use crate::phase;
 
@@ -71,15 +71,7 @@ impl Node {
     /// One of four a second, with what has changed.
     pub(super) fn regular_heartbeat(&mut self, now: Micros) {
         self.push_heartbeat();
-        let Summing { network, report, .. } = &mut self.summing;
-        if network.exists() {
-            // Another round alone waits for the heartbeat.
-            report.due |= report.round != network.round();
-            self.tell_tree(now);
-            if self.summing.network.ports_changed(now) {
-                self.push_ports(now);
-            }
-        }
+        self.beat_network(now);
         let pages = self.sensing.beat(now);
         self.push_sensors(pages);
         self.beat_zero();

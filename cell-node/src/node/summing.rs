@@ -345,6 +345,19 @@ impl Node {
         }
     }
 
+    /// With a regular heartbeat: reports its place in the tree and its ports if they have changed.
+    pub(super) fn beat_network(&mut self, now: Micros) {
+        let Summing { network, report, .. } = &mut self.summing;
+        if network.exists() {
+            // Another round alone waits for the heartbeat.
+            report.due |= report.round != network.round();
+            self.tell_tree(now);
+            if self.summing.network.ports_changed(now) {
+                self.push_ports(now);
+            }
+        }
+    }
+
     pub(super) fn push_tree(&mut self, now: Micros) {
         let Summing { network, sum, report, .. } = &mut self.summing;
         report.round = network.round();

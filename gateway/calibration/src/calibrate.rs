@@ -1,6 +1,6 @@
 //! All cells of a skin: each by itself, then with its neighbours, then which of them to distrust.
 
-use nalgebra::{Matrix3, UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Cell, Skin};
 
@@ -8,47 +8,16 @@ use crate::each::each;
 use crate::estimate::{Ages, Estimate, Guess, estimate};
 use crate::help::{Help, helpful};
 use crate::lag::Lags;
-use crate::neighbors::{Known, Spacing, improve};
+use crate::neighbors::{Known, improve};
 use crate::observe::{Observations, Reading};
-use crate::plan::Bounds;
 use crate::refusal::{Disturbance, Refusal};
 use crate::result::{Calibration, CellResult, Pose, SensorResult, Summary, Trouble};
+use crate::rounded::rounded;
 use crate::table::Table;
 use crate::zero::zero_offsets;
-use model::accelerometer::kinematics::G;
 use model::accelerometer::sensor::{DataSheet, rotation};
 
-/// What is known before a calibration.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Settings {
-    /// Of the accelerometers.
-    pub sheet: DataSheet,
-    /// Gravity as seen from the robot's base, in m/s2.
-    pub gravity: [f64; 3],
-    /// How far wired cells are apart, if that is known.
-    pub spacing: Option<Spacing>,
-    /// Whether zero offsets of the robot's joints are estimated too.
-    pub zero_offsets: bool,
-    /// How many threads compute.
-    pub threads: usize,
-    /// How the robot may move: for advice only.
-    pub bounds: Bounds,
-}
-
-impl Settings {
-    /// Sensors as the default data sheet says, on a robot that stands upright.
-    #[must_use]
-    pub fn of(skin: &Skin) -> Self {
-        Self {
-            sheet: DataSheet::default(),
-            gravity: [0.0, 0.0, -G],
-            spacing: None,
-            zero_offsets: false,
-            threads: 1,
-            bounds: Bounds::of(skin),
-        }
-    }
-}
+pub use crate::settings::Settings;
 
 /// A cell that sends less than this part of what it could is named.
 const SILENT: f64 = 0.5;
@@ -67,8 +36,6 @@ const MUCH_SHIFTED: f64 = 0.005;
 const SHIFTS: usize = 5;
 /// The logarithm of a likelihood ratio above which one joint is better than the next.
 const SURE: f64 = 10.0;
-/// Poses that are less certain than this are not determined: in m, and in rad.
-const ENOUGH: [f64; 2] = [0.02, 0.09];
 /// Another described pose is nearer if it is this many times nearer.
 const NEARER: f64 = 2.0;
 
@@ -434,32 +401,6 @@ fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult],
             help,
         });
     }
-}
-
-impl Pose {
-    /// Whether it is certain enough to be used.
-    #[must_use]
-    pub fn is_determined(&self) -> bool {
-        let [position, turn] = ENOUGH;
-        self.position_95() < position && self.turn_95() < turn
-    }
-
-    /// The same, seen from another frame of the same link.
-    pub(crate) fn seen_from(&self, (turn, shift): (&UnitQuaternion<f64>, &Vector3<f64>)) -> Self {
-        let matrix: Matrix3<f64> = turn.to_rotation_matrix().matrix().to_owned();
-        Self {
-            position: turn * self.position + shift,
-            rotation: turn * self.rotation,
-            position_covariance: matrix * self.position_covariance * matrix.transpose(),
-            ..*self
-        }
-    }
-}
-
-/// To so many digits behind the point.
-pub(crate) fn rounded(value: f64, digits: i32) -> f64 {
-    let scale = 10.0_f64.powi(digits);
-    (value * scale).round() / scale + 0.0
 }
 
 #[expect(clippy::cast_precision_loss, reason = "counts of readings")]

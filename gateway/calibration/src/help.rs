@@ -4,11 +4,11 @@ use nalgebra::{Cholesky, Matrix3};
 use protocol::skin::Skin;
 use serde::Serialize;
 
-use crate::calibrate::Settings;
 use crate::cell::{Information, POSITION, TURN};
 use crate::estimate::Estimate;
 use crate::motion::Step;
 use crate::plan::{AIM, SWING_S, Supposed, Swings, informed, poses};
+use crate::settings::Settings;
 use model::accelerometer::kinematics::Arm;
 
 /// What would help where a pose is not determined.

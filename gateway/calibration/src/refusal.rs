@@ -3,8 +3,8 @@
 use serde::Serialize;
 use thiserror::Error;
 
-use crate::calibrate::rounded;
 use crate::observe::{BusObservations, Gap};
+use crate::rounded::rounded;
 
 /// Gaps in the broadcasts of a recording.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]

@@ -4,11 +4,14 @@ use nalgebra::{Matrix3, SymmetricEigen, UnitQuaternion, Vector3};
 use protocol::skin::{Cell, Skin};
 use serde::Serialize;
 
-use crate::calibrate::rounded;
 use crate::help::Help;
 use crate::refusal::Disturbance;
+use crate::rounded::rounded;
 use crate::zero::ZeroOffset;
 use model::accelerometer::kinematics::Arm;
+
+/// Poses that are less certain than this are not determined: in m, and in rad.
+const ENOUGH: [f64; 2] = [0.02, 0.09];
 
 /// What was found.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -273,6 +276,24 @@ impl Pose {
     #[must_use]
     pub fn turn_95(&self) -> f64 {
         radius_95(&self.turn_covariance)
+    }
+
+    /// Whether it is certain enough to be used.
+    #[must_use]
+    pub fn is_determined(&self) -> bool {
+        let [position, turn] = ENOUGH;
+        self.position_95() < position && self.turn_95() < turn
+    }
+
+    /// The same, seen from another frame of the same link.
+    pub(crate) fn seen_from(&self, (turn, shift): (&UnitQuaternion<f64>, &Vector3<f64>)) -> Self {
+        let matrix: Matrix3<f64> = turn.to_rotation_matrix().matrix().to_owned();
+        Self {
+            position: turn * self.position + shift,
+            rotation: turn * self.rotation,
+            position_covariance: matrix * self.position_covariance * matrix.transpose(),
+            ..*self
+        }
     }
 }
 

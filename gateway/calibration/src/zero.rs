@@ -11,12 +11,13 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{JointKind, Skin};
 use serde::Serialize;
 
-use crate::calibrate::{Settings, rounded};
 use crate::cell::{Information, MOMENT, UNKNOWNS, Unknowns, expected};
 use crate::each::each;
 use crate::estimate::{Estimate, paired, residual};
 use crate::lag::Lags;
 use crate::observe::{Observations, Reading};
+use crate::rounded::rounded;
+use crate::settings::Settings;
 use crate::table::Table;
 
 /// Offsets that are supposed beforehand, as a standard deviation in rad or m.

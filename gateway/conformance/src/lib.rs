@@ -19,6 +19,7 @@ mod saved;
 mod session;
 pub mod survey;
 mod timing;
+mod timings;
 
 pub use checks::run;
 pub use saved::Saved;

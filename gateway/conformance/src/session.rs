@@ -19,7 +19,7 @@ use protocol::time::{Micros, Span};
 
 use crate::bus::{Bus, Seen, Stop};
 use crate::findings::Findings;
-use crate::timing::Timings;
+use crate::timings::Timings;
 
 pub(crate) use exchange::Exchange;
 pub(crate) use joints::Step;

@@ -1,6 +1,4 @@
-//! How long answers took.
-
-use std::collections::BTreeMap;
+//! Checks of how long answers take.
 
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Span;
@@ -8,56 +6,7 @@ use protocol::time::Span;
 use crate::arm;
 use crate::bus::Stop;
 use crate::session::Session;
-
-/// A bench that was late by more than this does not blame the cell for what was late meanwhile.
-const LATE: Span = Span::from_millis(1);
-
-/// What is limited by TIME-2, and by how many ms.
-const LIMITS: [(&str, u64); 6] = [
-    ("torque", 4),
-    ("heartbeat to sync", 10),
-    ("heartbeat to a claimant", 20),
-    ("configured", 50),
-    ("commit", 300),
-    ("report", 100),
-];
-
-#[derive(Clone, Copy, Debug, Default)]
-struct Times {
-    in_time: usize,
-    late: usize,
-    /// Late, and so was the bench.
-    blameless: usize,
-    longest: Span,
-}
-
-/// Times of answers by what they answer.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct Timings(BTreeMap<&'static str, Times>);
-
-impl Timings {
-    /// An answer took so long, while the bench was so late itself.
-    pub(crate) fn note(&mut self, what: &'static str, took: Span, bench: Span) {
-        let times = self.0.entry(what).or_default();
-        let limit = LIMITS.iter().find(|(name, _)| *name == what);
-        let is_late = limit.is_some_and(|(_, limit)| took > Span::from_millis(*limit));
-        match (is_late, bench > LATE) {
-            (false, _) => times.in_time += 1,
-            (true, true) => times.blameless += 1,
-            (true, false) => times.late += 1,
-        }
-        if bench <= LATE {
-            times.longest = times.longest.max(took);
-        }
-    }
-}
-
-impl Times {
-    /// Of many answers one in 50 may be late.
-    const fn are_right(self) -> bool {
-        self.late * 50 <= self.in_time + self.late || self.late == 1 && self.in_time > 0
-    }
-}
+use crate::timings::{LIMITS, Times};
 
 impl Session<'_> {
     /// Measures how long answers take at 62.5 joints a second; again what came too late, for the computer of a simulated cell

@@ -27,13 +27,3 @@ pub(crate) fn figures(link: &Link, surface: &Surface<'_>, spots: &[Spot], pitch:
         tilt: spots.iter().map(|spot| spot.tilt).fold(0.0, f64::max),
     }
 }
-
-/// The middle one of some numbers; of two the larger.
-pub(crate) fn median(values: &mut [f64]) -> Option<f64> {
-    let middle = values.len() / 2;
-    if values.is_empty() {
-        return None;
-    }
-    let (_, median, _) = values.select_nth_unstable_by(middle, f64::total_cmp);
-    Some(*median)
-}

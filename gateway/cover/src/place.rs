@@ -8,7 +8,6 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use crate::Options;
-use crate::figures::median;
 use crate::grid::Grid;
 use crate::relax::{Field, Site};
 use crate::surface::{Sample, Surface, cell_area, real};
@@ -104,6 +103,16 @@ pub(crate) fn spacing(spots: &[Spot], pitch: f64) -> Option<f64> {
     // A cell that is alone on its side says nothing of the spacing.
     let nearest = spots.iter().filter_map(nearest).filter(|&distance| distance < 3.0 * pitch);
     median(&mut nearest.collect::<Vec<_>>())
+}
+
+/// The middle one of some numbers; of two the larger.
+fn median(values: &mut [f64]) -> Option<f64> {
+    let middle = values.len() / 2;
+    if values.is_empty() {
+        return None;
+    }
+    let (_, median, _) = values.select_nth_unstable_by(middle, f64::total_cmp);
+    Some(*median)
 }
 
 /// The places on the mesh for relaxed sites.

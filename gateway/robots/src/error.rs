@@ -5,7 +5,7 @@ use thiserror::Error;
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS};
 use protocol::skin::REACH;
 
-use crate::chain::{MAX_LENGTH_M, MAX_RESIDUAL};
+use crate::rows::{MAX_LENGTH_M, MAX_RESIDUAL};
 
 /// What is wrong, and in which file: one line.
 #[derive(Clone, Debug, Error, PartialEq)]

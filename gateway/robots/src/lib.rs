@@ -40,17 +40,17 @@ mod taken;
 mod urdf;
 mod written;
 
-pub use chain::{Chain, Joint, LinkFrame, MAX_LENGTH_M, MAX_RESIDUAL};
+pub use chain::{Chain, Joint, LinkFrame};
 pub use describe::{CELLS_OF_A_BUS, CellOnLink, Import, ImportError};
 pub use error::{Problem, RobotError};
 pub use links::LinkPose;
 pub use nalgebra::Isometry3;
 pub use protocol::parameters::RowKind;
 pub use protocol::skin::JointKind;
-pub use rows::{Row, frames, pose_of};
-pub use taken::{Taken, chain_words};
+pub use rows::{MAX_LENGTH_M, MAX_RESIDUAL, Row, frames, pose_of};
+pub use taken::{Taken, chain_words, word};
 pub use urdf::{Geometry, Shape, Urdf, text};
-pub use written::{Written, word, written};
+pub use written::{Written, written};
 
 #[cfg(test)]
 mod tests;

@@ -2,10 +2,15 @@
 
 use core::f64::consts::{FRAC_PI_2, PI};
 
-use crate::chain::MAX_LENGTH_M;
 use nalgebra::{Isometry3, Matrix4, Point3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use protocol::parameters::RowKind;
 use protocol::skin::{Base, ChainRow, DenavitHartenberg, JointKind};
+
+/// `a` and `d` of a row are at least minus this and below it, in m.
+pub const MAX_LENGTH_M: f64 = 2.0;
+
+/// How much the rows may differ from the URDF, in m or rad.
+pub const MAX_RESIDUAL: f64 = 1e-9;
 
 /// Two axes whose angle has a smaller sine are parallel, and an angle that is nearer to a whole quarter turn is one: pi / 2
 /// written with 12 digits leaves 5e-12.

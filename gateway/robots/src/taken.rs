@@ -4,8 +4,6 @@ use std::collections::BTreeSet;
 
 use protocol::skin::Skin;
 
-use crate::written::word;
-
 /// Names that are taken.
 #[derive(Clone, Debug, Default)]
 pub struct Taken(BTreeSet<String>);
@@ -33,6 +31,12 @@ impl Taken {
             number += 1;
         }
     }
+}
+
+/// A name as a frame or a topic may have it.
+#[must_use]
+pub fn word(name: &str) -> String {
+    name.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '_' }).collect()
 }
 
 /// The words that stand for the chains of a skin in names of links, each another one; empty for an only chain.

@@ -192,12 +192,6 @@ fn shape(out: &mut String, xyz: [f64; 3], rpy: [f64; 3], geometry: &str) {
     );
 }
 
-/// A name as a frame or a topic may have it.
-#[must_use]
-pub fn word(name: &str) -> String {
-    name.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '_' }).collect()
-}
-
 fn escaped(name: &str) -> String {
     name.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

@@ -5,24 +5,14 @@ use model::decode::parameter;
 use model::decode::pick::Party;
 use model::scenario::contact_words;
 use protocol::fixed::{Q, Q1_14, Q5_10};
-use protocol::id::{CellId, Kind, Node};
+use protocol::id::Kind;
 use protocol::message::{From, Joints, Message, Request, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::schema::packets;
 
+use super::addressee::addressee;
 use super::sensing;
-
-/// The cell that a packet is for; `None` is every cell.
-pub(super) const fn only_cell(addressee: &Party) -> Option<CellId> {
-    if let Node::Cell(cell) = addressee.node { Some(cell) } else { None }
-}
-
-/// Parses whom a packet is for, which is never the gateway.
-pub(super) fn addressee(text: &str) -> Result<Party, String> {
-    let party = text.parse().ok().filter(|party: &Party| party.node != Node::Gateway);
-    party.ok_or_else(|| "a node id, 1 to 254, BUS:NODE, or everyone is possible".to_owned())
-}
 
 #[derive(Debug, Subcommand)]
 pub(super) enum What {
@@ -279,6 +269,7 @@ fn contact(text: &str) -> Result<[Q5_10; 3], String> {
 mod tests {
     use super::*;
     use clap::Parser;
+    use protocol::id::Node;
 
     #[derive(Parser)]
     struct Line {

@@ -10,7 +10,7 @@ use protocol::parameters::{Parameter, Sensing};
 use protocol::skin::sensing::continuous;
 use protocol::usage::{Failure, print};
 
-use super::packets::{addressee, only_cell};
+use super::addressee::{addressee, only_cell};
 use crate::arguments::{Word, one_of};
 use model::decode::pick::Party;
 

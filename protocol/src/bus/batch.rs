@@ -9,7 +9,10 @@ use rustix::io::Errno;
 use rustix::net::SendFlags;
 
 use super::calls;
+use super::slot::Slot;
 use crate::can::FD_BYTES;
+
+pub use super::slot::Notes;
 
 /// How many datagrams one call moves at most.
 pub const BATCH: usize = 64;
@@ -18,16 +21,6 @@ pub const BATCH: usize = 64;
 const FEW: usize = 4;
 /// Most sends are of so many at most; as with [`FEW`], room for 64 costs more.
 pub(super) const SMALL: usize = 8;
-
-/// Room for one datagram and the kernel's data about it.
-pub(super) struct Slot {
-    pub(super) bytes: [u8; FD_BYTES],
-    /// Control messages: a time stamp (32 bytes) and a drop count (24 bytes).
-    pub(super) control: [u64; 8],
-    pub(super) len: usize,
-    pub(super) control_len: usize,
-    pub(super) flags: i32,
-}
 
 /// Buffers for up to [`BATCH`] datagrams of at most 72 bytes.
 pub struct Batch {
@@ -132,79 +125,6 @@ impl std::fmt::Debug for Datagram<'_> {
     }
 }
 
-/// What the kernel notes beside a datagram.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Notes {
-    /// `SO_TIMESTAMPNS`: nanoseconds of the wall clock.
-    pub at_nanos: Option<u64>,
-    /// `SO_RXQ_OVFL`: how many the socket has dropped so far.
-    pub dropped: Option<u32>,
-}
-
-impl Notes {
-    fn read(control: &[u8]) -> Self {
-        let mut notes = Self::default();
-        for ControlMessage { kind, data } in ControlMessages(control) {
-            if kind == libc::SCM_TIMESTAMPNS {
-                notes.at_nanos = nanoseconds(data);
-            } else if kind == libc::SO_RXQ_OVFL {
-                notes.dropped = data.first_chunk().map(|&bytes| u32::from_ne_bytes(bytes));
-            }
-        }
-        notes
-    }
-}
-
-/// A control message of the level `SOL_SOCKET`.
-struct ControlMessage<'a> {
-    kind: i32,
-    data: &'a [u8],
-}
-
-/// Walks control messages: length, level, type, then the data, each padded to a word.
-struct ControlMessages<'a>(&'a [u8]);
-
-impl<'a> Iterator for ControlMessages<'a> {
-    type Item = ControlMessage<'a>;
-
-    fn next(&mut self) -> Option<ControlMessage<'a>> {
-        const WORD: usize = size_of::<usize>();
-        const HEAD: usize = size_of::<libc::cmsghdr>();
-        loop {
-            let (head, _) = self.0.split_first_chunk::<HEAD>()?;
-            let (len, rest) = head.split_at(WORD);
-            let len = len.try_into().map_or(0, usize::from_ne_bytes);
-            let number = |at| {
-                rest.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |&bytes| i32::from_ne_bytes(bytes))
-            };
-            let data = self.0.get(HEAD..len)?;
-            self.0 = self.0.get(len.next_multiple_of(WORD)..).unwrap_or_default();
-            if number(0) == libc::SOL_SOCKET {
-                return Some(ControlMessage { kind: number(4), data });
-            }
-        }
-    }
-}
-
-/// Hands out the descriptors that came with a datagram (`SCM_RIGHTS`).
-pub(super) fn each_passed(slot: &Slot, mut take: impl FnMut(i32)) {
-    let words = slot.control.map(u64::to_ne_bytes);
-    let messages = ControlMessages(words.as_flattened().get(..slot.control_len).unwrap_or_default());
-    for message in messages.filter(|message| message.kind == libc::SCM_RIGHTS) {
-        let (descriptors, _) = message.data.as_chunks();
-        descriptors.iter().for_each(|&bytes| take(i32::from_ne_bytes(bytes)));
-    }
-}
-
-/// A `struct timespec` of two 64-bit words.
-fn nanoseconds(timespec: &[u8]) -> Option<u64> {
-    let (seconds, rest) = timespec.split_first_chunk()?;
-    let nanos = rest.first_chunk()?;
-    let seconds = u64::try_from(i64::from_ne_bytes(*seconds)).ok()?;
-    let nanos = u64::try_from(i64::from_ne_bytes(*nanos)).ok()?;
-    seconds.checked_mul(1_000_000_000)?.checked_add(nanos)
-}
-
 /// Datagrams on their way out: at most N of at most 72 bytes.
 pub struct Outgoing<const N: usize = BATCH> {
     bytes: [[u8; FD_BYTES]; N],
@@ -293,7 +213,6 @@ impl<const N: usize> std::fmt::Debug for Outgoing<N> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use proptest::prelude::*;
     use rustix::net::{AddressFamily, SocketFlags, SocketType, socketpair};
 
     #[test]
@@ -375,13 +294,6 @@ mod tests {
             assert!(datagram.notes().at_nanos.is_some());
             // Nobody has the pipe's other end open.
             assert_eq!(rustix::io::read(&read, &mut [0]).unwrap(), 0, "{count}");
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn no_control_bytes_panic(bytes in proptest::collection::vec(any::<u8>(), 0..80)) {
-            let _ = Notes::read(&bytes);
         }
     }
 }

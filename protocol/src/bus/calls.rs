@@ -6,7 +6,7 @@ use std::io;
 use std::mem;
 use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
 
-use super::batch::{Slot, each_passed};
+use super::slot::{Slot, each_passed};
 
 /// Asks for `SCHED_BATCH`; whether it was granted.
 pub(super) fn set_batch() -> bool {

@@ -3,7 +3,7 @@
 use std::io;
 
 use super::batch::{BATCH, Batch};
-use super::kinds::Carrier;
+use super::carrier::Carrier;
 use crate::can::Frame;
 
 /// One received frame.

@@ -8,7 +8,7 @@ use rustix::net::{AddressFamily, Protocol, SocketFlags, SocketType, sockopt};
 use socketcan::{CanAddr, CanFdSocket, CanFilter, Socket, SocketOptions};
 
 use super::batch::{Batch, Datagram};
-use super::kinds::Carrier;
+use super::carrier::Carrier;
 use super::link::Link;
 use super::{Bus, BusError, Filter, Options};
 

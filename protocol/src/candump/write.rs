@@ -88,6 +88,12 @@ pub fn write_frame(out: &mut impl Write, frame: &Frame) -> fmt::Result {
     out.write_str(text.as_str())
 }
 
+impl fmt::Debug for Frame {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write_frame(f, self)
+    }
+}
+
 /// ASCII of at most `N` bytes.
 struct Text<const N: usize> {
     bytes: [u8; N],

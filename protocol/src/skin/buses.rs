@@ -2,10 +2,9 @@
 
 use std::collections::HashSet;
 
-use super::check::Checked;
 use super::{Bus, JointKind, Reply, Robot, raw, sensing};
 use crate::can::Format;
-use crate::document::Place;
+use crate::document::{Checked, Place};
 use crate::fixed::TorqueFormat;
 use crate::wire_time::BitRates;
 

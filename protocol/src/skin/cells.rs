@@ -2,16 +2,13 @@
 
 use std::collections::HashMap;
 
-use super::check::Checked;
+use super::chains::unit;
 use super::reach::{REACH, reach};
 use super::{Bus, Cell, Robot, baseline, raw};
-use crate::document::Place;
+use crate::document::{Checked, Place};
 use crate::fixed::Q;
 use crate::id::CellId;
 use crate::parameters::{Baseline, Contact};
-
-/// How far a quaternion's length may be from one.
-const UNIT_TOLERANCE: f64 = 1e-3;
 
 /// What a cell has that overrides none of it.
 #[derive(Clone, Copy)]
@@ -192,15 +189,4 @@ fn normal(at: &Place, raw: &raw::Cell) -> Checked<[f64; 3]> {
             Err(at.key("normal").fault("", why))
         }
     }
-}
-
-/// Parts of length one, exactly.
-pub(super) fn unit<const N: usize>(at: &Place, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
-    let length = parts.iter().map(|part| part * part).sum::<f64>().sqrt();
-    if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
-        let got = parts.map(|part| part.to_string()).join(", ");
-        let why = format!("this {what} has length {length:.6}; it must be 1 within {UNIT_TOLERANCE}");
-        return Err(at.fault(format_args!("[{got}]"), why));
-    }
-    Ok(parts.map(|part| part / length))
 }

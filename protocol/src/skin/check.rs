@@ -1,12 +1,11 @@
 //! From the file's words to checked types.
 
-use super::{Bus, Cell, baseline, buses, cells};
-use super::{Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing, names, raw, robot, sensing};
-use crate::document::{Fault, Place, span};
+use super::chains::{self, same_length};
+use super::{Bus, Cell, Controller, ControllerKind, LostBus, Reply, Safety, Skin, Timing};
+use super::{baseline, buses, cells, names, raw, sensing};
+use crate::document::{Checked, Place, span};
 use crate::fixed::Q;
 use crate::parameters::Contact;
-
-pub(super) type Checked<T> = Result<T, Fault>;
 
 /// A whole skin.
 pub(super) fn skin(raw: raw::Skin) -> Checked<Skin> {
@@ -35,7 +34,7 @@ fn checked(raw: raw::Skin, has_cells: impl Fn(&Bus) -> bool) -> Checked<Skin> {
     if raw.version != 1 {
         return Err(Place::named("version").fault(raw.version, "this program reads version 1"));
     }
-    let robot = robot::robot(raw.robot)?;
+    let robot = chains::robot(raw.robot)?;
     let timing = timing(&raw.timing)?;
     // The default for a skin without contacts: the force is the sum of the three words.
     let plain = Contact { alpha_c: Q::nearest(1.0), ..Contact::default() };
@@ -97,14 +96,6 @@ fn tree(skin: &Skin, index: usize, slot_us: u32, period_us: u16) -> Checked<()> 
     };
     let why = format!("the tree needs {slots} slots within the {period_us} us from joints to joints: {hint}");
     Err(at.key("slot_us").fault(slot_us, why))
-}
-
-pub(super) fn same_length(at: &Place, got: usize, joints: usize) -> Checked<()> {
-    if got == joints {
-        return Ok(());
-    }
-    let why = format!("one for each of the robot's {joints} joints is needed");
-    Err(at.fault(format_args!("{got} values"), why))
 }
 
 fn timing(raw: &raw::Timing) -> Checked<Timing> {

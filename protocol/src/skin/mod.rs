@@ -7,6 +7,7 @@ mod baseline;
 mod buses;
 mod cell_name;
 mod cells;
+mod chains;
 mod check;
 mod names;
 mod part;

@@ -1,8 +1,7 @@
 //! Names in a skin file: they reach terminals, URDF, SVG and topics, and nobody may be misled by one.
 
-use super::check::Checked;
 use super::raw;
-use crate::document::Place;
+use crate::document::{Checked, Place};
 use crate::usage::{is_unprintable, shown};
 
 /// The longest name, in characters.

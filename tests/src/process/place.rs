@@ -11,8 +11,7 @@ use rustix::process::Pid;
 use tempfile::TempDir;
 
 use super::running::{Running, all_processes, command_line, proc};
-use super::test_client::TestClient;
-use super::{PRESSED, Summary, TIMEOUT, names, program, skin, vcan};
+use super::{PRESSED, Summary, TIMEOUT, names, program, skin};
 
 /// A directory of its own for a test, and in it its embedded buses.
 pub struct Place {
@@ -23,13 +22,12 @@ pub struct Place {
 
 impl Place {
     pub fn new() -> Self {
-        Self { directory: TempDir::new().unwrap(), kind: BusKind::Embedded }
+        Self::on(BusKind::Embedded)
     }
 
-    /// One whose benches run on `vcan0` of a network that is the test's own.
-    pub fn on_vcan() -> Self {
-        vcan::own_network();
-        Self { kind: BusKind::SocketCan, ..Self::new() }
+    /// One whose benches run on buses of this kind.
+    pub(super) fn on(kind: BusKind) -> Self {
+        Self { directory: TempDir::new().unwrap(), kind }
     }
 
     /// What its benches run on.
@@ -133,16 +131,6 @@ impl Place {
     /// What a bench left.
     pub fn summary(&self) -> Summary {
         Summary(serde_json::from_str(&self.read("run.json")).unwrap())
-    }
-
-    /// Another client of its bus.
-    pub fn test_client(&self) -> TestClient {
-        self.test_client_of(protocol::can::Format::Fd)
-    }
-
-    /// The same on a bus of another format.
-    pub fn test_client_of(&self, format: protocol::can::Format) -> TestClient {
-        TestClient::on(self, "vcan0", format)
     }
 
     /// Processes of this place that live, with their command lines.

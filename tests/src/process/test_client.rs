@@ -21,6 +21,18 @@ pub struct TestClient {
     decoder: RefCell<Decoder>,
 }
 
+impl Place {
+    /// Another client of its bus.
+    pub fn test_client(&self) -> TestClient {
+        self.test_client_of(Format::Fd)
+    }
+
+    /// The same on a bus of another format.
+    pub fn test_client_of(&self, format: Format) -> TestClient {
+        TestClient::on(self, "vcan0", format)
+    }
+}
+
 impl TestClient {
     pub fn on(place: &Place, bus: &str, format: Format) -> Self {
         Self::on_kind(place, bus, format, Choice::Only(place.kind()))

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
 
 use model::generate::{Target, generate};
+use protocol::bus::BusKind;
 use protocol::can::Frame;
 use protocol::candump::{Line, parse, parse_frame};
 use protocol::id::{Id, Kind};
@@ -18,6 +19,14 @@ use protocol::id::{Id, Kind};
 use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 
 use super::{Place, until};
+
+impl Place {
+    /// One whose benches run on `vcan0` of a network that is the test's own.
+    pub fn on_vcan() -> Self {
+        own_network();
+        Self::on(BusKind::SocketCan)
+    }
+}
 
 /// Moves this thread, and the processes it starts from now on, into a new network with `lo` and `vcan0`. In a lab
 /// machine the network is the machine's, with its controllers: there `SKINBUS_NETWORK` is `here`.

@@ -2,10 +2,9 @@
 
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{BusError, BusKind, Choice};
+use protocol::bus::{BusError, BusKind};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::Errno;
 use thiserror::Error;
@@ -13,25 +12,13 @@ use thiserror::Error;
 use super::account::Account;
 use super::event::Event;
 use super::options::LineOptions;
-use super::participant::{Participant, Ready, open};
+use super::participant::{Participant, Ready};
+use super::settings::{Settings, open};
 
 /// How long a line may take at the end for what it has begun and for closing its adapter.
 const CLOSING: Duration = Duration::from_millis(500);
 /// Between two attempts at the start.
 const AGAIN: Duration = Duration::from_millis(20);
-
-/// The bus of some lines.
-#[derive(Clone, Debug, Eq, PartialEq)]
-pub struct Settings {
-    /// Its name.
-    pub bus: String,
-    /// Its kind.
-    pub choice: Choice,
-    /// Where embedded buses live; `None` is the usual directory.
-    pub directory: Option<PathBuf>,
-    /// Begin without lines that are away, and open them when they are there.
-    pub wait: bool,
-}
 
 /// Why lines cannot be joined to a bus.
 #[derive(Debug, Error)]

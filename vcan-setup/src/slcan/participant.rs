@@ -3,17 +3,17 @@
 use std::io;
 use std::time::{Duration, Instant};
 
-use protocol::bus::{Bus, BusError, Filter, Inbox, Options};
+use protocol::bus::{Bus, BusError, Inbox};
 use rustix::event::PollFlags;
 
 use super::account::{Account, Faults, faults_since};
-use super::bridge::Settings;
 use super::event::Event;
 use super::incoming::Incoming;
 use super::link::{Opener, Port};
 use super::options::{LineOptions, Stage};
 use super::outgoing::{Outgoing, closing};
 use super::refusals::{Action, Refusals};
+use super::settings::{Settings, open};
 
 /// From one attempt to open what is away to the next.
 const AGAIN: Duration = Duration::from_millis(100);
@@ -438,24 +438,5 @@ impl Participant {
         }
         self.outgoing.give_up();
         closed
-    }
-}
-
-/// Opens the client of a line.
-pub(super) fn open(settings: &Settings, line: &LineOptions) -> Result<Bus, BusError> {
-    let filters = if line.filters.is_empty() { vec![Filter::ALL] } else { line.filters.clone() };
-    let mut options = Options {
-        filters,
-        send_timeout: Duration::ZERO,
-        directory: settings.directory.clone(),
-        ..Options::default()
-    };
-    let open = |options: &Options| Bus::open(&settings.bus, settings.choice, options);
-    match open(&options) {
-        Err(BusError::ClassicOnly { .. }) if line.classic => {
-            options.fd = false;
-            open(&options)
-        }
-        opened => opened,
     }
 }

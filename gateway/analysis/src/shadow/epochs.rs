@@ -3,11 +3,9 @@
 use model::quantiles::Times;
 use protocol::id::CellId;
 use protocol::packet::Epoch;
-use serde::Serialize;
 
-use super::report::{Delays, Replies};
+use super::report::{Answering, Delays, Replies};
 use crate::fit::traffic::Says;
-use crate::fit::verdict::Cells;
 
 /// A set of cells of a bus.
 #[derive(Clone, Copy, Debug, Default)]
@@ -21,31 +19,6 @@ impl Set {
 
     fn len(&self) -> u32 {
         self.0.iter().map(|word| word.count_ones()).sum()
-    }
-}
-
-/// Cells that answered, epoch by epoch.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
-pub struct Answering {
-    /// Joints that were sent while cells were not halted.
-    pub epochs: u64,
-    /// Joints that were sent while they were.
-    pub epochs_halted: u64,
-    /// How many cells answered joints on average; none without joints.
-    pub mean: Option<f64>,
-    /// How many answered the same joints at most.
-    pub most: u32,
-    /// Cells of the bus, by the skin, else those that were received.
-    pub cells: u32,
-    /// Whether that is from the skin.
-    pub described: bool,
-}
-
-impl Answering {
-    /// In the words of [`crate::fit::verdict`].
-    #[must_use]
-    pub const fn cells(&self) -> Cells {
-        Cells::Some { most: self.most, cells: self.cells, described: self.described }
     }
 }
 

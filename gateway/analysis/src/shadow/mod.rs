@@ -31,9 +31,10 @@ use bus_timing::{Known, LinkId};
 use reported::Reported;
 
 pub use bus_timing::MAX_QUEUE;
-pub use epochs::Answering;
 pub use phase::PAUSE_NS;
-pub use report::{BusShadow, Counts, Delays, KindDelays, Loads, Most, Replies, Report, StartUp, Stretches};
+pub use report::{
+    Answering, BusShadow, Counts, Delays, KindDelays, Loads, Most, Replies, Report, StartUp, Stretches,
+};
 pub use reported::Shaded;
 pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
 

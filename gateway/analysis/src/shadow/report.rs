@@ -4,9 +4,8 @@ use model::quantiles::Times;
 use protocol::wire_time::BitRates;
 use serde::{Serialize, Serializer};
 
-use super::epochs::Answering;
 use crate::fit::traffic::BenchFrames;
-use crate::fit::verdict::Answer;
+use crate::fit::verdict::{Answer, Cells};
 
 /// All buses.
 #[derive(Clone, Debug, Serialize)]
@@ -173,6 +172,31 @@ pub struct KindDelays {
     pub kind: &'static str,
     /// How long it took.
     pub delay_us: Delays,
+}
+
+/// Cells that answered, epoch by epoch.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
+pub struct Answering {
+    /// Joints that were sent while cells were not halted.
+    pub epochs: u64,
+    /// Joints that were sent while they were.
+    pub epochs_halted: u64,
+    /// How many cells answered joints on average; none without joints.
+    pub mean: Option<f64>,
+    /// How many answered the same joints at most.
+    pub most: u32,
+    /// Cells of the bus, by the skin, else those that were received.
+    pub cells: u32,
+    /// Whether that is from the skin.
+    pub described: bool,
+}
+
+impl Answering {
+    /// In the words of [`crate::fit::verdict`].
+    #[must_use]
+    pub const fn cells(&self) -> Cells {
+        Cells::Some { most: self.most, cells: self.cells, described: self.described }
+    }
 }
 
 /// Answers to joints.

@@ -5,8 +5,6 @@ use std::path::PathBuf;
 
 use thiserror::Error;
 
-use super::exchange::Counts;
-
 /// What an external controller lacks that counts as absent. Each says what to do.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
@@ -72,25 +70,6 @@ impl Display for Others {
             (count, 0) => write!(f, " ({})", named(count)),
             (0, count) => write!(f, " ({})", unnamed(count)),
             (count, more) => write!(f, " ({}, {})", named(count), unnamed(more)),
-        }
-    }
-}
-
-impl Absence {
-    /// Why it counts as absent, if it does: it has never answered, or not in the `silent` last ticks, which are as many as
-    /// halt a robot whose controller had begun.
-    pub(super) fn of(socket: PathBuf, counts: &Counts, silent: Option<u32>) -> Option<Self> {
-        let &Counts { hellos, answers, missing, late, other_senders, failed, .. } = counts;
-        match (hellos, answers, silent) {
-            (0, ..) => {
-                Some(Self::NoHello { socket, others: Others { named: other_senders, unnamed: failed } })
-            }
-            (_, 0, _) => {
-                let nonsense = counts.nonsense.iter().sum();
-                Some(Self::NoAnswer { socket, missing, late, nonsense })
-            }
-            (.., Some(ticks)) => Some(Self::Gone { socket, answers, ticks }),
-            (.., None) => None,
         }
     }
 }

@@ -1,5 +1,8 @@
 //! The pending answer, and a tick's handling of received datagrams: no socket, no clock.
 
+use std::path::PathBuf;
+
+use super::absence::{Absence, Others};
 use super::datagram::{Command, Heard, Nonsense};
 use crate::controller::{BadCycle, Input, Pace, Step};
 
@@ -46,6 +49,24 @@ impl Counts {
         own.into_iter()
             .map(|(name, count)| (name.to_owned(), count))
             .chain(nonsense.map(|(why, count)| (format!("nonsense: {why}"), count)))
+    }
+
+    /// Why the controller counts as absent, if it does: it has never answered, or not in the `silent` last ticks, which are
+    /// as many as halt a robot whose controller had begun.
+    pub(super) fn absence(&self, socket: PathBuf, silent: Option<u32>) -> Option<Absence> {
+        let &Self { hellos, answers, missing, late, other_senders, failed, .. } = self;
+        match (hellos, answers, silent) {
+            (0, ..) => {
+                let others = Others { named: other_senders, unnamed: failed };
+                Some(Absence::NoHello { socket, others })
+            }
+            (_, 0, _) => {
+                let nonsense = self.nonsense.iter().sum();
+                Some(Absence::NoAnswer { socket, missing, late, nonsense })
+            }
+            (.., Some(ticks)) => Some(Absence::Gone { socket, answers, ticks }),
+            (.., None) => None,
+        }
     }
 
     fn nonsense(&mut self, why: Nonsense) {

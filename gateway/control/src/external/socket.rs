@@ -137,7 +137,7 @@ impl Controller for External {
     }
 
     fn absence(&self, silent: Option<u32>) -> Option<Absence> {
-        Absence::of(self.path.clone(), &self.exchange.counts, silent)
+        self.exchange.counts.absence(self.path.clone(), silent)
     }
 }
 

@@ -10,7 +10,8 @@ use protocol::schema::{self, Absent, Field, Format, Layout, PacketSchema, Units}
 use protocol::wire::LinkId;
 use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 
-use super::text::{Bits, Name};
+use super::fields::Name;
+use super::ports::Bits;
 use super::{Decoded, Foreign, wires};
 
 /// A frame and its meaning.

@@ -11,9 +11,11 @@
 //! without a known meaning: `meaning`.
 
 mod error_frame;
+mod fields;
 pub mod json;
 pub mod parameter;
 pub mod pick;
+mod ports;
 pub mod settle;
 mod text;
 mod wires;

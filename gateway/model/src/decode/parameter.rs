@@ -7,7 +7,7 @@ use protocol::schema::{self, Field, Format, Layout, Range};
 use protocol::wire::{PORTS, UPLINK};
 use thiserror::Error;
 
-pub use super::text::{Name, Words};
+pub use super::fields::{Name, Words};
 
 /// The largest number of a parameter: the bit above it means a write.
 const MAX: u8 = 127;

@@ -1,13 +1,14 @@
-//! The text of messages over wires, and of what ports lead to.
+//! The text of messages over wires.
 
 use core::fmt::{self, Display, Formatter};
 
 use protocol::message::VERSION;
 use protocol::packet::{BYTES, Bytes};
-use protocol::schema::{self, Field, Layout};
-use protocol::wire::{Hello, LinkId, PortMessage, Rank, UPLINK, Walk};
+use protocol::schema::{self, Layout};
+use protocol::wire::{Hello, LinkId, PortMessage, Rank, Walk};
 
-use super::text;
+use super::fields::say;
+use super::ports::Port;
 
 /// The bytes of a message over a wire, and their layout.
 pub(super) fn said(message: PortMessage) -> (Bytes, &'static Layout) {
@@ -43,7 +44,7 @@ impl Display for Said {
                 write!(f, "{first} to {last} remaining")
             };
         }
-        text::say(f, layout, &bytes)
+        say(f, layout, &bytes)
     }
 }
 
@@ -75,41 +76,4 @@ impl Display for Far {
             None => f.write_str("unreachable"),
         }
     }
-}
-
-/// A port by its number; the last one leads to the gateway's side.
-pub(super) struct Port(pub(super) i64);
-
-impl Display for Port {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        match usize::try_from(self.0) {
-            Ok(UPLINK) => f.write_str("uplink"),
-            Ok(_) | Err(_) => write!(f, "port {}", self.0),
-        }
-    }
-}
-
-/// What each port leads to.
-pub(super) fn around(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports: usize) -> fmt::Result {
-    for index in 0..ports {
-        let word = bytes.get(2 * index..).unwrap_or_default();
-        let part =
-            |name: &str| parts.iter().find(|part| part.name == name).map_or(0, |part| part.raw(word, 0));
-        write!(f, "{}{index} ", if index == 0 { "" } else { ", " })?;
-        if part("hears") == 0 {
-            f.write_str("silent")?;
-            continue;
-        }
-        write!(f, "leads to {} of ", Port(part("port")))?;
-        match part("node") {
-            0 => f.write_str("a cell without a node id")?,
-            number => write!(f, "{number}")?,
-        }
-        f.write_str(match (part("other_version"), part("works")) {
-            (1, _) => " (other version)",
-            (_, 0) => " (one way)",
-            _ => "",
-        })?;
-    }
-    Ok(())
 }

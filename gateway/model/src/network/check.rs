@@ -8,7 +8,7 @@ use std::fmt;
 use protocol::id::CellId;
 use protocol::message::{Heartbeat, Ports, State, Tree, VERSION};
 use protocol::skin::Wires;
-use protocol::wire::{PORTS, UPLINK};
+use protocol::wire::PORTS;
 use thiserror::Error;
 
 use super::tree::{Places, places};
@@ -347,11 +347,6 @@ impl<'a> Network<'a> {
             found.push(Difference::MissingWire { first, second, carries });
         }
     }
-}
-
-/// Whether a page is of a cell that is wired to the gateway and uses that wire.
-pub(super) fn is_root(tree: &Tree) -> bool {
-    tree.parent == Some(0) && usize::from(tree.up) == UPLINK
 }
 
 #[cfg(test)]

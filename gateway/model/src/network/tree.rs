@@ -4,8 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::id::CellId;
 use protocol::message::Tree;
-
-use super::check::is_root;
+use protocol::wire::UPLINK;
 
 /// Where cells are in their tree.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
@@ -62,6 +61,11 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Plac
         }
     }
     places
+}
+
+/// Whether a page is of a cell that is wired to the gateway and uses that wire.
+fn is_root(tree: &Tree) -> bool {
+    tree.parent == Some(0) && usize::from(tree.up) == UPLINK
 }
 
 fn from_the_smallest(mut circle: Vec<CellId>) -> Vec<CellId> {

@@ -2,14 +2,13 @@
 
 use core::f64::consts::TAU;
 
-use protocol::document::{Fault as Wrong, Place, span};
+use protocol::document::{Checked, Place};
 use protocol::skin::{MAX_ROBOT_JOINTS, Skin};
-use protocol::time::{Micros, Span};
+use protocol::time::Span;
 
 use super::names::Names;
+use super::times::{EndS, length};
 use super::{Mode, ModeChange, Motion, MotionKind, Scenario, Touch, faults, pressed, raw, sensors};
-
-pub(super) type Checked<T> = Result<T, Wrong>;
 
 pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     if raw.version != 1 {
@@ -28,44 +27,6 @@ pub(super) fn scenario(raw: raw::Scenario, skin: &Skin) -> Checked<Scenario> {
     let faults = faults::faults(&raw.fault, end, &names)?;
     let sensors = sensors::sensors(&raw.sensors, end)?;
     Ok(Scenario { duration, seed, motion, modes, touches, touches_repeat, faults, sensors })
-}
-
-/// The scenario's duration in s.
-#[derive(Clone, Copy)]
-pub(super) struct EndS(f64);
-
-impl EndS {
-    /// A moment within the scenario.
-    pub(super) fn moment(self, at: &Place, seconds: f64) -> Checked<Micros> {
-        if (0.0..self.0).contains(&seconds) {
-            return Ok(Micros(span(seconds).0));
-        }
-        self.outside(at, seconds)
-    }
-
-    /// A moment within the scenario, or its end.
-    pub(super) fn moment_or_end(self, at: &Place, seconds: f64) -> Checked<Micros> {
-        if (0.0..=self.0).contains(&seconds) {
-            return Ok(Micros(span(seconds).0));
-        }
-        self.outside(at, seconds)
-    }
-
-    fn outside(self, at: &Place, seconds: f64) -> Checked<Micros> {
-        let why = format_args!("the scenario goes from 0 to duration_s = {}", self.0);
-        Err(at.fault(seconds, why))
-    }
-}
-
-/// A year.
-pub(super) const LONGEST_S: f64 = 3.2e7;
-
-/// A length of time.
-pub(super) fn length(at: &Place, seconds: f64) -> Checked<Span> {
-    if (1e-6..=LONGEST_S).contains(&seconds) {
-        return Ok(span(seconds));
-    }
-    Err(at.fault(seconds, "must be above 0, and at most 3.2e7"))
 }
 
 fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {

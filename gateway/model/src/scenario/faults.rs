@@ -1,10 +1,10 @@
 //! Checks the faults of a scenario's file.
 
-use protocol::document::Place;
+use protocol::document::{Checked, Place};
 use protocol::time::Span;
 
-use super::check::{Checked, EndS, length};
 use super::names::{Given, Names};
+use super::times::{EndS, length};
 use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 
 pub(super) const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \

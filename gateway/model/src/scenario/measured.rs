@@ -12,8 +12,8 @@ use protocol::time::Micros;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
+use super::force::contact_words;
 use super::sensors::{ForceErrors, REFERENCE_C, Sensors};
-use super::touches::contact_words;
 use crate::accelerometer::sensor::normal;
 
 /// Time constants of creep in s: together they are nearly a logarithm of time.

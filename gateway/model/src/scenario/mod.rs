@@ -5,13 +5,16 @@
 //! index in [`Skin::cells`], buses by theirs in [`Skin::buses`].
 
 mod check;
+mod curve;
 mod faults;
+mod force;
 mod measured;
 mod names;
 mod pressed;
 mod raw;
 mod remarks;
 mod sensors;
+mod times;
 mod touches;
 
 use core::f64::consts::TAU;
@@ -25,8 +28,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::accelerometer::RobotState;
 
+pub use force::{MAX_FORCE_N, contact_words};
 pub use sensors::{ForceErrors, REFERENCE_C, Sensors};
-pub use touches::{MAX_FORCE_N, Stimulus, Touches, contact_words};
+pub use touches::{Stimulus, Touches};
 
 /// How long a run takes in which nothing happens, unless it is told.
 pub const IDLE: Span = Span::from_millis(10_000);

@@ -2,11 +2,10 @@
 
 use std::collections::HashMap;
 
-use protocol::document::Place;
+use protocol::document::{Checked, Place};
 use protocol::skin::{CellName, Reply, Skin};
 use protocol::wire::PORTS;
 
-use super::check::Checked;
 use super::raw;
 use crate::listing::ranges;
 

@@ -1,12 +1,12 @@
 //! Checks the touches of a scenario's file.
 
-use protocol::document::{Place, span};
+use protocol::document::{Checked, Place, span};
 use protocol::fixed::{Q, Q1_14};
 use protocol::time::Span;
 
-use super::check::{Checked, EndS, LONGEST_S, length};
+use super::force::MAX_FORCE_N;
 use super::names::{Given, Names};
-use super::touches::MAX_FORCE_N;
+use super::times::{EndS, LONGEST_S, length};
 use super::{Profile, Touch, raw};
 
 /// The touches, in the file's order.

@@ -5,7 +5,7 @@ use core::fmt;
 use serde::de::{Error, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
 
-use super::check::LONGEST_S;
+use super::times::LONGEST_S;
 use super::{IDLE, MotionKind};
 use crate::accelerometer::sensor::Given;
 

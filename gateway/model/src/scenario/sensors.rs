@@ -1,12 +1,12 @@
 //! How the sensors of a run differ from perfect ones: the table `[sensors]`.
 
-use protocol::document::Place;
+use protocol::document::{Checked, Place};
 use protocol::fixed::Q9_6;
 use protocol::time::Micros;
 
-use super::check::{Checked, EndS};
+use super::curve::linear;
 use super::raw;
-use super::touches::linear;
+use super::times::EndS;
 use crate::accelerometer::sensor::DataSheet;
 
 /// Data sheets state errors at this temperature, in °C.

@@ -4,16 +4,15 @@
 //! broadcast periods later. The words at that moment are those with which the cell answers these joints. Sensors that
 //! are not perfect are computed epoch by epoch ([`Measured`]).
 
-use core::f64::consts::PI;
-
-use protocol::fixed::Q5_10;
 use protocol::id::CellId;
 use protocol::message::SkinSensors;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
+use super::curve::seconds;
+use super::force::contact_words;
 use super::measured::{Measured, True};
-use super::{FaultKind, Profile, Scenario, SensorFault, Touch};
+use super::{FaultKind, Scenario, SensorFault, Touch};
 
 /// The sensor words of a cell from an epoch on.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -294,66 +293,8 @@ impl Touches {
     }
 }
 
-/// The value of a curve at a time in µs: linear between its points, which are in the order of time, and constant before the
-/// first and after the last one; `None` without any.
-pub(super) fn linear<T: Copy>(points: &[(T, f64)], at: u64, micros: impl Fn(T) -> u64) -> Option<f64> {
-    let after = points.partition_point(|(point, _)| micros(*point) <= at);
-    let before = after.checked_sub(1).and_then(|index| points.get(index));
-    match (before, points.get(after)) {
-        (Some(&(from, low)), Some(&(to, high))) => {
-            let passed = |until: u64| seconds(Span(until.saturating_sub(micros(from))));
-            Some(low + (high - low) * (passed(at) / passed(micros(to))))
-        }
-        (Some((_, one)), None) | (None, Some((_, one))) => Some(*one),
-        (None, None) => None,
-    }
-}
-
 impl Wrong {
     fn holds_at(&self, time: Micros) -> bool {
         self.at <= time && time.since(self.at) < self.length
     }
-}
-
-impl Touch {
-    /// Whether it touches at a time.
-    pub(super) fn holds_at(&self, time: Micros) -> bool {
-        self.at <= time && time.since(self.at) < self.length
-    }
-
-    /// The force in N at a time; `None` when it does not touch then.
-    pub(super) fn level(&self, time: Micros) -> Option<f64> {
-        if !self.holds_at(time) {
-            return None;
-        }
-        let since = time.since(self.at);
-        let part = seconds(since) / seconds(self.length);
-        Some(match &self.profile {
-            Profile::Step => self.force_n,
-            Profile::Ramp => self.force_n * part,
-            Profile::HalfSine => self.force_n * (PI * part).sin(),
-            Profile::Points(points) => linear(points, since.0, |Span(micros)| micros).unwrap_or(0.0),
-        })
-    }
-}
-
-/// The maximum force of three contact words together, in N.
-pub const MAX_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
-
-/// The three contact words of a force in N, as equal as they can be: they add up exactly to the force
-/// rounded to a word's step. Outside of their range they saturate.
-#[must_use]
-#[expect(clippy::cast_possible_truncation, reason = "rounded; the cast saturates, and NaN becomes 0")]
-pub fn contact_words(force_n: f64) -> [Q5_10; 3] {
-    let steps = (force_n * 1_024.0).round() as i64;
-    [2, 1, 0].map(|share| {
-        // Three numbers a third apart, rounded down, add up to the whole.
-        let steps = steps.saturating_add(share).div_euclid(3);
-        Q5_10::from_bits(i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX }))
-    })
-}
-
-#[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
-fn seconds(span: Span) -> f64 {
-    span.0 as f64 * 1e-6
 }

@@ -3,73 +3,9 @@
 use protocol::fixed::{TorqueFormat, is_saturated};
 use protocol::packet::Words;
 use protocol::parameters::MAX_JOINTS;
-use serde::ser::{Serialize, SerializeStruct, Serializer};
 
+use super::errors::Errors;
 use super::replies::Expected;
-use super::root_totals;
-
-/// Epochs over which errors of sums are averaged.
-const AVERAGED: u32 = 32;
-
-/// Mean and maximum of some absolute errors, in Nm; serialised as `mean_nm`, `max_nm` and `count`.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Errors {
-    sum: f64,
-    max: f64,
-    count: u64,
-}
-
-impl Serialize for Errors {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut errors = serializer.serialize_struct("Errors", 3)?;
-        errors.serialize_field("mean_nm", &self.mean())?;
-        errors.serialize_field("max_nm", &self.max)?;
-        errors.serialize_field("count", &self.count)?;
-        errors.end()
-    }
-}
-
-impl FromIterator<f64> for Errors {
-    /// Collects errors in Nm, of either sign.
-    fn from_iter<T: IntoIterator<Item = f64>>(errors: T) -> Self {
-        let mut all = Self::default();
-        errors.into_iter().for_each(|error| all.add(error));
-        all
-    }
-}
-
-impl Errors {
-    fn add(&mut self, error: f64) {
-        self.sum += error.abs();
-        self.max = self.max.max(error.abs());
-        self.count += 1;
-    }
-
-    /// How many torques were compared.
-    #[must_use]
-    pub const fn count(&self) -> u64 {
-        self.count
-    }
-
-    /// The mean absolute error in Nm; `None` without anything compared.
-    #[must_use]
-    #[expect(clippy::cast_precision_loss, reason = "a count of comparisons")]
-    pub fn mean(&self) -> Option<f64> {
-        (self.count > 0).then(|| self.sum / self.count as f64)
-    }
-
-    /// The maximum absolute error in Nm.
-    #[must_use]
-    pub const fn max(&self) -> f64 {
-        self.max
-    }
-
-    /// Both together.
-    #[must_use]
-    pub fn with(self, other: Self) -> Self {
-        Self { sum: self.sum + other.sum, max: self.max.max(other.max), count: self.count + other.count }
-    }
-}
 
 /// Exact torques in a torque format: what rounding to it alone makes of them.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -190,71 +126,9 @@ impl Accuracy {
     }
 }
 
-/// Errors of sums, epoch after epoch.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct SumError {
-    pub(super) each: Errors,
-    pub(super) averaged: Errors,
-    /// Words that were left out because they were saturated.
-    pub(super) saturated: u64,
-    /// Epochs in a row, and their errors together.
-    epochs: u32,
-    sum: [f64; MAX_JOINTS],
-    /// The errors of the epoch that was compared last.
-    pub(super) last: Option<[f64; MAX_JOINTS]>,
-}
-
-impl SumError {
-    /// Compares the sum of a complete epoch, in steps of Q7.8.
-    pub(super) fn take(
-        &mut self,
-        words: &[i32; MAX_JOINTS],
-        saturated: bool,
-        expected: &root_totals::Expected,
-    ) {
-        if !expected.constant {
-            self.interrupt();
-        }
-        if saturated {
-            self.saturated += expected.joints as u64;
-            return self.interrupt();
-        }
-        let mut errors = [0.0; MAX_JOINTS];
-        let compared = errors.iter_mut().zip(words).zip(expected.torque).zip(&mut self.sum);
-        for (((error, &word), torque), sum) in compared.take(expected.joints) {
-            *error = f64::from(word) / 256.0 - torque;
-            self.each.add(*error);
-            *sum += *error;
-        }
-        self.last = Some(errors);
-        self.epochs += 1;
-        if self.epochs == AVERAGED {
-            let sums = self.sum;
-            for sum in sums.iter().take(expected.joints) {
-                self.averaged.add(sum / f64::from(AVERAGED));
-            }
-            self.interrupt();
-        }
-    }
-
-    /// The next epoch begins a new average.
-    pub(super) const fn interrupt(&mut self) {
-        (self.epochs, self.sum) = (0, [0.0; MAX_JOINTS]);
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn errors_have_a_mean_and_a_maximum_and_add_up() {
-        let mut errors = Errors::default();
-        assert_eq!(errors.mean(), None);
-        [0.5, -1.0, 3.0].into_iter().for_each(|error| errors.add(error));
-        assert_eq!((errors.mean(), errors.max(), errors.count()), (Some(1.5), 3.0, 3));
-        assert_eq!((errors.with(errors).mean(), errors.with(errors).count()), (Some(1.5), 6));
-    }
 
     #[test]
     fn torques_beyond_the_range_of_a_format_are_counted_apart() {

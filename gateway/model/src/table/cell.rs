@@ -8,7 +8,7 @@ use protocol::parameters::{Events, LinksDown, Parameter, Parameters};
 use protocol::skin::{self, Safety};
 use protocol::time::Micros;
 
-use super::accuracy::Errors;
+use super::errors::Errors;
 use super::held::{Change, Held};
 use super::replies::{Outstanding, Replies, Requested};
 use super::root_totals::RootSums;

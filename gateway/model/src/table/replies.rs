@@ -3,7 +3,7 @@
 use derive_more::{Add, Sum};
 use protocol::parameters::MAX_JOINTS;
 
-use super::accuracy::Errors;
+use super::errors::Errors;
 use super::stuck::Stuck;
 use crate::tracker::LATEST;
 

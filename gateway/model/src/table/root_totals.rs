@@ -4,8 +4,11 @@ use protocol::fixed::TorqueFormat;
 use protocol::parameters::MAX_JOINTS;
 use serde::Serialize;
 
-use super::accuracy::SumError;
+use super::errors::Errors;
 use crate::tracker::LATEST;
+
+/// Epochs over which errors of sums are averaged.
+const AVERAGED: u32 = 32;
 
 /// Counts of sums.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
@@ -118,6 +121,54 @@ impl Expected {
             *sum += torque;
         }
         self.joints = self.joints.max(joint);
+    }
+}
+
+/// Errors of sums, epoch after epoch.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct SumError {
+    pub(super) each: Errors,
+    pub(super) averaged: Errors,
+    /// Words that were left out because they were saturated.
+    pub(super) saturated: u64,
+    /// Epochs in a row, and their errors together.
+    epochs: u32,
+    sum: [f64; MAX_JOINTS],
+    /// The errors of the epoch that was compared last.
+    pub(super) last: Option<[f64; MAX_JOINTS]>,
+}
+
+impl SumError {
+    /// Compares the sum of a complete epoch, in steps of Q7.8.
+    pub(super) fn take(&mut self, words: &[i32; MAX_JOINTS], saturated: bool, expected: &Expected) {
+        if !expected.constant {
+            self.interrupt();
+        }
+        if saturated {
+            self.saturated += expected.joints as u64;
+            return self.interrupt();
+        }
+        let mut errors = [0.0; MAX_JOINTS];
+        let compared = errors.iter_mut().zip(words).zip(expected.torque).zip(&mut self.sum);
+        for (((error, &word), torque), sum) in compared.take(expected.joints) {
+            *error = f64::from(word) / 256.0 - torque;
+            self.each.add(*error);
+            *sum += *error;
+        }
+        self.last = Some(errors);
+        self.epochs += 1;
+        if self.epochs == AVERAGED {
+            let sums = self.sum;
+            for sum in sums.iter().take(expected.joints) {
+                self.averaged.add(sum / f64::from(AVERAGED));
+            }
+            self.interrupt();
+        }
+    }
+
+    /// The next epoch begins a new average.
+    pub(super) const fn interrupt(&mut self) {
+        (self.epochs, self.sum) = (0, [0.0; MAX_JOINTS]);
     }
 }
 

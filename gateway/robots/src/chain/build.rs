@@ -5,23 +5,14 @@ use std::collections::BTreeMap;
 
 use nalgebra::{Isometry3, Point3};
 use protocol::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
-use protocol::skin::{JointKind, REACH, reach};
+use protocol::skin::{REACH, reach};
 
-use super::{Apart, Chain, Joint, LinkFrame, MAX_LENGTH_M, MAX_RESIDUAL};
+use super::path::{Hanging, behind, moves, path};
+use super::{Apart, Chain, Joint, LinkFrame};
 use crate::error::{Problem, RobotError};
 use crate::residual::{self, Residual};
-use crate::rows::{self, Axis, Row, frames};
+use crate::rows::{self, Axis, MAX_LENGTH_M, MAX_RESIDUAL, Row, frames};
 use crate::urdf::{Kind, Urdf, UrdfJoint};
-
-/// A link and how it hangs on the chain.
-pub(crate) struct Hanging {
-    /// Its name.
-    pub(crate) link: String,
-    /// Moving joints of the chain before it.
-    pub(crate) joint: usize,
-    /// From the link behind that joint (or the root) to this one; it does not move.
-    pub(crate) fixed: Isometry3<f64>,
-}
 
 /// Builds a chain, or says why it cannot.
 pub(super) fn build(urdf: &Urdf, root: Option<&str>, tip: &str) -> Result<Chain, RobotError> {
@@ -82,34 +73,6 @@ fn with_rows(
     Ok(chain)
 }
 
-/// The joints from the root to the tip.
-fn path(urdf: &Urdf, root: usize, tip: usize) -> Result<Vec<&UrdfJoint>, RobotError> {
-    let mut path = Vec::new();
-    if root == tip {
-        return Ok(path);
-    }
-    for joint in urdf.above(tip) {
-        path.push(joint);
-        if joint.parent == root {
-            path.reverse();
-            return Ok(path);
-        }
-    }
-    let mut names: Vec<_> = path.iter().rev().map(|joint| urdf.link_name(joint.parent)).collect();
-    names.push(urdf.link_name(tip));
-    let [root, tip] = [root, tip].map(|link| urdf.link_name(link).to_owned());
-    Err(urdf.error(Problem::NotBelow { tip, root, path: names.join(" > ") }))
-}
-
-/// How a joint of a path moves; none if it is fixed.
-fn moves(joint: &UrdfJoint) -> Option<JointKind> {
-    match joint.kind {
-        Kind::Revolute | Kind::Continuous => Some(JointKind::Revolute),
-        Kind::Prismatic => Some(JointKind::Prismatic),
-        Kind::Fixed | Kind::Floating | Kind::Planar => None,
-    }
-}
-
 /// The path's joints that move.
 fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec<Joint>, RobotError> {
     let mut joints = Vec::new();
@@ -140,22 +103,6 @@ fn joints(urdf: &Urdf, root: &str, tip: &str, path: &[&UrdfJoint]) -> Result<Vec
         count if count > MAX_JOINTS => Err(urdf.error(Problem::TooManyJoints { count, root, tip })),
         _ => Ok(joints),
     }
-}
-
-/// The frames of the links right behind the path's moving joints, in the root's coordinates; joints without a position are at zero.
-pub(crate) fn behind(path: &[&UrdfJoint], positions: &[f64]) -> Vec<Isometry3<f64>> {
-    let mut positions = positions.iter();
-    let mut pose = Isometry3::identity();
-    let mut all = Vec::new();
-    for joint in path {
-        if moves(joint).is_some() {
-            pose *= joint.transform(positions.next().copied().unwrap_or_default());
-            all.push(pose);
-        } else {
-            pose *= joint.origin;
-        }
-    }
-    all
 }
 
 /// Frame 0 and the rows.

@@ -1,6 +1,7 @@
 //! The joints between two links, with rows and the frame of each link.
 
 mod build;
+mod path;
 
 use nalgebra::Isometry3;
 use protocol::parameters::RowKind;
@@ -11,13 +12,7 @@ use crate::nearest::nearest;
 use crate::rows::{Row, frames};
 use crate::urdf::Urdf;
 
-pub(crate) use build::{Hanging, behind};
-
-/// `a` and `d` of a row are at least minus this and below it, in m.
-pub const MAX_LENGTH_M: f64 = 2.0;
-
-/// How much the rows may differ from the URDF, in m or rad.
-pub const MAX_RESIDUAL: f64 = 1e-9;
+pub(crate) use path::{Hanging, behind};
 
 /// The joints between two links.
 #[derive(Clone, Debug, PartialEq)]

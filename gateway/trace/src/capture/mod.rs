@@ -17,6 +17,7 @@ pub mod log;
 mod magic;
 mod mcap;
 mod parts;
+mod place;
 mod places;
 mod reader;
 mod text_kinds;
@@ -27,8 +28,8 @@ pub use extras::{Extras, Latched, RUN, SKIN, Topic, facts_of_run, seconds_since}
 pub use mcap::ORIGIN;
 pub(crate) use mcap::is_foreign_frame;
 pub use parts::{Part, PartsError};
-pub use places::{Place, Places};
-pub use reader::{Format, Reader};
+pub use place::{Place, Places};
+pub use reader::Reader;
 pub use text_kinds::DESCRIPTION;
 
 pub use crate::note::{BusNote, Note, NoteKind};
@@ -40,6 +41,15 @@ use protocol::candump::Record;
 
 /// What a file is read through.
 pub type Through = Box<dyn Fn(File) -> Box<dyn Read + Send> + Send>;
+
+/// What a capture is written in.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub enum Format {
+    /// Text of `candump -L`.
+    Candump,
+    /// An MCAP recording.
+    Mcap,
+}
 
 /// One entry of a capture.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,4 +1,4 @@
-//! Where in a capture a reader can go on, so that a moment is found without reading all that is before it.
+//! The search for places at which a reader can go on, so that a moment is found without reading all that is before it.
 //!
 //! ```text
 //!   MCAP:  heads of chunks ─────────────────┐
@@ -13,9 +13,9 @@ use std::path::{Path, PathBuf};
 use ::mcap::records::op;
 use protocol::input;
 
-use super::log::{Clock, LONGEST as LONGEST_LINE, LogReader, known_time};
+use super::log::{LONGEST as LONGEST_LINE, LogReader, known_time};
 use super::magic::is_mcap;
-use super::mcap::{Fault, State};
+use super::place::{Part, Place, Places};
 use super::{CaptureError, Entry, Reader};
 use crate::container::{LONGEST_DESCRIPTION, MAGIC, find};
 use crate::order::WINDOW_NS;
@@ -26,37 +26,6 @@ const PIECE: u64 = 64 << 10;
 const DESCRIPTIONS: usize = 16 << 20;
 /// Bytes of a log's end among which its last frame is looked for.
 const END: u64 = 4 * LONGEST_LINE as u64;
-
-/// Where in a capture an entry is.
-#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
-pub struct Place {
-    /// Which part, from 0.
-    pub(super) part: usize,
-    /// Bytes of the part before the record or the line.
-    pub(super) offset: u64,
-    /// Lines before it, where they were counted.
-    pub(super) line: u64,
-    /// Entries of the record before it.
-    pub(super) skip: u32,
-    /// The times of a log up to there.
-    pub(super) clock: Clock,
-}
-
-/// Some places of a capture, by time.
-#[derive(Debug)]
-pub struct Places {
-    parts: Vec<Part>,
-    /// In their order, each with the latest time of all that stands before the next one, in ns since 1970.
-    marks: Vec<(u64, Place)>,
-    piece: u64,
-}
-
-#[derive(Debug)]
-struct Part {
-    path: PathBuf,
-    /// Records of the summary that say what the messages are: operation codes and contents.
-    descriptions: Vec<(u8, Vec<u8>)>,
-}
 
 impl Places {
     /// Those of one file, or of the parts of one recording in any order. Reads of each only what says when it was written.
@@ -75,36 +44,6 @@ impl Places {
             places.add(&path).map_err(|source| CaptureError::Io { name, source })?;
         }
         Ok(places)
-    }
-
-    /// The latest time in the capture, in ns since 1970, as its places say; 0 of an empty one.
-    #[must_use]
-    pub fn latest(&self) -> u64 {
-        self.marks.last().map_or(0, |(latest, _)| *latest)
-    }
-
-    /// The last place that has nothing of this time or later before it.
-    #[must_use]
-    pub fn before(&self, nanos: u64) -> Place {
-        let at = self.marks.partition_point(|(latest, _)| *latest < nanos);
-        self.marks.get(at).or_else(|| self.marks.last()).map(|(_, place)| *place).unwrap_or_default()
-    }
-
-    pub(super) fn path(&self, part: usize) -> Option<&Path> {
-        self.parts.get(part).map(|part| part.path.as_path())
-    }
-
-    /// The parts behind one.
-    pub(super) fn behind(&self, part: usize) -> impl Iterator<Item = &PathBuf> {
-        self.parts.iter().skip(part + 1).map(|part| &part.path)
-    }
-
-    /// Says to the state of a reader what the messages of a part are.
-    pub(super) fn describe(&self, part: usize, state: &mut State) -> Result<(), Fault> {
-        for (opcode, body) in self.parts.get(part).into_iter().flat_map(|part| &part.descriptions) {
-            state.take(*opcode, body, false)?;
-        }
-        Ok(())
     }
 
     fn add(&mut self, path: &Path) -> io::Result<()> {

@@ -12,19 +12,10 @@ use super::log::{Clock, LogReader, Remark};
 use super::magic::{self, Kind, is_mcap};
 use super::mcap::{Buses, Fault, McapReader, ORIGIN, SOURCE, State, Survey};
 use super::parts::{self, Named, PartsError};
-use super::places::{Place, Places};
+use super::place::{Place, Places};
 use super::text_kinds::kind_of;
 use super::times::Times;
-use super::{CaptureError, Entry, Extras, Item, Through};
-
-/// What a capture is written in.
-#[derive(Clone, Copy, Debug, Eq, PartialEq)]
-pub enum Format {
-    /// Text of `candump -L`.
-    Candump,
-    /// An MCAP recording.
-    Mcap,
-}
+use super::{CaptureError, Entry, Extras, Format, Item, Through};
 
 /// Reads a capture from its beginning to its end, in bounded memory. The parts of a split recording are one capture.
 pub struct Reader {

@@ -16,8 +16,9 @@ mod source;
 pub use chunk::Chunk;
 pub use field::{Facts, Names, Record, parse};
 pub use search::{HEAD, first_record, is_record, own_length};
-pub(crate) use source::read_some;
 pub use source::{Framed, Source, find};
+
+use std::io::{self, Read};
 
 use thiserror::Error;
 
@@ -30,6 +31,16 @@ pub const MAGIC: &[u8] = mcap::MAGIC;
 pub const LONGEST: u64 = 128 << 20;
 /// The longest record that describes something: a schema, a channel, metadata.
 pub const LONGEST_DESCRIPTION: usize = 4 << 20;
+
+/// Reads what there is, whatever signals come.
+pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
+    loop {
+        match input.read(room) {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            done => return done,
+        }
+    }
+}
 
 /// What is wrong with a record or a chunk.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]

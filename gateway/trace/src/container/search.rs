@@ -8,8 +8,7 @@ use std::io::{self, Read, Seek, SeekFrom};
 use mcap::records::op;
 
 use super::field::Fields;
-use super::source::read_some;
-use super::{LONGEST, MAGIC};
+use super::{LONGEST, MAGIC, read_some};
 
 /// Bytes of an operation code and a length.
 pub const HEAD: usize = 9;

@@ -6,7 +6,7 @@ use mcap::records::op;
 
 use super::field::{Record, attachment_name, parse};
 use super::search::{HEAD, has_records, is_disguised, is_known, is_plain, own_length};
-use super::{Damage, LONGEST, MAGIC};
+use super::{Damage, LONGEST, MAGIC, read_some};
 
 /// Bytes that are kept of a record that is longer than anything that is taken into memory, or that nobody reads.
 const BEGINNING: u64 = 64 << 10;
@@ -346,16 +346,6 @@ fn remember(last: &mut [u8; MAGIC.len()], came: &[u8]) {
     let from = last.len() - came.len();
     if let Some(place) = last.get_mut(from..) {
         place.copy_from_slice(came);
-    }
-}
-
-/// Reads what there is, whatever signals come.
-pub(crate) fn read_some(input: &mut impl Read, room: &mut [u8]) -> io::Result<usize> {
-    loop {
-        match input.read(room) {
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
-            done => return done,
-        }
     }
 }
 

@@ -13,7 +13,7 @@ use socketcan::{CanFdSocket, SocketOptions};
 use super::{Answer, FilterPart, Hello, OWN_BYTE, VERSION, decode_dropped};
 use super::{address, open_directory, usual_directory};
 use crate::bus::batch::{self, Datagram};
-use crate::bus::kinds::Carrier;
+use crate::bus::carrier::Carrier;
 use crate::bus::{Bus, BusError, Filter, Options};
 
 /// How long a client waits for a server: it answers at once unless it is stopped.

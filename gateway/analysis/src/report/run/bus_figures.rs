@@ -1,13 +1,15 @@
 //! Figures from the frames of one bus: the same accounts that the gateway kept, epoch by epoch.
 
+use protocol::can::Frame;
 use protocol::candump::{Direction, Record};
+use protocol::id::{Command, Kind};
 use protocol::message::{Message, SensorPage};
+use protocol::packet::data_id;
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
 use protocol::wire_time::Bits;
 
-use super::frames_only::is_for_cells;
 use super::moments::Moments;
 use super::touched::Touched;
 use crate::fit::rates::Chosen;
@@ -66,6 +68,15 @@ pub(super) enum Effect {
     Joints([f64; MAX_JOINTS]),
     /// Cells are halted, or go on.
     Halted(bool),
+}
+
+/// Returns true for frames that cells receive and that change a table as the gateway's own do. Whoever took the capture
+/// does not tell who sent a frame; its identifier tells for whom it is.
+fn is_for_cells(frame: &Frame) -> bool {
+    let Ok(id) = data_id(frame) else { return false };
+    // A table learns of a resume from others' frames only: the gateway knows of its own.
+    let is_resume = id.kind == Kind::Command && Command::from_byte(id.node) == Some(Command::Resume);
+    id.sender().is_none() && !is_resume
 }
 
 /// The state of a bus' frames so far.
@@ -323,5 +334,41 @@ impl LinkId {
         self.table.finish();
         self.close();
         self.touched.finish();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::can::Format;
+    use protocol::id::{CellId, Node};
+    use protocol::message::{Heartbeat, Joints, Message, NetworkPage};
+    use protocol::packet::{Epoch, Packet};
+
+    fn frames(message: &Message) -> Vec<Frame> {
+        let packet: Packet = message.encode();
+        packet.frames(Format::Classic).collect()
+    }
+
+    #[test]
+    fn frames_for_cells_are_told_from_those_of_cells_by_their_identifiers() {
+        let page = NetworkPage::Heartbeat(Heartbeat::default());
+        let network = |from| Message::Network { from, epoch: Epoch(0), page };
+        let cell = Node::Cell(CellId::new(3).unwrap());
+        for (message, is) in [
+            (Message::Joints { epoch: Epoch(1), joints: Joints::default() }, true),
+            (Message::Sync, true),
+            (Message::Report, true),
+            (Message::Halt, true),
+            (Message::Resume, false),
+            (network(Node::Gateway), true),
+            (network(cell), false),
+        ] {
+            let frames = frames(&message);
+            assert!(
+                !frames.is_empty() && frames.iter().all(|frame| is_for_cells(frame) == is),
+                "{message:?}"
+            );
+        }
     }
 }

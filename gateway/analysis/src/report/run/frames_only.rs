@@ -1,22 +1,10 @@
 //! A capture that holds frames only, as a candump log does: series from joints and torques on the buses in place of the loop's
 //! topics, and the parts of a report that are missing.
 
-use protocol::can::Frame;
-use protocol::id::{Command, Kind};
-use protocol::packet::data_id;
 use protocol::skin::Skin;
 
 use super::bus_figures::{Effect, LinkId};
 use super::motion::Motion;
-
-/// Returns true for frames that cells receive and that change a table as the gateway's own do. Whoever took the capture
-/// does not tell who sent a frame; its identifier tells for whom it is.
-pub(super) fn is_for_cells(frame: &Frame) -> bool {
-    let Ok(id) = data_id(frame) else { return false };
-    // A table learns of a resume from others' frames only: the gateway knows of its own.
-    let is_resume = id.kind == Kind::Command && Command::from_byte(id.node) == Some(Command::Resume);
-    id.sender().is_none() && !is_resume
-}
 
 /// What a capture without a loop is, and what of it has been read.
 #[derive(Debug)]
@@ -125,37 +113,6 @@ fn sums(at: f64, skin: &Skin, bus_figures: &[LinkId], motion: &mut Motion) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use protocol::can::Format;
-    use protocol::id::{CellId, Node};
-    use protocol::message::{Heartbeat, Joints, Message, NetworkPage};
-    use protocol::packet::{Epoch, Packet};
-
-    fn frames(message: &Message) -> Vec<Frame> {
-        let packet: Packet = message.encode();
-        packet.frames(Format::Classic).collect()
-    }
-
-    #[test]
-    fn frames_for_cells_are_told_from_those_of_cells_by_their_identifiers() {
-        let page = NetworkPage::Heartbeat(Heartbeat::default());
-        let network = |from| Message::Network { from, epoch: Epoch(0), page };
-        let cell = Node::Cell(CellId::new(3).unwrap());
-        for (message, is) in [
-            (Message::Joints { epoch: Epoch(1), joints: Joints::default() }, true),
-            (Message::Sync, true),
-            (Message::Report, true),
-            (Message::Halt, true),
-            (Message::Resume, false),
-            (network(Node::Gateway), true),
-            (network(cell), false),
-        ] {
-            let frames = frames(&message);
-            assert!(
-                !frames.is_empty() && frames.iter().all(|frame| is_for_cells(frame) == is),
-                "{message:?}"
-            );
-        }
-    }
 
     #[test]
     fn halts_are_turns_and_a_repeated_one_is_none() {

@@ -1,0 +1,162 @@
+//! The text of fields, by their layout.
+
+use core::fmt::{self, Display, Formatter};
+
+use protocol::message::State;
+use protocol::packet::WORDS;
+use protocol::schema::{self, Field, Format, Layout, Part, Piece, Units};
+
+use super::ports::{Bits, Port, around, joined};
+
+/// The words of the parameter with this number, as values with units.
+#[derive(Clone, Copy, Debug)]
+pub struct Words(pub u8, pub [i16; WORDS]);
+
+impl Display for Words {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let bytes: Vec<u8> = self.1.into_iter().flat_map(i16::to_le_bytes).collect();
+        say(f, schema::value(self.0, self.1), &bytes)
+    }
+}
+
+/// The parameter's name; of a number without one, the number.
+#[derive(Clone, Copy, Debug)]
+pub struct Name(pub u8);
+
+impl Name {
+    /// That of a number as a field has it.
+    pub(super) fn of(raw: i64) -> Self {
+        Self(raw.to_le_bytes()[0])
+    }
+}
+
+impl Display for Name {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        match schema::parameter_name(self.0) {
+            Some(name) => f.write_str(name),
+            None => write!(f, "parameter {}", self.0),
+        }
+    }
+}
+
+/// The text of a layout's fields in these bytes.
+pub(super) fn say(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
+    fields(f, layout, Bytes { bytes, units: Units::default() })
+}
+
+/// The bytes of a packet, and what those of joints, torques and sums are worth.
+#[derive(Clone, Copy)]
+pub(super) struct Bytes<'a> {
+    pub(super) bytes: &'a [u8],
+    pub(super) units: Units,
+}
+
+/// The text of a layout's fields.
+pub(super) fn fields(f: &mut Formatter<'_>, layout: &Layout, words: Bytes<'_>) -> fmt::Result {
+    let number = layout.fields.first().map_or(0, |first| first.raw(words.bytes, 0));
+    fill(f, &layout.text, u16::try_from(number).unwrap_or_default(), words, &|_, name| {
+        Ok(field(&layout.fields, name))
+    })
+}
+
+/// The field of this name.
+pub(super) fn field<'a>(fields: &'a [Field], name: &str) -> Option<&'a Field> {
+    fields.iter().find(|field| field.name == name)
+}
+
+/// Gives the field of a name, or writes what is none.
+pub(super) type Find<'a> = dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a Field>, fmt::Error> + 'a;
+
+/// Writes the parts of a text that belong to a number.
+pub(super) fn fill<'a>(
+    f: &mut Formatter<'_>,
+    text: &[Part],
+    number: u16,
+    words: Bytes<'_>,
+    find: &Find<'a>,
+) -> fmt::Result {
+    for part in text {
+        let of = part.of.as_deref().map(|name| find(f, name)).transpose()?.flatten();
+        let number = of.map_or_else(|| i64::from(number), |field| field.raw(words.bytes, 0));
+        if !(part.when[0].into()..=part.when[1].into()).contains(&number) {
+            continue;
+        }
+        pieces(f, &part.pieces, words, find)?;
+    }
+    Ok(())
+}
+
+fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[Piece], words: Bytes<'_>, find: &Find<'a>) -> fmt::Result {
+    for piece in pieces {
+        match piece {
+            Piece::Words(text) => f.write_str(text)?,
+            Piece::Field { name, decimals } => {
+                if let Some(field) = find(f, name)? {
+                    show(f, field, words, *decimals)?;
+                }
+            }
+            Piece::Either { name, words: [no, yes] } => {
+                let is = find(f, name)?.is_some_and(|field| field.raw(words.bytes, 0) == 1);
+                f.write_str(if is { yes } else { no })?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Writes a field as a part of a text asks for it. An element whose unit is not the field's has its unit behind it.
+fn show(
+    f: &mut Formatter<'_>,
+    field: &Field,
+    Bytes { bytes, units }: Bytes<'_>,
+    decimals: usize,
+) -> fmt::Result {
+    let first = field.raw(bytes, 0);
+    match &field.format {
+        Format::Choice => f.write_str(field.name_of(first).unwrap_or_default()),
+        Format::Hex => write!(f, "{first:04X}"),
+        Format::Port => write!(f, "{}", Port(first)),
+        Format::Ports(..) => write!(f, "{}", Bits(first)),
+        Format::State => write!(f, "{}", Flags(State(u16::try_from(first).unwrap_or_default()))),
+        Format::Parameter(_) => write!(f, "{}", Name::of(first)),
+        Format::Reason => write!(f, "{} (reason {first})", schema::reason(first)),
+        Format::Total(_) => write!(f, "{:.decimals$}", field.total(bytes)),
+        Format::Group(parts) => around(f, parts, bytes, field.elements()),
+        Format::Fixed(_)
+        | Format::Threshold(_)
+        | Format::Saturating(_)
+        | Format::Torque
+        | Format::Angle
+        | Format::Position
+        | Format::Word
+        | Format::Unsigned(_)
+        | Format::Signed
+        | Format::Flag(_)
+        | Format::Page(_) => (0..field.elements_in(bytes)).try_for_each(|element| {
+            f.write_str(if element == 0 { "" } else { " " })?;
+            let raw = field.raw(bytes, element);
+            match i16::try_from(raw) {
+                Ok(i16::MAX) if field.is_saturating() => f.write_str("+saturated"),
+                Ok(i16::MIN) if field.is_saturating() => f.write_str("-saturated"),
+                _ if field.fraction() > 0 => {
+                    write!(f, "{:.decimals$}", field.real_in(raw, element, units))
+                }
+                _ => write!(f, "{raw}"),
+            }?;
+            match field.unit_in(element, units) {
+                unit if unit == field.unit => Ok(()),
+                unit => write!(f, " {unit}"),
+            }
+        }),
+    }
+}
+
+/// A state word: `configured+active, joint 2, version 1`.
+struct Flags(State);
+
+impl Display for Flags {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        joined(f, self.0.names())?;
+        write!(f, ", joint {}, version {}", self.0.joint(), self.0.version())
+    }
+}

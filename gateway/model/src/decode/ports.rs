@@ -1,0 +1,70 @@
+//! The text of ports, and of what they lead to.
+
+use core::fmt::{self, Display, Formatter};
+
+use protocol::schema::Field;
+use protocol::wire::UPLINK;
+
+/// A port by its number; the last one leads to the gateway's side.
+pub(super) struct Port(pub(super) i64);
+
+impl Display for Port {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        match usize::try_from(self.0) {
+            Ok(UPLINK) => f.write_str("uplink"),
+            Ok(_) | Err(_) => write!(f, "port {}", self.0),
+        }
+    }
+}
+
+/// What each port leads to.
+pub(super) fn around(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports: usize) -> fmt::Result {
+    for index in 0..ports {
+        let word = bytes.get(2 * index..).unwrap_or_default();
+        let part =
+            |name: &str| parts.iter().find(|part| part.name == name).map_or(0, |part| part.raw(word, 0));
+        write!(f, "{}{index} ", if index == 0 { "" } else { ", " })?;
+        if part("hears") == 0 {
+            f.write_str("silent")?;
+            continue;
+        }
+        write!(f, "leads to {} of ", Port(part("port")))?;
+        match part("node") {
+            0 => f.write_str("a cell without a node id")?,
+            number => write!(f, "{number}")?,
+        }
+        f.write_str(match (part("other_version"), part("works")) {
+            (1, _) => " (other version)",
+            (_, 0) => " (one way)",
+            _ => "",
+        })?;
+    }
+    Ok(())
+}
+
+/// The ports whose bits are set: `0+2`, or `none`.
+pub(super) struct Bits(pub(super) i64);
+
+impl Bits {
+    /// Their numbers.
+    pub(super) fn ports(&self) -> impl Iterator<Item = u8> + use<> {
+        let bits = self.0;
+        (0..8).filter(move |port| bits >> port & 1 == 1)
+    }
+}
+
+impl Display for Bits {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        joined(f, self.ports())
+    }
+}
+
+/// Things with a plus between them, or `none`.
+pub(super) fn joined(f: &mut Formatter<'_>, all: impl Iterator<Item = impl Display>) -> fmt::Result {
+    let mut any = false;
+    for one in all {
+        write!(f, "{}{one}", if any { "+" } else { "" })?;
+        any = true;
+    }
+    if any { Ok(()) } else { f.write_str("none") }
+}

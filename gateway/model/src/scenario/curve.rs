@@ -1,0 +1,24 @@
+//! Curves over time.
+
+use protocol::time::Span;
+
+/// The value of a curve at a time in µs: linear between its points, which are in the order of time, and constant before the
+/// first and after the last one; `None` without any.
+pub(super) fn linear<T: Copy>(points: &[(T, f64)], at: u64, micros: impl Fn(T) -> u64) -> Option<f64> {
+    let after = points.partition_point(|(point, _)| micros(*point) <= at);
+    let before = after.checked_sub(1).and_then(|index| points.get(index));
+    match (before, points.get(after)) {
+        (Some(&(from, low)), Some(&(to, high))) => {
+            let passed = |until: u64| seconds(Span(until.saturating_sub(micros(from))));
+            Some(low + (high - low) * (passed(at) / passed(micros(to))))
+        }
+        (Some((_, one)), None) | (None, Some((_, one))) => Some(*one),
+        (None, None) => None,
+    }
+}
+
+/// A length of time in s.
+#[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
+pub(super) fn seconds(span: Span) -> f64 {
+    span.0 as f64 * 1e-6
+}

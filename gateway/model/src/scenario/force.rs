@@ -1,0 +1,47 @@
+//! The force of a touch over time, and the contact words that hold it.
+
+use core::f64::consts::PI;
+
+use protocol::fixed::Q5_10;
+use protocol::time::{Micros, Span};
+
+use super::curve::{linear, seconds};
+use super::{Profile, Touch};
+
+/// The maximum force of three contact words together, in N.
+pub const MAX_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
+
+/// The three contact words of a force in N, as equal as they can be: they add up exactly to the force
+/// rounded to a word's step. Outside of their range they saturate.
+#[must_use]
+#[expect(clippy::cast_possible_truncation, reason = "rounded; the cast saturates, and NaN becomes 0")]
+pub fn contact_words(force_n: f64) -> [Q5_10; 3] {
+    let steps = (force_n * 1_024.0).round() as i64;
+    [2, 1, 0].map(|share| {
+        // Three numbers a third apart, rounded down, add up to the whole.
+        let steps = steps.saturating_add(share).div_euclid(3);
+        Q5_10::from_bits(i16::try_from(steps).unwrap_or(if steps < 0 { i16::MIN } else { i16::MAX }))
+    })
+}
+
+impl Touch {
+    /// Whether it touches at a time.
+    pub(super) fn holds_at(&self, time: Micros) -> bool {
+        self.at <= time && time.since(self.at) < self.length
+    }
+
+    /// The force in N at a time; `None` when it does not touch then.
+    pub(super) fn level(&self, time: Micros) -> Option<f64> {
+        if !self.holds_at(time) {
+            return None;
+        }
+        let since = time.since(self.at);
+        let part = seconds(since) / seconds(self.length);
+        Some(match &self.profile {
+            Profile::Step => self.force_n,
+            Profile::Ramp => self.force_n * part,
+            Profile::HalfSine => self.force_n * (PI * part).sin(),
+            Profile::Points(points) => linear(points, since.0, |Span(micros)| micros).unwrap_or(0.0),
+        })
+    }
+}

@@ -1,0 +1,42 @@
+//! Moments and lengths of time in a scenario's file.
+
+use protocol::document::{Checked, Place, span};
+use protocol::time::{Micros, Span};
+
+/// The scenario's duration in s.
+#[derive(Clone, Copy)]
+pub(super) struct EndS(pub(super) f64);
+
+impl EndS {
+    /// A moment within the scenario.
+    pub(super) fn moment(self, at: &Place, seconds: f64) -> Checked<Micros> {
+        if (0.0..self.0).contains(&seconds) {
+            return Ok(Micros(span(seconds).0));
+        }
+        self.outside(at, seconds)
+    }
+
+    /// A moment within the scenario, or its end.
+    pub(super) fn moment_or_end(self, at: &Place, seconds: f64) -> Checked<Micros> {
+        if (0.0..=self.0).contains(&seconds) {
+            return Ok(Micros(span(seconds).0));
+        }
+        self.outside(at, seconds)
+    }
+
+    fn outside(self, at: &Place, seconds: f64) -> Checked<Micros> {
+        let why = format_args!("the scenario goes from 0 to duration_s = {}", self.0);
+        Err(at.fault(seconds, why))
+    }
+}
+
+/// A year.
+pub(super) const LONGEST_S: f64 = 3.2e7;
+
+/// A length of time.
+pub(super) fn length(at: &Place, seconds: f64) -> Checked<Span> {
+    if (1e-6..=LONGEST_S).contains(&seconds) {
+        return Ok(span(seconds));
+    }
+    Err(at.fault(seconds, "must be above 0, and at most 3.2e7"))
+}

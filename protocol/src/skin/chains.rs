@@ -1,0 +1,229 @@
+//! The robot's joints and chains, from the file's words to checked types.
+
+use core::f64::consts::TAU;
+
+use super::raw;
+use super::robot::{Base, Chain, ChainRow, DenavitHartenberg, Joint, JointKind, MAX_ROBOT_JOINTS, Robot};
+use crate::document::{Checked, Place};
+use crate::fixed::Q1_14;
+use crate::parameters::{MAX_JOINTS, MAX_ROWS, RowKind};
+
+/// Positions in m that a word holds: [-2, 2), less some steps for rounding.
+const SLIDE: f64 = 2.0 - 1e-3;
+/// How far a chain begins from the robot's base, in m.
+const FAR: f64 = 100.0;
+/// How far a quaternion's length may be from one.
+const UNIT_TOLERANCE: f64 = 1e-3;
+
+/// The robot of the file's words.
+pub(super) fn robot(raw: raw::Robot) -> Checked<Robot> {
+    let at = Place::named("robot");
+    if raw.urdf.as_ref().is_some_and(String::is_empty) {
+        return Err(at.key("urdf").fault("\"\"", "the path of a file, from the skin's file"));
+    }
+    match (raw.joints, raw.joint.is_empty() && raw.chain.is_empty()) {
+        (Some(rows), true) => Ok(Robot { urdf: raw.urdf, ..serial(&at, raw.name, &rows, raw.limits_rad)? }),
+        (None, false) => {
+            if raw.limits_rad.is_some() {
+                return Err(at.key("limits_rad").fault("", "with [[robot.joint]] each joint has its limits"));
+            }
+            let joints = joints(&at, &raw.joint)?;
+            let chains = chains(&at, &raw.chain, &joints)?;
+            Ok(Robot { name: raw.name, urdf: raw.urdf, joints, chains })
+        }
+        (Some(_), false) => {
+            let why = "either joints, or [[robot.joint]] and [[robot.chain]], not both";
+            Err(at.key("joints").fault("", why))
+        }
+        (None, true) => {
+            let why = "give the rows of its joints, or [[robot.joint]] and [[robot.chain]]";
+            Err(at.key("joints").fault("", why))
+        }
+    }
+}
+
+/// A robot of one chain of revolute joints, a row each.
+fn serial(
+    at: &Place,
+    name: String,
+    rows: &[DenavitHartenberg],
+    limits: Option<Vec<[f64; 2]>>,
+) -> Checked<Robot> {
+    let count = rows.len();
+    if count == 0 || count > MAX_JOINTS {
+        let why = format!("a robot has 1 to {MAX_JOINTS} revolute joints here");
+        return Err(at.key("joints").fault(format_args!("{count} joints"), why));
+    }
+    for (index, row) in rows.iter().enumerate() {
+        fits(&at.key("joints").nth(index), row)?;
+    }
+    let all = limits.unwrap_or_else(|| vec![[-TAU, TAU]; count]);
+    same_length(&at.key("limits_rad"), all.len(), count)?;
+    for (index, &limits) in all.iter().enumerate() {
+        self::limits(&at.key("limits_rad").nth(index), limits, JointKind::Revolute)?;
+    }
+    let joint = |(index, &limits): (usize, &[f64; 2])| Joint {
+        name: format!("joint{}", index + 1),
+        kind: JointKind::Revolute,
+        limits,
+    };
+    let rows = rows.iter().zip(&all);
+    let rows = rows.map(|(&table, &limits)| ChainRow { kind: RowKind::Revolute, table, limits });
+    let chain = Chain {
+        name: "chain".to_owned(),
+        base: Base::default(),
+        joints: (0..count).collect(),
+        rows: rows.collect(),
+    };
+    Ok(Robot { name, urdf: None, joints: all.iter().enumerate().map(joint).collect(), chains: vec![chain] })
+}
+
+/// Whether the lengths of a row fit their words, and its angles are numbers.
+fn fits(at: &Place, row: &DenavitHartenberg) -> Checked<()> {
+    at.key("a").fit(row.a, Q1_14::try_nearest)?;
+    at.key("d").fit(row.d, Q1_14::try_nearest)?;
+    at.key("alpha").finite(row.alpha)?;
+    at.key("theta_offset").finite(row.theta_offset)?;
+    Ok(())
+}
+
+fn limits(at: &Place, [min, max]: [f64; 2], kind: JointKind) -> Checked<[f64; 2]> {
+    let got = format!("[{min}, {max}]");
+    // Written so that NaN is refused too.
+    if !(min.is_finite() && max.is_finite() && min < max) {
+        return Err(at.fault(got, "the smaller position comes first"));
+    }
+    if kind == JointKind::Prismatic && (min < -SLIDE || max > SLIDE) {
+        return Err(at.fault(got, format_args!("a joint slides within -{SLIDE} to {SLIDE} m")));
+    }
+    Ok([min, max])
+}
+
+fn joints(at: &Place, raw: &[raw::Joint]) -> Checked<Vec<Joint>> {
+    let count = raw.len();
+    if count == 0 || count > MAX_ROBOT_JOINTS {
+        let why = format!("a robot has 1 to {MAX_ROBOT_JOINTS} joints");
+        return Err(at.key("joint").fault(format_args!("{count} joints"), why));
+    }
+    let mut joints: Vec<Joint> = Vec::with_capacity(count);
+    for (index, raw) in raw.iter().enumerate() {
+        let at = at.key("joint").nth(index);
+        if raw.name.is_empty() || joints.iter().any(|joint| joint.name == raw.name) {
+            let why = "each joint has a name of its own";
+            return Err(at.key("name").fault(format_args!("{:?}", raw.name), why));
+        }
+        let kinds = [JointKind::Revolute, JointKind::Prismatic].map(|kind| (kind.name(), kind));
+        let kind = at.key("kind").word(&raw.kind, &kinds)?;
+        let given = match (raw.limits, kind) {
+            (Some(limits), _) => limits,
+            (None, JointKind::Revolute) => [-TAU, TAU],
+            (None, JointKind::Prismatic) => {
+                return Err(at.key("limits").fault("", "a prismatic joint needs them, in m"));
+            }
+        };
+        let limits = limits(&at.key("limits"), given, kind)?;
+        joints.push(Joint { name: raw.name.clone(), kind, limits });
+    }
+    Ok(joints)
+}
+
+fn chains(at: &Place, raw: &[raw::Chain], joints: &[Joint]) -> Checked<Vec<Chain>> {
+    if raw.is_empty() {
+        return Err(at.key("chain").fault("[]", "at least one chain is needed"));
+    }
+    let mut chains: Vec<Chain> = Vec::with_capacity(raw.len());
+    for (index, raw) in raw.iter().enumerate() {
+        let at = at.key("chain").nth(index);
+        if raw.name.is_empty() || chains.iter().any(|chain| chain.name == raw.name) {
+            let why = "each chain has a name of its own";
+            return Err(at.key("name").fault(format_args!("{:?}", raw.name), why));
+        }
+        chains.push(chain(&at, raw, joints)?);
+    }
+    let unused = |(index, _): &(usize, &Joint)| chains.iter().all(|chain| !chain.joints.contains(index));
+    if let Some((index, joint)) = joints.iter().enumerate().find(unused) {
+        let at = at.key("joint").nth(index).key("name");
+        return Err(at.fault(format_args!("{:?}", joint.name), "no chain has this joint"));
+    }
+    Ok(chains)
+}
+
+fn base(at: &Place, raw: &raw::Base) -> Checked<Base> {
+    if let Some((index, value)) =
+        raw.position.iter().enumerate().find(|(_, it)| it.is_nan() || it.abs() > FAR)
+    {
+        return Err(at
+            .key("position")
+            .nth(index)
+            .fault(value, format_args!("it must be within -{FAR} to {FAR} m")));
+    }
+    let orientation = raw.orientation.map(|it| unit(&at.key("orientation"), "quaternion", it));
+    Ok(Base {
+        position: raw.position,
+        orientation: orientation.unwrap_or_else(|| Ok(Base::default().orientation))?,
+    })
+}
+
+fn chain(at: &Place, raw: &raw::Chain, joints: &[Joint]) -> Checked<Chain> {
+    let count = raw.rows.len();
+    if count > MAX_ROWS {
+        let why = format!("a chain has at most {MAX_ROWS} rows");
+        return Err(at.key("rows").fault(format_args!("{count} rows"), why));
+    }
+    let mut chain = Chain {
+        name: raw.name.clone(),
+        base: raw.base.as_ref().map_or_else(|| Ok(Base::default()), |raw| base(&at.key("base"), raw))?,
+        joints: Vec::new(),
+        rows: Vec::with_capacity(raw.rows.len()),
+    };
+    for (index, raw) in raw.rows.iter().enumerate() {
+        let at = at.key("rows").nth(index);
+        let table =
+            DenavitHartenberg { a: raw.a, alpha: raw.alpha, d: raw.d, theta_offset: raw.theta_offset };
+        fits(&at, &table)?;
+        let Some(name) = &raw.joint else {
+            chain.rows.push(ChainRow { kind: RowKind::Fixed, table, limits: [0.0; 2] });
+            continue;
+        };
+        let at = at.key("joint");
+        let known = joints.iter().position(|joint| joint.name == *name);
+        let known = known.and_then(|number| Some((number, joints.get(number)?)));
+        let (number, joint) = known
+            .ok_or_else(|| at.fault(format_args!("{name:?}"), "no such joint: name one of robot.joint"))?;
+        if chain.joints.contains(&number) {
+            return Err(at.fault(format_args!("{name:?}"), "this chain has the joint already"));
+        }
+        let [min, max] = joint.limits;
+        if joint.kind == JointKind::Prismatic && [min, max].iter().any(|q| (table.d + q).abs() > SLIDE) {
+            let why = format!("d and its position together stay within -{SLIDE} to {SLIDE} m");
+            return Err(at.fault(format_args!("{name:?} from {min} to {max} with d = {}", table.d), why));
+        }
+        chain.joints.push(number);
+        chain.rows.push(ChainRow { kind: joint.kind.row(), table, limits: joint.limits });
+    }
+    let moving = chain.joints.len();
+    if moving == 0 || moving > MAX_JOINTS {
+        let why = format!("a chain has 1 to {MAX_JOINTS} joints: rows with the name of one");
+        return Err(at.key("rows").fault(format_args!("{moving} joints"), why));
+    }
+    Ok(chain)
+}
+
+pub(super) fn same_length(at: &Place, got: usize, joints: usize) -> Checked<()> {
+    if got == joints {
+        return Ok(());
+    }
+    let why = format!("one for each of the robot's {joints} joints is needed");
+    Err(at.fault(format_args!("{got} values"), why))
+}
+
+/// Parts of length one, exactly.
+pub(super) fn unit<const N: usize>(at: &Place, what: &str, parts: [f64; N]) -> Checked<[f64; N]> {
+    let length = parts.iter().map(|part| part * part).sum::<f64>().sqrt();
+    if length.is_nan() || (length - 1.0).abs() > UNIT_TOLERANCE {
+        let got = parts.map(|part| part.to_string()).join(", ");
+        let why = format!("this {what} has length {length:.6}; it must be 1 within {UNIT_TOLERANCE}");
+        return Err(at.fault(format_args!("[{got}]"), why));
+    }
+    Ok(parts.map(|part| part / length))
+}
