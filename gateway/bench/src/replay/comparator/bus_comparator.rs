@@ -1,15 +1,24 @@
 //! What is known of one bus: its cells, the joints sent to them, and their replies.
+//!
+//! What can be in one of a few states is in [`super::states`], with a table of each: here are the messages that are their
+//! inputs, and the queues between the capture and the bus.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
-use model::tracker::{Claim, Word};
-use protocol::id::{CellId, Node};
+use model::tracker::{Claim, PerCell, Word};
+use protocol::id::CellId;
 use protocol::message::{Answer, Heard, Joints, Message, NetworkPage};
 use protocol::packet::{Epoch, Words};
 use protocol::schema::Units;
 use protocol::time::Micros;
 
 use super::WINDOW;
+use super::states::contact::{Contact, End};
+use super::states::first_joints::{self, FirstJoints};
+use super::states::line::{self, Line};
+use super::states::pass::{self, Pass};
+use super::states::progress::{self, Progress};
+use super::states::sending::{self, Sending};
 use super::sums::{Sums, Trees};
 use super::tally::Lacking;
 use crate::replay::difference::What;
@@ -29,12 +38,19 @@ pub struct Present {
     pub claim: Claim,
     /// Its counters when they came first, and last.
     pub heard: Option<(Heard, Heard)>,
-    /// Whether it is not waited for any more, because it did not answer.
-    pub is_given_up: bool,
-    /// The latest joints that it has reported as done, by number of announcement.
-    pub(super) done: u64,
-    /// Heartbeats since the last announcement.
-    pub(super) heartbeats: u32,
+    /// How far it is with the joints announced last.
+    pub(super) progress: Progress,
+}
+
+impl Present {
+    /// Whether the next joints wait for it.
+    pub(super) fn is_awaited(&self) -> bool {
+        self.claim.is_settled() && matches!(self.progress, Progress::Awaited { .. })
+    }
+
+    pub(super) const fn is_given_up(&self) -> bool {
+        matches!(self.progress, Progress::GivenUp { .. })
+    }
 }
 
 /// Something of the capture, and the same of now.
@@ -58,16 +74,12 @@ pub(super) struct Round {
     pub(super) epoch: Epoch,
     /// When they were recorded, in ns since 1970.
     pub(super) nanos: u64,
-    /// Whether a bus did not take them.
-    pub(super) is_unsent: bool,
+    /// How they were sent again.
+    pub(super) sending: Sending,
     /// The words of each reply, recorded and now.
     pub(super) replies: BTreeMap<(CellId, What), Both<Option<Words>>>,
     /// Sums, recorded and now.
     pub(super) sums: Both<Sums>,
-    /// The epoch under which these joints were sent last.
-    pub(super) announced_as: Epoch,
-    /// How often they were; 0 before they are sent.
-    pub(super) announced: u32,
     /// The cells touched at these joints and at the ones before, by the recorded stimuli.
     pub(super) touched: [Touched; 2],
     /// Whether a pass begins with them.
@@ -75,6 +87,11 @@ pub(super) struct Round {
 }
 
 impl Round {
+    /// Whether sums of this epoch are of these joints, and not of an earlier time that they were sent.
+    pub(super) fn has_sums_of(&self, epoch: Epoch) -> bool {
+        self.sending.under().unwrap_or(self.epoch) == epoch
+    }
+
     /// Whether something touches a cell at these joints, if that is known.
     pub(super) fn is_touched(&self, cell: CellId) -> Option<bool> {
         self.touched.last().and_then(|touched| touched.is(cell))
@@ -90,10 +107,16 @@ impl Round {
 #[derive(Debug)]
 pub(super) struct KnownCell {
     pub(super) cell: Surveyed,
-    /// It sent the end of a contact earlier now, because it took joints that it had not taken then.
-    pub(super) ended_earlier: bool,
-    /// Whether its last recorded torque was no end of a contact; none when it has sent none yet.
-    pub(super) speaks: Option<bool>,
+    /// Its recorded contact.
+    pub(super) contact: Contact,
+    /// Whether that ended earlier now.
+    pub(super) end: End,
+}
+
+impl KnownCell {
+    pub(super) fn new(cell: Surveyed) -> Self {
+        Self { cell, contact: Contact::default(), end: End::default() }
+    }
 }
 
 /// Recorded answers to `configure`, and those that came now, as far as they are not compared yet.
@@ -117,15 +140,22 @@ struct Question {
 
 /// One pass over the capture, as far as it has been read.
 #[derive(Debug, Default)]
-struct Pass {
+struct Reading {
+    pass: Pass,
     /// What holds at the last recorded joints, and who is touched at them.
     state: State,
     touched: Touched,
     /// The number of its first round.
     first_round: u64,
-    /// Whether there were messages before that, and the last joints of that time.
-    begins_later: bool,
-    earlier: Option<Epoch>,
+}
+
+impl Reading {
+    /// Takes in what the capture has next; whether that is the first joints of the pass.
+    const fn next(&mut self, input: pass::Input) -> bool {
+        let (next, is_first) = self.pass.next(input);
+        self.pass = next;
+        is_first
+    }
 }
 
 /// One bus.
@@ -151,15 +181,14 @@ pub(super) struct BusComparator {
     pub(super) speaking: BTreeSet<CellId>,
     /// Whether cells were switched to unrequested sensors frames, which come at times of their own.
     pub(super) senses: bool,
-    /// Cells that had taken no joints when they last reported their counters, with the epoch that they send until they
-    /// have: it belongs to no joints.
-    pub(super) untouched: Both<BTreeMap<CellId, Epoch>>,
-    pass: Pass,
+    /// Whether cells have taken joints since their start.
+    pub(super) first_joints: Both<PerCell<FirstJoints>>,
+    reading: Reading,
     /// Rounds that were announced.
     pub(super) sent: u64,
     /// The round after which the capture has no more joints.
     pub(super) last_round: Option<u64>,
-    pub(super) is_down: bool,
+    line: Line,
 }
 
 impl BusComparator {
@@ -169,7 +198,7 @@ impl BusComparator {
     }
 
     pub(super) fn new(name: String, cells: BTreeMap<CellId, Surveyed>) -> Self {
-        let known_cell = |(node, cell)| (node, KnownCell { cell, ended_earlier: false, speaks: None });
+        let known_cell = |(node, cell)| (node, KnownCell::new(cell));
         Self {
             name,
             known: cells.into_iter().map(known_cell).collect(),
@@ -181,7 +210,16 @@ impl BusComparator {
 
     /// Whether there were messages before the first round of this pass.
     pub(super) const fn begins_later(&self) -> bool {
-        self.pass.begins_later
+        self.reading.pass.begins_later()
+    }
+
+    pub(super) const fn is_down(&self) -> bool {
+        matches!(self.line, Line::Down)
+    }
+
+    /// Takes in what happens to the bus.
+    pub(super) const fn line(&mut self, input: line::Input) {
+        self.line = self.line.next(input);
     }
 
     pub(super) fn round(&mut self, number: u64) -> Option<&mut Round> {
@@ -218,7 +256,28 @@ impl BusComparator {
     /// Everything announced so far has to be confirmed by another message of each cell.
     pub(super) fn announce(&mut self) {
         self.announcements += 1;
-        self.present.values_mut().for_each(|present| present.heartbeats = 0);
+        let announced = |progress: Progress| progress.next(progress::Input::Announced);
+        self.present.values_mut().for_each(|present| present.progress = announced(present.progress));
+    }
+
+    /// Gives up the cells that are waited for; returns them.
+    pub(super) fn give_up(&mut self) -> Vec<CellId> {
+        let mut late = Vec::new();
+        for (cell, present) in self.present.iter_mut().filter(|(_, present)| present.is_awaited()) {
+            present.progress = present.progress.next(progress::Input::TimesOut);
+            late.push(*cell);
+        }
+        late
+    }
+
+    /// Takes in what becomes of the joints of a round, if that is remembered.
+    pub(super) fn send(&mut self, number: u64, input: sending::Input) {
+        let Some(round) = self.round(number) else { return };
+        round.sending = round.sending.next(input);
+        if matches!(input, sending::Input::Sent { .. }) {
+            // When joints are repeated, all cells resend their sums.
+            round.sums.now.clear();
+        }
     }
 
     /// Drops recorded replies to what was not sent. Whether something was sent after the last joints is unknown, so
@@ -236,7 +295,9 @@ impl BusComparator {
     /// Takes in that the capture begins again.
     pub(super) fn begin(&mut self) {
         self.recorded.fill(None);
-        self.pass = Pass { first_round: self.rounds_so_far(), ..Pass::default() };
+        let mut reading = Reading { first_round: self.rounds_so_far(), ..Reading::default() };
+        reading.next(pass::Input::Begins);
+        self.reading = reading;
     }
 
     fn rounds_so_far(&self) -> u64 {
@@ -246,24 +307,13 @@ impl BusComparator {
     /// Takes in that joints were on the bus in the capture; returns the number of their round, if they will be sent.
     pub(super) fn record_joints(&mut self, nanos: u64, epoch: Epoch, is_sent: bool) -> Option<u64> {
         let number = self.rounds_so_far();
-        let is_first = number == self.pass.first_round;
-        if is_first {
-            self.pass.earlier = self.pass.state.last_epoch();
-        }
+        let last = self.reading.state.last_epoch();
+        let input = if is_sent { pass::Input::Joints { last } } else { pass::Input::NotSent };
+        let is_first = self.reading.next(input);
         let before = self.take_joints(epoch);
         if is_sent {
-            let touched = [before, self.pass.touched];
-            let announced_as = epoch;
-            self.rounds.push_back(Round {
-                epoch,
-                nanos,
-                announced_as,
-                touched,
-                is_first,
-                ..Round::default()
-            });
-        } else {
-            self.pass.begins_later |= is_first;
+            let touched = [before, self.reading.touched];
+            self.rounds.push_back(Round { epoch, nanos, touched, is_first, ..Round::default() });
         }
         let round = is_sent.then_some(number);
         *self.recorded.get_mut(usize::from(epoch.0))? = round;
@@ -271,17 +321,19 @@ impl BusComparator {
     }
 
     fn take_joints(&mut self, epoch: Epoch) -> Touched {
-        self.pass.state.take(&Message::Joints { epoch, joints: Joints::default() });
-        std::mem::replace(&mut self.pass.touched, self.pass.state.touched())
+        self.reading.state.take(&Message::Joints { epoch, joints: Joints::default() });
+        std::mem::replace(&mut self.reading.touched, self.reading.state.touched())
     }
 
     /// Takes in the capture's other messages. `is_in_part`: whether it is in the part that is replayed.
     pub(super) fn record_state(&mut self, message: &Message, is_in_part: bool) {
-        self.pass.begins_later |= !is_in_part && self.rounds_so_far() == self.pass.first_round;
+        if !is_in_part {
+            self.reading.next(pass::Input::NotSent);
+        }
         if let Message::Joints { epoch, .. } = *message {
             self.take_joints(epoch);
         } else {
-            self.pass.state.take(message);
+            self.reading.state.take(message);
         }
         if let (Message::Configure { to, tag, .. }, true) = (*message, is_in_part) {
             let round = self.rounds_so_far();
@@ -298,15 +350,14 @@ impl BusComparator {
 
     /// Whether the cell with a node id in the capture only claims it.
     pub(super) fn is_claiming(&self, cell: CellId) -> bool {
-        self.pass.state.claim(cell).is_some_and(|claim| !claim.is_settled())
+        self.reading.state.claim(cell).is_some_and(|claim| !claim.is_settled())
     }
 
     /// Whether a reply of this epoch, which no joints of the part have had yet, answers joints from before it.
     fn is_earlier(&self, epoch: Epoch) -> bool {
-        let rounds = self.rounds_so_far() - self.pass.first_round;
-        let last = if rounds == 0 { self.pass.state.last_epoch() } else { self.pass.earlier };
-        self.pass.begins_later
-            && rounds < WINDOW
+        let Reading { pass, state, first_round, .. } = &self.reading;
+        let last = pass.earlier(state.last_epoch());
+        self.rounds_so_far() - first_round < WINDOW
             && last.is_some_and(|last| (0..100).contains(&last.since(epoch)))
     }
 
@@ -316,7 +367,7 @@ impl BusComparator {
         let answers = self.answers.entry(from).or_default();
         match answers.announced.iter().position(|announced| announced.tag == tag) {
             Some(at) => drop(answers.announced.remove(at)),
-            None if self.pass.begins_later => return false,
+            None if self.reading.pass.begins_later() => return false,
             None => {}
         }
         answers.recorded.push_back((rounds, tag, answer));
@@ -338,18 +389,20 @@ impl BusComparator {
     }
 
     pub(super) fn network(&mut self, cell: CellId, epoch: Epoch, page: &NetworkPage) {
-        let announcement = self.announced(epoch);
-        let present = self.present.entry(cell).or_default();
+        let reported = self.announced(epoch).map(|announced| announced.announcement);
+        let has_announced = self.announcements > 0;
+        let found = || Present { progress: Progress::found(has_announced), ..Present::default() };
+        let present = self.present.entry(cell).or_insert_with(found);
         match *page {
             NetworkPage::Heartbeat(heartbeat) => {
                 if matches!(present.claim.hear(Micros(0), &heartbeat), Word::Claimant | Word::Outsider) {
                     return;
                 }
-                present.is_given_up = false;
-                present.heartbeats += 1;
-                if let Some(announced) = announcement {
-                    present.done = present.done.max(announced.announcement);
-                }
+                present.progress = present.progress.next(if reported == Some(self.announcements) {
+                    progress::Input::ReportsLast
+                } else {
+                    progress::Input::ReportsOther
+                });
                 if !present.claim.is_settled() {
                     self.hear_parent(cell, epoch, None);
                 }
@@ -363,18 +416,9 @@ impl BusComparator {
         }
     }
 
-    /// Whether a cell is done with the joints announced last. One that does not take them, because they are those of
-    /// another robot, reports the epoch before; after two heartbeats it has processed them: one of the two is the
-    /// answer to the sync that came after them.
-    pub(super) const fn has_done(&self, present: &Present) -> bool {
-        present.done >= self.announcements || present.heartbeats >= 2
-    }
-
     /// The cells that are waited for.
     pub(super) fn undone(&self) -> impl Iterator<Item = CellId> {
-        let waits =
-            |present: &Present| present.claim.is_settled() && !present.is_given_up && !self.has_done(present);
-        self.present.iter().filter(move |(_, present)| waits(present)).map(|(cell, _)| *cell)
+        self.present.iter().filter(|(_, present)| present.is_awaited()).map(|(cell, _)| *cell)
     }
 }
 
@@ -411,67 +455,9 @@ impl Answers {
 }
 
 /// Takes in what a message shows of whether its cell has taken any joints yet.
-pub(super) fn take_first_joints(untouched: &mut BTreeMap<CellId, Epoch>, message: &Message) {
-    if let Message::Torque { from, .. } = *message {
-        untouched.remove(&from);
+pub(super) fn take_first_joints(cells: &mut PerCell<FirstJoints>, message: &Message) {
+    let Some((cell, input)) = first_joints::Input::of(message) else { return };
+    if let Some(place) = cells.get_mut(cell) {
+        *place = place.next(input);
     }
-    let Message::Network { from: Node::Cell(cell), epoch, page } = *message else { return };
-    match page {
-        NetworkPage::Heard(Heard { joints: 0, joints_late: 0, .. }) => {
-            untouched.insert(cell, epoch);
-        }
-        NetworkPage::Heard(_) => {
-            untouched.remove(&cell);
-        }
-        NetworkPage::Heartbeat(_)
-        | NetworkPage::Tree(_)
-        | NetworkPage::Refused(_)
-        | NetworkPage::Ports(_) => {
-            if untouched.get(&cell).is_some_and(|said| *said != epoch) {
-                untouched.remove(&cell);
-            }
-        }
-    }
-}
-
-/// Whether the recording explains why it has no such reply.
-pub(super) fn explain_extra(
-    lacking: &mut Lacking,
-    known_cell: Option<&mut KnownCell>,
-    (cell, round): (CellId, &Round),
-    is_last: bool,
-    is_end: bool,
-) -> bool {
-    // After what seemed a start nothing is known of its contact, and it may go on.
-    let is_free = round.touched.iter().all(|touched| touched.is(cell) == Some(false));
-    let Some(known_cell) = known_cell else {
-        // A cell that the recording does not have.
-        lacking.silent += 1;
-        return true;
-    };
-    let cell = &mut known_cell.cell;
-    if cell.measured {
-        return true;
-    }
-    let is_counted = cell.is_counted_at(round.nanos);
-    if cell.is_silent_at(round.nanos) {
-        lacking.silent += 1;
-    } else if is_last && !is_counted {
-        lacking.ended += 1;
-    } else if !is_free && !is_counted {
-        lacking.uncounted += 1;
-    } else if cell.untaken > 0 {
-        cell.untaken -= 1;
-        lacking.untaken += 1;
-    } else if cell.unrecorded > 0 {
-        cell.unrecorded -= 1;
-        lacking.unrecorded += 1;
-    } else if is_last {
-        lacking.ended += 1;
-    } else {
-        return false;
-    }
-    // Counters tell how many are missing, and not which: the end may have been sent later then.
-    known_cell.ended_earlier = is_end;
-    true
 }

@@ -5,8 +5,10 @@ use std::collections::BTreeSet;
 use protocol::id::CellId;
 use protocol::packet::Words;
 
-use super::bus_comparator::{Both, BusComparator, KnownCell, Round, explain_extra};
+use super::bus_comparator::{Both, BusComparator, KnownCell, Round};
+use super::states::contact::{self, End};
 use super::sums::{Outcome, ROUNDING, Side, Why, compare};
+use super::tally::Lacking;
 use super::{Comparator, First, Tally};
 use crate::replay::difference::{How, Said, What};
 
@@ -17,16 +19,18 @@ impl Comparator {
         let Some(round) = bus_comparator.rounds.pop_front() else { return };
         let number = bus_comparator.base;
         bus_comparator.base += 1;
-        let Some(tolerance) = tolerance.filter(|_| round.announced > 0) else { return };
+        let Some(tolerance) = tolerance.filter(|_| round.sending.is_announced()) else { return };
         if round.is_first {
-            bus_comparator.known.values_mut().for_each(|known_cell| known_cell.speaks = None);
+            for known_cell in bus_comparator.known.values_mut() {
+                known_cell.contact = known_cell.contact.next(contact::Recorded::PassBegins);
+            }
         }
         let at = Some((number, round.epoch, round.nanos));
         for (&(cell, what), &pair) in &round.replies {
             if let Some(how) =
                 bus_comparator.compare_reply(number, &round, (cell, what), pair, (tally, tolerance))
             {
-                tally.count(how, round.is_unsent);
+                tally.count(how, round.sending.is_unsent());
                 let said = [pair.recorded, pair.now].map(|words| Some(Said::Words(what, words?)));
                 first.note(how, bus_comparator.called(), cell, at, said);
             }
@@ -52,15 +56,17 @@ impl BusComparator {
         let (is_last, begins_later) = (self.last_round == Some(number), self.begins_later());
         let is_torque = what == What::Torque;
         let mut known_cell = self.known.get_mut(&cell);
-        let spoke = known_cell.as_ref().and_then(|known_cell| known_cell.speaks);
+        let contact = known_cell.as_ref().map(|known_cell| known_cell.contact).unwrap_or_default();
         if let (Some(known_cell), Some(recorded), true) = (&mut known_cell, recorded, is_torque) {
-            known_cell.speaks = Some(!recorded.is_zero());
+            let is_end = recorded.is_zero();
+            let input = if is_end { contact::Recorded::End } else { contact::Recorded::Torque };
+            known_cell.contact = contact.next(input);
         }
         match (recorded, now) {
             (None, None) => None,
             (Some(recorded), Some(now)) => {
                 if let Some(known_cell) = known_cell.filter(|_| is_torque) {
-                    known_cell.ended_earlier = false;
+                    known_cell.end = known_cell.end.next(contact::Round::Both);
                 }
                 let is_equal = match what {
                     What::Torque => tally.compare_torque(&recorded, &now, tolerance),
@@ -73,18 +79,17 @@ impl BusComparator {
                 tally.lacking.sensed_otherwise += 1;
                 None
             }
-            (Some(_), None) if round.is_unsent => Some(How::Missing),
+            (Some(_), None) if round.sending.is_unsent() => Some(How::Missing),
             (Some(recorded), None) => {
                 let is_end = is_torque && recorded.is_zero();
-                // The contact had ended before, by the recorded stimuli, or began before the part: the cell had not taken
-                // the joints at which it ended.
-                let was_over = spoke.map_or(begins_later, |spoke| spoke && !round.may_answer(cell));
+                // The cell had not taken the joints at which the contact ended.
+                let was_over = contact.was_over(begins_later, round.may_answer(cell));
                 let is_later = |known_cell: &&mut KnownCell| {
                     let was_over = was_over && !known_cell.cell.is_counted_at(round.nanos);
-                    is_end && (known_cell.ended_earlier || was_over)
+                    is_end && (known_cell.end == End::Earlier || was_over)
                 };
                 let Some(known_cell) = known_cell.filter(is_later) else { return Some(How::Missing) };
-                known_cell.ended_earlier = false;
+                known_cell.end = known_cell.end.next(contact::Round::LateEnd);
                 tally.lacking.said_later += 1;
                 None
             }
@@ -120,7 +125,7 @@ impl BusComparator {
             let is_touched = round.is_touched(cell);
             let is_doubtful = || {
                 then.is_doubtful(cell, is_touched, false)
-                    || round.announced > 1 && now.is_doubtful(cell, is_touched, true)
+                    || round.sending.is_repeated() && now.is_doubtful(cell, is_touched, true)
             };
             if matches!(outcome, Outcome::Different | Outcome::Missing | Outcome::Extra) && is_doubtful() {
                 outcome = Outcome::Omitted(Why::NotTaken);
@@ -139,7 +144,7 @@ impl BusComparator {
                 }
                 Outcome::Omitted(why) => {
                     *match why {
-                        _ if round.is_unsent => &mut tally.not_requested,
+                        _ if round.sending.is_unsent() => &mut tally.not_requested,
                         Why::Changing => &mut lacking.parent_changing,
                         Why::Unknown => &mut lacking.tree_unknown,
                         Why::NotTaken => &mut lacking.sums_not_taken,
@@ -159,7 +164,7 @@ impl BusComparator {
                 }
                 Outcome::Extra => How::Extra,
             };
-            tally.count(how, round.is_unsent);
+            tally.count(how, round.sending.is_unsent());
             let said = owns.map(|own| own.map(Said::Sum));
             first.note(how, self.called(), cell, Some((number, round.epoch, round.nanos)), said);
         }
@@ -202,4 +207,46 @@ impl BusComparator {
             }
         }
     }
+}
+
+/// Whether the recording explains why it has no such reply.
+fn explain_extra(
+    lacking: &mut Lacking,
+    known_cell: Option<&mut KnownCell>,
+    (cell, round): (CellId, &Round),
+    is_last: bool,
+    is_end: bool,
+) -> bool {
+    // After what seemed a start nothing is known of its contact, and it may go on.
+    let is_free = round.touched.iter().all(|touched| touched.is(cell) == Some(false));
+    let Some(known_cell) = known_cell else {
+        // A cell that the recording does not have.
+        lacking.silent += 1;
+        return true;
+    };
+    let cell = &mut known_cell.cell;
+    if cell.measured {
+        return true;
+    }
+    let is_counted = cell.is_counted_at(round.nanos);
+    if cell.is_silent_at(round.nanos) {
+        lacking.silent += 1;
+    } else if is_last && !is_counted {
+        lacking.ended += 1;
+    } else if !is_free && !is_counted {
+        lacking.uncounted += 1;
+    } else if cell.untaken > 0 {
+        cell.untaken -= 1;
+        lacking.untaken += 1;
+    } else if cell.unrecorded > 0 {
+        cell.unrecorded -= 1;
+        lacking.unrecorded += 1;
+    } else if is_last {
+        lacking.ended += 1;
+    } else {
+        return false;
+    }
+    // Counters tell how many are missing, and not which: the end may have been sent later then.
+    known_cell.end = known_cell.end.next(contact::Round::Extra { is_end });
+    true
 }

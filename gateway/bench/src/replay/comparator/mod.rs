@@ -12,6 +12,7 @@
 
 mod bus_comparator;
 mod close;
+mod states;
 mod sums;
 mod tally;
 
@@ -26,6 +27,9 @@ use protocol::skin::Skin;
 
 pub use bus_comparator::Present;
 use bus_comparator::{Announced, Both, BusComparator, take_first_joints};
+use states::first_joints::FirstJoints;
+use states::progress::Progress;
+use states::{line, sending};
 pub use sums::Own;
 use sums::{Side, Sum};
 pub use tally::{Lacking, Steps, Tally};
@@ -151,9 +155,10 @@ impl Comparator {
             let sensing = Sensing::from_words(words).filter(|_| is_sensing);
             bus_comparator.senses |= sensing.is_some_and(|sensing| sensing != Sensing::Off);
         }
-        take_first_joints(&mut bus_comparator.untouched.recorded, message);
+        take_first_joints(&mut bus_comparator.first_joints.recorded, message);
         let Some((cell, epoch, what, words)) = reply(message) else { return };
-        if what != What::Torque && bus_comparator.untouched.recorded.get(&cell) == Some(&epoch) {
+        let untaken = FirstJoints::Awaited { epoch };
+        if what != What::Torque && bus_comparator.first_joints.recorded.get(cell) == Some(&untaken) {
             // Of no joints, even if joints of that epoch were on the bus by then.
             return;
         }
@@ -192,13 +197,7 @@ impl Comparator {
         }
         let Some(number) = round else { return };
         it.sent = it.sent.max(number + 1);
-        if let Some(round) = it.round(number) {
-            round.is_unsent = false;
-            // When joints are repeated, all cells resend their sums.
-            round.sums.now.clear();
-            round.announced_as = epoch;
-            round.announced += 1;
-        }
+        it.send(number, sending::Input::Sent { under: epoch });
         while self
             .bus_comparators
             .get(bus_comparator)
@@ -222,20 +221,16 @@ impl Comparator {
 
     /// Takes in that a bus did not take the joints of a round.
     pub fn was_not_sent(&mut self, bus_comparator: usize, round: u64) {
-        if let Some(round) = self
-            .bus_comparators
-            .get_mut(bus_comparator)
-            .and_then(|bus_comparator| bus_comparator.round(round))
-        {
-            round.is_unsent = true;
+        if let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) {
+            bus_comparator.send(round, sending::Input::Refused);
         }
     }
 
     /// Takes in a message of another sender on a bus.
     pub fn hear(&mut self, index: usize, message: &Message) {
         let Some(bus_comparator) = self.bus_comparators.get_mut(index) else { return };
-        bus_comparator.is_down = false;
-        take_first_joints(&mut bus_comparator.untouched.now, message);
+        bus_comparator.line(line::Input::Message);
+        take_first_joints(&mut bus_comparator.first_joints.now, message);
         if let Message::Network { from: Node::Cell(cell), epoch, page } = *message {
             bus_comparator.network(cell, epoch, &page);
         } else if let Message::Joints { .. } | Message::Network { .. } = message {
@@ -250,12 +245,13 @@ impl Comparator {
             bus_comparator.answers.entry(from).or_default().now.push_back((tag, answer));
         } else if let Message::Sum { from, epoch, torque, count } = *message
             && let Some((_, round)) =
-                bus_comparator.announced_round(epoch).filter(|(_, round)| round.announced_as == epoch)
+                bus_comparator.announced_round(epoch).filter(|(_, round)| round.has_sums_of(epoch))
         {
             round.sums.now.take(from, Sum { torque, count });
         }
         let Some((cell, epoch, what, words)) = reply(message) else { return };
-        if what != What::Torque && bus_comparator.untouched.now.get(&cell) == Some(&epoch) {
+        let untaken = FirstJoints::Awaited { epoch };
+        if what != What::Torque && bus_comparator.first_joints.now.get(cell) == Some(&untaken) {
             return;
         }
         let Some((number, round)) = bus_comparator.announced_round(epoch) else { return };
@@ -286,27 +282,20 @@ impl Comparator {
     pub fn is_done(&self, bus_comparator: usize) -> bool {
         self.bus_comparators
             .get(bus_comparator)
-            .is_none_or(|bus_comparator| bus_comparator.is_down || bus_comparator.undone().next().is_none())
+            .is_none_or(|bus_comparator| bus_comparator.is_down() || bus_comparator.undone().next().is_none())
     }
 
     /// Cells that are done with the joints announced last, so that progress can be seen.
     #[must_use]
     pub fn done(&self, bus_comparator: usize) -> usize {
         self.bus_comparators.get(bus_comparator).map_or(0, |bus_comparator| {
-            bus_comparator.present.values().filter(|present| bus_comparator.has_done(present)).count()
+            bus_comparator.present.values().filter(|present| present.progress == Progress::Done).count()
         })
     }
 
     /// Gives up the cells that are not done; returns them.
     pub fn give_up(&mut self, bus_comparator: usize) -> Vec<CellId> {
-        let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) else { return Vec::new() };
-        let late: Vec<_> = bus_comparator.undone().collect();
-        for cell in &late {
-            if let Some(present) = bus_comparator.present.get_mut(cell) {
-                present.is_given_up = true;
-            }
-        }
-        late
+        self.bus_comparators.get_mut(bus_comparator).map_or_else(Vec::new, BusComparator::give_up)
     }
 
     /// How many recorded torques and sums of the joints of a round have not come, of cells that are there.
@@ -319,9 +308,8 @@ impl Comparator {
         else {
             return 0;
         };
-        let is_there = |cell: &CellId| {
-            bus_comparator.present.get(cell).is_some_and(|present: &Present| !present.is_given_up)
-        };
+        let is_there =
+            |cell: &CellId| bus_comparator.present.get(cell).is_some_and(|present| !present.is_given_up());
         let replies = round.replies.iter().filter(|((_, what), _)| *what == What::Torque);
         let unanswered = replies.filter(|(_, pair)| pair.recorded.is_some() && pair.now.is_none());
         let torques = unanswered.filter(|((cell, _), _)| is_there(cell)).count();
@@ -337,7 +325,7 @@ impl Comparator {
     /// Takes in that a bus is down, so that none of its cells is waited for; the next message ends this.
     pub fn is_down(&mut self, bus_comparator: usize) {
         if let Some(bus_comparator) = self.bus_comparators.get_mut(bus_comparator) {
-            bus_comparator.is_down = true;
+            bus_comparator.line(line::Input::Lost);
         }
     }
 

@@ -61,10 +61,8 @@ fn rated_within(tolerance: u16, recording: &[Message], now: &[Message]) -> Compa
     }
     survey.finish();
     let cells = survey.buses[0].cells.clone();
-    comparator.bus_comparators[0].known = cells
-        .into_iter()
-        .map(|(node, cell)| (node, KnownCell { cell, ended_earlier: false, speaks: None }))
-        .collect();
+    comparator.bus_comparators[0].known =
+        cells.into_iter().map(|(node, cell)| (node, KnownCell::new(cell))).collect();
     comparator.mute(false);
     for (nanos, message) in times.zip(recording) {
         if let Message::Joints { epoch, .. } = *message {

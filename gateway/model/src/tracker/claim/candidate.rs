@@ -1,0 +1,92 @@
+//! An outsider that may own a node id when the owner is silent.
+//!
+//! | before | heartbeat of an outsider | next |
+//! |---|---|---|
+//! | nobody | any | first of its counter |
+//! | so many of a counter | goes on with it, 100 ms later or more | one more of it |
+//! | so many of a counter | sooner, or with another counter | first of its counter |
+//!
+//! A heartbeat of the owner, or of a start that is believed, leaves nobody. The candidate succeeds an owner that is
+//! silent if it has just started, or with the third heartbeat of its counter.
+
+use protocol::time::Span;
+
+use super::life::Life;
+
+/// So many heartbeats whose counter goes on show a start of which no claim was heard, on an id that two senders used.
+const SHOWN_BY: u8 = 3;
+
+/// A cell's heartbeats are a quarter of a second apart. Old ones that are sent again in the order of their counters, by
+/// chance, come much sooner.
+const PACE: Span = Span::from_millis(100);
+
+/// An outsider: its last heartbeat, and how many there were whose counter goes on.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) struct Candidate {
+    last: Life,
+    shown: u8,
+}
+
+impl Candidate {
+    /// The candidate after a heartbeat of an outsider.
+    pub(super) fn next(before: Option<Self>, new: Life) -> Self {
+        let goes_on = |it: &Self| it.last.sent(&new).is_some() && new.at.since(it.last.at) >= PACE;
+        let shown = before.filter(goes_on).map_or(1, |it| it.shown.saturating_add(1));
+        Self { last: new, shown }
+    }
+
+    /// Whether it owns the id from its last heartbeat on.
+    pub(super) fn succeeds(&self, owner: Option<&Life>) -> bool {
+        let is_silent = owner.is_none_or(|owner| !owner.is_alive(self.last.at));
+        is_silent && (self.last.has_just_started() || self.shown >= SHOWN_BY)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::message::{Heartbeat, State};
+    use protocol::time::Micros;
+
+    use super::*;
+
+    fn life(ms: u64, serial: u32, sent: u16) -> Life {
+        let state = if sent == 0 { State::CLAIMING } else { State::default() };
+        Life::new(Micros(ms * 1_000), &Heartbeat { serial, sent, state, ..Heartbeat::default() })
+    }
+
+    fn after(heard: &[(u64, u32, u16)]) -> Candidate {
+        let next = |before, &(ms, serial, sent): &(u64, u32, u16)| {
+            Some(Candidate::next(before, life(ms, serial, sent)))
+        };
+        heard.iter().fold(None, next).unwrap()
+    }
+
+    #[test]
+    fn nobody_then_any() {
+        assert_eq!(after(&[(0, 7, 10)]).shown, 1);
+    }
+
+    #[test]
+    fn a_counter_that_goes_on_100_ms_later() {
+        assert_eq!(after(&[(0, 7, 10), (100, 7, 11)]).shown, 2);
+        assert_eq!(after(&[(0, 7, 10), (100, 7, 11), (200, 7, 11 + 2_048)]).shown, 3);
+    }
+
+    #[test]
+    fn a_counter_that_comes_sooner_or_is_another() {
+        for (ms, serial, sent) in [(99, 7, 11), (100, 7, 10), (100, 7, 9), (100, 8, 11), (100, 7, 11 + 2_048)]
+        {
+            assert_eq!(after(&[(0, 7, 10), (ms, serial, sent)]).shown, 1, "{ms} {serial} {sent}");
+        }
+    }
+
+    #[test]
+    fn a_silent_owner_is_succeeded_by_a_start_or_a_third_heartbeat() {
+        let (alive, silent) = (life(0, 5, 1), life(0, 5, 1));
+        let start = after(&[(601, 7, 0)]);
+        assert!(start.succeeds(Some(&silent)) && start.succeeds(None));
+        assert!(!after(&[(600, 7, 0)]).succeeds(Some(&alive)));
+        let [two, three] = [2, 3].map(|many| after(&[(500, 7, 1), (600, 7, 2), (700, 7, 3)][..many]));
+        assert!(!two.succeeds(None) && three.succeeds(Some(&silent)));
+    }
+}

@@ -1,0 +1,243 @@
+//! The owner of a node id as a state machine: states, what a heartbeat shows, and the table of both.
+//!
+//! ```text
+//!            Claims,               Intrudes, Starts,
+//!   ┌──────┐ Settles ┌──────┐      Jumps, Succeeds      ┌─────────┐
+//!   │ Free │ ──────> │ Sole │ ────────────────────────> │ Doubted │
+//!   └──────┘         └──────┘                           └────┬────┘
+//!                                                            │ FormerContinues
+//!                    ┌───────────┐       Succeeds       ┌────▼───┐
+//!                    │ Inherited │ <─────────────────── │ Shared │
+//!                    └─────┬─────┘                      └────▲───┘
+//!                          └───────── FormerContinues ───────┘
+//! ```
+//!
+//! Each row is a row of the tests beside this file, which go through all states and all evidence. *Former* is the life
+//! before a start that may be taken back; it *may go on* for 10 s after its last heartbeat.
+//!
+//! | row | state | evidence | next | word | why |
+//! |---|---|---|---|---|---|
+//! | `first_claim` | `Free` | `Claims` | `Sole` | `Started`, not again | a cell claims its id for half a second after a start, and at no other time |
+//! | `found` | `Free` | `Settles` | `Sole` | `First` | it started before anybody listened |
+//! | `other_claim` | all others | `Claims` | the same | `Claimant` | a claimant yields to the cell that has the id, or that claimed it first |
+//! | `claimant_lost` | all others | `Settles` | the same, new owner | `First` | the owner only claimed the id, and did not get it |
+//! | `old` | all others | `Repeats` | the same | `Overtaken` | it shows nothing that its successor did not |
+//! | `next` | all others | `Continues` | the same, newer owner | `Known` | the counter fits the owner, and no better the former |
+//! | `away` | `Sole`, `Doubted` | `Returns` | the same, newer owner | `Known` | after 10 s nothing is known of how much it sent; its serial number is the owner's |
+//! | `start` | `Sole` | `Intrudes`, `Starts`, `Jumps`, `Succeeds` | `Doubted`, former: the owner | `Started` again | a start is believed at once |
+//! | `further_start` | `Doubted`, former may go on | `Intrudes`, `Starts`, `Jumps`, `Succeeds` | `Doubted`, former: as before | `Started` again | two old heartbeats in turn hide no cell that goes on |
+//! | `start_after_former` | `Doubted`, former may not | `Intrudes`, `Starts`, `Jumps`, `Succeeds` | `Doubted`, former: the owner | `Started` again | of what may be taken back only the owner is left |
+//! | `impossible` | `Sole`, `Doubted` | `Exceeds` | the same | `Outsider` | neither the owner nor a cell that started since can have sent so much |
+//! | `taken_back` | `Doubted`, `Inherited` | `FormerContinues` | `Shared` | `Shared` | what seemed a start was an old heartbeat, or another cell's with this id |
+//! | `outsider` | `Shared`, `Inherited` | `Intrudes`, `Starts`, `Jumps`, `Returns`, `Exceeds` | the same | `Outsider` | a start is not believed while the owner is alive: once is enough |
+//! | `successor` | `Shared` | `Succeeds` | `Inherited`, former: the owner | `Started` again | the owner is silent, and the candidate shows that it is alive |
+//! | `further_successor` | `Inherited`, former may go on | `Succeeds` | `Inherited`, former: as before | `Started` again | as `further_start` |
+//! | `successor_after_former` | `Inherited`, former may not | `Succeeds` | `Inherited`, former: the owner | `Started` again | as `start_after_former` |
+//! | `incomparable` | `Free`; `Sole`, `Shared` | all but `Claims`, `Settles`; `FormerContinues` | the same | `Overtaken` | cannot come: there is no owner, no former to compare with |
+//!
+//! An id that was shared stays so: `Shared` and `Inherited` have no way back to `Sole`. Whether the owner has settled is
+//! no state: its last heartbeat says it.
+
+use super::Word;
+use super::life::{LEAP, Life};
+
+/// What is known of the owner of a node id.
+#[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
+pub(super) enum Ownership {
+    /// No heartbeat has come.
+    #[default]
+    Free,
+    /// One cell has the id, or is the first one to claim it.
+    Sole { owner: Life },
+    /// The owner seemed to start; the life before it may go on, and then that was no start.
+    Doubted { owner: Life, former: Life },
+    /// Two senders have used the id in turn: only who succeeds a silent owner is believed.
+    Shared { owner: Life },
+    /// The owner succeeded a silent one of a shared id; the life before it may go on.
+    Inherited { owner: Life, former: Life },
+}
+
+/// What a heartbeat shows. In the order in which it is looked for, which [`Ownership::evidence`] keeps.
+#[derive(Clone, Copy, Debug, Eq, PartialEq)]
+pub(super) enum Evidence {
+    /// It has CLAIMING, and another serial number than the owner's or no owner to compare with.
+    Claims,
+    /// It has no CLAIMING, and another serial number than an owner that only claims the id, or no owner to compare with.
+    Settles,
+    /// It is of another serial number than a settled owner's, or its counter is not the owner's; the former's goes on to
+    /// it. If both counters go on to it: the owner's claim was heard and cannot be over; or it was not heard, and the
+    /// former's counter is nearer.
+    FormerContinues,
+    /// It is of another cell that has settled, as the owner has.
+    Intrudes,
+    /// It is the owner's first packet after a start.
+    Starts,
+    /// It is the owner's last one again, or an older one. Of an owner whose claim was not heard: or the former's.
+    Repeats,
+    /// The owner's counter goes on to it.
+    Continues,
+    /// The owner was away for more than 10 s, and its counter is ahead of where it was.
+    Returns,
+    /// It is of a life that has sent more than any cell that started since the owner's last heartbeat.
+    Exceeds,
+    /// Its counter is neither the owner's nor the former's: a cell whose claim was lost, or an old heartbeat.
+    Jumps,
+    /// An outsider owns the id now, by what [`super::candidate`] knows of it. No single heartbeat shows this.
+    Succeeds,
+}
+
+impl Ownership {
+    /// The cell that has the id, or claims it.
+    pub(super) const fn owner(&self) -> Option<&Life> {
+        match self {
+            Self::Free => None,
+            Self::Sole { owner }
+            | Self::Doubted { owner, .. }
+            | Self::Shared { owner }
+            | Self::Inherited { owner, .. } => Some(owner),
+        }
+    }
+
+    /// The life before the owner's start, by which that may be taken back.
+    pub(super) const fn former(&self) -> Option<&Life> {
+        match self {
+            Self::Doubted { former, .. } | Self::Inherited { former, .. } => Some(former),
+            Self::Free | Self::Sole { .. } | Self::Shared { .. } => None,
+        }
+    }
+
+    /// The same state with another owner.
+    const fn with_owner(self, owner: Life) -> Self {
+        match self {
+            Self::Free => Self::Free,
+            Self::Sole { .. } => Self::Sole { owner },
+            Self::Doubted { former, .. } => Self::Doubted { owner, former },
+            Self::Shared { .. } => Self::Shared { owner },
+            Self::Inherited { former, .. } => Self::Inherited { owner, former },
+        }
+    }
+
+    /// The same state after the owner's next heartbeat.
+    fn with_last(self, last: Life) -> Self {
+        self.owner().map_or(self, |owner| self.with_owner(owner.with_last(last)))
+    }
+
+    /// What a heartbeat shows; `new` is the life that would begin with it.
+    pub(super) fn evidence(&self, new: &Life) -> Evidence {
+        let Some(owner) = self.owner() else {
+            return if new.is_settled() { Evidence::Settles } else { Evidence::Claims };
+        };
+        let of_former = self.former().and_then(|former| former.sent(new));
+        if !owner.is_same_cell(new) {
+            return match (owner.is_settled(), new.is_settled()) {
+                (_, false) => Evidence::Claims,
+                (false, true) => Evidence::Settles,
+                (true, true) if of_former.is_some() => Evidence::FormerContinues,
+                (true, true) => Evidence::Intrudes,
+            };
+        }
+        if new.has_just_started() {
+            return Evidence::Starts;
+        }
+        let is_old_of_former =
+            || self.former().is_some_and(|former| former.is_alive(new.at) && former.is_past(new));
+        if owner.is_past(new) || owner.claimed.is_none() && is_old_of_former() {
+            return Evidence::Repeats;
+        }
+        match (owner.sent(new), of_former) {
+            (Some(_), Some(_)) if owner.claims_until(new) => Evidence::FormerContinues,
+            (Some(own), Some(its)) if owner.claimed.is_none() && self.is_formers(new, own, its) => {
+                Evidence::FormerContinues
+            }
+            (Some(_), _) => Evidence::Continues,
+            (None, Some(_)) => Evidence::FormerContinues,
+            (None, None) if owner.back(new).cast_signed() < 0 && !owner.may_go_on(new.at) => {
+                Evidence::Returns
+            }
+            (None, None) if !owner.has_time_for(new.at, new.heartbeat.sent) => Evidence::Exceeds,
+            (None, None) => Evidence::Jumps,
+        }
+    }
+
+    /// Whether a counter that is `own` ahead of the owner's and `its` ahead of the former's is rather the former's.
+    fn is_formers(&self, new: &Life, own: u16, its: u16) -> bool {
+        let is_alive = self.former().is_some_and(|former| former.is_alive(new.at));
+        its < own && (is_alive || own > LEAP && its < own / 8)
+    }
+
+    /// The state after a heartbeat that shows this, and what the heartbeat means; `new` is the life that would begin
+    /// with it. The rows of the table are named beside the arms.
+    pub(super) fn next(self, evidence: Evidence, new: Life) -> (Self, Word) {
+        use Evidence as E;
+        const AGAIN: Word = Word::Started { again: true };
+        let left_of = |former: Life, owner: Life| if former.may_go_on(new.at) { former } else { owner };
+        match (self, evidence) {
+            // first_claim
+            (Self::Free, E::Claims) => (Self::Sole { owner: new }, Word::Started { again: false }),
+            // found
+            (Self::Free, E::Settles) => (Self::Sole { owner: new }, Word::First),
+            // other_claim
+            (
+                Self::Sole { .. } | Self::Doubted { .. } | Self::Shared { .. } | Self::Inherited { .. },
+                E::Claims,
+            ) => (self, Word::Claimant),
+            // claimant_lost
+            (
+                Self::Sole { .. } | Self::Doubted { .. } | Self::Shared { .. } | Self::Inherited { .. },
+                E::Settles,
+            ) => (self.with_owner(new), Word::First),
+            // old
+            (
+                Self::Sole { .. } | Self::Doubted { .. } | Self::Shared { .. } | Self::Inherited { .. },
+                E::Repeats,
+            ) => (self, Word::Overtaken),
+            // next, away
+            (
+                Self::Sole { .. } | Self::Doubted { .. } | Self::Shared { .. } | Self::Inherited { .. },
+                E::Continues,
+            )
+            | (Self::Sole { .. } | Self::Doubted { .. }, E::Returns) => (self.with_last(new), Word::Known),
+            // start
+            (Self::Sole { owner }, E::Intrudes | E::Starts | E::Jumps | E::Succeeds) => {
+                (Self::Doubted { owner: new, former: owner }, AGAIN)
+            }
+            // further_start, start_after_former
+            (Self::Doubted { owner, former }, E::Intrudes | E::Starts | E::Jumps | E::Succeeds) => {
+                (Self::Doubted { owner: new, former: left_of(former, owner) }, AGAIN)
+            }
+            // taken_back
+            (Self::Doubted { .. } | Self::Inherited { .. }, E::FormerContinues) => {
+                (Self::Shared { owner: new }, Word::Shared)
+            }
+            // impossible, outsider
+            (Self::Sole { .. } | Self::Doubted { .. }, E::Exceeds)
+            | (
+                Self::Shared { .. } | Self::Inherited { .. },
+                E::Intrudes | E::Starts | E::Jumps | E::Returns | E::Exceeds,
+            ) => (self, Word::Outsider),
+            // successor
+            (Self::Shared { owner }, E::Succeeds) => (Self::Inherited { owner: new, former: owner }, AGAIN),
+            // further_successor, successor_after_former
+            (Self::Inherited { owner, former }, E::Succeeds) => {
+                (Self::Inherited { owner: new, former: left_of(former, owner) }, AGAIN)
+            }
+            // incomparable
+            (
+                Self::Free,
+                E::FormerContinues
+                | E::Intrudes
+                | E::Starts
+                | E::Repeats
+                | E::Continues
+                | E::Returns
+                | E::Exceeds
+                | E::Jumps
+                | E::Succeeds,
+            )
+            | (Self::Sole { .. } | Self::Shared { .. }, E::FormerContinues) => (self, Word::Overtaken),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;
