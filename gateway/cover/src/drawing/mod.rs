@@ -3,11 +3,10 @@
 //! Cells are hexagons with their node ids, coloured by bus; a root has a second hexagon. The page turns and zooms,
 //! and shows a cell that is chosen, searched as `bus:node`, or named behind `#` in its address.
 
-mod thin;
-
+use nalgebra::Point3;
 use serde::Serialize;
 
-use thin::thinned;
+use crate::mesh::simplify;
 
 /// The most triangles that a page has; more are merged.
 pub const MAX_TRIANGLES: usize = 12_000;
@@ -25,7 +24,7 @@ pub struct Drawing {
     pub cells: Vec<DrawnCell>,
     /// Lines below the cells, for instance from joint to joint.
     pub segments: Vec<[[f64; 3]; 2]>,
-    /// The links' surface. Of more than [`MAX_TRIANGLES`], corners that are close are merged.
+    /// The links' surface, of which at most [`MAX_TRIANGLES`] are drawn.
     pub triangles: Vec<[[f64; 3]; 3]>,
 }
 
@@ -69,13 +68,16 @@ pub fn page(drawing: &Drawing) -> String {
     }
     let segments: Vec<_> =
         drawing.segments.iter().map(|segment| segment.map(|end| end.map(rounded))).collect();
-    let triangles = thinned(&drawing.triangles, MAX_TRIANGLES).into_iter();
+    let triangles = drawing.triangles.iter().map(|triangle| triangle.map(Point3::from)).collect();
+    let triangles = simplify(vec![triangles], MAX_TRIANGLES).into_iter().flatten();
     let data = Data {
         pitch: if drawing.pitch.is_finite() { drawing.pitch } else { 0.0 },
         buses: &drawing.buses,
         cells: &cells,
         segments: &segments,
-        triangles: triangles.map(|triangle| triangle.map(|corner| corner.map(rounded))).collect(),
+        triangles: triangles
+            .map(|triangle| triangle.map(|corner| <[f64; 3]>::from(corner.coords).map(rounded)))
+            .collect(),
     };
     // Strings and finite numbers are always JSON. Without `<`, nothing in it ends the script element.
     let data = serde_json::to_string(&data).unwrap_or_default().replace('<', "\\u003c");
