@@ -4,7 +4,6 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use protocol::id::CellId;
-use protocol::time::Micros;
 
 use crate::run::RunError;
 
@@ -49,9 +48,4 @@ pub(crate) fn spawn<T: Send + 'static>(
 ) -> Result<JoinHandle<T>, RunError> {
     let named = thread::Builder::new().name(name.to_owned());
     named.spawn(work).map_err(|source| RunError::Thread { name: name.to_owned(), source })
-}
-
-/// The time since then.
-pub(crate) fn since(began: Instant) -> Micros {
-    Micros(u64::try_from(began.elapsed().as_micros()).unwrap_or(u64::MAX))
 }

@@ -9,6 +9,7 @@ use core::fmt::Write;
 use nalgebra::{UnitQuaternion, Vector3};
 use protocol::parameters::RowKind;
 use protocol::skin::{JointKind, Skin};
+use protocol::xml::escaped;
 
 use crate::rows::{Row, pose_of};
 use crate::taken::chain_words;
@@ -196,8 +197,4 @@ fn shape(out: &mut String, xyz: [f64; 3], rpy: [f64; 3], geometry: &str) {
 #[must_use]
 pub fn word(name: &str) -> String {
     name.chars().map(|letter| if letter.is_ascii_alphanumeric() { letter } else { '_' }).collect()
-}
-
-fn escaped(name: &str) -> String {
-    name.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

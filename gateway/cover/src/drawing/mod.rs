@@ -4,6 +4,7 @@
 //! and shows a cell that is chosen, searched as `bus:node`, or named behind `#` in its address.
 
 use nalgebra::Point3;
+use protocol::xml::escaped;
 use serde::Serialize;
 
 use crate::mesh::simplify;
@@ -101,21 +102,6 @@ pub fn page(drawing: &Drawing) -> String {
 /// To a hundredth of a millimetre.
 fn rounded(value: f64) -> f64 {
     if value.is_finite() { (value * 1e5).round() / 1e5 } else { 0.0 }
-}
-
-fn escaped(text: &str) -> String {
-    let mut escaped = String::with_capacity(text.len());
-    for letter in text.chars() {
-        match letter {
-            '&' => escaped.push_str("&amp;"),
-            '<' => escaped.push_str("&lt;"),
-            '>' => escaped.push_str("&gt;"),
-            '"' => escaped.push_str("&quot;"),
-            '\'' => escaped.push_str("&#39;"),
-            _ => escaped.push(letter),
-        }
-    }
-    escaped
 }
 
 #[cfg(test)]
