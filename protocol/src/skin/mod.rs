@@ -8,6 +8,7 @@ mod buses;
 mod cell_name;
 mod cells;
 mod check;
+pub mod file;
 mod names;
 mod part;
 mod raw;
