@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use analysis::report::svg::escaped;
+use protocol::xml::escaped;
 
 /// A report: its test cases in their order.
 #[derive(Debug)]

@@ -15,7 +15,7 @@ use protocol::usage::{Failure, print};
 
 use super::arguments::{FORMATS, Word, one_of};
 use super::output::Overwrite;
-pub(crate) use show::drawing;
+pub(crate) use show::still;
 
 const REPLIES: &[Word<Answers>] =
     &[("torque", "Each cell its own torque", Answers::Torque), ("sum", "Sums along the tree", Answers::Sum)];

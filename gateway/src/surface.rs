@@ -1,10 +1,13 @@
 //! What a skin's robot looks like: its URDF's links on the rows of the skin's chains.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use cover::Part;
+use cover::mesh::{Triangle, simplify};
 use protocol::skin::{Chain, ChainRow, Skin};
 use robots::{Isometry3, LinkFrame, Row, Urdf};
+use view::Shell;
 
 use super::output::note;
 use super::print::count;
@@ -12,60 +15,60 @@ use super::robot_file::{read_urdf, urdf_of};
 use super::visuals::{Packages, Visuals};
 
 /// A part of a link.
-#[derive(Clone, Debug)]
-pub(crate) struct Placed {
+struct Placed {
     /// The skin's chain.
-    pub(crate) chain: usize,
+    chain: usize,
     /// The row in whose frame it is, from 1; 0 is where the chain begins.
-    pub(crate) row: usize,
+    row: usize,
     /// The part; its pose is from that frame.
-    pub(crate) part: Part,
+    part: Part,
 }
 
-/// A robot's URDF beside its skin.
-#[derive(Debug)]
-pub(crate) struct Surface {
-    pub(crate) urdf: Urdf,
-    /// The URDF's chains, in the order of the skin's.
-    pub(crate) chains: Vec<robots::Chain>,
-    pub(crate) parts: Vec<Placed>,
-}
-
-impl Surface {
-    /// That of the skin in a file; none if it names no URDF. What cannot be drawn is noted.
-    pub(crate) fn read(file: &Path, skin: &Skin, packages: &Packages) -> Option<Self> {
-        let path = urdf_of(file, skin.robot.urdf.as_deref()?);
-        let surface = read_urdf(&path).and_then(|(urdf, _)| Self::of(urdf, &path, skin, packages));
-        surface.map_err(|error| note(format_args!("the robot is not drawn: {error}"))).ok()
+/// Returns what a page draws of the robot of the skin in a file: for each row its triangles, at most `most` in all; more are
+/// simplified. Nothing, if the skin names no URDF. What cannot be drawn is noted.
+pub(crate) fn shells(file: &Path, skin: &Skin, packages: &Packages, most: usize) -> Vec<Shell> {
+    let Some(path) = skin.robot.urdf.as_deref().map(|urdf| urdf_of(file, urdf)) else { return Vec::new() };
+    let parts = read_urdf(&path).and_then(|(urdf, _)| parts(&urdf, &path, skin, packages));
+    let parts =
+        parts.map_err(|error| note(format_args!("the robot is not drawn: {error}"))).unwrap_or_default();
+    let mut rows = BTreeMap::<_, Vec<_>>::new();
+    for Placed { chain, row, part } in parts {
+        rows.entry((chain, row)).or_default().extend(part.triangles(&Isometry3::identity()));
     }
+    let (places, triangles): (Vec<_>, Vec<_>) = rows.into_iter().unzip();
+    let points = |triangles: Vec<Triangle>| {
+        triangles.into_iter().map(|triangle| triangle.map(|corner| corner.coords.into())).collect()
+    };
+    let shells = places.into_iter().zip(simplify(triangles, most));
+    shells.map(|((chain, row), all)| Shell { chain, row, triangles: points(all) }).collect()
+}
 
-    fn of(urdf: Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<Self, String> {
-        let found = skin.robot.chains.iter().map(|chain| {
-            chain_of(&urdf, chain).ok_or_else(|| {
-                format!(
-                    "{} has no chain with the rows of {}: import the skin from it again",
-                    urdf.file, chain.name
-                )
-            })
-        });
-        let chains = found.collect::<Result<Vec<_>, _>>()?;
-        let visuals = Visuals::new(&urdf, file, packages);
-        let (mut parts, mut missing) = (Vec::new(), Vec::new());
-        for link in urdf.links() {
-            match visuals.parts(link) {
-                Err(error) => missing.push(error),
-                Ok(all) => {
-                    let Some((chain, row, frame)) = place(&urdf, &chains, link) else { continue };
-                    let put = |part: Part| Part { pose: frame * part.pose, ..part };
-                    parts.extend(all.into_iter().map(|part| Placed { chain, row, part: put(part) }));
-                }
+fn parts(urdf: &Urdf, file: &Path, skin: &Skin, packages: &Packages) -> Result<Vec<Placed>, String> {
+    let found = skin.robot.chains.iter().map(|chain| {
+        chain_of(urdf, chain).ok_or_else(|| {
+            format!(
+                "{} has no chain with the rows of {}: import the skin from it again",
+                urdf.file, chain.name
+            )
+        })
+    });
+    let chains = found.collect::<Result<Vec<_>, _>>()?;
+    let visuals = Visuals::new(urdf, file, packages);
+    let (mut parts, mut missing) = (Vec::new(), Vec::new());
+    for link in urdf.links() {
+        match visuals.parts(link) {
+            Err(error) => missing.push(error),
+            Ok(all) => {
+                let Some((chain, row, frame)) = place(urdf, &chains, link) else { continue };
+                let put = |part: Part| Part { pose: frame * part.pose, ..part };
+                parts.extend(all.into_iter().map(|part| Placed { chain, row, part: put(part) }));
             }
         }
-        if let Some(first) = missing.first() {
-            note(format_args!("{} not drawn: {first}", count(missing.len(), "link")));
-        }
-        Ok(Self { urdf, chains, parts })
     }
+    if let Some(first) = missing.first() {
+        note(format_args!("{} not drawn: {first}", count(missing.len(), "link")));
+    }
+    Ok(parts)
 }
 
 /// The URDF's chain with the same rows as a skin's.

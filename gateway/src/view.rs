@@ -3,7 +3,6 @@
 mod address;
 mod token;
 
-use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::io;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr, TcpListener};
@@ -16,10 +15,8 @@ use std::process::{Child, Command};
 use bench::remote::Lines;
 use bench::run;
 use clap::Args;
-use cover::mesh::{Triangle, simplify};
 use protocol::skin::Skin;
 use protocol::usage::Failure;
-use robots::Isometry3;
 use trace::capture::{CaptureError, Format, Reader};
 use view::Shell;
 use view::play::{self, play};
@@ -30,7 +27,7 @@ use view::server::{Access, url};
 use super::arguments::{BusKinds, bus_names, bus_of, nanos};
 use super::input::{no_frame, read_skin, remark_another, skin_of, stopped};
 use super::output::note;
-use super::surface::{Placed, Surface};
+use super::surface::shells;
 use super::visuals::Packages;
 use address::AddressFile;
 
@@ -201,8 +198,8 @@ impl View {
     /// The skin in a file, and its robot by its meshes, as far as they are found.
     fn read(&self, path: &Path) -> Result<(Skin, Vec<Shell>), Failure> {
         let skin = read_skin(path)?;
-        let surface = Surface::read(path, &skin, &self.packages).map(|it| simplified(&it));
-        Ok((skin, surface.unwrap_or_default()))
+        let surface = shells(path, &skin, &self.packages, TRIANGLES);
+        Ok((skin, surface))
     }
 
     /// The skin of a recording; of the one in it the URDF is not beside it.
@@ -247,21 +244,6 @@ impl View {
     }
 }
 
-/// What a page draws of a robot: for each row its triangles.
-fn simplified(surface: &Surface) -> Vec<Shell> {
-    let mut rows = BTreeMap::<_, Vec<_>>::new();
-    for Placed { chain, row, part } in &surface.parts {
-        rows.entry((*chain, *row)).or_default().extend(part.triangles(&Isometry3::identity()));
-    }
-    let (places, triangles): (Vec<_>, Vec<_>) = rows.into_iter().unzip();
-    let shells = places.into_iter().zip(simplify(triangles, TRIANGLES));
-    let point = |triangles: Vec<Triangle>| {
-        triangles.into_iter().map(|triangle| triangle.map(|corner| corner.coords.into())).collect()
-    };
-    shells.map(|((chain, row), all)| Shell { chain, row, triangles: point(all) }).collect()
-}
-
-/// Prints where the page is.
 /// The error for an address that no page can have.
 fn unbound(listen: SocketAddr, error: &io::Error) -> Failure {
     let is = |kind| error.kind() == kind;
@@ -277,6 +259,7 @@ fn unbound(listen: SocketAddr, error: &io::Error) -> Failure {
     ))
 }
 
+/// Prints where the page is.
 fn say(url: Option<String>) {
     url.iter().for_each(|url| note(format_args!("view: {url}")));
 }

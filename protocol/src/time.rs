@@ -3,6 +3,7 @@
 //! The cores never read a clock: a test, a simulation and a microcontroller each bring their own.
 
 use core::ops::{Add, Sub};
+use core::time::Duration;
 
 /// A point in time: microseconds since a start that the caller chose.
 #[derive(Clone, Copy, Debug, Default, Eq, Hash, Ord, PartialEq, PartialOrd)]
@@ -28,6 +29,12 @@ impl Span {
 }
 
 impl Micros {
+    /// Returns the point in time so long after the start, or the last one that there is.
+    #[must_use]
+    pub fn after(start: Duration) -> Self {
+        Self(u64::try_from(start.as_micros()).unwrap_or(u64::MAX))
+    }
+
     /// How long ago `earlier` was; nothing when it lies ahead.
     #[must_use]
     pub const fn since(self, earlier: Self) -> Span {

@@ -104,13 +104,13 @@ pub fn put(text: &str) -> io::Result<()> {
 /// written like `\u{1b}`.
 #[must_use]
 pub fn shown(text: &str) -> Cow<'_, str> {
-    escaped(text, is_unprintable)
+    with_codes(text, is_unprintable)
 }
 
 /// The same of a text of several lines: its line feeds and tabs stay.
 #[must_use]
 pub fn shown_lines(text: &str) -> Cow<'_, str> {
-    escaped(text, |letter| is_unprintable(letter) && !matches!(letter, '\n' | '\t'))
+    with_codes(text, |letter| is_unprintable(letter) && !matches!(letter, '\n' | '\t'))
 }
 
 /// Returns true for controls, marks and overrides of the direction of text, separators of lines, invisible characters that
@@ -133,13 +133,14 @@ pub const fn is_unprintable(letter: char) -> bool {
     ) || letter as u32 & 0xfffe == 0xfffe
 }
 
-fn escaped(text: &str, is_escaped: impl Fn(char) -> bool) -> Cow<'_, str> {
-    if !text.contains(&is_escaped) {
+/// Writes the letters that `is_coded` chooses as their code points, like `\u{1b}`.
+fn with_codes(text: &str, is_coded: impl Fn(char) -> bool) -> Cow<'_, str> {
+    if !text.contains(&is_coded) {
         return Cow::Borrowed(text);
     }
     let mut whole = String::with_capacity(text.len() + 16);
     for letter in text.chars() {
-        if is_escaped(letter) {
+        if is_coded(letter) {
             whole.extend(letter.escape_unicode());
         } else {
             whole.push(letter);

@@ -26,7 +26,7 @@ impl Clock {
     }
 
     pub(super) fn now(&self) -> Micros {
-        Micros(u64::try_from(self.start.elapsed().as_micros()).unwrap_or(u64::MAX))
+        Micros::after(self.start.elapsed())
     }
 
     /// Compares itself with the wall's clock, when it is time to.

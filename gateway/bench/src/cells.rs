@@ -12,7 +12,6 @@ use protocol::message::Message;
 use protocol::time::Micros;
 
 use crate::bus::listen::{self, Listener, passing, send};
-use crate::setup::since;
 
 /// Cells send four heartbeats a second, which show their frames' format.
 const FORMAT: Duration = Duration::from_millis(300);
@@ -77,7 +76,7 @@ impl Watch {
     /// The same as the time on the listing's clock.
     #[must_use]
     pub fn now(&self) -> Micros {
-        since(self.began)
+        Micros::after(self.began.elapsed())
     }
 
     /// Queries the cells once their frames' format is known; repeatedly if `again`.

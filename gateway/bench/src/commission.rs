@@ -15,7 +15,6 @@ use protocol::time::Micros;
 
 use crate::bus::listen::{self, Listener, passing, send};
 use crate::bus::roots::Roots;
-use crate::setup::since;
 
 /// How long a signal to end may wait if nothing comes.
 const LOOK: Duration = Duration::from_millis(50);
@@ -125,7 +124,7 @@ impl Bench {
         };
         let room = self.listener.bus().receive_buffer().checked_div(FRAME_BYTES * frames).unwrap_or(0);
         let began = Instant::now();
-        let clock = || since(began);
+        let clock = || Micros::after(began.elapsed());
         let mut commission = Commission::new(skin, self.index, wish, room, clock());
         let lost = self.converse(&mut commission, &clock, stopped, tell).err();
         if lost.is_some() {

@@ -9,12 +9,11 @@ use protocol::can::Format;
 use protocol::id::{CellId, Kind, Node};
 use protocol::message::{Answer, Message, Request};
 use protocol::parameters::{Parameter, Sensing};
-use protocol::time::Span;
+use protocol::time::{Micros, Span};
 use thiserror::Error;
 
 use crate::answers::Answers;
 use crate::bus::listen::{self, Listener, send};
-use crate::setup::since;
 
 /// How long cells are listened for: two heartbeats and a margin.
 const LISTEN: Duration = Duration::from_millis(600);
@@ -87,10 +86,10 @@ pub fn switch(bus: Bus, format: Format, only: Option<CellId>, mode: Sensing) -> 
     tell(listener.bus(), only.map_or(Node::Everyone, Node::Cell))?;
     let began = Instant::now();
     let mut requests = Repeats::new(AGAIN);
-    requests.said_to_all(since(began));
+    requests.said_to_all(Micros::after(began.elapsed()));
     while began.elapsed() < TIMEOUT && !are_complete(&answers, only, began.elapsed() >= LISTEN) {
         answers.hear(&mut listener)?;
-        for cell in requests.due(since(began), answers.missing()) {
+        for cell in requests.due(Micros::after(began.elapsed()), answers.missing()) {
             tell(listener.bus(), Node::Cell(cell))?;
         }
     }

@@ -3,7 +3,6 @@
 use std::time::{Duration, Instant};
 
 use protocol::id::CellId;
-use protocol::time::Micros;
 
 /// A timeout that restarts with each progress.
 #[derive(Clone, Copy, Debug)]
@@ -37,9 +36,4 @@ pub(crate) fn names(cells: &[CellId], place: &str) -> String {
         }
         _ => numbers.join(", ") + place,
     }
-}
-
-/// The time since then.
-pub(crate) fn since(began: Instant) -> Micros {
-    Micros(u64::try_from(began.elapsed().as_micros()).unwrap_or(u64::MAX))
 }

@@ -1,8 +1,8 @@
 //! The text of a skin with the poses that were found.
 
 use protocol::skin::Skin;
+use protocol::skin::file::{Edit, Value};
 use thiserror::Error;
-use toml_edit::{Array, DocumentMut, Item, Value};
 
 use crate::result::{Calibration, Found};
 
@@ -20,53 +20,33 @@ pub enum WriteError {
 /// # Errors
 /// When the text is not the skin's.
 pub fn calibrated(skin: &Skin, text: &str, calibration: &Calibration) -> Result<String, WriteError> {
-    let wrong = |why: String| WriteError::Text(why);
-    let mut document: DocumentMut =
-        text.parse().map_err(|error: toml_edit::TomlError| wrong(error.to_string()))?;
-    let cells = document.get_mut("cell").and_then(Item::as_array_of_tables_mut);
-    let cells = cells.ok_or_else(|| wrong("its cells are not [[cell]] tables".to_owned()))?;
-    if cells.len() != skin.cells.len() {
-        return Err(wrong(format!("{} cells, not {}", cells.len(), skin.cells.len())));
-    }
-    for ((table, cell), result) in cells.iter_mut().zip(&skin.cells).zip(&calibration.cells) {
+    let mut edit = Edit::new(skin, text).map_err(|error| WriteError::Text(error.to_string()))?;
+    for (index, (cell, result)) in skin.cells.iter().zip(&calibration.cells).enumerate() {
         let Some(found) = result.found.filter(|_| result.is_written()) else { continue };
         let Found { joint, row, position, orientation, .. } = found;
         if joint != cell.joint {
-            put(table.entry("joint"), Value::from(i64::from(joint)));
+            put(&mut edit, index, "joint", Value::Integer(i64::from(joint)), "node");
         }
-        if table.contains_key("row") {
-            put(table.entry("row"), Value::from(i64::from(row)));
-        }
-        put(table.entry("position"), array(&position));
-        let keys: Vec<_> = table.iter().map(|(key, _)| key.to_owned()).collect();
-        put(table.entry("orientation"), array(&orientation));
+        edit.set(index, "row", Value::Integer(i64::from(row)));
+        edit.set(index, "position", Value::Numbers(&position));
         // A cell has one of the two: the orientation takes the normal's place.
-        if table.remove("normal").is_some() {
-            let place = |key: &str| keys.iter().position(|it| it == key);
-            let order = |key: &str| place(key).or_else(|| place("normal"));
-            table.sort_values_by(|one, _, other, _| order(one.get()).cmp(&order(other.get())));
+        let orientation = Value::Numbers(&orientation);
+        if edit.has(index, "normal") {
+            edit.replace(index, "normal", "orientation", orientation);
+        } else {
+            put(&mut edit, index, "orientation", orientation, "position");
         }
     }
-    Ok(document.to_string())
+    Ok(edit.text())
 }
 
-/// Puts a value in the place of another one, and keeps the white space and the comment around that.
-fn put(entry: toml_edit::Entry<'_>, mut new: Value) {
-    match entry {
-        toml_edit::Entry::Occupied(mut entry) => {
-            if let Some(old) = entry.get_mut().as_value_mut() {
-                *new.decor_mut() = old.decor().clone();
-                *old = new;
-            }
-        }
-        toml_edit::Entry::Vacant(entry) => {
-            entry.insert(Item::Value(new));
-        }
+/// Sets a value, behind another one if the cell does not have it.
+fn put(edit: &mut Edit<'_>, cell: usize, key: &str, value: Value<'_>, after: &str) {
+    if edit.has(cell, key) {
+        edit.set(cell, key, value);
+    } else {
+        edit.insert(cell, key, value, after);
     }
-}
-
-fn array(of: &[f64]) -> Value {
-    Value::Array(of.iter().copied().collect::<Array>())
 }
 
 #[cfg(test)]

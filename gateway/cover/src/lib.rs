@@ -19,7 +19,6 @@
 //! # }
 //! ```
 
-pub mod drawing;
 mod figures;
 mod grid;
 pub mod mesh;

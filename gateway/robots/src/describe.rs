@@ -6,12 +6,12 @@
 //!   CellOnLink ─┘
 //! ```
 
-use core::fmt::Write;
-
 use nalgebra::{Point3, Vector3};
 use protocol::bus::is_plain;
+use protocol::can::Format;
 use protocol::document::DocumentError;
 use protocol::parameters::RowKind;
+use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
 use protocol::skin::{JointKind, MAX_ROBOT_JOINTS, REACH, Skin, reach};
 use thiserror::Error;
 
@@ -346,100 +346,86 @@ impl Import<'_> {
 
     fn text(&self, buses: &[Bus], cells: &[Placed<'_>]) -> String {
         let joints = self.joints();
-        let each = |value: &dyn Fn(&Joint) -> f64| {
-            joints.iter().map(|joint| format!("{:?}", value(joint))).collect::<Vec<_>>().join(", ")
-        };
+        let each =
+            |value: &dyn Fn(&Joint) -> f64| joints.iter().map(|joint| value(joint)).collect::<Vec<_>>();
         let by_kind = |turns: f64, slides: f64| {
             move |joint: &Joint| if joint.kind == JointKind::Prismatic { slides } else { turns }
         };
-        let mut out = format!("# {}\n", self.command);
+        let mut draft = Draft::default();
+        draft.comment(self.command);
         for chain in self.chains {
-            let (tip, count, rows) = (&chain.tip, chain.joints.len(), chain.rows.len());
-            let _ = writeln!(
-                out,
-                "# {} to {tip}: {count} joints in {rows} rows, which differ from the URDF by {:.1e} m or rad at most.",
-                chain.root, chain.residual
-            );
+            let (root, tip, count, rows) = (&chain.root, &chain.tip, chain.joints.len(), chain.rows.len());
+            let far = chain.residual;
+            draft.comment(&format!(
+                "{root} to {tip}: {count} joints in {rows} rows, which differ from the URDF by {far:.1e} m or rad at most."
+            ));
         }
-        let name = self.name;
-        let _ = write!(out, "version = 1\nname = {name:?}\n\n[robot]\nname = {name:?}\n");
+        draft.set("version", Value::Integer(1));
+        draft.set("name", Value::Text(self.name));
+        draft.table("[robot]", None);
+        draft.set("name", Value::Text(self.name));
         if let Some(urdf) = self.urdf {
-            let _ = writeln!(out, "urdf = {urdf:?}");
+            draft.set("urdf", Value::Text(urdf));
         }
-        for Joint { name, kind, limits: [min, max], .. } in &joints {
-            let (word, unit) = (kind.name(), kind.unit());
-            let _ = write!(
-                out,
-                "\n[[robot.joint]]\nname = {name:?}\nkind = \"{word}\"\nlimits = [{min:?}, {max:?}]   # {unit}\n"
-            );
+        for Joint { name, kind, limits, .. } in &joints {
+            draft.table("[[robot.joint]]", None);
+            draft.set("name", Value::Text(name));
+            draft.set("kind", Value::Text(kind.name()));
+            draft.set_remarked("limits", Value::Numbers(limits), 3, kind.unit());
         }
-        for chain in self.chains {
-            let _ = write!(
-                out,
-                "\n[[robot.chain]]   # standard Denavit-Hartenberg, base to tip; m, rad\nname = {:?}\n",
-                chain.tip
-            );
-            let base = chain.below * chain.base;
-            let [position, turn] =
-                [base.translation.vector.as_slice(), base.rotation.coords.as_slice()].map(|all| {
-                    all.iter().map(|&value| format!("{:?}", tidy(value))).collect::<Vec<_>>().join(", ")
-                });
-            let _ = writeln!(out, "base = {{ position = [{position}], orientation = [{turn}] }}\nrows = [");
-            let mut names = chain.joints.iter();
-            for row in &chain.rows {
-                let joint = if row.kind == RowKind::Fixed { None } else { names.next() };
-                let joint = joint.map_or_else(String::new, |joint| format!("joint = {:?}, ", joint.name));
-                let (a, alpha, d, offset) = (row.a, row.alpha, row.d, row.theta_offset);
-                let _ = writeln!(
-                    out,
-                    "  {{ {joint}a = {a:?}, alpha = {alpha:?}, d = {d:?}, theta_offset = {offset:?} }},"
-                );
-            }
-            out.push_str("]\n");
-        }
-        out.push_str(
-            "\n[timing]\ncontrol_hz = 500.0\njoint_broadcast_hz = 62.5\n\n\
-             [contact]   # the paper's Algorithm 1\nalpha_c = 1.0\nalpha_p = 0.0\ncontact_threshold_n = 0.1\n\
-             proximity_threshold = 0.05\nforce_threshold_n = 0.1\n",
-        );
+        self.chains.iter().for_each(|chain| add_chain(&mut draft, chain));
+        draft.paper(62.5);
         for bus in buses {
             let chain = self.chains.get(bus.chain).map_or("", |chain| &chain.tip);
-            let _ = write!(
-                out,
-                "\n[[bus]]\nname = {:?}\nchain = {chain:?}\nreply = \"torque\"\nformat = \"fd\"\n",
-                bus.name
-            );
+            draft.bus(&DraftBus { name: &bus.name, chain: Some(chain), slot_us: None, format: Format::Fd });
         }
-        let speed = |joint: &Joint| joint.max_speed.unwrap_or(MAX_SPEED);
-        let _ = write!(
-            out,
-            "\n[controller]   # M q'' + D q' = tau, joint by joint\nkind = \"kinesthetic\"\n\
-             inertia = [{}]     # kg m2, or kg\ndamping = [{}]     # Nm s/rad, or N s/m\nmax_speed = [{}]   # rad/s, or m/s\n",
-            each(&by_kind(1.0, 10.0)),
-            each(&by_kind(4.0, 80.0)),
-            each(&speed),
-        );
+        draft.table("[controller]", Some("M q'' + D q' = tau, joint by joint"));
+        draft.set("kind", Value::Text("kinesthetic"));
+        draft.set_remarked("inertia", Value::Numbers(&each(&by_kind(1.0, 10.0))), 5, "kg m2, or kg");
+        draft.set_remarked("damping", Value::Numbers(&each(&by_kind(4.0, 80.0))), 5, "Nm s/rad, or N s/m");
+        let speed = each(&|joint| joint.max_speed.unwrap_or(MAX_SPEED));
+        draft.set_remarked("max_speed", Value::Numbers(&speed), 3, "rad/s, or m/s");
         for cell in cells {
             let bus = buses.get(cell.bus).map_or("", |bus| &bus.name);
             let own = self.chains.get(cell.chain).and_then(|chain| row_of(chain, cell.joint));
-            let row = if own == Some(cell.row) { String::new() } else { format!("row = {}\n", cell.row) };
             let CellOnLink { link, neighbors, root, .. } = cell.cell;
-            let [[px, py, pz], [nx, ny, nz]] = [cell.position, cell.normal].map(|it| it.map(tidy));
-            let _ = write!(
-                out,
-                "\n[[cell]]   # on {}\nbus = {bus:?}\nnode = {}\njoint = {}\n{row}position = [{px:?}, {py:?}, {pz:?}]\n\
-                 normal = [{nx:?}, {ny:?}, {nz:?}]\n",
-                link, cell.node, cell.joint
-            );
-            if neighbors.iter().any(Option::is_some) {
-                let _ = writeln!(out, "neighbors = {:?}", neighbors.map(Option::unwrap_or_default));
-            }
-            if *root {
-                out.push_str("root = true\n");
-            }
+            draft.cell(&DraftCell {
+                remark: Some(&format!("on {link}")),
+                bus,
+                node: cell.node.into(),
+                serial: None,
+                joint: cell.joint,
+                row: Some(cell.row).filter(|row| own != Some(*row)),
+                position: cell.position.map(tidy),
+                facing: Facing::Normal(cell.normal.map(tidy)),
+                neighbors: neighbors
+                    .iter()
+                    .any(Option::is_some)
+                    .then(|| neighbors.map(Option::unwrap_or_default)),
+                root: *root,
+            });
         }
-        out
+        draft.text()
     }
+}
+
+/// Adds a chain: where it begins, and its rows.
+fn add_chain(draft: &mut Draft, chain: &Chain) {
+    draft.table("[[robot.chain]]", Some("standard Denavit-Hartenberg, base to tip; m, rad"));
+    draft.set("name", Value::Text(&chain.tip));
+    let base = chain.below * chain.base;
+    let [position, turn] = [base.translation.vector.as_slice(), base.rotation.coords.as_slice()]
+        .map(|all| all.iter().copied().map(tidy).collect::<Vec<_>>());
+    let base = [("position", Value::Numbers(&position)), ("orientation", Value::Numbers(&turn))];
+    draft.set_table("base", &base);
+    let mut names = chain.joints.iter();
+    let rows = chain.rows.iter().map(|row| {
+        let joint = if row.kind == RowKind::Fixed { None } else { names.next() };
+        let joint = joint.map(|joint| ("joint", Value::Text(&joint.name)));
+        let table = [("a", row.a), ("alpha", row.alpha), ("d", row.d), ("theta_offset", row.theta_offset)];
+        joint.into_iter().chain(table.map(|(key, value)| (key, Value::Number(value)))).collect()
+    });
+    draft.set_rows("rows", None, rows);
 }
 
 /// The row of a joint, both from 1.

@@ -9,6 +9,7 @@ use core::fmt::Write;
 use nalgebra::{UnitQuaternion, Vector3};
 use protocol::parameters::RowKind;
 use protocol::skin::{JointKind, Skin};
+use protocol::xml::escaped;
 
 use crate::rows::{Row, pose_of};
 use crate::taken::chain_words;
@@ -190,8 +191,4 @@ fn shape(out: &mut String, xyz: [f64; 3], rpy: [f64; 3], geometry: &str) {
         out,
         "    <visual>{origin}<geometry>{geometry}</geometry><material name=\"grey\"/></visual>"
     );
-}
-
-fn escaped(name: &str) -> String {
-    name.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }

@@ -3,13 +3,13 @@
 use std::path::Path;
 
 use calibration::Calibration;
-use cover::drawing::page as drawn;
 use protocol::skin::Skin;
+use view::{Moved, Scene};
 
-use crate::skin::drawing;
+use crate::skin::still;
 use crate::visuals::Packages;
 
-/// The page: cells where they were found, and a line from where each of them was described.
+/// Returns the page: cells where they were found, and a line from where each of them was described.
 pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> String {
     let mut found = skin.clone();
     for (cell, result) in found.cells.iter_mut().zip(&calibration.cells) {
@@ -19,12 +19,16 @@ pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> Strin
         cell.orientation = Some(pose.orientation);
         cell.normal = [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)];
     }
-    let packages = Packages::beside();
-    let described = drawing(file, skin, &packages);
-    let mut picture = drawing(file, &found, &packages);
-    for ((cell, old), result) in picture.cells.iter_mut().zip(&described.cells).zip(&calibration.cells) {
-        picture.segments.push([old.position, cell.position]);
-        let mut detail = |name: &str, value: String| cell.details.push((name.to_owned(), value));
+    let mut still = still(file, &found, &Packages::beside());
+    let described = Scene::of(skin, false);
+    for (index, (old, result)) in described.cells.into_iter().zip(&calibration.cells).enumerate() {
+        let chain = described.buses.get(old.bus).map_or(0, |bus| bus.chain);
+        if result.found.is_some_and(|_| result.is_written()) {
+            let (position, normal) = (old.position, old.normal);
+            still.moved.push(Moved { cell: index, chain, row: old.row, position, normal });
+        }
+        let Some(details) = still.details.get_mut(index) else { continue };
+        let mut detail = |name: &str, value: String| details.push((name.to_owned(), value));
         if let Some(pose) = result.found {
             let certain = format!("within {} mm and {} degrees", pose.position_mm, pose.orientation_deg);
             detail("Certain", certain);
@@ -34,6 +38,6 @@ pub(super) fn page(file: &Path, skin: &Skin, calibration: &Calibration) -> Strin
         }
         result.troubles.iter().for_each(|trouble| detail("Not to be trusted", trouble.to_string()));
     }
-    picture.name = format!("{}, calibrated", skin.name);
-    drawn(&picture)
+    still.scene.name = format!("{}, calibrated", skin.name);
+    still.page()
 }

@@ -12,7 +12,9 @@
 //! A recording goes the same way: [`tape`] takes its frames up to a moment into [`Live`], [`index`] keeps states on the way,
 //! and [`player`] goes from one of them to any moment.
 //!
-//! [`live`], [`pressed`], [`scene`], [`surface`], [`command`] and [`tape`] have no socket and no clock; [`server`], [`serve`] and
+//! A skin without its buses is a [`Still`]: one file with the same scene and the same page's modules.
+//!
+//! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`] and [`tape`] have no socket and no clock; [`server`], [`serve`] and
 //! [`play`] are the shell.
 
 pub mod command;
@@ -24,6 +26,7 @@ pub mod pressed;
 pub mod scene;
 pub mod serve;
 pub mod server;
+pub mod still;
 pub mod surface;
 pub mod tape;
 pub mod token;
@@ -33,6 +36,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 pub use live::Live;
 pub use scene::Scene;
+pub use still::{Moved, Still};
 pub use surface::Shell;
 pub use token::Token;
 

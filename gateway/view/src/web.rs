@@ -1,31 +1,49 @@
-//! The page's files.
+//! The page's files: served one by one, or as one script in a page that stands alone.
 
-/// What is served under a path: its type and its bytes.
+/// The files of the live page and of the page of a skin that stands still.
+const FILES: [(&str, &str); 25] = [
+    ("index.html", include_str!("../web/index.html")),
+    ("still.html", include_str!("../web/still.html")),
+    ("style.css", include_str!("../web/style.css")),
+    ("app.js", include_str!("../web/app.js")),
+    ("bench.js", include_str!("../web/bench.js")),
+    ("camera.js", include_str!("../web/camera.js")),
+    ("colours.js", include_str!("../web/colours.js")),
+    ("dom.js", include_str!("../web/dom.js")),
+    ("frames.js", include_str!("../web/frames.js")),
+    ("gl.js", include_str!("../web/gl.js")),
+    ("halted.js", include_str!("../web/halted.js")),
+    ("legend.js", include_str!("../web/legend.js")),
+    ("link.js", include_str!("../web/link.js")),
+    ("math.js", include_str!("../web/math.js")),
+    ("numbers.js", include_str!("../web/numbers.js")),
+    ("pace.js", include_str!("../web/pace.js")),
+    ("picture.js", include_str!("../web/picture.js")),
+    ("plots.js", include_str!("../web/plots.js")),
+    ("robot.js", include_str!("../web/robot.js")),
+    ("snapshot.js", include_str!("../web/snapshot.js")),
+    ("still.js", include_str!("../web/still.js")),
+    ("time.js", include_str!("../web/time.js")),
+    ("touch.js", include_str!("../web/touch.js")),
+    ("wires.js", include_str!("../web/wires.js")),
+    ("words.js", include_str!("../web/words.js")),
+];
+
+/// Returns the text of a file.
+pub(crate) fn text(name: &str) -> Option<&'static str> {
+    FILES.iter().find(|(known, _)| *known == name).map(|(_, text)| *text)
+}
+
+/// Returns what is served under a path: its type and its bytes.
 pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
-    const SCRIPT: &str = "text/javascript; charset=utf-8";
-    Some(match path {
-        "/" => ("text/html; charset=utf-8", include_bytes!("../web/index.html")),
-        "/style.css" => ("text/css; charset=utf-8", include_bytes!("../web/style.css")),
-        "/app.js" => (SCRIPT, include_bytes!("../web/app.js")),
-        "/bench.js" => (SCRIPT, include_bytes!("../web/bench.js")),
-        "/math.js" => (SCRIPT, include_bytes!("../web/math.js")),
-        "/robot.js" => (SCRIPT, include_bytes!("../web/robot.js")),
-        "/picture.js" => (SCRIPT, include_bytes!("../web/picture.js")),
-        "/camera.js" => (SCRIPT, include_bytes!("../web/camera.js")),
-        "/gl.js" => (SCRIPT, include_bytes!("../web/gl.js")),
-        "/pace.js" => (SCRIPT, include_bytes!("../web/pace.js")),
-        "/colours.js" => (SCRIPT, include_bytes!("../web/colours.js")),
-        "/plots.js" => (SCRIPT, include_bytes!("../web/plots.js")),
-        "/wires.js" => (SCRIPT, include_bytes!("../web/wires.js")),
-        "/words.js" => (SCRIPT, include_bytes!("../web/words.js")),
-        "/touch.js" => (SCRIPT, include_bytes!("../web/touch.js")),
-        "/dom.js" => (SCRIPT, include_bytes!("../web/dom.js")),
-        "/time.js" => (SCRIPT, include_bytes!("../web/time.js")),
-        "/halted.js" => (SCRIPT, include_bytes!("../web/halted.js")),
-        "/frames.js" => (SCRIPT, include_bytes!("../web/frames.js")),
-        "/link.js" => (SCRIPT, include_bytes!("../web/link.js")),
+    let name = if path == "/" { "index.html" } else { path.strip_prefix('/')? };
+    let kind = match name.rsplit_once('.')? {
+        (_, "js") => "text/javascript; charset=utf-8",
+        (_, "css") => "text/css; charset=utf-8",
+        _ if path == "/" => "text/html; charset=utf-8",
         _ => return None,
-    })
+    };
+    text(name).map(|text| (kind, text.as_bytes()))
 }
 
 /// Checks that a file is a script or a style: the same for everybody, with nothing about the bench.
@@ -33,48 +51,111 @@ pub(crate) fn is_code(path: &str) -> bool {
     path != "/" && file(path).is_some()
 }
 
+/// Returns a module and all that it imports as one script: each in a function of its own, behind those that it imports.
+///
+/// Of a module's syntax this knows what the files here have: an import in one line, and declarations behind `export`.
+pub(crate) fn bundle(entry: &'static str) -> String {
+    let mut script = String::from("\"use strict\";\nconst modules = {};\n");
+    add(entry, &mut Vec::new(), &mut script);
+    script
+}
+
+fn add(name: &'static str, added: &mut Vec<&'static str>, script: &mut String) {
+    if added.contains(&name) {
+        return;
+    }
+    added.push(name);
+    let Some(text) = text(name) else { return };
+    let (mut body, mut exported) = (String::new(), Vec::new());
+    for line in text.lines() {
+        if let Some((names, from)) = import(line) {
+            add(from, added, script);
+            let names =
+                names.strip_prefix("* as ").map_or_else(|| names.replace(" as ", ": "), str::to_owned);
+            body.push_str(&format!("const {names} = modules[\"{from}\"];"));
+        } else if let Some(declaration) = line.strip_prefix("export ") {
+            exported.extend(declared(declaration));
+            body.push_str(declaration);
+        } else {
+            body.push_str(line);
+        }
+        body.push('\n');
+    }
+    let exported = exported.join(", ");
+    script.push_str(&format!("modules[\"{name}\"] = (() => {{\n{body}return {{ {exported} }};\n}})();\n"));
+}
+
+/// The names and the file of an import.
+fn import(line: &'static str) -> Option<(&'static str, &'static str)> {
+    let (names, from) = line.strip_prefix("import ")?.split_once(" from \"./")?;
+    Some((names, from.strip_suffix("\";")?))
+}
+
+/// The names that a declaration makes: of a function, a class, a constant, or constants in brackets.
+fn declared(declaration: &str) -> Vec<&str> {
+    let Some((_, rest)) = declaration.split_once(' ') else { return Vec::new() };
+    let is_of_name = |letter: char| letter.is_ascii_alphanumeric() || letter == '_';
+    match rest.strip_prefix('[').and_then(|rest| rest.split_once(']')) {
+        Some((names, _)) => names.split(", ").collect(),
+        None => rest.split(|letter| !is_of_name(letter)).take(1).collect(),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    const FILES: [&str; 20] = [
-        "/",
-        "/style.css",
-        "/app.js",
-        "/bench.js",
-        "/math.js",
-        "/robot.js",
-        "/picture.js",
-        "/camera.js",
-        "/gl.js",
-        "/pace.js",
-        "/colours.js",
-        "/plots.js",
-        "/wires.js",
-        "/words.js",
-        "/touch.js",
-        "/dom.js",
-        "/time.js",
-        "/frames.js",
-        "/halted.js",
-        "/link.js",
-    ];
-
     #[test]
     fn the_page_is_small_and_asks_for_nothing_outside() {
         let mut bytes = 0;
-        for path in FILES {
-            let (_, content) = file(path).unwrap();
-            let text = str::from_utf8(content).unwrap();
-            assert!(!text.contains("http:") && !text.contains("https:") && !text.contains("//cdn"), "{path}");
-            assert!(!text.contains("innerHTML") && !text.contains("eval("), "{path}");
-            bytes += content.len();
-            for (_, import) in text.match_indices("from \"./").map(|(at, _)| (at, &text[at + 8..])) {
-                let name = import.split('"').next().unwrap();
-                assert!(FILES.contains(&format!("/{name}").as_str()), "{path} imports {name}");
+        for (name, text) in FILES {
+            assert!(!text.contains("http:") && !text.contains("https:") && !text.contains("//cdn"), "{name}");
+            assert!(!text.contains("innerHTML") && !text.contains("eval("), "{name}");
+            assert!(text.lines().count() <= 500, "{name}");
+            bytes += text.len();
+            for line in text.lines().filter(|line| line.starts_with("import ")) {
+                let (_, from) = import(line).unwrap_or_else(|| panic!("{name}: {line}"));
+                assert!(super::text(from).is_some(), "{name} imports {from}");
             }
         }
         assert!(bytes <= 200_000, "{bytes}");
-        assert_eq!(file("/../Cargo.toml"), None);
+        for (path, is_served) in [
+            ("/", true),
+            ("/app.js", true),
+            ("/style.css", true),
+            ("/index.html", false),
+            ("/still.html", false),
+            ("/../Cargo.toml", false),
+            ("app.js", false),
+            ("//", false),
+        ] {
+            assert_eq!(file(path).is_some(), is_served, "{path}");
+        }
+    }
+
+    #[test]
+    fn a_bundle_has_each_module_once_behind_those_that_it_imports() {
+        for entry in ["still.js", "app.js"] {
+            let script = bundle(entry);
+            assert!(!script.lines().any(|line| line.starts_with("import ") || line.starts_with("export ")));
+            assert!(!script.contains("</script"), "it would end the element that it is in");
+            let place = |name: &str| script.find(&format!("modules[\"{name}\"] = (() =>"));
+            for (name, text) in FILES.into_iter().filter(|(name, _)| place(name).is_some()) {
+                assert_eq!(script.matches(&format!("modules[\"{name}\"] = (() =>")).count(), 1, "{name}");
+                for (names, from) in text.lines().filter_map(import) {
+                    assert!(place(from).unwrap() < place(name).unwrap(), "{name} before {from}");
+                    let exported = FILES.iter().find(|(known, _)| *known == from).unwrap().1.lines();
+                    let exported: Vec<_> =
+                        exported.filter_map(|line| line.strip_prefix("export ")).flat_map(declared).collect();
+                    let names = names.trim_matches(|letter| "{} ".contains(letter)).split(", ");
+                    for name in names.filter(|name| !name.starts_with('*')) {
+                        let name = name.split(" as ").next().unwrap();
+                        assert!(exported.contains(&name), "{from} has no {name}");
+                    }
+                }
+            }
+        }
+        assert_eq!(declared("const [TREE, CUT] = [0, 1];"), ["TREE", "CUT"]);
+        assert_eq!(declared("function table(rows) {"), ["table"]);
     }
 }

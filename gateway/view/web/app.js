@@ -4,9 +4,10 @@ import { Bench } from "./bench.js";
 import { Camera } from "./camera.js";
 import { SHOWS, css, ramp } from "./colours.js";
 import { hold } from "./frames.js";
+import { shapes } from "./legend.js";
 import { Link } from "./link.js";
 import { point, project } from "./math.js";
-import { Pace, STILL_MS } from "./pace.js";
+import { Painter } from "./pace.js";
 import { Picture } from "./picture.js";
 import { Plots, number } from "./plots.js";
 import { TimeBar } from "./time.js";
@@ -17,7 +18,7 @@ import * as words from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), camera = new Camera();
-let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, trees = [], chosen = -1, pressed = -1, due = false;
+let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, trees = [], chosen = -1, pressed = -1;
 // For whoever looks from outside.
 window.skinbus = { frames: 0, snapshots: 0, where, joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
 
@@ -34,19 +35,13 @@ try {
 
 const view = () => camera.matrix(canvas.clientWidth, canvas.clientHeight);
 
-const pace = new Pace(picture?.software ?? false);
-$("software").hidden = !pace.software;
-let later = 0;
-function redraw() {
-  if (due) return;
-  due = true;
-  setTimeout(() => requestAnimationFrame(() => draw(false)), pace.wait(performance.now()));
-}
+const painter = new Painter(picture?.software ?? false, draw);
+$("software").hidden = !picture?.software;
+const redraw = () => painter.redraw();
 
-function draw(still) {
-  due = false;
-  if (!scene || !snapshot) return;
-  const began = performance.now(), news = said;
+function draw(ratio) {
+  if (!scene || !snapshot) return { drew: false, worked: false };
+  const news = said;
   if (news) {
     said = null;
     words.say(scene, news, ask);
@@ -58,14 +53,9 @@ function draw(still) {
     camera.fit(extent(scene, all));
   }
   picture?.update(snapshot.cells, SHOWS[$("shows").value], chosen);
-  const drew = picture?.draw(view(), all, pace.ratio(window.devicePixelRatio || 1, still)) ?? false;
-  if (!drew && !news) return;
-  window.skinbus.frames++;
-  pace.drew(began, performance.now());
-  requestAnimationFrame(() => pace.ready(performance.now()));
-  if (!drew || still || !pace.software) return;
-  clearTimeout(later);
-  later = setTimeout(() => requestAnimationFrame(() => draw(true)), STILL_MS);
+  const drew = picture?.draw(view(), all, ratio) ?? false;
+  if (drew || news) window.skinbus.frames++;
+  return { drew, worked: news !== null };
 }
 
 const name = (i) => (i < 0 ? "" : `${scene.buses[scene.cells[i].bus].name}:${scene.cells[i].node}`);
@@ -103,7 +93,7 @@ function where(i) {
 
 const bench = new Bench((command) => link.send(command));
 function drawTree() {
-  picture?.tree($("tree").checked ? wires(scene, trees) : []);
+  picture?.ribbons($("tree").checked ? wires(scene, trees) : []);
 }
 
 // The robot's surface, once it is there; cylinders are drawn until then.
@@ -202,5 +192,5 @@ function legend() {
 $("shows").onchange = legend;
 $("tree").onchange = () => { drawTree(); redraw(); };
 legend();
-words.shapes(css);
-matchMedia("(prefers-color-scheme: dark)").onchange = () => { if (scene) picture?.colours(); words.shapes(css); redraw(); };
+shapes($("shapes"), css);
+matchMedia("(prefers-color-scheme: dark)").onchange = () => { if (scene) picture?.colours(); shapes($("shapes"), css); redraw(); };

@@ -1,13 +1,16 @@
 // Where the picture is seen from.
 
-import { look, perspective, times } from "./math.js";
+import { add, cross, look, perspective, times, unit } from "./math.js";
 
 // So many sizes away a sphere of that size is seen whole, and the thickness of the links around it.
 const FAR = 1.15;
 
+// Of a picture that is higher than wide the width counts.
+const focus = (width, height) => Math.min(2, 2 * width / Math.max(1, height));
+
 export class Camera {
   constructor() {
-    Object.assign(this, { yaw: -1.0, pitch: 0.3, zoom: 1, middle: [0, 0, 0], size: 1, moved: false, box: null });
+    Object.assign(this, { yaw: -1.0, pitch: 0.3, zoom: 1, most: 20, middle: [0, 0, 0], size: 1, moved: false, box: null });
   }
 
   // Shows this box and all before it, unless somebody has moved the camera: it stands still once the robot has been everywhere.
@@ -26,19 +29,57 @@ export class Camera {
     this.pitch = Math.min(1.5, Math.max(-1.5, this.pitch + dy * 0.008));
   }
 
-  nearer(by) {
+  // Shows all again, from where it is seen now.
+  whole() {
+    Object.assign(this, { moved: false, zoom: 1 });
+    if (this.box) this.fit(this.box);
+  }
+
+  // Comes nearer by a factor; what is at a place stays there, in pixels from the middle of a picture of this size.
+  nearer(by, [x, y] = [0, 0], width = 1, height = 1) {
+    const before = this.zoom;
     this.moved = true;
-    this.zoom = Math.min(20, Math.max(0.3, this.zoom * by));
+    this.zoom = Math.min(this.most, Math.max(0.3, this.zoom * by));
+    const grown = this.zoom / before - 1;
+    this.move(-x * grown, -y * grown, width, height);
+  }
+
+  // Moves what is seen by so many pixels of a picture of this size.
+  move(dx, dy, width, height) {
+    const grain = this.grain(width, height), to = this.toward(), right = unit(cross([0, 0, 1], to));
+    this.moved = true;
+    this.middle = add(add(this.middle, right, -dx * grain), cross(to, right), dy * grain);
+  }
+
+  // Looks at a place from its front, near enough that a length of it is as long as so many pixels.
+  face(place, normal, length, pixels, width, height) {
+    const [x, y, z] = normal;
+    Object.assign(this, { moved: true, middle: place, yaw: Math.atan2(y, x) + 0.25 });
+    this.pitch = Math.min(1.5, Math.max(-1.5, Math.asin(Math.min(1, Math.max(-1, z))) + 0.15));
+    this.zoom = Math.min(this.most, Math.max(this.zoom, this.zoom * pixels * this.grain(width, height) / length));
+  }
+
+  // The length of a pixel at the middle.
+  grain(width, height) {
+    return this.distance() / focus(width, height) * 2 / Math.max(1, height);
+  }
+
+  distance() {
+    return this.size * FAR / this.zoom;
+  }
+
+  // The direction from the middle to the eye.
+  toward() {
+    const c = Math.cos(this.pitch);
+    return [c * Math.cos(this.yaw), c * Math.sin(this.yaw), Math.sin(this.pitch)];
   }
 
   eye() {
-    const far = this.size * FAR / this.zoom, c = Math.cos(this.pitch);
-    return [c * Math.cos(this.yaw), c * Math.sin(this.yaw), Math.sin(this.pitch)].map((v, i) => this.middle[i] + far * v);
+    return add(this.middle, this.toward(), this.distance());
   }
 
   matrix(width, height) {
-    const aspect = width / Math.max(1, height), eye = this.eye();
-    const far = this.size * 6 / Math.min(1, this.zoom);
-    return times(perspective(Math.min(2, 2 * aspect), aspect, this.size * 0.02, far), look(eye, this.middle));
+    const near = Math.min(this.size * 0.02, this.distance() * 0.2), far = this.size * 6 / Math.min(1, this.zoom);
+    return times(perspective(focus(width, height), width / Math.max(1, height), near, far), look(this.eye(), this.middle));
   }
 }

@@ -20,3 +20,15 @@ export function show(box, fresh) {
     else old.replaceWith(it);
   });
 }
+
+// A table of rows [name, value, class of the value].
+export function table(rows) {
+  const it = element("table");
+  for (const [name, value, className] of rows) {
+    const row = element("tr"), head = element("th", name);
+    head.scope = "row";
+    row.append(head, element("td", value, className));
+    it.append(row);
+  }
+  return it;
+}

@@ -15,12 +15,13 @@ export function context(canvas) {
   return { gl, software };
 }
 
-// A program of a vertex and a fragment shader, with the places of its uniforms.
-export function program(gl, sources) {
+// A program of a vertex and a fragment shader, with the places of its uniforms; `defines` are names that its `#ifdef`s ask for.
+export function program(gl, sources, ...defines) {
+  const head = defines.map((name) => `#define ${name}\n`).join("");
   const it = gl.createProgram();
   [gl.VERTEX_SHADER, gl.FRAGMENT_SHADER].forEach((type, at) => {
     const shader = gl.createShader(type);
-    gl.shaderSource(shader, `#version 300 es\nprecision highp float;\n${sources[at]}`);
+    gl.shaderSource(shader, `#version 300 es\nprecision highp float;\n${head}${sources[at]}`);
     gl.compileShader(shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
     gl.attachShader(it, shader);

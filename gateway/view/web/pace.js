@@ -30,3 +30,29 @@ export class Pace {
     return this.software ? (still ? 2 : 1) : Math.min(2, device);
   }
 }
+
+// Draws when something may have changed, as often as the machine can. `draw(ratio)` returns whether it drew, and whether it did
+// anything else that takes time.
+export class Painter {
+  constructor(software, draw) {
+    Object.assign(this, { pace: new Pace(software), draw, due: false, later: 0 });
+  }
+
+  redraw() {
+    if (this.due) return;
+    this.due = true;
+    setTimeout(() => requestAnimationFrame(() => this.paint(false)), this.pace.wait(performance.now()));
+  }
+
+  paint(still) {
+    this.due = false;
+    const { pace } = this, began = performance.now();
+    const { drew, worked } = this.draw(pace.ratio(window.devicePixelRatio || 1, still));
+    if (!drew && !worked) return;
+    pace.drew(began, performance.now());
+    requestAnimationFrame(() => pace.ready(performance.now()));
+    if (!drew || still || !pace.software) return;
+    clearTimeout(this.later);
+    this.later = setTimeout(() => requestAnimationFrame(() => this.paint(true)), STILL_MS);
+  }
+}

@@ -2,13 +2,31 @@
 
 import { colourOf, css, rgb, shapeOf } from "./colours.js";
 import { context, floats, program } from "./gl.js";
-import { cellOf } from "./link.js";
+import { atlas } from "./numbers.js";
+import { cellOf } from "./snapshot.js";
 import { add } from "./math.js";
 import { axes, cylinders, neighbors, triangles } from "./robot.js";
-import { FLOATS, ribbons } from "./wires.js";
+import { CUT, FLOATS, MOVED, ribbons } from "./wires.js";
 
 // Light is that of a vertex, not of a pixel: a software renderer has few of the one and many of the other.
 const LIGHT = "float light(vec3 n) { return max(dot(normalize(n), normalize(vec3(.4, -.5, .77))), 0.); }";
+
+// How much ink of the cell's number is at a place in its hexagon. What a pixel to the right and one upward are there says how far from
+// the middle it is on the screen: letters stand upright however the cell is turned. The numbers of small hexagons fade.
+const NUMBERS = `#ifdef NUMBERS
+uniform highp sampler2D numbers; uniform float legible;
+float written(vec2 dx, vec2 dy) {
+  float size = 1. / max(max(length(dx), length(dy)), 1e-6), turned = dx.x * dy.y - dx.y * dy.x;
+  if (size < legible || abs(turned) < 1e-12) return 0.;
+  vec2 far = vec2(place.x * dy.y - place.y * dy.x, dx.x * place.y - dx.y * place.x) / turned;
+  // Letters of the picture of all numbers are 48 pixels high, and tiles 128 by 64.
+  float scale = min(size * (node > 99 ? .58 : .74), 2.4 * legible) / 48.;
+  vec2 in_tile = vec2(far.x, -far.y) / (scale * vec2(128., 64.)) + .5;
+  if (min(in_tile.x, in_tile.y) < 0. || max(in_tile.x, in_tile.y) > 1.) return 0.;
+  vec2 tile = vec2(node % 16, node / 16);
+  return textureLod(numbers, (tile + in_tile) / 16., max(0., -log2(scale) - .5)).r * smoothstep(legible, 1.1 * legible, size);
+}
+#endif`;
 
 const SOLID = [`layout(location=0) in vec3 at; layout(location=1) in vec3 n; uniform mat4 view, m; uniform vec3 colour; out vec3 c;
 ${LIGHT}
@@ -17,16 +35,21 @@ void main() { c = colour * (.58 + .42 * light(mat3(m) * n)); gl_Position = view 
 void main() { o = vec4(c, 1.); }`];
 
 // uv: the place in the hexagon, whose corners are at 1; kind: shape, and 16 if chosen, 32 if pressed, 64 if a root.
-const CELL = [`layout(location=0) in vec3 at; layout(location=1) in vec3 n; layout(location=2) in vec2 uv; layout(location=3) in vec4 look;
-uniform mat4 view, m; uniform vec3 edge; out vec2 place; flat out vec3 inner, rim; flat out int kind;
+const CELL = [`layout(location=0) in vec3 at; layout(location=1) in vec3 n; layout(location=2) in vec2 uv; layout(location=3) in vec4 look; layout(location=4) in float number;
+uniform mat4 view, m; uniform vec3 edge; out vec2 place; flat out vec3 inner, rim, ink; flat out int kind, node;
 ${LIGHT}
 void main() {
   float l = .62 + .38 * light(mat3(m) * n);
-  place = uv; inner = look.rgb * l; rim = edge * l; kind = int(look.w * 255. + .5);
+  place = uv; inner = look.rgb * l; rim = edge * l; kind = int(look.w * 255. + .5); node = int(number + .5);
+  ink = dot(look.rgb, vec3(.299, .587, .114)) > .38 ? vec3(.06, .08, .09) : vec3(1.);
   gl_Position = view * m * vec4(at, 1.);
 }`,
-`in vec2 place; flat in vec3 inner, rim; flat in int kind; uniform vec3 mark, chosen; out vec4 o;
+`in vec2 place; flat in vec3 inner, rim, ink; flat in int kind, node; uniform vec3 mark, chosen; out vec4 o;
+${NUMBERS}
 void main() {
+#ifdef NUMBERS
+  vec2 dx = dFdx(place), dy = dFdy(place);
+#endif
   vec2 p = abs(place);
   float hex = max(p.x + p.y * .57735, p.y * 1.1547);
   if (hex > 1.001) discard;
@@ -41,19 +64,25 @@ void main() {
     if (shape == 5 && p.y < .16 && p.x < .66) c = mark;
     if (shape == 7 && r < .34) c = mark;
     if (shape == 6 && max(p.x, p.y) < .34) c = mark;
-    if ((kind & 64) != 0 && hex > .5 && hex < .6) c = mark;
+    if ((kind & 64) != 0 && hex > .52 && hex < .62) c = ink;
     if ((kind & 48) != 0 && hex > .72) c = (kind & 32) != 0 && hex < .84 ? mark : chosen;
   }
+#ifdef NUMBERS
+  // Buses have colours that are like that of what is chosen.
+  if ((kind & 16) != 0 && hex > .66 && hex < .76) c = ink;
+  c = mix(c, ink, written(dx, dy));
+#endif
   o = vec4(c, 1.);
 }`];
 
-// A wire of the tree, or one that is cut: that is dashed. It is a little nearer than the cells that it leads over.
+// A ribbon: a wire that is cut is dashed, a cell's way stands out. It is a little nearer than the cells that it leads over.
 const WIRE = [`layout(location=0) in vec3 at; layout(location=1) in vec2 how; uniform mat4 view; out vec2 kind;
 void main() { kind = how; gl_Position = view * vec4(at, 1.); gl_Position.z -= .0006 * gl_Position.w; }`,
 `in vec2 kind; uniform vec3 mark, alarm; out vec4 o;
 void main() {
-  if (kind.y > .5 && fract(kind.x * 3. + .25) > .5) discard;
-  o = vec4(kind.y > .5 ? alarm : mark, 1.);
+  int it = int(kind.y + .5);
+  if (it == ${CUT} && fract(kind.x * 3. + .25) > .5) discard;
+  o = vec4(it == ${CUT} || it == ${MOVED} ? alarm : mark, 1.);
 }`];
 
 // What a cell is drawn as: its hexagon, or a triangle around it, of which a software renderer draws the pixels in the hexagon.
@@ -61,10 +90,13 @@ const corner = (degrees, far) => [far * Math.cos(degrees * Math.PI / 180), far *
 const HEXAGON = { corners: [0, 60, 120, 180, 240, 300].map((at) => corner(at, 1)), fan: [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5] };
 const TRIANGLE = { corners: [90, 210, 330].map((at) => corner(at, Math.sqrt(3))), fan: [0, 1, 2] };
 
+// From this radius in pixels of the page on, a hexagon has its number.
+const LEGIBLE = 12;
+
 export class Picture {
-  constructor(canvas) {
-    this.canvas = canvas;
-    Object.assign(this, context(canvas));
+  // With `numbers`, hexagons that are large enough have their cells' node ids.
+  constructor(canvas, numbers = false) {
+    Object.assign(this, { canvas, numbers }, context(canvas));
   }
 
   // Takes a scene: what does not change.
@@ -72,9 +104,10 @@ export class Picture {
     const { gl } = this;
     [this.scene, this.before] = [scene, null];
     this.solid = program(gl, SOLID);
-    this.cell = program(gl, CELL);
+    this.cell = program(gl, CELL, ...(this.numbers ? ["NUMBERS"] : []));
     this.wire = program(gl, WIRE);
     this.wires = [];
+    if (this.numbers) atlas(gl);
     this.ribbon = { vao: gl.createVertexArray(), buffer: gl.createBuffer() };
     gl.bindVertexArray(this.ribbon.vao);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.ribbon.buffer);
@@ -97,17 +130,17 @@ export class Picture {
     });
     const nearest = neighbors(scene), { corners, fan } = this.software ? TRIANGLE : HEXAGON;
     [this.vertices, this.indices] = [corners.length, fan.length];
-    const data = new Float32Array(order.length * corners.length * 8), size = scene.pitch * 0.56;
+    const data = new Float32Array(order.length * corners.length * 9), size = scene.pitch * 0.56;
     const indices = new Uint32Array(order.length * fan.length);
     order.forEach((i, at) => {
-      const { position, normal } = scene.cells[i], [x, y] = axes(scene, nearest, i);
+      const { node, position, normal } = scene.cells[i], [x, y] = axes(scene, nearest, i);
       const middle = add(position, normal, 0.0012);
-      corners.forEach(([u, v], k) => data.set([...add(add(middle, x, u * size), y, v * size), ...normal, u, v], (at * corners.length + k) * 8));
+      corners.forEach(([u, v], k) => data.set([...add(add(middle, x, u * size), y, v * size), ...normal, u, v, node], (at * corners.length + k) * 9));
       fan.forEach((corner, k) => { indices[at * fan.length + k] = at * corners.length + corner; });
     });
     this.cells = gl.createVertexArray();
     gl.bindVertexArray(this.cells);
-    floats(gl, data, [[0, 3], [1, 3], [2, 2]]);
+    floats(gl, data, [[0, 3], [1, 3], [2, 2], [4, 1]]);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
     this.looks = new Uint32Array(order.length * corners.length);
@@ -144,8 +177,8 @@ export class Picture {
     this.changed = true;
   }
 
-  // Takes the wires that are drawn.
-  tree(wires) {
+  // Takes the ribbons that are drawn.
+  ribbons(wires) {
     if (JSON.stringify(wires) === JSON.stringify(this.wires)) return;
     [this.wires, this.changed] = [wires, true];
   }
@@ -197,6 +230,7 @@ export class Picture {
     gl.uniform3fv(cell.mark, theme.mark);
     gl.uniform3fv(cell.edge, theme.edge);
     gl.uniform3fv(cell.chosen, theme.chosen);
+    if (this.numbers) gl.uniform1f(cell.legible, LEGIBLE * ratio);
     for (const { chain, row, first, count } of this.groups) {
       gl.uniformMatrix4fv(cell.m, false, frames[chain][row]);
       gl.drawElements(gl.TRIANGLES, count * this.indices, gl.UNSIGNED_INT, first * this.indices * 4);

@@ -18,40 +18,56 @@ export function pick(scene, frames, camera, view, width, height, x, y) {
   return hit.filter((it) => it.far < nearest + scene.pitch).reduce((best, it) => (it.off < best.off ? it : best), { i: -1, off: Infinity }).i;
 }
 
-// Calls `on.at(x, y)` for the cell there, `on.press(cell)`, `on.release()`, `on.turn(dx, dy)`, `on.zoom(by)`.
+// What is released within so many pixels of where it was pressed is a click.
+const CLICK = 5;
+
+// Calls `on.at(x, y)` for the cell there, `on.press(cell)`, `on.release()`, `on.turn(dx, dy)`, `on.zoom(by, x, y)`. Where nothing can be
+// pressed there is `on.choose(cell)`, for a click, and `on.move(dx, dy)`, for a drag with shift, another button or two fingers.
 export function listen(canvas, on) {
   const pointers = new Map();
-  let presses = false, apart = 0;
+  let presses = false, apart = 0, travelled = 0;
   const place = (event) => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top]; };
   const stop = () => { if (presses) { presses = false; on.release(); } };
   canvas.addEventListener("pointerdown", (event) => {
     canvas.focus({ preventScroll: true });
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, place(event));
-    if (pointers.size > 1) { stop(); apart = 0; return; }
-    const cell = event.button === 0 && !event.shiftKey ? on.at(...place(event)) : -1;
+    if (pointers.size > 1) { stop(); apart = 0; travelled = CLICK; return; }
+    travelled = 0;
+    const cell = !on.choose && event.button === 0 && !event.shiftKey ? on.at(...place(event)) : -1;
     if (cell >= 0) { presses = true; on.press(cell); }
   });
   canvas.addEventListener("pointermove", (event) => {
     const before = pointers.get(event.pointerId);
     if (!before) return;
-    const now = place(event);
+    const now = place(event), [dx, dy] = [now[0] - before[0], now[1] - before[1]];
     pointers.set(event.pointerId, now);
+    travelled += Math.hypot(dx, dy);
     if (pointers.size === 2) {
       const [a, b] = [...pointers.values()], far = Math.hypot(a[0] - b[0], a[1] - b[1]);
-      if (apart) on.zoom(far / apart);
+      on.move?.(dx / 2, dy / 2);
+      if (apart) on.zoom(far / apart, (a[0] + b[0]) / 2, (a[1] + b[1]) / 2);
       apart = far;
     } else if (presses) {
       const cell = on.at(...now);
       if (cell >= 0) on.press(cell);
+    } else if (on.move && (event.shiftKey || event.buttons > 1)) {
+      on.move(dx, dy);
     } else {
-      on.turn(now[0] - before[0], now[1] - before[1]);
+      on.turn(dx, dy);
     }
   });
+  canvas.addEventListener("pointerup", (event) => {
+    if (on.choose && pointers.size === 1 && travelled < CLICK) on.choose(on.at(...place(event)));
+  });
+  if (on.move) canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
     canvas.addEventListener(name, (event) => { pointers.delete(event.pointerId); if (!pointers.size) stop(); apart = 0; });
   }
-  canvas.addEventListener("wheel", (event) => { event.preventDefault(); on.zoom(Math.exp(-event.deltaY * 0.0015)); }, { passive: false });
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    on.zoom(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), ...place(event));
+  }, { passive: false });
   canvas.addEventListener("keydown", (event) => {
     const turns = { ArrowLeft: [-12, 0], ArrowRight: [12, 0], ArrowUp: [0, -12], ArrowDown: [0, 12] };
     const key = event.key;

@@ -1,25 +1,15 @@
 // What the page says in words: facts, buses, silent cells, the chosen cell.
 
-import { BUSES, SHAPES, busColour } from "./colours.js";
-import { element, show } from "./dom.js";
+import { BUSES } from "./colours.js";
+import { element, show, table } from "./dom.js";
 import { forget, frames } from "./frames.js";
 import { haltedWords } from "./halted.js";
+import { busKey } from "./legend.js";
 import { number } from "./plots.js";
 
 // More buses than these have a row each in one table.
 const FEW_BUSES = 3;
 const $ = (id) => document.getElementById(id);
-
-function table(rows) {
-  const it = element("table");
-  for (const [name, value, className] of rows) {
-    const row = element("tr"), head = element("th", name);
-    head.scope = "row";
-    row.append(head, element("td", value, className));
-    it.append(row);
-  }
-  return it;
-}
 
 function facts(pairs) {
   show($("facts"), pairs.map(([name, value, className]) => {
@@ -151,41 +141,8 @@ export function link(text, isBad) {
 export function buses(scene) {
   $("bus-colours").replaceChildren(...BUSES.slice(0, scene.buses.length).map((_, at) => {
     const same = scene.buses.filter((_, bus) => bus % BUSES.length === at).map((bus) => bus.name);
-    const item = element("li"), key = element("canvas");
-    [key.width, key.height] = [14, 14];
-    key.setAttribute("aria-hidden", "true");
-    const pen = key.getContext("2d");
-    pen.fillStyle = `rgb(${busColour(at).join(" ")})`;
-    pen.fillRect(0, 0, 14, 14);
-    item.append(key, element("span", same.length > 2 ? `${same[0]}, ${same[1]} ... ${same[same.length - 1]}` : same.join(", ")));
-    return item;
-  }));
-}
-
-// The shapes of cells, as the picture draws them.
-export function shapes(css) {
-  const size = 48;
-  $("shapes").replaceChildren(...SHAPES.map(({ name, mark }) => {
-    const item = element("li"), canvas = element("canvas");
-    [canvas.width, canvas.height] = [size, size];
-    canvas.setAttribute("aria-hidden", "true");
-    const pen = canvas.getContext("2d"), r = size * 0.46;
-    pen.translate(size / 2, size / 2);
-    const hexagon = (k) => { pen.beginPath(); for (let i = 0; i < 6; i++) pen.lineTo(k * r * Math.cos(i * Math.PI / 3), k * r * Math.sin(i * Math.PI / 3)); pen.closePath(); };
-    hexagon(1);
-    pen.fillStyle = css("--unlit"); pen.fill();
-    pen.strokeStyle = css("--faint"); pen.lineWidth = 3; pen.stroke();
-    pen.fillStyle = pen.strokeStyle = css("--mark");
-    pen.lineWidth = 6;
-    const erase = () => { pen.globalCompositeOperation = "destination-out"; pen.fill(); pen.globalCompositeOperation = "source-over"; };
-    if (mark === "cross") { pen.beginPath(); for (const s of [1, -1]) { pen.moveTo(-r * 0.5, -s * r * 0.5); pen.lineTo(r * 0.5, s * r * 0.5); } pen.stroke(); }
-    if (mark === "ring") { hexagon(0.7); erase(); }
-    if (mark === "hole") { pen.beginPath(); pen.arc(0, 0, r * 0.4, 0, 7); erase(); }
-    if (mark === "disc") { pen.beginPath(); pen.arc(0, 0, r * 0.34, 0, 7); pen.fill(); }
-    if (mark === "half") { pen.fillRect(0, -r * 0.7, r * 0.6, r * 1.4); }
-    if (mark === "bar") { pen.fillRect(-r * 0.66, -r * 0.16, r * 1.32, r * 0.32); }
-    if (mark === "square") { pen.fillRect(-r * 0.34, -r * 0.34, r * 0.68, r * 0.68); }
-    item.append(canvas, element("span", name));
+    const item = element("li");
+    item.append(busKey(at), element("span", same.length > 2 ? `${same[0]}, ${same[1]} ... ${same[same.length - 1]}` : same.join(", ")));
     return item;
   }));
 }

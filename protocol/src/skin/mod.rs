@@ -9,6 +9,7 @@ mod cell_name;
 mod cells;
 mod chains;
 mod check;
+pub mod file;
 mod names;
 mod part;
 mod raw;

@@ -2,9 +2,11 @@
 //!
 //! [`text`] decodes a file by its byte order mark or its declaration. [`prepare`] repairs what changes no value: it binds
 //! prefixes that the file does not, blanks comments with `--` inside and a document type without definitions, and takes
-//! NUL bytes off the end. Lines stay where they are. [`foreign`] names files that are no XML or the wrong one.
+//! NUL bytes off the end. Lines stay where they are. [`foreign`] names files that are no XML or the wrong one. [`escaped`] makes
+//! a text safe to be written into XML or HTML.
 
 mod encoding;
+mod escape;
 mod foreign;
 mod tags;
 
@@ -14,6 +16,7 @@ use std::fmt;
 use std::ops::Range;
 
 pub use encoding::{text, utf16};
+pub use escape::escaped;
 pub use foreign::{Foreign, foreign, kind_of_root};
 use tags::{Part, Tag, parts};
 

@@ -7,6 +7,7 @@
     reason = "a test may stop"
 )]
 
+mod drawn;
 mod odd_robots;
 
 use skinbus_tests::process;
@@ -73,12 +74,6 @@ fn refused(place: &Place, words: &str, expected: &str) {
 
 fn read(place: &Place, name: &str) -> Skin {
     Skin::read(&place.path(name)).unwrap()
-}
-
-/// What a page's script reads.
-fn data(page: &str) -> Value {
-    let (_, data) = page.split_once(r#"id="skin">"#).unwrap();
-    serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap()
 }
 
 #[test]
@@ -179,56 +174,6 @@ fn a_box_holds_no_cell_and_a_bus_has_one_chain() {
     assert_eq!(chains, ["left_palm", "right_palm"]);
     let joints = |bus| skin.cells_of(bus).map(|cell| cell.joint).collect::<BTreeSet<_>>();
     assert!(joints(0).contains(&2) && !joints(1).contains(&2), "the torso belongs to the first chain");
-}
-
-#[test]
-fn a_skin_is_drawn_on_one_page() {
-    let place = arm();
-    run(&place, &format!("{COVER} -o skin.toml")).well();
-    let ended = run(&place, "skin show skin.toml --package arm_parts=parts -o skin.html").well();
-    assert_eq!(ended.stderr, "");
-    let page = place.read("skin.html");
-    let outside = page.replace("http://www.w3.org/2000/svg", "");
-    assert!(!outside.contains("http:") && !outside.contains("https:"), "it asks for nothing outside");
-    let drawn = data(&page);
-    let names = |value: &Value| (value["bus"].as_u64().unwrap(), value["node"].as_u64().unwrap());
-    let drawn_names: Vec<_> = drawn["cells"].as_array().unwrap().iter().map(names).collect();
-    let skin = read(&place, "skin.toml");
-    let all: Vec<_> = skin.cells.iter().map(|cell| (cell.bus as u64, cell.node.get().into())).collect();
-    assert_eq!(drawn_names, all);
-    assert_eq!(drawn["buses"][0], "vcan0");
-    assert!(drawn["triangles"].as_array().unwrap().len() > 100);
-    // Each cell of the upper arm lies on its tube, which stands upright from 0.15 to 0.45 m.
-    let upper =
-        drawn["cells"].as_array().unwrap().iter().zip(&skin.cells).filter(|(_, cell)| cell.joint == 1);
-    for (drawn, _) in upper {
-        let [x, y, z] = [0, 1, 2].map(|axis| drawn["position"][axis].as_f64().unwrap());
-        assert!(x.hypot(y) < 0.051 && (0.149..0.451).contains(&z), "{x} {y} {z}");
-    }
-
-    // Without the mesh, the rest; without the URDF, lines.
-    let said = run(&place, "skin show skin.toml -o less.html").well().stderr;
-    assert!(said.starts_with("1 link not drawn: arm.urdf: link plate: mesh package://arm_parts/"), "{said}");
-    fs::remove_file(place.path("arm.urdf")).unwrap();
-    let ended = run(&place, "skin show skin.toml").well();
-    assert!(ended.stderr.starts_with("the robot is not drawn: arm.urdf: No such file"), "{}", ended.stderr);
-    let with_urdf = drawn;
-    let drawn = data(&ended.stdout);
-    // Where the chain begins is in the skin too.
-    for (one, other) in with_urdf["cells"].as_array().unwrap().iter().zip(drawn["cells"].as_array().unwrap())
-    {
-        for axis in 0..3 {
-            let [one, other] = [one, other].map(|cell| cell["position"][axis].as_f64().unwrap());
-            assert!((one - other).abs() < 2e-5, "{one} {other}");
-        }
-    }
-    assert_eq!(drawn["triangles"].as_array().unwrap().len(), 0);
-    assert!(!drawn["segments"].as_array().unwrap().is_empty());
-    let ur5 = example("ur5-253.toml").display().to_string();
-    let page = run(&place, &format!("skin show {ur5}")).well().stdout;
-    assert_eq!(data(&page)["cells"].as_array().unwrap().len(), 253);
-    place.write("skin.html", "mine");
-    refused(&place, &format!("skin show {ur5} -o skin.html"), "-o skin.html: ");
 }
 
 #[test]

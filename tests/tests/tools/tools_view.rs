@@ -293,6 +293,61 @@ fn a_recording_is_gone_through_in_a_browser() {
     view.end().well();
 }
 
+#[test]
+#[ignore = "needs tests/tools/install"]
+fn a_skin_is_looked_at_in_a_file_without_a_server() {
+    let place = Place::new();
+    place.skin(24);
+    place.start("skinbus", "skin show skin.toml -o skin.html").end().well();
+    let url = format!("file://{}", place.path("skin.html").display());
+    let mut browser = Browser::new(1400, 900);
+    browser.open(&format!("{url}#vcan0:7"));
+    browser.until("window.skinbus && window.skinbus.frames > 0");
+    let title = "document.getElementById('cell-title').textContent";
+    browser.until(&format!("{title} === 'vcan0:7'"));
+    browser.until("window.skinbus.where(6)");
+    // Another one by a click, and none by a click beside them all.
+    browser.value("document.getElementById('whole').click()");
+    let at = |browser: &mut Browser, expression: &str| {
+        let found = browser.until(expression);
+        [0, 1].map(|axis| found[axis].as_f64().unwrap())
+    };
+    let cell = at(
+        &mut browser,
+        "(() => { const b = document.getElementById('picture').getBoundingClientRect(); for (let i = 7; i < 24; i++) { \
+         const at = window.skinbus.where(i); if (at) return [b.x + at[0], b.y + at[1], window.seen = i]; } return null; })()",
+    );
+    let click = |browser: &mut Browser, at| {
+        for kind in ["mousePressed", "mouseReleased"] {
+            browser.mouse(kind, at);
+        }
+    };
+    click(&mut browser, cell);
+    browser.until(&format!("{title} === `vcan0:${{window.seen + 1}}`"));
+    let corner = at(
+        &mut browser,
+        "(() => { const b = document.getElementById('picture').getBoundingClientRect(); return [b.x + 3, b.y + 3]; })()",
+    );
+    click(&mut browser, corner);
+    browser.until(&format!("{title} === 'No cell chosen'"));
+    // A search, and a neighbour of what it found.
+    let search = |text: &str| {
+        format!(
+            "document.getElementById('search').value = '{text}'; document.getElementById('find').requestSubmit()"
+        )
+    };
+    browser.value(&search("99"));
+    browser.until("document.getElementById('cell').textContent === 'There is no cell 99.'");
+    browser.value(&search("3"));
+    browser.until(&format!("{title} === 'vcan0:3'"));
+    browser.value("document.querySelector('#cell button').click()");
+    browser.until(&format!("{title} !== 'vcan0:3'"));
+    is_accessible(&mut browser);
+    let outside: Vec<_> = browser.requests().into_iter().filter(|it| !it.starts_with(&url)).collect();
+    assert_eq!(outside, Vec::<&str>::new(), "the page asks for nothing");
+    assert_eq!(browser.complaints(), Vec::<&serde_json::Value>::new());
+}
+
 /// Prints how often the page draws an arm that moves, beside the 253 processes of its cells.
 #[test]
 #[ignore = "needs tests/tools/install"]

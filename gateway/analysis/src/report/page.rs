@@ -2,6 +2,8 @@
 
 use std::fmt::Write as _;
 
+use protocol::xml::escaped;
+
 use super::figure::{Figure, Finding, Page, Section, Size, Table, Verdict};
 use super::svg;
 
@@ -12,7 +14,7 @@ const STYLE: &str = include_str!("page.css");
 #[must_use]
 pub fn html(page: &Page) -> String {
     let mut out = String::new();
-    let title = svg::escaped(&page.title);
+    let title = escaped(&page.title);
     let _ = write!(
         out,
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\"/>\n\
@@ -26,7 +28,7 @@ pub fn html(page: &Page) -> String {
     if page.sections.len() > 2 {
         out.push_str("<nav><ul>\n");
         for section in &page.sections {
-            let (name, title) = (svg::escaped(&section.name), svg::escaped(&section.title));
+            let (name, title) = (escaped(&section.name), escaped(&section.title));
             let _ = writeln!(out, "<li><a href=\"#{name}\">{title}</a></li>");
         }
         out.push_str("</ul></nav>\n");
@@ -39,7 +41,7 @@ pub fn html(page: &Page) -> String {
     if !page.facts.is_empty() {
         out.push_str("<footer>\n<h2>How it came about</h2>\n<dl>\n");
         for (name, value) in &page.facts {
-            let _ = writeln!(out, "<dt>{}</dt><dd>{}</dd>", svg::escaped(name), svg::escaped(value));
+            let _ = writeln!(out, "<dt>{}</dt><dd>{}</dd>", escaped(name), escaped(value));
         }
         out.push_str("</dl>\n</footer>\n");
     }
@@ -49,12 +51,12 @@ pub fn html(page: &Page) -> String {
 
 fn paragraph(out: &mut String, text: &str) {
     if !text.is_empty() {
-        let _ = writeln!(out, "<p>{}</p>", svg::escaped(text));
+        let _ = writeln!(out, "<p>{}</p>", escaped(text));
     }
 }
 
 fn section(out: &mut String, section: &Section) {
-    let (name, title) = (svg::escaped(&section.name), svg::escaped(&section.title));
+    let (name, title) = (escaped(&section.name), escaped(&section.title));
     let _ = writeln!(out, "<section id=\"{name}\">\n<h2>{title}</h2>");
     for text in &section.text {
         paragraph(out, text);
@@ -63,7 +65,7 @@ fn section(out: &mut String, section: &Section) {
         findings(out, &section.findings);
     }
     for drawing in &section.drawings {
-        let (name, title) = (svg::escaped(drawing.name()), svg::escaped(drawing.title()));
+        let (name, title) = (escaped(drawing.name()), escaped(drawing.title()));
         let _ = writeln!(out, "<figure class=\"wide\" id=\"{name}\">");
         out.push_str(&svg::inline_cells(drawing, svg::natural(Size::Wide).0, "desk"));
         out.push_str(&svg::inline_cells(drawing, svg::natural(Size::Half).0, "hand"));
@@ -84,7 +86,7 @@ fn section(out: &mut String, section: &Section) {
 
 fn figure(out: &mut String, figure: &Figure) {
     let class = if figure.size == Size::Wide { "wide" } else { "half" };
-    let _ = writeln!(out, "<figure class=\"{class}\" id=\"{}\">", svg::escaped(&figure.name));
+    let _ = writeln!(out, "<figure class=\"{class}\" id=\"{}\">", escaped(&figure.name));
     let natural = svg::height(figure, figure.size);
     if figure.size == Size::Wide {
         // Letters that can be read across a desk are too small in the hand: a phone gets a drawing of its own.
@@ -93,7 +95,7 @@ fn figure(out: &mut String, figure: &Figure) {
     } else {
         out.push_str(&svg::inline(figure, natural, "both"));
     }
-    let _ = writeln!(out, "<figcaption>{}</figcaption>\n</figure>", svg::escaped(&figure.title));
+    let _ = writeln!(out, "<figcaption>{}</figcaption>\n</figure>", escaped(&figure.title));
 }
 
 /// The attribute of what stands to the right.
@@ -122,7 +124,7 @@ fn findings(out: &mut String, findings: &[Finding]) {
         let papers = finding.paper.as_ref().map(ToString::to_string).unwrap_or_default();
         let command = finding.command.as_deref().map(command);
         let command = command.map_or_else(String::new, |command| format!("<br/>{command}"));
-        let _ = write!(out, "<tr><td>{}{command}</td>", svg::escaped(&finding.what));
+        let _ = write!(out, "<tr><td>{}{command}</td>", escaped(&finding.what));
         let cells: [(&str, &str); 4] = [
             (&papers, " class=\"n\" data-head=\"paper\""),
             (&finding.ours.to_string(), " class=\"n\" data-head=\"here\""),
@@ -139,7 +141,7 @@ fn findings(out: &mut String, findings: &[Finding]) {
 fn table(out: &mut String, table: &Table) {
     // Not as the table's caption, which would be as wide as the table where that is wider than the screen.
     if !table.title.is_empty() {
-        let _ = writeln!(out, "<h3>{}</h3>", svg::escaped(&table.title));
+        let _ = writeln!(out, "<h3>{}</h3>", escaped(&table.title));
     }
     out.push_str("<div class=\"scroll\"><table>\n");
     let columns = 0..table.head.len();
@@ -165,8 +167,8 @@ fn table(out: &mut String, table: &Table) {
 /// A command, of which no line ends within the name of an option: a line may end behind a hyphen.
 fn command(text: &str) -> String {
     let word = |word: &str| match word.starts_with('-') {
-        true => format!("<span>{}</span>", svg::escaped(word)),
-        false => svg::escaped(word),
+        true => format!("<span>{}</span>", escaped(word)),
+        false => escaped(word),
     };
     format!("<code>{}</code>", text.split(' ').map(word).collect::<Vec<_>>().join(" "))
 }
@@ -185,7 +187,7 @@ fn row<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'
 
 fn cells<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
     for (text, attributes) in cells {
-        let _ = write!(out, "<{tag}{attributes}>{}</{tag}>", svg::escaped(text));
+        let _ = write!(out, "<{tag}{attributes}>{}</{tag}>", escaped(text));
     }
 }
 

@@ -18,7 +18,7 @@ use plotters::element::{Circle, PathElement, Polygon, Rectangle, Text};
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use plotters_svg::SVGBackend;
-use protocol::usage::is_unprintable;
+use protocol::xml::escaped;
 
 use super::figure::{Axis, Figure, Mark, On, Series, Shape, Size};
 use super::scale::Span;
@@ -135,27 +135,6 @@ fn classed(body: &str) -> String {
         body = body.replace(&width, &format!("{width} stroke-dasharray=\"{dashes}\""));
     }
     body
-}
-
-/// Text as XML has it.
-#[must_use]
-pub fn escaped(text: &str) -> String {
-    let mut safe = String::with_capacity(text.len());
-    for letter in text.chars() {
-        match letter {
-            '&' => safe.push_str("&amp;"),
-            '<' => safe.push_str("&lt;"),
-            '>' => safe.push_str("&gt;"),
-            '"' => safe.push_str("&quot;"),
-            '\'' => safe.push_str("&#39;"),
-            // XML has no other control characters, not even escaped; nor has it U+FFFE.
-            letter if is_unprintable(letter) && !matches!(letter, '\n' | '\t') => {
-                safe.push(char::REPLACEMENT_CHARACTER)
-            }
-            letter => safe.push(letter),
-        }
-    }
-    safe
 }
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;

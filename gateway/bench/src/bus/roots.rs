@@ -2,7 +2,6 @@
 
 use std::time::{Duration, Instant};
 
-use crate::setup::since;
 use protocol::bus::{Bus, Filter};
 use protocol::can::{EXTENDED, Frame, REMOTE};
 use protocol::id::{CellId, Id, Kind, Node};
@@ -104,7 +103,7 @@ impl Roots {
     }
 
     fn now(&self) -> Micros {
-        since(self.began)
+        Micros::after(self.began.elapsed())
     }
 
     /// Takes a frame that came from the bus; whether it was one of a wire, which is handled here alone.

@@ -27,7 +27,7 @@ use crate::emulate::Emulation;
 use crate::processes::Processes;
 use crate::processes::ended::EndedProcesses;
 use crate::record::Recorder;
-use crate::setup::{names, since};
+use crate::setup::names;
 use crate::view::{CellView, View};
 use control::cycle::Cycle;
 use control::cycle::turn::{Line, Shared, Timed};
@@ -112,7 +112,7 @@ pub(super) struct Bench<'a> {
 impl Bench<'_> {
     /// The time since it began.
     pub(super) fn now(&self) -> Micros {
-        since(self.began)
+        Micros::after(self.began.elapsed())
     }
 
     /// The name of a bus of the skin.

@@ -1,4 +1,4 @@
-//! Fewer triangles of the same shape: corners that are near each other become one.
+//! Fewer triangles of the same shape: corners that are near each other become one of them.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,11 +12,16 @@ const GROWTH: f64 = 1.12;
 /// A cube of the grid.
 type Cube = [i64; 3];
 
-/// At most `most` triangles in all that look as those of these parts; the parts' own if they are no more. Parts stay apart. Corners
-/// within a cube of a grid become their mean, in cubes that are as small as `most` allows.
+/// Returns at most `most` triangles in all that look as those of these parts; the parts' own if they are no more. Parts stay apart.
+/// The corners within a cube of a grid become the one that is nearest to their mean, in cubes that are as small as `most`
+/// allows: each corner that is left is one of the mesh, and no side is preferred. Triangles with a coordinate that is not finite
+/// are left out.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "a number of triangles")]
-pub fn simplify(parts: Vec<Vec<Triangle>>, most: usize) -> Vec<Vec<Triangle>> {
+pub fn simplify(mut parts: Vec<Vec<Triangle>>, most: usize) -> Vec<Vec<Triangle>> {
+    for part in &mut parts {
+        part.retain(|triangle| triangle.iter().flat_map(Point3::iter).all(|value| value.is_finite()));
+    }
     if parts.iter().map(Vec::len).sum::<usize>() <= most {
         return parts;
     }
@@ -36,18 +41,34 @@ fn area([a, b, c]: &Triangle) -> f64 {
     (b - a).cross(&(c - a)).norm() / 2.0
 }
 
-/// The triangles whose corners are in three cubes of this size, each once.
+/// The corners within a cube.
+struct Cluster {
+    sum: Vector3<f64>,
+    count: f64,
+    /// The corner that is nearest to their mean, and how far it is.
+    nearest: (Point3<f64>, f64),
+}
+
+/// Returns the triangles whose corners are in three cubes of this size, each once.
 #[expect(clippy::cast_possible_truncation, reason = "a coordinate over a size that is no smaller than 1 um")]
 fn clustered(part: &[Triangle], size: f64) -> Vec<Triangle> {
     // From the part's own corner, so that a cube as large as the part holds it.
     let infinite = Point3::new(f64::INFINITY, f64::INFINITY, f64::INFINITY);
     let low = part.iter().flatten().fold(infinite, |low, corner| low.inf(corner));
     let cube = |corner: &Point3<f64>| -> Cube { ((corner - low) / size).map(|it| it.floor() as i64).into() };
-    let mut means = BTreeMap::<Cube, (Vector3<f64>, f64)>::new();
+    let mut clusters = BTreeMap::<Cube, Cluster>::new();
     for corner in part.iter().flatten() {
-        let (sum, count) = means.entry(cube(corner)).or_insert_with(|| (Vector3::zeros(), 0.0));
-        *sum += corner.coords;
-        *count += 1.0;
+        let none = || Cluster { sum: Vector3::zeros(), count: 0.0, nearest: (*corner, f64::INFINITY) };
+        let cluster = clusters.entry(cube(corner)).or_insert_with(none);
+        cluster.sum += corner.coords;
+        cluster.count += 1.0;
+    }
+    for corner in part.iter().flatten() {
+        let Some(cluster) = clusters.get_mut(&cube(corner)) else { continue };
+        let far = (corner.coords - cluster.sum / cluster.count).norm();
+        if far < cluster.nearest.1 {
+            cluster.nearest = (*corner, far);
+        }
     }
     let mut seen = BTreeSet::new();
     let kept = part.iter().filter_map(|triangle| {
@@ -57,8 +78,8 @@ fn clustered(part: &[Triangle], size: f64) -> Vec<Triangle> {
         sorted.sort_unstable();
         (a != b && b != c && c != a && seen.insert(sorted)).then_some(cubes)
     });
-    let mean = |cube: &Cube| means.get(cube).map(|(sum, count)| Point3::from(sum / *count));
-    kept.filter_map(|[a, b, c]| Some([mean(&a)?, mean(&b)?, mean(&c)?])).collect()
+    let nearest = |cube: &Cube| clusters.get(cube).map(|cluster| cluster.nearest.0);
+    kept.filter_map(|[a, b, c]| Some([nearest(&a)?, nearest(&b)?, nearest(&c)?])).collect()
 }
 
 #[cfg(test)]
@@ -87,7 +108,10 @@ mod tests {
         let left: f64 = few.iter().map(area).sum();
         assert!((left / whole - 1.0).abs() < 0.05, "{left} of {whole} m2");
         for [a, b, c] in &few {
-            assert!([a, b, c].iter().all(|corner| (corner.coords.norm() - 0.1).abs() < 0.005));
+            assert!(
+                [a, b, c].iter().all(|corner| (corner.coords.norm() - 0.1).abs() < 1e-9),
+                "on the sphere"
+            );
             let outward = (b - a).cross(&(c - a)).dot(&a.coords);
             assert!(outward > 0.0, "the corners turn as before");
         }
@@ -102,5 +126,19 @@ mod tests {
         };
         assert_eq!(simplify(vec![part(0.0), part(0.0)], 2), vec![part(0.0), part(0.0)]);
         assert_eq!(simplify(vec![part(0.0), part(1.0)], 0), [Vec::<Triangle>::new(), Vec::new()]);
+    }
+
+    #[test]
+    fn triangles_that_cannot_be_drawn_are_left_out() {
+        let corner = |x: f64| Point3::new(x, 1.0, 1.0);
+        let small = [corner(1.0); 3];
+        assert_eq!(simplify(vec![vec![small; 9]], 3), [Vec::<Triangle>::new()], "without an area");
+        for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
+            let part = vec![small, [corner(0.0), corner(bad), corner(2.0)]];
+            assert_eq!(simplify(vec![part], 9), [vec![small]]);
+        }
+        let far =
+            [Point3::new(-f64::MAX, 0.0, 0.0), Point3::new(f64::MAX, 0.0, 0.0), Point3::new(0.0, 1.0, 0.0)];
+        assert!(simplify(vec![vec![far; 9]], 3).concat().len() <= 3, "it ends");
     }
 }

@@ -1,5 +1,5 @@
 //! Links of a real robot, measured by means of their own: random points of the mesh, and every triangle asked for
-//! every ray. With `SKINBUS_PAGE`, the path of an HTML file, the skin is drawn too.
+//! every ray.
 
 #![allow(
     clippy::unwrap_used,
@@ -11,7 +11,6 @@
 use std::env;
 use std::path::PathBuf;
 
-use crate::drawing::{Drawing, DrawnCell, page};
 use crate::mesh::{Mesh, Triangle, UpAxis};
 use crate::{Cell, Link, Options, Part, Skin, cover};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
@@ -145,41 +144,8 @@ fn panda_wears_a_skin_of_the_real_pitch() {
     let start = std::time::Instant::now();
     let skin = cover(covered, &others, &Options { pitch: PITCH, ..Options::default() }).unwrap();
     println!("{} cells on {} buses in {:.1} s", skin.cells.len(), skin.buses, start.elapsed().as_secs_f64());
-    if let Ok(path) = env::var("SKINBUS_PAGE") {
-        std::fs::write(path, page(&drawing(&skin, &all))).unwrap();
-    }
     for index in 0..covered.len() {
         measure(&skin, &all, index);
-    }
-}
-
-/// The skin on the robot, to look at.
-fn drawing(skin: &Skin, all: &[Link]) -> Drawing {
-    let cells = skin.cells.iter().map(|cell| {
-        let link = &all[COVERED][cell.link];
-        let (position, normal) = vectors(cell);
-        DrawnCell {
-            bus: cell.bus,
-            node: cell.node.into(),
-            label: String::new(),
-            position: (link.pose * position).coords.into(),
-            normal: (link.pose * normal).into(),
-            neighbors: cell.neighbors.iter().flatten().map(|&node| node.into()).collect(),
-            root: cell.root,
-            details: vec![("Link".to_owned(), link.name.clone())],
-        }
-    });
-    let corners = |triangle: Triangle| triangle.map(|corner| corner.coords.into());
-    Drawing {
-        name: "Panda".to_owned(),
-        pitch: PITCH,
-        buses: (0..skin.buses).map(|bus| format!("vcan{bus}")).collect(),
-        cells: cells.collect(),
-        segments: all
-            .windows(2)
-            .map(|pair| [0, 1].map(|end| pair[end].pose.translation.vector.into()))
-            .collect(),
-        triangles: all.iter().flat_map(|link| triangles(link, &link.pose)).map(corners).collect(),
     }
 }
 

@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 
 use protocol::id::CellId;
 use protocol::skin::Skin;
+use protocol::skin::file::{Edit, EditError, Value};
 use thiserror::Error;
-use toml_edit::{DocumentMut, Item, Table, Value, value};
 
 /// Why there is no copy.
 #[derive(Debug, Error)]
@@ -50,58 +50,31 @@ pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String,
     // The new node id of each cell, by its bus and its node id in the file.
     let renamed: BTreeMap<_, _> =
         skin.cells.iter().map(|cell| ((cell.bus, cell.node), number(cell.serial, cell.node))).collect();
-    let not_the_text = |why: String| NodeIdsError::Text(why);
-    let mut document: DocumentMut =
-        text.parse().map_err(|error: toml_edit::TomlError| not_the_text(error.to_string()))?;
-    let cells = document.get_mut("cell").and_then(Item::as_array_of_tables_mut);
-    let cells = cells.ok_or_else(|| not_the_text("its cells are not [[cell]] tables".to_owned()))?;
-    if cells.len() != skin.cells.len() {
-        return Err(not_the_text(format!("{} cells, not {}", cells.len(), skin.cells.len())));
-    }
-    for (table, cell) in cells.iter_mut().zip(&skin.cells) {
+    let not_the_text = |error: EditError| NodeIdsError::Text(error.to_string());
+    let mut edit = Edit::new(skin, text).map_err(not_the_text)?;
+    for (index, cell) in skin.cells.iter().enumerate() {
         let new = number(cell.serial, cell.node);
         if new != cell.node {
+            edit.set(index, "node", value(new));
             // An omitted serial number would change with the node id.
-            if !table.contains_key("serial") {
-                put_after_node(table, i64::from(cell.serial));
+            if !edit.has(index, "serial") {
+                edit.insert(index, "serial", Value::Integer(i64::from(cell.serial)), "node");
             }
-            set(table.get_mut("node"), new);
         }
-        let ports = table.get_mut("neighbors").and_then(Item::as_array_mut);
-        for (port, neighbor) in ports.into_iter().flat_map(|ports| ports.iter_mut()).zip(cell.neighbors) {
-            let renamed = neighbor.and_then(|neighbor| renamed.get(&(cell.bus, neighbor)));
-            if let (Some(&renamed), Some(neighbor)) = (renamed, neighbor)
+        for (port, neighbor) in cell.neighbors.iter().enumerate() {
+            let Some(neighbor) = *neighbor else { continue };
+            if let Some(&renamed) = renamed.get(&(cell.bus, neighbor))
                 && renamed != neighbor
             {
-                *port = keep_decor(port, renamed);
+                edit.set_element(index, "neighbors", port, value(renamed));
             }
         }
     }
-    Ok(document.to_string())
+    Ok(edit.text())
 }
 
-/// Replaces a node id, and keeps the white space and the comment around it.
-fn set(item: Option<&mut Item>, number: CellId) {
-    if let Some(old) = item.and_then(Item::as_value_mut) {
-        *old = keep_decor(old, number);
-    }
-}
-
-fn keep_decor(old: &Value, number: CellId) -> Value {
-    let mut new = Value::from(i64::from(number.get()));
-    *new.decor_mut() = old.decor().clone();
-    new
-}
-
-/// Inserts a serial number right after the node id.
-fn put_after_node(table: &mut Table, serial: i64) {
-    let keys: Vec<String> = table.iter().map(|(key, _)| key.to_owned()).collect();
-    table.insert("serial", value(serial));
-    let order = |key: &str| match key {
-        "serial" => keys.iter().position(|key| key == "node").map(|place| 2 * place + 1),
-        key => keys.iter().position(|other| other == key).map(|place| 2 * place),
-    };
-    table.sort_values_by(|one, _, other, _| order(one.get()).cmp(&order(other.get())));
+fn value(node: CellId) -> Value<'static> {
+    Value::Integer(i64::from(node.get()))
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! The text of a `skin.toml`.
 
 use protocol::skin::DenavitHartenberg;
+use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
 
 use super::arm::{self, Covered, Place};
 use super::{Format, Reply, Target};
@@ -11,7 +12,6 @@ const SLOTS_SHARE: f64 = 0.75;
 pub(super) fn toml(target: &Target, arm: &Covered) -> String {
     let Target { robot: _, cells, buses, broadcast_hz, reply, format } = target;
     let usual = Target::default();
-    let robot = arm.name.to_lowercase();
     let [(upper, on_upper), (lower, on_lower)] = arm.limbs;
     let options = [
         (*buses != usual.buses, format!(" --buses {buses}")),
@@ -21,58 +21,67 @@ pub(super) fn toml(target: &Target, arm: &Covered) -> String {
     ];
     let options: String =
         options.into_iter().filter_map(|(is_unusual, option)| is_unusual.then_some(option)).collect();
-    let is_joined = arm.buses.len() == 1 && on_upper > 0 && on_lower > 0;
-    let cable = format!("# A cable leads from node {on_upper} over the elbow to node {}.\n", on_upper + 1);
-    let cable = if is_joined { &cable } else { "" };
-    let joints = arm.joints.map(|DenavitHartenberg { a, alpha, d, theta_offset }| {
-        format!("  {{ a = {a:?}, alpha = {alpha:?}, d = {d:?}, theta_offset = {theta_offset:?} }},\n")
+    let mut draft = Draft::default();
+    draft.comment(&format!("skinbus skin generate --cells {cells}{options}"));
+    draft.comment("");
+    draft.comment(&format!(
+        "Hexagonal cells, {} mm apart, in rings that are turned by half a cell",
+        arm.pitch_mm
+    ));
+    draft.comment(&format!(
+        "against each other: {on_upper} around the {upper}, {on_lower} around the {lower}."
+    ));
+    draft.comment("Ports: 0 and 1 along the ring, 2 to the ring before, 3 to the ring after.");
+    if arm.buses.len() == 1 && on_upper > 0 && on_lower > 0 {
+        draft
+            .comment(&format!("A cable leads from node {on_upper} over the elbow to node {}.", on_upper + 1));
+    }
+    draft.set("version", Value::Integer(1));
+    draft.set("name", Value::Text(&format!("{}-{cells}", arm.name.to_lowercase())));
+    draft.table("[robot]", None);
+    draft.set("name", Value::Text(arm.name));
+    let rows = arm.joints.iter().map(|&DenavitHartenberg { a, alpha, d, theta_offset }| {
+        let values = [("a", a), ("alpha", alpha), ("d", d), ("theta_offset", theta_offset)];
+        values.map(|(key, value)| (key, Value::Number(value))).to_vec()
     });
-    let format = format.name();
-    let places = || arm.buses.iter().enumerate();
-    let buses = places().map(|(bus, places)| {
-        let reply = match reply {
-            Reply::Torque => "\"torque\"".to_owned(),
-            Reply::Sum => format!("\"sum\"\nslot_us = {}", slot_us(places, *broadcast_hz)),
-        };
-        format!("[[bus]]\nname = \"vcan{bus}\"\nreply = {reply}\nformat = \"{format}\"\n\n")
-    });
-    let described = places().flat_map(|(bus, places)| places.iter().zip(1..).map(move |it| cell(bus, it)));
-    format!(
-        "# skinbus skin generate --cells {cells}{options}\n#\n\
-         # Hexagonal cells, {pitch} mm apart, in rings that are turned by half a cell\n\
-         # against each other: {on_upper} around the {upper}, {on_lower} around the {lower}.\n\
-         # Ports: 0 and 1 along the ring, 2 to the ring before, 3 to the ring after.\n{cable}\
-         version = 1\nname = \"{robot}-{cells}\"\n\n\
-         [robot]\nname = \"{name}\"\n\
-         joints = [   # standard Denavit-Hartenberg, base to tip; m, rad\n{joints}]\n\n\
-         [timing]\ncontrol_hz = 500.0\njoint_broadcast_hz = {broadcast_hz:?}\n\n\
-         [contact]   # the paper's Algorithm 1\nalpha_c = 1.0\nalpha_p = 0.0\ncontact_threshold_n = 0.1\n\
-         proximity_threshold = 0.05\nforce_threshold_n = 0.1\n\n{buses}\
-         [controller]   # M q'' + D q' = tau, joint by joint\nkind = \"kinesthetic\"\n\
-         inertia = [1.0, 1.0, 1.0, 0.5, 0.5, 0.5]           # kg m2\n\
-         damping = [4.0, 4.0, 4.0, 2.0, 2.0, 2.0]           # Nm s/rad\n\
-         max_speed_rad_s = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]\n{described}",
-        pitch = arm.pitch_mm,
-        name = arm.name,
-        joints = joints.concat(),
-        buses = buses.collect::<String>(),
-        described = described.collect::<String>(),
-    )
+    draft.set_rows("joints", Some("standard Denavit-Hartenberg, base to tip; m, rad"), rows);
+    draft.paper(*broadcast_hz);
+    for (bus, places) in arm.buses.iter().enumerate() {
+        let slot_us = (*reply == Reply::Sum).then(|| slot_us(places, *broadcast_hz));
+        draft.bus(&DraftBus { name: &bus_name(bus), chain: None, slot_us, format: *format });
+    }
+    draft.table("[controller]", Some("M q'' + D q' = tau, joint by joint"));
+    draft.set("kind", Value::Text("kinesthetic"));
+    draft.set_remarked("inertia", Value::Numbers(&[1.0, 1.0, 1.0, 0.5, 0.5, 0.5]), 11, "kg m2");
+    draft.set_remarked("damping", Value::Numbers(&[4.0, 4.0, 4.0, 2.0, 2.0, 2.0]), 11, "Nm s/rad");
+    draft.set("max_speed_rad_s", Value::Numbers(&[2.0, 2.0, 2.0, 3.0, 3.0, 3.0]));
+    for (bus, places) in arm.buses.iter().enumerate() {
+        places.iter().zip(1..).for_each(|(place, node)| cell(&mut draft, bus, place, node));
+    }
+    draft.text()
 }
 
-/// A cell of a bus with its node there.
-fn cell(bus: usize, (place, node): (&Place, usize)) -> String {
-    let [x, y, z] = place.position.map(|value| round(value, 1e6));
+fn bus_name(bus: usize) -> String {
+    format!("vcan{bus}")
+}
+
+/// Adds a cell of a bus with its node there.
+fn cell(draft: &mut Draft, bus: usize, place: &Place, node: usize) {
     // Turned about x, the limb's own direction: the cell's z axis points away from the limb.
     let (sin, cos) = (-place.turn / 2.0).sin_cos();
     let [qx, qw] = [sin, cos].map(|value| round(value, 1e9));
-    let wires = place.wires.map(|wire| wire.map_or(0, |at| at + 1));
-    let (serial, joint) = (100_000 * (bus + 1) + node, place.joint);
-    let root = if place.root { "root = true\n" } else { "" };
-    format!(
-        "\n[[cell]]\nbus = \"vcan{bus}\"\nnode = {node}\nserial = {serial}\njoint = {joint}\n\
-         position = [{x:?}, {y:?}, {z:?}]\norientation = [{qx:?}, 0.0, 0.0, {qw:?}]\nneighbors = {wires:?}\n{root}"
-    )
+    draft.cell(&DraftCell {
+        remark: None,
+        bus: &bus_name(bus),
+        node,
+        serial: Some(100_000 * (bus + 1) + node),
+        joint: place.joint.into(),
+        row: None,
+        position: place.position.map(|value| round(value, 1e6)),
+        facing: Facing::Orientation([qx, 0.0, 0.0, qw]),
+        neighbors: Some(place.wires.map(|wire| wire.map_or(0, |at| u8::try_from(at + 1).unwrap_or(u8::MAX)))),
+        root: place.root,
+    });
 }
 
 /// Slots for every depth of the tree, within a part of the period, in whole 10 µs.

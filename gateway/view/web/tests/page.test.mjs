@@ -6,14 +6,14 @@ import { about, allowed, isDown, processOf } from "../bench.js";
 import { Camera } from "../camera.js";
 import { BUSES, SHAPES, SHOWS, busColour, colourOf, ramp, shapeOf } from "../colours.js";
 import { haltedWords } from "../halted.js";
-import { cellOf, decode, decodeHistory } from "../link.js";
 import { cross, dot, look, perspective, point, project, row, times, unit } from "../math.js";
 import { Pace, SOFTWARE_HZ } from "../pace.js";
 import { axes, cylinders, extent, frames, neighbors, triangles } from "../robot.js";
+import { cellOf, decode, decodeHistory } from "../snapshot.js";
 import { pick } from "../touch.js";
 import { number } from "../plots.js";
 import { clock, requested } from "../time.js";
-import { FLOATS, ribbons, wires } from "../wires.js";
+import { CUT, FLOATS, MOVED, TREE, WIRE, ribbons, wired, wires } from "../wires.js";
 
 const close = (a, b, within = 1e-9) => a.forEach((v, i) => assert.ok(Math.abs(v - b[i]) < within, `${a} ${b}`));
 const IDENTITY = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
@@ -134,6 +134,26 @@ test("the camera shows all of the robot until somebody moves it", () => {
   assert.deepEqual(camera.middle, middle);
 });
 
+test("a zoom keeps what is under the pointer, a drag moves it, and a cell is faced", () => {
+  const camera = new Camera(), [w, h] = [1000, 800];
+  camera.fit({ low: [-0.5, -0.5, 0], high: [0.5, 0.5, 1] });
+  const seen = (p) => project(camera.matrix(w, h), p, w, h).slice(0, 2);
+  // A point in the plane of the middle, which is seen to the right and above.
+  const up = cross(camera.toward(), unit(cross([0, 0, 1], camera.toward())));
+  const p = camera.middle.map((v, i) => v + 0.2 * up[i] + 0.1 * unit(cross([0, 0, 1], camera.toward()))[i]);
+  const [x, y] = seen(p);
+  assert.ok(x > w / 2 && y < h / 2);
+  camera.nearer(2, [x - w / 2, y - h / 2], w, h);
+  close(seen(p), [x, y], 1e-6);
+  camera.move(30, -20, w, h);
+  close(seen(p), [x + 30, y - 20], 1e-6);
+  camera.face([0.1, 0.2, 0.3], [0, 1, 0], 0.015, 20, w, h);
+  close(seen([0.1, 0.2, 0.3]), [w / 2, h / 2], 1e-6);
+  assert.ok(camera.grain(w, h) * 20 <= 0.015 * 1.0001 && dot(camera.toward(), [0, 1, 0]) > 0.9);
+  camera.whole();
+  assert.deepEqual([camera.zoom, camera.middle], [1, [0, 0, 0.5]]);
+});
+
 test("numbers are short", () => {
   assert.deepEqual([0, 0.12345, -1.5, 12.34, -250.4].map(number), ["0.0000", "0.1235", "−1.50", "12.3", "−250"]);
   close(unit([0, 3, 4]), [0, 0.6, 0.8]);
@@ -207,19 +227,34 @@ test("the tree leads from each cell to its parent, and a wire that does not work
   const cells = [at(1, 0, [2, 0, 0, 3]), at(2, 0.03, [1, 0, 0, 0]), at(3, 0.06, [1, 0, 0, 0], 2), { ...at(1, 0.5, [2, 0, 0, 0]), bus: 1 }];
   const it = { ...scene(cells), buses: [{ name: "vcan0", chain: 0 }, { name: "vcan1", chain: 0 }] };
   // 1 is a root, both of its wires work; 2 hangs on 1; 3 has not reported, the other bus sends no sums.
-  assert.deepEqual(wires(it, [[[0, 0b1001], [1, 0b0001], null], null]), [{ from: 1, to: 0, cut: false }]);
+  assert.deepEqual(wires(it, [[[0, 0b1001], [1, 0b0001], null], null]), [{ from: 1, to: 0, kind: TREE }]);
   // The wire between 1 and 2 is cut, as both say.
-  assert.deepEqual(wires(it, [[[0, 0b1000], [null, 0], [1, 0b0001]], null]), [{ from: 0, to: 1, cut: true }, { from: 2, to: 0, cut: false }]);
-  const all = [{ from: 1, to: 0, cut: false }, { from: 2, to: 0, cut: true }], places = frames(it, [0, 0, 0, 0, 0, 0]);
+  assert.deepEqual(wires(it, [[[0, 0b1000], [null, 0], [1, 0b0001]], null]), [{ from: 0, to: 1, kind: CUT }, { from: 2, to: 0, kind: TREE }]);
+  const all = [{ from: 1, to: 0, kind: TREE }, { from: 2, to: 0, kind: CUT }], places = frames(it, [0, 0, 0, 0, 0, 0]);
   const corners = ribbons(it, places, all);
   assert.equal(corners.length, 2 * 6 * FLOATS);
   const corner = (k) => [...corners.slice(k * FLOATS, (k + 1) * FLOATS)];
-  assert.deepEqual([corner(0)[4], corner(6)[4]], [0, 1]);
+  assert.deepEqual([corner(0)[4], corner(6)[4]], [TREE, CUT]);
   const gap = (a, b) => Math.hypot(...[0, 1, 2].map((i) => corner(a)[i] - corner(b)[i]));
   assert.ok(gap(0, 1) > 3 * gap(3, 5), "narrow at the parent");
   close([gap(6, 7)], [gap(9, 11)], 1e-6);
   const far = point(places[0][2], [0.06, 0, 0]).map((v, i) => v - (corner(6)[i] + corner(7)[i]) / 2);
   assert.ok(Math.hypot(...far) < 0.3 * it.pitch, "a wire leads from one row's frame to another's");
+});
+
+test("a wire of the skin is there once and leaves the numbers free, and a cell's way begins at a place", () => {
+  const at = (node, x, neighbors) => ({ ...cell(1, [x, 0, 0], [0, 0, 1]), node, neighbors });
+  const it = scene([at(1, 0, [2, 0, 0, 9]), at(2, 0.03, [1, 3, 0, 0]), at(3, 0.06, [2, 0, 0, 0])]), places = frames(it, [0, 0, 0, 0, 0, 0]);
+  const all = wired(it);
+  assert.deepEqual(all, [{ from: 0, to: 1, kind: WIRE }, { from: 1, to: 2, kind: WIRE }], "9 is no cell");
+  const ends = (corners) => [0, 3].map((k) => [0, 1, 2].map((i) => (corners[k * FLOATS + i] + corners[(k + 1 + 3 * (k > 0)) * FLOATS + i]) / 2));
+  const middle = (x) => point(places[0][1], [x, 0, 0.12 * it.pitch]);
+  const along = (p) => Math.hypot(...p.map((v, i) => v - middle(0)[i]));
+  const [begin] = ends(ribbons(it, places, all));
+  assert.ok(along(begin) > 0.01 && along(begin) < 0.015);
+  const from = { chain: 0, row: 1, position: [0.01, 0, 0], normal: [0, 0, 1] };
+  const [old] = ends(ribbons(it, places, [{ from, to: 1, kind: MOVED }]));
+  close(old, middle(0.01), 1e-6);
 });
 
 test("buses have colours of their own, and cells at rest none", () => {

@@ -30,7 +30,9 @@ use crate::shadow::{self, Shadow};
 use bus_figures::LinkId;
 use frames_only::FramesOnly;
 use motion::Motion;
-use trace::capture::{CaptureError, Entry, Extras, Format, Item, Note, NoteKind, Other, Reader, SKIN};
+use trace::capture::{
+    CaptureError, Entry, Extras, Format, Item, Note, NoteKind, Other, Reader, SKIN, seconds_since,
+};
 use trace::recording::layout::Layout;
 use trace::ros2::read;
 
@@ -401,8 +403,7 @@ impl Run {
 
     /// Seconds since the first message.
     fn seconds(&mut self, nanos: u64) -> f64 {
-        let began = *self.began.get_or_insert(nanos);
-        if nanos >= began { (nanos - began) as f64 * 1e-9 } else { (began - nanos) as f64 * -1e-9 }
+        seconds_since(*self.began.get_or_insert(nanos), nanos)
     }
 
     /// Takes what it is now known of that a real bus would have carried it.

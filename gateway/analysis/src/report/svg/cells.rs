@@ -2,10 +2,12 @@
 
 use std::fmt::Write as _;
 
+use protocol::xml::escaped;
+
 use super::super::figure::{Axis, Drawing, Legend, Map, Panel, Size, Strip, quantity};
 use super::super::scale::Span;
 use super::colour::{LEVELS, TRACK, colours, level};
-use super::{FAINT, INK, LETTERS, dark, escaped, natural};
+use super::{FAINT, INK, LETTERS, dark, natural};
 
 /// A letter's mean width.
 const LETTER: f64 = 0.56 * LETTERS;

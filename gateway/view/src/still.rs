@@ -1,0 +1,158 @@
+//! A skin that stands still, as one HTML page that needs nothing else: no server, no library, no network.
+//!
+//! The page draws the same [`Scene`] with the same modules as the live one: cells are hexagons with their node ids, coloured by
+//! bus; a root has a second hexagon. It turns and zooms, and shows a cell that is chosen, searched as `bus:node`, or named behind
+//! `#` in its address.
+
+use protocol::xml::escaped;
+use serde::Serialize;
+
+use crate::scene::Scene;
+use crate::surface::{Shell, pack};
+use crate::web;
+
+/// A skin as its page shows it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Still {
+    /// What is drawn.
+    pub scene: Scene,
+    /// The robot's surface, where it is known.
+    pub surface: Vec<Shell>,
+    /// The position of each joint of the robot, in rad or m.
+    pub positions: Vec<f64>,
+    /// More about each cell, as names and values, in the scene's order.
+    pub details: Vec<Vec<(String, String)>>,
+    /// Cells that were somewhere else; a line leads from there to each.
+    pub moved: Vec<Moved>,
+}
+
+/// The place where a cell was.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Moved {
+    /// The cell, as an index into [`Scene::cells`].
+    pub cell: usize,
+    /// The chain of its frame.
+    pub chain: usize,
+    /// The row whose frame it is, from 1.
+    pub row: u8,
+    /// Its middle there, in m.
+    pub position: [f64; 3],
+    /// The direction in which it faced there.
+    pub normal: [f64; 3],
+}
+
+/// What the page's script reads.
+#[derive(Serialize)]
+struct Data<'a> {
+    scene: &'a Scene,
+    positions: &'a [f64],
+    details: &'a [Vec<(String, String)>],
+    moved: &'a [Moved],
+    /// The corners of the surface in base64, as [`pack`] has them.
+    surface: String,
+}
+
+impl Still {
+    /// Returns the page.
+    #[must_use]
+    pub fn page(&self) -> String {
+        let (shells, corners) = pack(&self.surface);
+        let data = Data {
+            scene: &Scene { shells, may_press: false, ..self.scene.clone() },
+            positions: &self.positions,
+            details: &self.details,
+            moved: &self.moved,
+            surface: base64(&corners),
+        };
+        // Strings and numbers are always JSON. Without `<`, nothing in it ends the script element.
+        let data = serde_json::to_string(&data).unwrap_or_default().replace('<', "\\u003c");
+        let mut text = String::new();
+        // Parts are put in from left to right, so that no text is searched for marks again.
+        for (at, piece) in web::text("still.html").unwrap_or_default().split('@').enumerate() {
+            match piece {
+                "NAME" => text.push_str(&escaped(&self.scene.name)),
+                "CSS" => text.push_str(web::text("style.css").unwrap_or_default()),
+                "DATA" => text.push_str(&data),
+                "SCRIPT" => text.push_str(&web::bundle("still.js")),
+                _ => {
+                    debug_assert!(at % 2 == 0, "an unknown mark: {piece}");
+                    text.push_str(piece);
+                }
+            }
+        }
+        text
+    }
+}
+
+/// Writes bytes in base64 (RFC 4648, section 4).
+fn base64(bytes: &[u8]) -> String {
+    const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for three in bytes.chunks(3) {
+        let word =
+            (0..3).fold(0_usize, |word, at| word << 8 | three.get(at).map_or(0, |byte| usize::from(*byte)));
+        for at in 0..4 {
+            let letter = LETTERS.get(word >> (18 - 6 * at) & 63).copied().unwrap_or_default();
+            text.push(if at <= three.len() { char::from(letter) } else { '=' });
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use protocol::skin::Skin;
+
+    fn still() -> Still {
+        let skin = Skin::parse("ur5", include_str!("../../examples/ur5-253.toml")).unwrap();
+        let mut scene = Scene::of(&skin, true);
+        scene.name = "<arm> & @DATA@ 'x'".to_owned();
+        let details = vec![vec![("a<b".to_owned(), "</script><b>".to_owned())]; scene.cells.len()];
+        let triangles = vec![[[0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]];
+        let [position, normal] = [[0.0, 0.1, 0.2], [0.0, 0.0, 1.0]];
+        Still {
+            positions: vec![0.0; scene.joints.len()],
+            moved: vec![Moved { cell: 7, chain: 0, row: 2, position, normal }],
+            surface: vec![Shell { chain: 0, row: 1, triangles }],
+            scene,
+            details,
+        }
+    }
+
+    #[test]
+    fn text_is_escaped_and_data_can_be_read() {
+        let page = still().page();
+        assert_eq!(page.matches("&lt;arm&gt; &amp; @DATA@ &#39;x&#39;").count(), 2, "title and heading");
+        assert_eq!(page.matches("</script>").count(), 2, "of the page's own two");
+        let (_, data) = page.split_once(r#"id="skin">"#).unwrap();
+        let (data, _) = data.split_once("</script>").unwrap();
+        let data: serde_json::Value = serde_json::from_str(data).unwrap();
+        assert_eq!(data["scene"]["cells"].as_array().unwrap().len(), 253);
+        assert_eq!(
+            (&data["scene"]["may_press"], &data["scene"]["shells"][0]["count"]),
+            (&false.into(), &3.into())
+        );
+        assert_eq!(data["details"][9], serde_json::json!([["a<b", "</script><b>"]]));
+        assert_eq!(data["moved"][0]["position"], serde_json::json!([0.0, 0.1, 0.2]));
+        assert_eq!(data["surface"].as_str().unwrap().len(), 3 * 24 / 3 * 4);
+    }
+
+    #[test]
+    fn the_page_asks_for_nothing_outside() {
+        let page = still().page();
+        assert!(!page.contains("http:") && !page.contains("https:") && !page.contains("import "));
+        assert!(!page.contains("src=") && !page.contains("href=") && !page.contains("@import"));
+        assert!(page.contains("default-src 'none'"));
+    }
+
+    #[test]
+    fn bytes_in_base64_are_those_of_the_rfc() {
+        for (bytes, text) in
+            [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")]
+        {
+            assert_eq!(base64(bytes.as_bytes()), text);
+        }
+        assert_eq!(base64(&[0xff, 0xef, 0xbe]), "/+++");
+    }
+}

@@ -1,0 +1,178 @@
+//! Makes the text of a skin that did not exist.
+
+use core::fmt::Write;
+
+use super::Value;
+use crate::can::Format;
+use crate::usage::shown;
+
+/// The text of a new skin, from its first line to its last.
+#[derive(Clone, Debug, Default)]
+pub struct Draft(String);
+
+/// A bus of a new skin.
+#[derive(Clone, Copy, Debug)]
+pub struct DraftBus<'a> {
+    /// Its name.
+    pub name: &'a str,
+    /// Its chain, where that is written.
+    pub chain: Option<&'a str>,
+    /// The slot of a sum in µs; without it, cells answer with their torques.
+    pub slot_us: Option<u64>,
+    /// The format of its frames.
+    pub format: Format,
+}
+
+/// The direction in which a cell faces.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Facing {
+    /// The outward normal in the frame of the cell's row.
+    Normal([f64; 3]),
+    /// The cell's orientation there, as a quaternion x, y, z, w.
+    Orientation([f64; 4]),
+}
+
+/// A cell of a new skin.
+#[derive(Clone, Copy, Debug)]
+pub struct DraftCell<'a> {
+    /// What is remarked beside its head.
+    pub remark: Option<&'a str>,
+    /// Its bus.
+    pub bus: &'a str,
+    /// Its node id.
+    pub node: usize,
+    /// Its serial number, where that is written.
+    pub serial: Option<usize>,
+    /// The joint that moves it, from 1.
+    pub joint: usize,
+    /// Its row, where that is not the joint's.
+    pub row: Option<usize>,
+    /// Its middle in the frame of its row, in m.
+    pub position: [f64; 3],
+    /// Where it faces.
+    pub facing: Facing,
+    /// The nodes at its ports, 0 for none; absent where that is not written.
+    pub neighbors: Option<[u8; 4]>,
+    /// Whether it is wired to the gateway.
+    pub root: bool,
+}
+
+impl Draft {
+    /// Adds a line of a comment.
+    pub fn comment(&mut self, text: &str) {
+        match text {
+            "" => self.0.push_str("#\n"),
+            text => self.line(format_args!("# {}", shown(text))),
+        }
+    }
+
+    fn line(&mut self, text: core::fmt::Arguments<'_>) {
+        let _ = writeln!(self.0, "{text}");
+    }
+
+    /// Begins a table behind an empty line; `head` with its brackets, and a remark beside it.
+    pub fn table(&mut self, head: &str, remark: Option<&str>) {
+        match remark {
+            Some(remark) => self.line(format_args!("\n{head}   # {}", shown(remark))),
+            None => self.line(format_args!("\n{head}")),
+        }
+    }
+
+    /// Adds a key and its value.
+    pub fn set(&mut self, key: &str, value: Value<'_>) {
+        self.line(format_args!("{key} = {value}"));
+    }
+
+    /// Adds a key and its value with a remark, which begins behind so many blanks.
+    pub fn set_remarked(&mut self, key: &str, value: Value<'_>, blanks: usize, remark: &str) {
+        self.line(format_args!("{key} = {value}{:blanks$}# {}", "", shown(remark)));
+    }
+
+    /// Adds a key with an inline table.
+    pub fn set_table(&mut self, key: &str, values: &[(&str, Value<'_>)]) {
+        self.line(format_args!("{key} = {}", inline(values)));
+    }
+
+    /// Adds a key with an array of inline tables, one in each line.
+    pub fn set_rows<'v>(
+        &mut self,
+        key: &str,
+        remark: Option<&str>,
+        rows: impl Iterator<Item = Vec<(&'v str, Value<'v>)>>,
+    ) {
+        match remark {
+            Some(remark) => self.line(format_args!("{key} = [   # {}", shown(remark))),
+            None => self.line(format_args!("{key} = [")),
+        }
+        rows.for_each(|row| self.line(format_args!("  {},", inline(&row))));
+        self.0.push_str("]\n");
+    }
+
+    /// Adds the times and the gains that the paper has.
+    pub fn paper(&mut self, broadcast_hz: f64) {
+        self.table("[timing]", None);
+        self.set("control_hz", Value::Number(500.0));
+        self.set("joint_broadcast_hz", Value::Number(broadcast_hz));
+        self.table("[contact]", Some("the paper's Algorithm 1"));
+        for (key, value) in [
+            ("alpha_c", 1.0),
+            ("alpha_p", 0.0),
+            ("contact_threshold_n", 0.1),
+            ("proximity_threshold", 0.05),
+            ("force_threshold_n", 0.1),
+        ] {
+            self.set(key, Value::Number(value));
+        }
+    }
+
+    /// Adds a bus.
+    pub fn bus(&mut self, bus: &DraftBus<'_>) {
+        self.table("[[bus]]", None);
+        self.set("name", Value::Text(bus.name));
+        if let Some(chain) = bus.chain {
+            self.set("chain", Value::Text(chain));
+        }
+        self.set("reply", Value::Text(if bus.slot_us.is_some() { "sum" } else { "torque" }));
+        if let Some(slot_us) = bus.slot_us {
+            self.set("slot_us", Value::Integer(i64::try_from(slot_us).unwrap_or(i64::MAX)));
+        }
+        self.set("format", Value::Text(bus.format.name()));
+    }
+
+    /// Adds a cell.
+    pub fn cell(&mut self, cell: &DraftCell<'_>) {
+        let whole = |value: usize| Value::Integer(i64::try_from(value).unwrap_or(i64::MAX));
+        self.table("[[cell]]", cell.remark);
+        self.set("bus", Value::Text(cell.bus));
+        self.set("node", whole(cell.node));
+        if let Some(serial) = cell.serial {
+            self.set("serial", whole(serial));
+        }
+        self.set("joint", whole(cell.joint));
+        if let Some(row) = cell.row {
+            self.set("row", whole(row));
+        }
+        self.set("position", Value::Numbers(&cell.position));
+        match &cell.facing {
+            Facing::Normal(normal) => self.set("normal", Value::Numbers(normal)),
+            Facing::Orientation(turn) => self.set("orientation", Value::Numbers(turn)),
+        }
+        if let Some(neighbors) = &cell.neighbors {
+            self.set("neighbors", Value::Nodes(neighbors));
+        }
+        if cell.root {
+            self.set("root", Value::Flag(true));
+        }
+    }
+
+    /// Returns the whole text.
+    #[must_use]
+    pub fn text(self) -> String {
+        self.0
+    }
+}
+
+fn inline(values: &[(&str, Value<'_>)]) -> String {
+    let all: Vec<_> = values.iter().map(|(key, value)| format!("{key} = {value}")).collect();
+    format!("{{ {} }}", all.join(", "))
+}

@@ -1,0 +1,144 @@
+//! Changes values of a text that somebody wrote.
+
+use core::ops::Range;
+
+use thiserror::Error;
+use toml_edit::{Document, Item, Key, Table, TableLike};
+
+use super::Value;
+use crate::skin::Skin;
+
+/// The error for a text that is not the text of a skin.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum EditError {
+    /// It cannot be read.
+    #[error(transparent)]
+    Toml(#[from] toml_edit::TomlError),
+    /// It has no cells.
+    #[error("its cells are not [[cell]] tables")]
+    NoCells,
+    /// It has other cells.
+    #[error("{found} cells, not {expected}")]
+    Count {
+        /// Cells of the text.
+        found: usize,
+        /// Cells of the skin.
+        expected: usize,
+    },
+}
+
+/// The text of a skin's file, of whose cells some values are changed.
+///
+/// Every byte that is not of a changed value stays: comments, order, spelling, spaces, line ends, a byte order mark. Without a
+/// change the text is the given one.
+#[derive(Debug)]
+pub struct Edit<'a> {
+    text: &'a str,
+    document: Document<&'a str>,
+    /// Texts in the place of others, in any order; they do not overlap.
+    changes: Vec<(Range<usize>, String)>,
+}
+
+impl<'a> Edit<'a> {
+    /// Reads a skin's text.
+    ///
+    /// # Errors
+    /// When the text is no TOML, or has another number of cells than the skin.
+    pub fn new(skin: &Skin, text: &'a str) -> Result<Self, EditError> {
+        let edit = Self { text, document: Document::parse(text)?, changes: Vec::new() };
+        let (found, expected) = (edit.count().ok_or(EditError::NoCells)?, skin.cells.len());
+        if found != expected {
+            return Err(EditError::Count { found, expected });
+        }
+        Ok(edit)
+    }
+
+    /// The cells of the text: `[[cell]]` tables, or tables in an array.
+    fn count(&self) -> Option<usize> {
+        match self.document.get("cell")? {
+            Item::ArrayOfTables(cells) => Some(cells.len()),
+            other => Some(other.as_array()?.len()),
+        }
+    }
+
+    fn cell(&self, index: usize) -> Option<&dyn TableLike> {
+        match self.document.get("cell")? {
+            Item::ArrayOfTables(cells) => cells.get(index).map(|table: &Table| table as &dyn TableLike),
+            other => other.as_array()?.get(index)?.as_inline_table().map(|table| table as &dyn TableLike),
+        }
+    }
+
+    /// The places of a cell's key and of its value.
+    fn places(&self, cell: usize, key: &str) -> Option<(Range<usize>, Range<usize>)> {
+        let (key, item) = self.cell(cell)?.get_key_value(key)?;
+        Some((Key::span(key)?, item.span()?))
+    }
+
+    /// Returns true if a cell has a key.
+    #[must_use]
+    pub fn has(&self, cell: usize, key: &str) -> bool {
+        self.places(cell, key).is_some()
+    }
+
+    /// Puts a value in the place of a cell's, if the cell has the key.
+    pub fn set(&mut self, cell: usize, key: &str, value: Value<'_>) {
+        if let Some((_, place)) = self.places(cell, key) {
+            self.changes.push((place, value.to_string()));
+        }
+    }
+
+    /// Puts a value in the place of an element of a cell's array, if there is one.
+    pub fn set_element(&mut self, cell: usize, key: &str, index: usize, value: Value<'_>) {
+        let array = self.cell(cell).and_then(|cell| cell.get(key)?.as_array());
+        if let Some(place) = array.and_then(|array| array.get(index)?.span()) {
+            self.changes.push((place, value.to_string()));
+        }
+    }
+
+    /// Puts another key and its value in the place of a cell's, if the cell has that.
+    pub fn replace(&mut self, cell: usize, key: &str, other: &str, value: Value<'_>) {
+        if let Some((name, place)) = self.places(cell, key) {
+            self.changes.push((name, other.to_owned()));
+            self.changes.push((place, value.to_string()));
+        }
+    }
+
+    /// Adds a key that a cell does not have: on a line of its own below that of `after`, or behind its value in an inline table.
+    pub fn insert(&mut self, cell: usize, key: &str, value: Value<'_>, after: &str) {
+        let Some((name, place)) = self.places(cell, after) else { return };
+        let rest = self.text.get(place.end..).unwrap_or_default();
+        let is_inline = self.document.get("cell").is_some_and(Item::is_value);
+        let (offset, text) = if is_inline {
+            (0, format!(", {key} = {value}"))
+        } else {
+            // The new line is indented and ends as the one above it.
+            let before = self.text.get(..name.start).unwrap_or_default();
+            let indent = before.rsplit('\n').next().unwrap_or_default();
+            let line = rest.find('\n').unwrap_or(rest.len());
+            let end = if rest.get(..line).is_some_and(|line| line.ends_with('\r')) { "\r\n" } else { "\n" };
+            match rest.len() == line {
+                true => (line, format!("{end}{indent}{key} = {value}")),
+                false => (line + 1, format!("{indent}{key} = {value}{end}")),
+            }
+        };
+        let at = place.end + offset;
+        self.changes.push((at..at, text));
+    }
+
+    /// Returns the text with its changes.
+    #[must_use]
+    pub fn text(mut self) -> String {
+        // What is inserted at one place stays in the order of the calls.
+        self.changes.sort_by_key(|(place, _)| (place.start, place.end));
+        let mut out = String::with_capacity(self.text.len());
+        let mut at = 0;
+        for (place, new) in &self.changes {
+            out.push_str(self.text.get(at..place.start).unwrap_or_default());
+            out.push_str(new);
+            at = place.end;
+        }
+        out.push_str(self.text.get(at..).unwrap_or_default());
+        out
+    }
+}

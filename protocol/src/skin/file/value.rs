@@ -1,0 +1,52 @@
+//! A value as it stands in a file.
+
+use core::fmt::{self, Write};
+
+use crate::usage::is_unprintable;
+
+/// A value that is written. Numbers are finite.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Value<'a> {
+    /// A whole number.
+    Integer(i64),
+    /// A number, with as many digits as tell it from its neighbours.
+    Number(f64),
+    /// An array of numbers.
+    Numbers(&'a [f64]),
+    /// An array of node ids; 0 for a port without a wire.
+    Nodes(&'a [u8]),
+    /// A text, which is quoted.
+    Text(&'a str),
+    /// `true` or `false`.
+    Flag(bool),
+}
+
+impl fmt::Display for Value<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Integer(value) => write!(f, "{value}"),
+            Self::Number(value) => write!(f, "{value:?}"),
+            Self::Numbers(values) => write!(f, "{values:?}"),
+            Self::Nodes(values) => write!(f, "{values:?}"),
+            Self::Text(text) => quoted(f, text),
+            Self::Flag(value) => write!(f, "{value}"),
+        }
+    }
+}
+
+/// Writes a basic string of TOML, which has other escapes than Rust.
+fn quoted(f: &mut fmt::Formatter<'_>, text: &str) -> fmt::Result {
+    f.write_char('"')?;
+    for letter in text.chars() {
+        match letter {
+            '"' | '\\' => write!(f, "\\{letter}")?,
+            '\n' => f.write_str("\\n")?,
+            '\r' => f.write_str("\\r")?,
+            '\t' => f.write_str("\\t")?,
+            letter if is_unprintable(letter) && letter > '\u{ffff}' => write!(f, "\\U{:08x}", letter as u32)?,
+            letter if is_unprintable(letter) => write!(f, "\\u{:04x}", letter as u32)?,
+            letter => f.write_char(letter)?,
+        }
+    }
+    f.write_char('"')
+}
