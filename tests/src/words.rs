@@ -80,9 +80,14 @@ const NAMES: &[(&str, &str)] = &[
 /// Terms that have such a word in them: after this one, and before this one.
 const AFTER: &[(&str, &str)] = &[("least", "at")];
 const BEFORE: &[(&str, &str)] = &[("least", "significant"), ("least", "squares")];
-/// Former names of faults, which are still read.
-const FORMER: &[(&str, &str)] =
-    &[("cut", "scenario"), ("mend", "scenario"), ("ear", "mesh/polygon"), ("ears", "mesh/polygon")];
+/// Former names of faults, which are still read, and names of others' libraries.
+const FORMER: &[(&str, &str)] = &[
+    ("cut", "scenario"),
+    ("mend", "scenario"),
+    ("ear", "mesh/polygon"),
+    ("ears", "mesh/polygon"),
+    ("Left", "report/svg"),
+];
 
 struct Word<'a> {
     text: &'a str,
@@ -136,7 +141,7 @@ fn names(text: &str) -> String {
     });
     let lines: Vec<_> = lines.collect();
     let mut is_text = false;
-    let parted = lines.join("\n");
+    let parted = lines.join("\n").replace("'\"'", "");
     let mut kept = String::new();
     for part in parted.split('"') {
         if is_text {

@@ -96,7 +96,7 @@ orientation = [0.0, 0.0, 0.0, 1.0]
         let text = calibrated(&skin, SKIN, &calibration(&cells)).unwrap();
         let expected = SKIN
             .replace("[-0.2, 0.0, 0.06]", "[0.01, -0.02, 0.3]")
-            .replace("normal = [0.0, 1.0, 0.0] # up", "orientation = [0.0, 0.0, 0.6, 0.8]");
+            .replace("normal = [0.0, 1.0, 0.0]", "orientation = [0.0, 0.0, 0.6, 0.8]");
         assert_eq!(text, expected);
         cells[1].found = Some(found);
         let text = calibrated(&skin, SKIN, &calibration(&cells)).unwrap();

@@ -46,6 +46,7 @@ use outsiders::Outsiders;
 use root_totals::RootTotals;
 use switched::Switched;
 
+pub use crate::tracker::Uplink;
 pub use accuracy::{Accuracy, Rounded};
 pub use cell::{Cell, Said};
 pub use counters::{Counters, Event};
@@ -57,8 +58,6 @@ pub use root_totals::{Contributions, SumCounts};
 pub use sensed::Sensed;
 pub use status::Status;
 pub use switched::{SWITCHES, Switch};
-
-pub use crate::tracker::Uplink;
 
 /// What a tick needs to know of a bus: of the same size for any number of cells.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -35,7 +35,7 @@
 //! | `successor_after_former` | `Inherited`, former may not | `Succeeds` | `Inherited`, former: the owner | `Started` again | as `start_after_former` |
 //! | `incomparable` | `Free`; `Sole`, `Shared` | all but `Claims`, `Settles`; `FormerContinues` | the same | `Overtaken` | cannot come: there is no owner, no former to compare with |
 //!
-//! An id that was shared stays so: `Shared` and `Inherited` have no way back to `Sole`. Whether the owner has settled is
+//! An id that was shared stays so: `Shared` and `Inherited` never become `Sole` again. Whether the owner has settled is
 //! no state: its last heartbeat says it.
 
 use super::Word;
