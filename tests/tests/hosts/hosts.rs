@@ -400,7 +400,7 @@ fn wrong_use_is_one_line() {
         let ended = host.start(&link_program(), &format!("link vcan0 --bus-kind embedded {words}")).end();
         ended.refusal(2).to_owned()
     };
-    assert!(refused("").contains("no --connect, no --listen and no --config"));
+    assert!(refused("").contains("no endpoint: say where the other hosts are"));
     assert!(refused("--listen udp/127.0.0.1:1").contains("an endpoint is tcp/HOST:PORT or tls/HOST:PORT"));
     assert!(refused("--listen tcp/127.0.0.1:0 --host a/b").contains("it has one of"));
     let _link = host.link("--listen tcp/127.0.0.1:0");
