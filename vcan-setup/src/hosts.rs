@@ -4,21 +4,13 @@
 //!   bus ──> outgoing ──> message ──> transport ──> incoming ──> bus of another host
 //! ```
 //!
-//! No input or output: a shell with a transport moves the bytes. A source numbers every frame that it takes from its bus,
+//! No input or output: a shell with a transport, the program `vcan-link`, moves the bytes ([`program`]). A source numbers every frame that it takes from its bus,
 //! those that it then drops too, so that whoever hears it knows how many are missing and where they were lost.
 
-#[cfg(feature = "link")]
-pub mod event;
 pub mod incoming;
-#[cfg(feature = "link")]
-pub mod link;
-#[cfg(feature = "link")]
-mod log;
 pub mod message;
+pub mod options;
 pub mod outgoing;
+pub mod program;
 pub mod report;
 pub mod returned;
-#[cfg(feature = "link")]
-pub mod session;
-#[cfg(feature = "link")]
-mod watchers;

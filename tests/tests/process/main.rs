@@ -17,6 +17,7 @@ mod process_flash;
 mod process_foxglove;
 mod process_halts;
 mod process_import;
+mod process_link;
 mod process_network;
 mod process_parts;
 mod process_readme;

@@ -2,8 +2,6 @@
 //! 1 (it failed, or this machine does not allow it) and 2 (wrong use or configuration).
 
 mod doctor;
-#[cfg(feature = "link")]
-mod link;
 mod serve;
 mod slcan;
 mod status;
@@ -20,6 +18,8 @@ use protocol::bus::{BusError, check_name};
 use protocol::skin::Skin;
 use protocol::usage::{Failure, end, one_line, quoted_os};
 use serde::Serialize;
+use vcan_setup::hosts::options::LinkOptions;
+use vcan_setup::hosts::program;
 use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::Target;
@@ -34,7 +34,8 @@ use vcan_setup::plan::Target;
   vcan-setup status                the CAN interfaces of this machine
   sudo vcan-setup down vcan0
   vcan-setup serve vcan0           a bus where the kernel has no CAN
-  vcan-setup slcan vcan0 /dev/ttyACM0 --cell 12    a cell behind a serial adapter"
+  vcan-setup slcan vcan0 /dev/ttyACM0 --cell 12    a cell behind a serial adapter
+  vcan-setup link vcan0 --connect tcp/10.0.0.7:7447    the same bus on another host"
 )]
 struct Arguments {
     #[command(subcommand)]
@@ -49,8 +50,7 @@ enum Command {
     Doctor(doctor::Doctor),
     Serve(serve::Serve),
     Slcan(slcan::Slcan),
-    #[cfg(feature = "link")]
-    Link(link::Link),
+    Link(LinkOptions),
 }
 
 impl Command {
@@ -62,8 +62,8 @@ impl Command {
             Self::Doctor(command) => command.run(),
             Self::Serve(command) => command.run(),
             Self::Slcan(command) => command.run(),
-            #[cfg(feature = "link")]
-            Self::Link(command) => command.run(),
+            // After the names of this program and of the command.
+            Self::Link(_) => Err(Failure::run(program::run(std::env::args_os().skip(2)))),
         }
     }
 }

@@ -4,14 +4,14 @@ use std::io::{ErrorKind, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::{UnixListener, UnixStream};
 
-use super::report::Report;
+use vcan_setup::hosts::report::Report;
 
 /// Programs at most; further ones are hung up on.
 const WATCHERS: usize = 64;
 
 /// Those that are connected, and where others connect.
 #[derive(Debug)]
-pub(super) struct Watchers {
+pub(crate) struct Watchers {
     listener: UnixListener,
     streams: Vec<UnixStream>,
     /// The newest report that all of them have, as a line.
@@ -21,17 +21,17 @@ pub(super) struct Watchers {
 }
 
 impl Watchers {
-    pub(super) const fn new(listener: UnixListener) -> Self {
+    pub(crate) const fn new(listener: UnixListener) -> Self {
         Self { listener, streams: Vec::new(), line: Vec::new(), is_full: false }
     }
 
     /// Readable when somebody connects; nothing to wait for while nobody can be taken.
-    pub(super) fn listener(&self) -> Option<BorrowedFd<'_>> {
+    pub(crate) fn listener(&self) -> Option<BorrowedFd<'_>> {
         (!self.is_full).then(|| self.listener.as_fd())
     }
 
     /// Takes those that connect, and gives them the newest report.
-    pub(super) fn accept(&mut self) {
+    pub(crate) fn accept(&mut self) {
         loop {
             let mut stream = match self.listener.accept() {
                 Ok((stream, _)) => stream,
@@ -51,7 +51,7 @@ impl Watchers {
     }
 
     /// Tells all of them, if it is new. Whoever does not read is hung up on, for half a line would be worse than none.
-    pub(super) fn tell(&mut self, report: &Report) {
+    pub(crate) fn tell(&mut self, report: &Report) {
         let Ok(mut line) = serde_json::to_vec(report) else { return };
         line.push(b'\n');
         if line != self.line {
@@ -66,8 +66,8 @@ mod tests {
     use std::path::Path;
 
     use protocol::bus::BusKind;
+    use vcan_setup::hosts::report::{Reports, listen};
 
-    use super::super::report::{Reports, listen};
     use super::*;
 
     #[test]

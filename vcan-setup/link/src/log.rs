@@ -12,8 +12,8 @@ use tracing::span::{Attributes, Id, Record};
 use tracing::subscriber::Interest;
 use tracing::{Event as Entry, Level, Metadata, Subscriber};
 
-use super::event::Event;
-use super::session::plain;
+use crate::event::Event;
+use crate::session::plain;
 
 /// Where failed connections are logged, at level debug because they are tried again.
 const CONNECTIONS: &str = "zenoh::net::runtime::orchestrator";
@@ -32,7 +32,7 @@ struct Log {
 }
 
 /// Hands warnings, errors and failed connections to `tell`; once in a process.
-pub(super) fn listen(tell: Sender<Event>) {
+pub(crate) fn listen(tell: Sender<Event>) {
     let log = Log { tell: Mutex::new(tell), said: Mutex::default() };
     // A program that has a log of its own has these there.
     let _ = tracing::subscriber::set_global_default(log);

@@ -12,6 +12,11 @@ use protocol::bus::{Bus, BusError, BusKind, Inbox, Options};
 use protocol::id::CellId;
 use rustix::event::{EventfdFlags, PollFd, PollFlags, Timespec, eventfd, poll};
 use rustix::io::Errno;
+use vcan_setup::hosts::incoming::{Heard, Incoming, SOURCES};
+use vcan_setup::hosts::message::Stamped;
+use vcan_setup::hosts::outgoing::{Outgoing, Sent};
+use vcan_setup::hosts::report::{Host, Report, listen};
+use vcan_setup::hosts::returned::Returned;
 use zenoh::bytes::ZBytes;
 use zenoh::key_expr::KeyExpr;
 use zenoh::pubsub::Publisher;
@@ -19,16 +24,10 @@ use zenoh::qos::{CongestionControl, Priority};
 use zenoh::sample::{Locality, Sample, SampleKind};
 use zenoh::{Session, Wait};
 
-pub use super::event::Event;
-use super::incoming::{Heard, Incoming, SOURCES};
-use super::log;
-use super::message::Stamped;
-use super::outgoing::{Outgoing, Sent};
-use super::report::{Host, Report, listen};
-use super::returned::Returned;
-use super::session::{FRAMES, HEARD, config, host_of, key, life};
-pub use super::session::{LinkError, Settings};
-use super::watchers::Watchers;
+use crate::event::Event;
+use crate::log;
+use crate::session::{FRAMES, HEARD, LinkError, Settings, config, host_of, key, life};
+use crate::watchers::Watchers;
 
 /// Frames that may wait unread in the socket of the bus.
 const RECEIVE_BUFFER: usize = 8 << 20;
@@ -67,7 +66,7 @@ impl Shared {
 }
 
 /// A bus that is linked.
-pub struct Link {
+pub(crate) struct Link {
     settings: Settings,
     kind: BusKind,
     session: Session,
@@ -100,7 +99,7 @@ impl Link {
     ///
     /// # Errors
     /// When the bus cannot be opened, the configuration is wrong, or another link has the same name.
-    pub fn open(settings: Settings) -> Result<Self, LinkError> {
+    pub(crate) fn open(settings: Settings) -> Result<Self, LinkError> {
         let own = key(FRAMES, &settings.bus, &settings.host)?;
         let config = config(&settings)?;
         let kind = settings.choice.resolve(&settings.bus);
@@ -215,7 +214,7 @@ impl Link {
 
     /// What carries the bus here.
     #[must_use]
-    pub const fn kind(&self) -> BusKind {
+    pub(crate) const fn kind(&self) -> BusKind {
         self.kind
     }
 
@@ -223,7 +222,7 @@ impl Link {
     ///
     /// # Errors
     /// When the system cannot wait.
-    pub fn run(mut self, stop: impl AsFd, mut report: impl FnMut(Event)) -> Result<Report, LinkError> {
+    pub(crate) fn run(mut self, stop: impl AsFd, mut report: impl FnMut(Event)) -> Result<Report, LinkError> {
         let (mut inbox, mut bytes) = (Inbox::new(), Vec::new());
         let (mut said, mut say_at, mut open_at) = ((0, 0), Instant::now(), Instant::now());
         let mut warned = BTreeSet::new();

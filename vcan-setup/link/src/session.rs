@@ -11,33 +11,33 @@ use zenoh::Config;
 use zenoh::key_expr::KeyExpr;
 
 /// What a host takes from its bus: `skinbus/frames/BUS/HOST`. The liveliness tokens have these keys too.
-pub(super) const FRAMES: &str = "frames";
+pub(crate) const FRAMES: &str = "frames";
 /// What a host has heard of each other: `skinbus/heard/BUS/HOST`.
-pub(super) const HEARD: &str = "heard";
+pub(crate) const HEARD: &str = "heard";
 
 /// How a bus is linked.
 #[derive(Clone, Debug)]
-pub struct Settings {
+pub(crate) struct Settings {
     /// The bus here, and elsewhere.
-    pub bus: String,
+    pub(crate) bus: String,
     /// Its kind here.
-    pub choice: Choice,
+    pub(crate) choice: Choice,
     /// Where embedded buses live; `None` is the usual directory.
-    pub directory: Option<PathBuf>,
+    pub(crate) directory: Option<PathBuf>,
     /// This host's name.
-    pub host: String,
+    pub(crate) host: String,
     /// A configuration of Zenoh.
-    pub config: Option<PathBuf>,
+    pub(crate) config: Option<PathBuf>,
     /// Where to connect to, as `tcp/192.168.1.7:7447`.
-    pub connect: Vec<String>,
+    pub(crate) connect: Vec<String>,
     /// Where to wait for others.
-    pub listen: Vec<String>,
+    pub(crate) listen: Vec<String>,
 }
 
 /// Why a bus cannot be linked.
 #[derive(Debug, Error)]
 #[non_exhaustive]
-pub enum LinkError {
+pub(crate) enum LinkError {
     /// The bus cannot be opened, or is lost for good.
     #[error(transparent)]
     Bus(#[from] BusError),
@@ -74,7 +74,7 @@ pub enum LinkError {
 
 impl Settings {
     /// An error of Zenoh, and the configuration that it may be about.
-    pub(super) fn blame(&self, error: &str) -> LinkError {
+    pub(crate) fn blame(&self, error: &str) -> LinkError {
         let of = self.config.as_ref().map_or_else(String::new, |path| format!("{}: ", path.display()));
         LinkError::Zenoh(format!("{of}{}", plain(error)))
     }
@@ -83,20 +83,20 @@ impl Settings {
 impl LinkError {
     /// Whether the user has asked for what cannot be.
     #[must_use]
-    pub const fn is_usage(&self) -> bool {
+    pub(crate) const fn is_usage(&self) -> bool {
         matches!(
             self,
             Self::Alone | Self::Endpoint(..) | Self::PlainBesideTls { .. } | Self::Name(..) | Self::Twice(_)
         )
     }
 
-    pub(super) fn zenoh(error: impl fmt::Display) -> Self {
+    pub(crate) fn zenoh(error: impl fmt::Display) -> Self {
         Self::Zenoh(plain(&error.to_string()))
     }
 }
 
 /// What an error of Zenoh says, without the places in its source.
-pub(super) fn plain(error: &str) -> String {
+pub(crate) fn plain(error: &str) -> String {
     let message = error.split_once("msg: \"").and_then(|(_, rest)| rest.split_once("\", location"));
     let text = message.map_or(error, |(message, _)| message);
     text.split(" at /").next().unwrap_or(text).trim_end_matches('.').to_owned()
@@ -110,7 +110,7 @@ pub(super) fn plain(error: &str) -> String {
 /// # Errors
 ///
 /// The file cannot be read, an endpoint has an unsupported form or no TLS beside others with TLS, or there is none.
-pub(super) fn config(settings: &Settings) -> Result<Config, LinkError> {
+pub(crate) fn config(settings: &Settings) -> Result<Config, LinkError> {
     let mut config = match &settings.config {
         Some(path) => Config::from_file(path).map_err(|error| settings.blame(&error.to_string()))?,
         None => Config::default(),
@@ -226,7 +226,7 @@ fn set_unless_given(config: &mut Config, key: &str) -> Result<(), LinkError> {
     Ok(())
 }
 
-pub(super) fn key(what: &str, bus: &str, host: &str) -> Result<KeyExpr<'static>, LinkError> {
+pub(crate) fn key(what: &str, bus: &str, host: &str) -> Result<KeyExpr<'static>, LinkError> {
     for name in [bus, host] {
         if name != "*" && name.contains(['*', '$', '?', '#', '/']) {
             let why = "it has one of * $ ? # /".to_owned();
@@ -237,12 +237,12 @@ pub(super) fn key(what: &str, bus: &str, host: &str) -> Result<KeyExpr<'static>,
     KeyExpr::try_from(text).map_err(|error| LinkError::Name(format!("{bus}, {host}"), error.to_string()))
 }
 
-pub(super) fn host_of(key: &str) -> &str {
+pub(crate) fn host_of(key: &str) -> &str {
     key.rsplit('/').next().unwrap_or(key)
 }
 
 /// A number that no other start has.
-pub(super) fn life() -> u64 {
+pub(crate) fn life() -> u64 {
     let mut bytes = [0; 8];
     // Early at boot there may be nothing random.
     match rustix::rand::getrandom(&mut bytes, rustix::rand::GetRandomFlags::empty()) {

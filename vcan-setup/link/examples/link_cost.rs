@@ -1,7 +1,7 @@
 //! What `vcan-setup link` adds to a round trip, and what it takes of a processor for a frame, with two embedded buses of
 //! this machine as the two hosts.
 //!
-//! `cargo build --release -p vcan-setup --features link --bins --examples && target/release/examples/link_cost`
+//! `cd vcan-setup/link && cargo build --locked --release --bins --examples && target/release/examples/link_cost`
 #![allow(clippy::print_stdout, reason = "an example that prints")]
 
 use std::error::Error;
@@ -106,9 +106,9 @@ impl Links {
     fn start(&mut self, folder: &Path, host: &str, how: &str) -> Outcome<()> {
         // Beside the folder of the examples.
         let program: PathBuf =
-            std::env::current_exe()?.parent().and_then(Path::parent).ok_or("no folder")?.join("vcan-setup");
+            std::env::current_exe()?.parent().and_then(Path::parent).ok_or("no folder")?.join("vcan-link");
         let mut command = Command::new(program);
-        command.args(["link", BUS, "--bus-kind=embedded", "--host", host, how]).env("SKINBUS_DIR", folder);
+        command.args([BUS, "--bus-kind=embedded", "--host", host, how]).env("SKINBUS_DIR", folder);
         self.0.push(command.stdout(Stdio::null()).stderr(Stdio::null()).spawn()?);
         Ok(())
     }
@@ -176,7 +176,7 @@ fn until_answered(near: &Bus, pings: &mut impl Iterator<Item = u32>) -> Outcome<
             return Ok(());
         }
     }
-    Err("nobody answers: is vcan-setup built with the feature `link`?".into())
+    Err("nobody answers: is vcan-link built beside the folder of the examples?".into())
 }
 
 fn round_trip(near: &Bus, pings: &mut impl Iterator<Item = u32>) -> Outcome<Option<Duration>> {

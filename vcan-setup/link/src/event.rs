@@ -4,7 +4,7 @@ use std::fmt;
 
 /// What happened.
 #[derive(Clone, Debug, Eq, PartialEq)]
-pub enum Event {
+pub(crate) enum Event {
     /// Another host has linked the bus.
     Joined(String),
     /// A host is gone, or not reached any more.

@@ -1,0 +1,106 @@
+//! `vcan-link`: joins a bus with those of the same name on other hosts. `vcan-setup link` runs it.
+
+mod event;
+mod link;
+mod log;
+mod session;
+mod watchers;
+
+use std::os::unix::net::UnixStream;
+use std::process::ExitCode;
+
+use clap::Parser;
+use clap::error::ErrorKind;
+use protocol::usage::{Failure, end, one_line, print};
+use signal_hook::consts::{SIGINT, SIGTERM};
+use vcan_setup::hosts::options::LinkOptions;
+use vcan_setup::hosts::program;
+use vcan_setup::hosts::report::{Host, Report};
+
+use link::Link;
+use session::Settings;
+
+#[derive(Debug, Parser)]
+#[command(name = "vcan-link", bin_name = "vcan-setup link", version)]
+struct Arguments {
+    #[command(flatten)]
+    options: LinkOptions,
+}
+
+fn main() -> ExitCode {
+    let done = program::check_caller().map_err(Failure::run).and_then(|()| match Arguments::try_parse() {
+        Ok(arguments) => run(arguments.options),
+        // Help and version, which are asked for, are printed as they are.
+        Err(queried) if !queried.use_stderr() => queried.exit(),
+        Err(wrong) if wrong.kind() == ErrorKind::DisplayHelpOnMissingArgumentOrSubcommand => wrong.exit(),
+        Err(wrong) => Err(Failure::usage(one_line(&wrong.render().to_string()))),
+    });
+    end("vcan-setup", done)
+}
+
+fn run(options: LinkOptions) -> Result<(), Failure> {
+    let (stop, stopped) = UnixStream::pair().map_err(no_signals)?;
+    for signal in [SIGINT, SIGTERM] {
+        let stop = stop.try_clone().map_err(no_signals)?;
+        signal_hook::low_level::pipe::register(signal, stop).map_err(no_signals)?;
+    }
+    let machine = || rustix::system::uname().nodename().to_string_lossy().into_owned();
+    let host = options.host.unwrap_or_else(machine);
+    let settings = Settings {
+        bus: options.bus.clone(),
+        choice: options.bus_kind,
+        directory: None,
+        host: host.clone(),
+        config: options.config,
+        connect: options.connect,
+        listen: options.listen,
+    };
+    let link = Link::open(settings)
+        .map_err(|error| if error.is_usage() { Failure::usage(error) } else { Failure::run(error) })?;
+    let ready = format!("{} ({}) is linked as '{host}'", options.bus, link.kind());
+    if options.json {
+        say(&ready)
+    } else {
+        print(&format!("{ready}\n"))?
+    }
+    let report =
+        link.run(stopped, |event| say(&format!("{}: {event}", options.bus))).map_err(Failure::run)?;
+    print(&if options.json { json(&report)? } else { text(&report) })
+}
+
+fn json(report: &Report) -> Result<String, Failure> {
+    serde_json::to_string_pretty(report).map(|text| text + "\n").map_err(Failure::run)
+}
+
+fn text(report: &Report) -> String {
+    let Report { sent, hosts, returned, .. } = report;
+    let mut text = format!(
+        "from here: {} frames taken, {} sent in {} messages, {} dropped, {} missed\n",
+        sent.taken, sent.sent, sent.messages, sent.dropped, sent.missed
+    );
+    for (host, Host { heard, .. }) in hosts {
+        text += &format!(
+            "from '{host}': {} frames taken, {} sent to the bus; lost {} on the way, {} there, {} here; {} from before\n",
+            heard.taken,
+            heard.sent,
+            heard.lost,
+            heard.dropped_there + heard.missed_there,
+            heard.dropped_here + heard.refused,
+            heard.before,
+        );
+    }
+    if *returned > 0 {
+        text += &format!(
+            "{returned} frames of other hosts came back from the bus here, and were not sent again\n"
+        );
+    }
+    text
+}
+
+fn no_signals(error: std::io::Error) -> Failure {
+    Failure::run(format!("cannot catch signals: {error}"))
+}
+
+fn say(text: &str) {
+    protocol::usage::say(&format!("vcan-setup: {text}"));
+}

@@ -1,0 +1,48 @@
+//! The command line of `vcan-setup link`: read by `vcan-setup`, which then runs the program `vcan-link`, and by that.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use protocol::bus::{BusError, Choice, check_name};
+
+/// Join a bus here with those of the same name on other hosts, until SIGINT or SIGTERM
+///
+/// Carries every frame over Zenoh (TCP or TLS), or counts it as lost with where and why. Nothing waits for a link: what
+/// it cannot carry is dropped, and counted. Nobody is looked for in the network: say where the others are with --connect,
+/// where they find this host with --listen, or both in a file of Zenoh's. A connection that was lost is made again.
+#[derive(Args, Debug)]
+#[command(after_help = "Examples:
+  vcan-setup link vcan0 --listen tcp/192.168.1.7:7447      on the host of the robot
+  vcan-setup link vcan0 --connect tcp/192.168.1.7:7447     on the host of the cells
+  vcan-setup link vcan0 --config tls.json5
+
+A program of its own does it, vcan-link, beside vcan-setup or on PATH. To install it, in the project's folder:
+  cargo install --locked --path vcan-setup/link")]
+pub struct LinkOptions {
+    /// The bus
+    #[arg(value_parser = bus_name)]
+    pub bus: String,
+    /// A configuration of Zenoh: certificates, access control, endpoints
+    #[arg(long, value_name = "FILE.json5")]
+    pub config: Option<PathBuf>,
+    /// Connect to this host, as often as there are hosts: tcp/HOST:PORT or tls/HOST:PORT
+    #[arg(long, value_name = "ENDPOINT")]
+    pub connect: Vec<String>,
+    /// Wait for other hosts here
+    #[arg(long, value_name = "ENDPOINT")]
+    pub listen: Vec<String>,
+    /// This host's name among the others; else the machine's
+    #[arg(long, value_name = "NAME")]
+    pub host: Option<String>,
+    /// socketcan or embedded; else SocketCAN if there is an interface of this name, else the embedded bus
+    #[arg(long, value_name = "KIND", default_value_t = Choice::Auto)]
+    pub bus_kind: Choice,
+    /// Print what has become of the frames as JSON
+    #[arg(long)]
+    pub json: bool,
+}
+
+/// Returns a bus' name, as the command line gives it.
+fn bus_name(word: &str) -> Result<String, BusError> {
+    check_name(word).map(|()| word.to_owned())
+}

@@ -1,0 +1,154 @@
+//! The program `vcan-link`, which joins a bus with those of other hosts: where it is, and how it takes the place of
+//! `vcan-setup link`.
+//!
+//! It is a workspace of its own because of Zenoh, and is installed by itself. Both programs have to be of one version.
+
+use std::env;
+use std::ffi::{OsStr, OsString};
+use std::io;
+use std::os::unix::process::CommandExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use protocol::usage::quoted_os;
+use rustix::fs::{Access, access};
+use thiserror::Error;
+
+/// The program's name.
+pub const PROGRAM: &str = "vcan-link";
+/// The environment variable that has the program's path, where it is neither beside `vcan-setup` nor on `PATH`.
+pub const VARIABLE: &str = "SKINBUS_VCAN_LINK";
+/// The environment variable in which `vcan-setup` passes its version to the program.
+const CALLER: &str = "VCAN_SETUP_VERSION";
+/// The version of this crate, which both programs are built with.
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+
+/// The reason why the program does not run.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ProgramError {
+    /// There is no such file.
+    #[error(
+        "vcan-link was found neither beside vcan-setup nor on PATH; to install it, in the project's folder: \
+         `cargo install --locked --path vcan-setup/link`"
+    )]
+    Missing,
+    /// The system does not run the file that [`VARIABLE`] names.
+    #[error("cannot run {}: {source}; {VARIABLE} names it", quoted_os(path.as_os_str()))]
+    Named {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// The system does not run the file that was found.
+    #[error("cannot run {}: {source}", quoted_os(path.as_os_str()))]
+    Found {
+        /// The file.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// The program and the `vcan-setup` that runs it are of different versions.
+    #[error(
+        "vcan-link {VERSION} was run by vcan-setup {0}: both have to be of one version; in the project's folder: \
+         `cargo install --locked --path vcan-setup/link`"
+    )]
+    Version(String),
+}
+
+/// Runs the program in the place of this process, which keeps its id: exit code and signals are the program's. Returns only
+/// when that fails.
+pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
+    let named = env::var_os(VARIABLE).filter(|path| !path.is_empty()).map(PathBuf::from);
+    let start = |path: &Path| Command::new(path).args(arguments).env(CALLER, VERSION).exec();
+    if let Some(path) = named {
+        // A bare name would be searched in PATH, and not here.
+        let path = if path.components().count() == 1 { Path::new(".").join(path) } else { path };
+        let source = start(&path);
+        return ProgramError::Named { path, source };
+    }
+    let own = env::current_exe().ok();
+    match find(own.as_deref().and_then(Path::parent), env::var_os("PATH").as_deref()) {
+        Some(path) => {
+            let source = start(&path);
+            ProgramError::Found { path, source }
+        }
+        None => ProgramError::Missing,
+    }
+}
+
+/// Finds the program beside `vcan-setup`, else in the folders of `PATH`: the first file that may be executed, else the first
+/// one, so that the error can name it.
+fn find(beside: Option<&Path>, path: Option<&OsStr>) -> Option<PathBuf> {
+    let folders = beside.map(Path::to_owned).into_iter();
+    let folders = folders.chain(path.into_iter().flat_map(env::split_paths));
+    // An empty folder of PATH would be the current one.
+    let folders = folders.filter(|folder| !folder.as_os_str().is_empty());
+    let files: Vec<_> = folders.map(|folder| folder.join(PROGRAM)).filter(|file| file.is_file()).collect();
+    let executable = files.iter().find(|file| access(file.as_path(), Access::EXEC_OK).is_ok());
+    executable.or_else(|| files.first()).cloned()
+}
+
+/// Compares the version of the `vcan-setup` that ran this program with its own; nothing to compare where none did.
+///
+/// # Errors
+///
+/// [`ProgramError::Version`].
+pub fn check_caller() -> Result<(), ProgramError> {
+    fits(env::var_os(CALLER).as_deref())
+}
+
+fn fits(caller: Option<&OsStr>) -> Result<(), ProgramError> {
+    match caller {
+        Some(version) if version != VERSION => {
+            Err(ProgramError::Version(version.to_string_lossy().into_owned()))
+        }
+        Some(_) | None => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::os::unix::ffi::OsStrExt;
+    use std::os::unix::fs::PermissionsExt;
+
+    use super::*;
+
+    #[test]
+    fn it_is_found_beside_or_on_path_and_what_cannot_be_executed_comes_last() {
+        let folder = tempfile::tempdir().unwrap();
+        let [beside, odd, plain] = [&b"beside"[..], b"o d\xff", b"plain"].map(|name| {
+            let folder = folder.path().join(OsStr::from_bytes(name));
+            fs::create_dir(&folder).unwrap();
+            folder
+        });
+        let put = |folder: &Path, mode| {
+            let file = folder.join(PROGRAM);
+            fs::write(&file, "").unwrap();
+            fs::set_permissions(&file, fs::Permissions::from_mode(mode)).unwrap();
+            file
+        };
+        let path = env::join_paths([Path::new(""), &plain, &odd]).unwrap();
+        let found = || find(Some(&beside), Some(&path));
+        assert_eq!(found(), None);
+        let in_plain = put(&plain, 0o644);
+        assert_eq!(found(), Some(in_plain), "the error is about this one");
+        let in_odd = put(&odd, 0o755);
+        assert_eq!(found(), Some(in_odd));
+        let in_beside = put(&beside, 0o755);
+        assert_eq!(found(), Some(in_beside));
+        assert_eq!(find(None, None), None);
+        fs::create_dir(folder.path().join(PROGRAM)).unwrap();
+        assert_eq!(find(Some(folder.path()), None), None, "a folder");
+    }
+
+    #[test]
+    fn another_version_is_refused_with_both() {
+        assert!(fits(None).is_ok() && fits(Some(VERSION.as_ref())).is_ok());
+        let error = fits(Some("0.0.9".as_ref())).unwrap_err().to_string();
+        assert!(error.starts_with(&format!("vcan-link {VERSION} was run by vcan-setup 0.0.9: ")), "{error}");
+        assert!(fits(Some("".as_ref())).is_err());
+    }
+}
