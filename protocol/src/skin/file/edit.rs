@@ -56,17 +56,16 @@ impl<'a> Edit<'a> {
 
     /// The cells of the text: `[[cell]]` tables, or tables in an array.
     fn count(&self) -> Option<usize> {
-        match self.document.get("cell")? {
-            Item::ArrayOfTables(cells) => Some(cells.len()),
-            other => Some(other.as_array()?.len()),
-        }
+        let cells = self.document.get("cell")?;
+        if let Item::ArrayOfTables(cells) = cells { Some(cells.len()) } else { Some(cells.as_array()?.len()) }
     }
 
     fn cell(&self, index: usize) -> Option<&dyn TableLike> {
-        match self.document.get("cell")? {
-            Item::ArrayOfTables(cells) => cells.get(index).map(|table: &Table| table as &dyn TableLike),
-            other => other.as_array()?.get(index)?.as_inline_table().map(|table| table as &dyn TableLike),
+        let cells = self.document.get("cell")?;
+        if let Item::ArrayOfTables(cells) = cells {
+            return cells.get(index).map(|table: &Table| table as &dyn TableLike);
         }
+        cells.as_array()?.get(index)?.as_inline_table().map(|table| table as &dyn TableLike)
     }
 
     /// The places of a cell's key and of its value.

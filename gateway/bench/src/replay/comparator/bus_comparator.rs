@@ -38,12 +38,12 @@ pub struct Present {
     pub claim: Claim,
     /// Its counters when they came first, and last.
     pub heard: Option<(Heard, Heard)>,
-    /// How far it is with the joints announced last.
+    /// Its progress with the joints announced last.
     pub(super) progress: Progress,
 }
 
 impl Present {
-    /// Whether the next joints wait for it.
+    /// Returns whether the next joints wait for it.
     pub(super) fn is_awaited(&self) -> bool {
         self.claim.is_settled() && matches!(self.progress, Progress::Awaited { .. })
     }
@@ -74,7 +74,7 @@ pub(super) struct Round {
     pub(super) epoch: Epoch,
     /// When they were recorded, in ns since 1970.
     pub(super) nanos: u64,
-    /// How they were sent again.
+    /// Their state on the way back to the bus.
     pub(super) sending: Sending,
     /// The words of each reply, recorded and now.
     pub(super) replies: BTreeMap<(CellId, What), Both<Option<Words>>>,
@@ -87,7 +87,7 @@ pub(super) struct Round {
 }
 
 impl Round {
-    /// Whether sums of this epoch are of these joints, and not of an earlier time that they were sent.
+    /// Returns whether sums of this epoch are of these joints, and not of an earlier time that they were sent.
     pub(super) fn has_sums_of(&self, epoch: Epoch) -> bool {
         self.sending.under().unwrap_or(self.epoch) == epoch
     }
@@ -109,7 +109,7 @@ pub(super) struct KnownCell {
     pub(super) cell: Surveyed,
     /// Its recorded contact.
     pub(super) contact: Contact,
-    /// Whether that ended earlier now.
+    /// Its end now.
     pub(super) end: End,
 }
 
@@ -181,7 +181,7 @@ pub(super) struct BusComparator {
     pub(super) speaking: BTreeSet<CellId>,
     /// Whether cells were switched to unrequested sensors frames, which come at times of their own.
     pub(super) senses: bool,
-    /// Whether cells have taken joints since their start.
+    /// Cells by the joints that they have taken since their start.
     pub(super) first_joints: Both<PerCell<FirstJoints>>,
     reading: Reading,
     /// Rounds that were announced.

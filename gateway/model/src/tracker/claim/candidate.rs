@@ -2,18 +2,18 @@
 //!
 //! | before | heartbeat of an outsider | next |
 //! |---|---|---|
-//! | nobody | any | first of its counter |
+//! | none | any | first of its counter |
 //! | so many of a counter | goes on with it, 100 ms later or more | one more of it |
 //! | so many of a counter | sooner, or with another counter | first of its counter |
 //!
-//! A heartbeat of the owner, or of a start that is believed, leaves nobody. The candidate succeeds an owner that is
+//! A heartbeat of the owner, or of a start that is believed, ends the candidacy. The candidate succeeds an owner that is
 //! silent if it has just started, or with the third heartbeat of its counter.
 
 use protocol::time::Span;
 
 use super::life::Life;
 
-/// So many heartbeats whose counter goes on show a start of which no claim was heard, on an id that two senders used.
+/// Heartbeats whose counter goes on that show a start without its claim, on an id that two senders used.
 const SHOWN_BY: u8 = 3;
 
 /// A cell's heartbeats are a quarter of a second apart. Old ones that are sent again in the order of their counters, by
@@ -28,14 +28,14 @@ pub(super) struct Candidate {
 }
 
 impl Candidate {
-    /// The candidate after a heartbeat of an outsider.
+    /// Returns the candidate after a heartbeat of an outsider.
     pub(super) fn next(before: Option<Self>, new: Life) -> Self {
         let goes_on = |it: &Self| it.last.sent(&new).is_some() && new.at.since(it.last.at) >= PACE;
         let shown = before.filter(goes_on).map_or(1, |it| it.shown.saturating_add(1));
         Self { last: new, shown }
     }
 
-    /// Whether it owns the id from its last heartbeat on.
+    /// Returns whether it owns the id from its last heartbeat on.
     pub(super) fn succeeds(&self, owner: Option<&Life>) -> bool {
         let is_silent = owner.is_none_or(|owner| !owner.is_alive(self.last.at));
         is_silent && (self.last.has_just_started() || self.shown >= SHOWN_BY)
@@ -62,7 +62,7 @@ mod tests {
     }
 
     #[test]
-    fn nobody_then_any() {
+    fn none_then_any() {
         assert_eq!(after(&[(0, 7, 10)]).shown, 1);
     }
 

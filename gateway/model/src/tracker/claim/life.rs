@@ -25,7 +25,7 @@ pub(super) const CLAIM_TAKES: Span = Span::from_millis(240);
 pub(super) struct Life {
     pub(super) heartbeat: Heartbeat,
     pub(super) at: Micros,
-    /// When it claimed the id, if that was heard.
+    /// Time of its claim, if that was received.
     pub(super) claimed: Option<Micros>,
 }
 
@@ -41,12 +41,12 @@ impl Life {
         Self { claimed: self.claimed, ..last }
     }
 
-    /// Whether it has the id, and does not only claim it.
+    /// Returns whether it has the id, and does not only claim it.
     pub(super) fn is_settled(&self) -> bool {
         !self.heartbeat.state.has(State::CLAIMING)
     }
 
-    /// Whether its last heartbeat is the first packet of a cell since it started, which is a claim.
+    /// Returns whether its last heartbeat is the first packet of a cell since it started, which is a claim.
     pub(super) fn has_just_started(&self) -> bool {
         !self.is_settled() && self.heartbeat.sent == 0
     }
@@ -59,35 +59,35 @@ impl Life {
         at.since(self.at) <= DEAD_AFTER
     }
 
-    /// Whether it may go on; its bus may have been lost.
+    /// Returns whether it may go on; its bus may have been lost.
     pub(super) fn may_go_on(&self, at: Micros) -> bool {
         at.since(self.at) <= GONE_AFTER
     }
 
-    /// How far another one's counter is behind its own, modulo 2^16.
+    /// Returns how far another one's counter is behind its own, modulo 2^16.
     pub(super) const fn back(&self, other: &Self) -> u16 {
         self.heartbeat.sent.wrapping_sub(other.heartbeat.sent)
     }
 
-    /// How many packets it has sent since its last heartbeat, if this one can be its next.
+    /// Returns how many packets it has sent since its last heartbeat, if this one can be its next.
     pub(super) fn sent(&self, next: &Self) -> Option<u16> {
         let sent = next.back(self);
         let is_next = self.is_same_cell(next) && self.may_go_on(next.at) && sent.cast_signed() > 0;
         (is_next && self.has_time_for(next.at, sent)).then_some(sent)
     }
 
-    /// Whether a cell can have sent so many packets since this one's last heartbeat.
+    /// Returns whether a cell can have sent so many packets since this one's last heartbeat.
     pub(super) fn has_time_for(&self, at: Micros, sent: u16) -> bool {
         u64::from(sent) <= u64::from(AT_MOST) * (1 + at.since(self.at).0 / DEAD_AFTER.0)
     }
 
-    /// Whether a heartbeat is an old one of it, or its last one again.
+    /// Returns whether a heartbeat is an old one of it, or its last one again.
     pub(super) fn is_past(&self, old: &Self) -> bool {
         let back = self.back(old);
         self.is_same_cell(old) && (back == 0 || back <= OVERTAKES && old.heartbeat.sent > 1)
     }
 
-    /// Whether it still claims the id, so that a heartbeat without CLAIMING is not its.
+    /// Returns whether it still claims the id, so that a heartbeat without CLAIMING is not its.
     pub(super) fn claims_until(&self, next: &Self) -> bool {
         let settles = !self.is_settled() && next.is_settled();
         settles && self.claimed.is_some_and(|claimed| next.at.since(claimed) < CLAIM_TAKES)

@@ -41,7 +41,7 @@
 use super::Word;
 use super::life::{LEAP, Life};
 
-/// What is known of the owner of a node id.
+/// The owner of a node id, and how sure it is.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) enum Ownership {
     /// No heartbeat has come.
@@ -51,13 +51,13 @@ pub(super) enum Ownership {
     Sole { owner: Life },
     /// The owner seemed to start; the life before it may go on, and then that was no start.
     Doubted { owner: Life, former: Life },
-    /// Two senders have used the id in turn: only who succeeds a silent owner is believed.
+    /// Two senders have used the id in turn: only a successor of a silent owner is believed.
     Shared { owner: Life },
     /// The owner succeeded a silent one of a shared id; the life before it may go on.
     Inherited { owner: Life, former: Life },
 }
 
-/// What a heartbeat shows. In the order in which it is looked for, which [`Ownership::evidence`] keeps.
+/// A fact that a heartbeat shows. [`Ownership::evidence`] returns the first that holds.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Evidence {
     /// It has CLAIMING, and another serial number than the owner's or no owner to compare with.
@@ -122,7 +122,7 @@ impl Ownership {
         self.owner().map_or(self, |owner| self.with_owner(owner.with_last(last)))
     }
 
-    /// What a heartbeat shows; `new` is the life that would begin with it.
+    /// Returns the fact that a heartbeat shows; `new` is the life that would begin with it.
     pub(super) fn evidence(&self, new: &Life) -> Evidence {
         let Some(owner) = self.owner() else {
             return if new.is_settled() { Evidence::Settles } else { Evidence::Claims };
@@ -159,13 +159,14 @@ impl Ownership {
         }
     }
 
-    /// Whether a counter that is `own` ahead of the owner's and `its` ahead of the former's is rather the former's.
+    /// Returns whether a counter that is `own` ahead of the owner's and `its` ahead of the former's is rather the
+    /// former's.
     fn is_formers(&self, new: &Life, own: u16, its: u16) -> bool {
         let is_alive = self.former().is_some_and(|former| former.is_alive(new.at));
         its < own && (is_alive || own > LEAP && its < own / 8)
     }
 
-    /// The state after a heartbeat that shows this, and what the heartbeat means; `new` is the life that would begin
+    /// Returns the state after a heartbeat that shows this, and what the heartbeat means; `new` is the life that would begin
     /// with it. The rows of the table are named beside the arms.
     pub(super) fn next(self, evidence: Evidence, new: Life) -> (Self, Word) {
         use Evidence as E;

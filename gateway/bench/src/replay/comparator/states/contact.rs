@@ -1,4 +1,4 @@
-//! Where the contact of a cell ends, in the capture and now.
+//! The end of a cell's contact, in the capture and now.
 //!
 //! A cell sends the end of a contact once, at the next joints that it takes. Where it did not take joints then and takes
 //! them now, the end comes earlier now, and the recorded one has no counterpart.
@@ -32,7 +32,7 @@ pub(in super::super) enum Contact {
     Over,
 }
 
-/// What the capture has of a cell.
+/// A recorded torque, or the start of a pass.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Recorded {
     Torque,
@@ -42,7 +42,7 @@ pub(in super::super) enum Recorded {
     PassBegins,
 }
 
-/// Whether the last end of a contact came earlier now than in the capture.
+/// The last end of a contact now, compared with the capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum End {
     #[default]
@@ -51,7 +51,7 @@ pub(in super::super) enum End {
     Earlier,
 }
 
-/// How the torques of a cell in one round compare.
+/// The torques of a cell in one round.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Round {
     /// One came in the capture and one now.
@@ -63,7 +63,7 @@ pub(in super::super) enum Round {
 }
 
 impl Contact {
-    /// The state after an input.
+    /// Returns the state after an input.
     pub(in super::super) const fn next(self, input: Recorded) -> Self {
         match (self, input) {
             (Self::Unknown | Self::Lasts | Self::Over, Recorded::Torque) => Self::Lasts,
@@ -72,7 +72,7 @@ impl Contact {
         }
     }
 
-    /// Whether the contact was over before a recorded end, which came late: by the recorded stimuli the cell cannot
+    /// Returns whether the contact was over before a recorded end, which came late: by the recorded stimuli the cell cannot
     /// have been in contact at these joints or the ones before, or it was in contact before the part that is replayed.
     pub(in super::super) const fn was_over(self, begins_later: bool, may_answer: bool) -> bool {
         match self {
@@ -84,7 +84,7 @@ impl Contact {
 }
 
 impl End {
-    /// The state after an input.
+    /// Returns the state after an input.
     pub(in super::super) const fn next(self, input: Round) -> Self {
         match (self, input) {
             (Self::AsRecorded | Self::Earlier, Round::Extra { is_end: true }) => Self::Earlier,

@@ -1,4 +1,4 @@
-//! Whether a cell has taken any joints since its start.
+//! The first joints of a cell since its start.
 //!
 //! Until it has, its packets have an epoch that belongs to no joints, and its sensor values are not compared.
 //!
@@ -15,7 +15,7 @@ use protocol::id::{CellId, Node};
 use protocol::message::{Heard, Message, NetworkPage};
 use protocol::packet::Epoch;
 
-/// What a cell has shown of its first joints.
+/// A cell, by the joints since its start.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum FirstJoints {
     /// It has taken joints, or nothing is known.
@@ -25,7 +25,7 @@ pub(in super::super) enum FirstJoints {
     Awaited { epoch: Epoch },
 }
 
-/// What a packet of the cell shows.
+/// A packet of the cell, by what it shows of that.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
     /// Its counters: no joints since its start.
@@ -42,7 +42,7 @@ pub(in super::super) enum Input {
 }
 
 impl Input {
-    /// What a message shows of its cell's first joints.
+    /// Returns a message's cell, and what it shows of that cell's first joints.
     pub(in super::super) const fn of(message: &Message) -> Option<(CellId, Self)> {
         if let Message::Torque { from, .. } = *message {
             return Some((from, Self::Torque));
@@ -61,7 +61,7 @@ impl Input {
 }
 
 impl FirstJoints {
-    /// The state after an input.
+    /// Returns the state after an input.
     pub(in super::super) fn next(self, input: Input) -> Self {
         match (self, input) {
             (Self::Taken | Self::Awaited { .. }, Input::CountsNone { epoch }) => Self::Awaited { epoch },

@@ -1,11 +1,11 @@
-//! Whether a bus carries messages.
+//! The state of a bus.
 //!
 //! | row | state | input | next | why |
 //! |---|---|---|---|---|
 //! | `lost` | both | `Lost` | `Down` | nothing can come from its cells, so none of them is waited for |
 //! | `back` | both | `Message` | `Up` | something came |
 
-/// What is known of a bus.
+/// A bus by what came last.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Line {
     #[default]
@@ -14,7 +14,7 @@ pub(in super::super) enum Line {
     Down,
 }
 
-/// What happens to a bus.
+/// An event of a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
     /// A message of another sender came.
@@ -24,7 +24,7 @@ pub(in super::super) enum Input {
 }
 
 impl Line {
-    /// The state after an input.
+    /// Returns the state after an input.
     pub(in super::super) const fn next(self, input: Input) -> Self {
         match (self, input) {
             (Self::Up | Self::Down, Input::Lost) => Self::Down,

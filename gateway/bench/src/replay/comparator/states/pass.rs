@@ -1,4 +1,4 @@
-//! What a pass over the capture has had before the joints that are sent again.
+//! A pass over the capture, by what came before the joints that are sent again.
 //!
 //! A reply in the capture may answer joints from before the part that is replayed: then it is counted and not compared.
 //!
@@ -15,7 +15,7 @@
 
 use protocol::packet::Epoch;
 
-/// How far a pass over the capture is.
+/// A pass over the capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Pass {
     /// Nothing came yet.
@@ -29,7 +29,7 @@ pub(in super::super) enum Pass {
     Part { earlier: Option<Epoch> },
 }
 
-/// What the capture has next.
+/// The next message of the capture, by what becomes of it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
     /// It begins again.
@@ -41,7 +41,7 @@ pub(in super::super) enum Input {
 }
 
 impl Pass {
-    /// The state after an input, and whether that was the first joints of the pass.
+    /// Returns the state after an input, and whether that was the first joints of the pass.
     pub(in super::super) const fn next(self, input: Input) -> (Self, bool) {
         match (self, input) {
             (Self::Fresh | Self::Before | Self::Whole | Self::Part { .. }, Input::Begins) => {
@@ -55,12 +55,12 @@ impl Pass {
         }
     }
 
-    /// Whether there were messages before the first joints that are sent again.
+    /// Returns whether there were messages before the first joints that are sent again.
     pub(in super::super) const fn begins_later(self) -> bool {
         matches!(self, Self::Before | Self::Part { .. })
     }
 
-    /// The epoch of the last joints before those, if replies to it can come; `last` is the epoch of the last joints.
+    /// Returns the epoch of the last joints before those, if replies to it can come; `last` is the epoch of the last joints.
     pub(in super::super) const fn earlier(self, last: Option<Epoch>) -> Option<Epoch> {
         match self {
             Self::Fresh | Self::Whole => None,

@@ -1,4 +1,4 @@
-//! Whether a cell is done with the joints announced last.
+//! The progress of a cell with the joints announced last.
 //!
 //! A heartbeat has the epoch of the last joints that its cell took. A cell that does not take joints, because they are
 //! those of another robot, reports the epoch before: after two heartbeats it has processed them, because one of the two
@@ -18,7 +18,7 @@
 //! A cell that is found after an announcement begins as `Awaited`. Cells that only claim their node id go through the same states
 //! and are not waited for: that is in their claim.
 
-/// How far a cell is with the joints announced last.
+/// Progress of a cell with the joints announced last.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Progress {
     /// It has processed them, or there were none.
@@ -30,7 +30,7 @@ pub(in super::super) enum Progress {
     GivenUp { heard: bool },
 }
 
-/// What happens to a cell.
+/// An event of a cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
     /// Joints were announced, or a sync that they are confirmed with.
@@ -49,7 +49,7 @@ impl Progress {
         if has_announced { Self::Awaited { heard: false } } else { Self::Done }
     }
 
-    /// The state after an input.
+    /// Returns the state after an input.
     pub(in super::super) const fn next(self, input: Input) -> Self {
         match (self, input) {
             (Self::Done | Self::Awaited { .. }, Input::Announced) => Self::Awaited { heard: false },

@@ -1,4 +1,4 @@
-//! How recorded joints were sent again.
+//! Recorded joints that are sent again.
 //!
 //! | row | state | input | next | why |
 //! |---|---|---|---|---|
@@ -10,7 +10,7 @@
 
 use protocol::packet::Epoch;
 
-/// How the joints of a round were sent again, and under which epoch last.
+/// The joints of a round, and the epoch under which they were sent last.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(in super::super) enum Sending {
     /// They have not been sent: nothing is compared.
@@ -33,7 +33,7 @@ pub(in super::super) enum Sending {
     },
 }
 
-/// What happens to joints.
+/// An event of joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(in super::super) enum Input {
     /// They are sent under this epoch.
@@ -43,7 +43,7 @@ pub(in super::super) enum Input {
 }
 
 impl Sending {
-    /// The state after an input.
+    /// Returns the state after an input.
     pub(in super::super) const fn next(self, input: Input) -> Self {
         match (self, input) {
             (Self::Recorded, Input::Sent { under }) => Self::Sent { under },
@@ -57,22 +57,22 @@ impl Sending {
         }
     }
 
-    /// Whether they were announced.
+    /// Returns whether they were announced.
     pub(in super::super) const fn is_announced(self) -> bool {
         !matches!(self, Self::Recorded)
     }
 
-    /// Whether the bus did not take them.
+    /// Returns whether the bus did not take them.
     pub(in super::super) const fn is_unsent(self) -> bool {
         matches!(self, Self::Unsent { .. } | Self::RepeatedUnsent { .. })
     }
 
-    /// Whether they were announced more than once.
+    /// Returns whether they were announced more than once.
     pub(in super::super) const fn is_repeated(self) -> bool {
         matches!(self, Self::Repeated { .. } | Self::RepeatedUnsent { .. })
     }
 
-    /// The epoch under which they were sent last.
+    /// Returns the epoch under which they were sent last.
     pub(in super::super) const fn under(self) -> Option<Epoch> {
         match self {
             Self::Recorded => None,
