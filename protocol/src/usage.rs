@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use std::ffi::OsStr;
 use std::fmt::{self, Display, Write as _};
 use std::io::{self, ErrorKind, IsTerminal, Write};
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use crate::stop::Stoppable;
@@ -200,6 +201,14 @@ pub fn quoted_os(word: &OsStr) -> String {
         }
     }
     whole + "'"
+}
+
+/// Returns the path that an environment variable has, if it has one. A bare name is that of a file here: it would be searched
+/// in `PATH`.
+#[must_use]
+pub fn path_in(variable: &str) -> Option<PathBuf> {
+    let path = std::env::var_os(variable).filter(|path| !path.is_empty()).map(PathBuf::from)?;
+    Some(if path.components().count() == 1 { Path::new(".").join(path) } else { path })
 }
 
 /// Returns the words of the command line, the program's own name first. Bytes that are not UTF-8 are replaced.

@@ -1,4 +1,4 @@
-//! What one newton on the cell does to each joint: the cell's kernel.
+//! The cell's kernel: the effect of one newton on the cell on each joint.
 //!
 //! It computes the paper's Eq. 8 for a cell on the link that joint k moves,
 //!

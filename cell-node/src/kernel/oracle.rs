@@ -1,6 +1,6 @@
-//! What the cell's kernel is compared with: the paper's method, its sine, real numbers, and operation counts.
+//! Comparisons for the cell's kernel: the paper's method, its sine, real numbers, and operation counts.
 //!
-//! Of the feature `oracle`; no cell has it. [`Projection`] computes the same Jacobian as [`Wrench`] by the paper's way:
+//! Cells are built without this module, the feature `oracle`. [`Projection`] computes the same Jacobian as [`Wrench`] by the paper's way:
 //! it carries the frames from the base up to the cell (Eq. 20 to 25).
 //!
 //! | UR5, cell on the last link | mul | add | sin | cos | mean torque error | max |

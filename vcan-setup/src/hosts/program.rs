@@ -10,7 +10,7 @@ use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use protocol::usage::quoted_os;
+use protocol::usage::{path_in, quoted_os};
 use rustix::fs::{Access, access};
 use thiserror::Error;
 
@@ -60,11 +60,8 @@ pub enum ProgramError {
 /// Runs the program in the place of this process, which keeps its id: exit code and signals are the program's. Returns only
 /// when that fails.
 pub fn run(arguments: impl IntoIterator<Item = OsString>) -> ProgramError {
-    let named = env::var_os(VARIABLE).filter(|path| !path.is_empty()).map(PathBuf::from);
     let start = |path: &Path| Command::new(path).args(arguments).env(CALLER, VERSION).exec();
-    if let Some(path) = named {
-        // A bare name would be searched in PATH, and not here.
-        let path = if path.components().count() == 1 { Path::new(".").join(path) } else { path };
+    if let Some(path) = path_in(VARIABLE) {
         let source = start(&path);
         return ProgramError::Named { path, source };
     }

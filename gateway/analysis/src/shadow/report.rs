@@ -181,13 +181,13 @@ pub struct Answering {
     pub epochs: u64,
     /// Joints that were sent while they were.
     pub epochs_halted: u64,
-    /// How many cells answered joints on average; none without joints.
+    /// The mean number of cells that answered joints; absent without joints.
     pub mean: Option<f64>,
-    /// How many answered the same joints at most.
+    /// The largest number of cells that answered the same joints.
     pub most: u32,
     /// Cells of the bus, by the skin, else those that were received.
     pub cells: u32,
-    /// Whether that is from the skin.
+    /// True if that number is the skin's.
     pub described: bool,
 }
 

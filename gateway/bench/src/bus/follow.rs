@@ -93,7 +93,7 @@ enum State {
     },
 }
 
-/// What is known of a bus that is followed.
+/// Follows a bus: its state, and the frames that came last.
 #[derive(Debug, Default)]
 pub struct Follower {
     /// The gateway's ends of the wires to the roots, where cells reply with sums.
@@ -127,10 +127,10 @@ impl Follower {
     /// Sends what the wires to roots need, then receives, or goes on with what a loss needs; waits for at most about
     /// `wait` beside the time to gather.
     pub fn step(&mut self, source: &mut impl Source, wait: Duration) -> Step {
-        if matches!(self.state, State::Gone { .. }) || source.bus().is_none() {
-            return self.reopen(source, wait);
-        }
-        let Some(bus) = source.bus() else { return Step::Nothing };
+        let bus = match source.bus() {
+            Some(bus) if !matches!(self.state, State::Gone { .. }) => bus,
+            Some(_) | None => return self.reopen(source, wait),
+        };
         let mut timeout = wait;
         if let Some(roots) = &mut self.roots {
             roots.speak(bus);

@@ -18,6 +18,7 @@ use std::time::{Duration, Instant};
 use protocol::bus::Kinds;
 use protocol::last_words::CellRange;
 use protocol::skin::{Cell, Skin};
+use protocol::usage::path_in;
 use rustix::fs::{MemfdFlags, memfd_create};
 use rustix::process::{Pid, Resource, Rlimit, Signal, getrlimit, kill_process, setrlimit};
 use thiserror::Error;
@@ -116,11 +117,8 @@ fn variable(name: &str) -> String {
 /// # Errors
 /// When it is not there.
 pub fn program(name: &'static str) -> Result<PathBuf, LaunchError> {
-    let given = std::env::var_os(variable(name)).filter(|path| !path.is_empty()).map(PathBuf::from);
     let beside = || std::env::current_exe().ok().and_then(|own| Some(own.parent()?.join(name)));
-    let path = given.or_else(beside).unwrap_or_else(|| PathBuf::from(name));
-    // A bare name would be searched in PATH, and not here.
-    let path = if path.components().count() == 1 { Path::new(".").join(path) } else { path };
+    let path = path_in(&variable(name)).or_else(beside).unwrap_or_else(|| Path::new(".").join(name));
     if path.is_file() { Ok(path) } else { Err(LaunchError::Missing { name, path }) }
 }
 

@@ -3,7 +3,7 @@
 use crate::kernel::Number;
 use crate::kernel::rounding::{Bounded, Held, Rounding};
 
-/// What else a kernel needs that multiplies vectors of three components.
+/// Sums of products of vectors with three components, beside those of the cell's kernel.
 pub(super) trait Sums: Rounding {
     /// A number and two products.
     fn more_and_more<N: Number>(number: N, first: N::Wide, second: N::Wide) -> N;
