@@ -4,6 +4,7 @@
 //! bus; a root has a second hexagon. It turns and zooms, and shows a cell that is chosen, searched as `bus:node`, or named behind
 //! `#` in its address.
 
+use data_encoding::BASE64;
 use protocol::xml::escaped;
 use serde::Serialize;
 
@@ -62,7 +63,7 @@ impl Still {
             positions: &self.positions,
             details: &self.details,
             moved: &self.moved,
-            surface: base64(&corners),
+            surface: BASE64.encode(&corners),
         };
         // Strings and numbers are always JSON. Without `<`, nothing in it ends the script element.
         let data = serde_json::to_string(&data).unwrap_or_default().replace('<', "\\u003c");
@@ -82,21 +83,6 @@ impl Still {
         }
         text
     }
-}
-
-/// Writes bytes in base64 (RFC 4648, section 4).
-fn base64(bytes: &[u8]) -> String {
-    const LETTERS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
-    for three in bytes.chunks(3) {
-        let word =
-            (0..3).fold(0_usize, |word, at| word << 8 | three.get(at).map_or(0, |byte| usize::from(*byte)));
-        for at in 0..4 {
-            let letter = LETTERS.get(word >> (18 - 6 * at) & 63).copied().unwrap_or_default();
-            text.push(if at <= three.len() { char::from(letter) } else { '=' });
-        }
-    }
-    text
 }
 
 #[cfg(test)]
@@ -151,8 +137,8 @@ mod tests {
         for (bytes, text) in
             [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")]
         {
-            assert_eq!(base64(bytes.as_bytes()), text);
+            assert_eq!(BASE64.encode(bytes.as_bytes()), text);
         }
-        assert_eq!(base64(&[0xff, 0xef, 0xbe]), "/+++");
+        assert_eq!(BASE64.encode(&[0xff, 0xef, 0xbe]), "/+++");
     }
 }
