@@ -10,7 +10,7 @@ use std::fs;
 use std::path::Path;
 
 use process::log::{Cause, Log, same_torques};
-use process::vcan::{Candump, cansend, frames_of, small_skin, tool};
+use process::vcan::{Candump, backlog_drops, cansend, frames_of, small_skin, tool};
 use process::{PRESSED, Place, Summary};
 use protocol::can::{Format, Frame};
 use protocol::candump::{Line, parse};
@@ -366,6 +366,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     place.write("skin.toml", &small_skin(CELLS.into()));
     place.scenario(PRESSED);
     let mut candump = Candump::start("vcan0", &place.path("candump.log"));
+    let backlog = backlog_drops();
     let bench = place.running_bench(600.0, "");
     place.test_client().waits_for("a torque", torque_of(1, true));
     for noise in NOISE {
@@ -404,7 +405,13 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
         NOISE.iter().map(|noise| noise.rsplit(' ').next().unwrap().parse::<u64>().unwrap()).sum();
     // That error frame, and a frame of candump's each time.
     let expected = expected + 1 + NOISE.len() as u64;
-    assert_eq!(summary.odd(0), expected, "each of cangen's frames is odd, and nothing else: {:#}", summary.0);
+    // A busy kernel drops frames before any socket has them, and tells the sender nothing.
+    let at_least = expected - (backlog_drops() - backlog);
+    assert!(
+        (at_least..=expected).contains(&summary.odd(0)),
+        "each of cangen's {at_least} to {expected} frames is odd, and nothing else: {:#}",
+        summary.0
+    );
     for (cell, refused) in &*reported.borrow() {
         assert_eq!(*refused, refused_by(*cell, &frames), "cell {cell}");
     }
