@@ -13,8 +13,8 @@ use protocol::bus::{BusError, Options, Received};
 use protocol::can::Format;
 use protocol::id::{CellId, Kind};
 use protocol::packet;
+use protocol::port::{LinkId, PORTS};
 use protocol::time::{Micros, Span};
-use protocol::wire::{LinkId, PORTS};
 
 use crate::flash::Flash;
 use crate::identity::Identity;

@@ -15,8 +15,8 @@ use protocol::fixed::{Acc, Q7_8};
 use protocol::packet::Epoch;
 use protocol::parameters::MAX_JOINTS;
 use protocol::parameters::Slots;
+use protocol::port::PORTS;
 use protocol::time::{Micros, Span};
-use protocol::wire::PORTS;
 
 /// A missing sum is NACKed in so many epochs, because the child's reply may be lost too.
 const MISSING: u8 = 4;

@@ -3,35 +3,21 @@
 
 #[cfg(feature = "host")]
 pub mod bus;
-pub mod can;
-pub mod candump;
 #[cfg(feature = "host")]
-pub mod document;
-pub mod factory;
-pub mod fixed;
-pub mod id;
+mod shell;
 #[cfg(feature = "host")]
-pub mod input;
+mod skin_file;
+mod wire;
+
 #[cfg(feature = "host")]
-pub mod last_words;
-pub mod message;
-pub mod packet;
-pub mod parameters;
+pub use shell::{input, last_words, stop, usage};
 #[cfg(feature = "host")]
-pub mod schema;
+pub use skin_file::{document, skin, xml};
 #[cfg(feature = "host")]
-pub mod skin;
-pub mod slcan;
-#[cfg(feature = "host")]
-pub mod stop;
-pub mod time;
-pub mod touch;
-#[cfg(feature = "host")]
-pub mod usage;
-pub mod wire;
-pub mod wire_time;
-#[cfg(feature = "host")]
-pub mod xml;
+pub use wire::schema;
+pub use wire::{
+    can, candump, factory, fixed, id, message, packet, parameters, port, slcan, time, touch, wire_time,
+};
 
 #[cfg(test)]
 mod tests;

@@ -52,9 +52,9 @@ const SOMEWHERE: &[(&str, &str, &[&str])] = &[
     (
         "label|labels|seek|seeks",
         "rank and version; local repair",
-        &["cell-node/src", "protocol/src/wire", "reference/tree.md", "model/src/network"],
+        &["cell-node/src", "protocol/src/wire/port", "reference/tree.md", "model/src/network"],
     ),
-    ("missed|ask", "NACK, probe", &["cell-node/src", "protocol/src/wire", "reference/tree.md"]),
+    ("missed|ask", "NACK, probe", &["cell-node/src", "protocol/src/wire/port", "reference/tree.md"]),
     (
         "cut|cuts",
         "link down",

@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use protocol::bus::Filter;
 use protocol::can::{EXTENDED, REMOTE};
 use protocol::id::Id;
-use protocol::wire::{FLAG, LinkId};
+use protocol::port::{FLAG, LinkId};
 
 use super::sockets::Hearing;
 

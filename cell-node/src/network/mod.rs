@@ -22,8 +22,8 @@ use heapless::Deque;
 use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
 use protocol::packet::Epoch;
+use protocol::port::{Hello, PORTS, PortMessage, Rank, UPLINK};
 use protocol::time::{Micros, Span};
-use protocol::wire::{Hello, PORTS, PortMessage, Rank, UPLINK};
 
 use crate::phase;
 use node_ids::NodeIds;

@@ -1,8 +1,8 @@
 //! Node ids for cells that have none: a walk over the tree assigns them, depth first.
 
 use protocol::id::CellId;
+use protocol::port::{PORTS, PortMessage, Walk};
 use protocol::time::Micros;
-use protocol::wire::{PORTS, PortMessage, Walk};
 
 use super::Network;
 use super::port::Port;

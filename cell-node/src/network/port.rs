@@ -2,8 +2,8 @@
 
 use protocol::id::CellId;
 use protocol::message::{PortState, VERSION};
+use protocol::port::{Hello, Rank};
 use protocol::time::{Micros, Span};
-use protocol::wire::{Hello, Rank};
 
 /// After so long without a hello a port leads nowhere: two hellos and some jitter.
 pub(super) const SILENT: Span = Span::from_millis(600);

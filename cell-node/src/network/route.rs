@@ -1,7 +1,7 @@
 //! The route to the root: which parent a cell joins, follows and leaves, and which children it grants.
 
+use protocol::port::{PortMessage, Rank, UPLINK};
 use protocol::time::{Micros, Span};
-use protocol::wire::{PortMessage, Rank, UPLINK};
 
 use super::port::Port;
 use super::{ALL, FormerParent, JOIN_TIMEOUT, Lost, Network, Parent, REPAIR};

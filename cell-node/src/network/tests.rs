@@ -1,5 +1,5 @@
 use super::*;
-use protocol::wire::Walk;
+use protocol::port::Walk;
 
 const MS: u64 = 1_000;
 

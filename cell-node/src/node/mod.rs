@@ -26,8 +26,8 @@ use protocol::fixed::Q7_8;
 use protocol::id::{Command, Id, Kind, Node as Address};
 use protocol::message::{From, Heard, Joints, Message, NetworkPage, SensorPage, State};
 use protocol::packet::{self, Epoch, Length, Lengths, Packet};
+use protocol::port::{PORTS, PortMessage};
 use protocol::time::{Micros, Span};
-use protocol::wire::{PORTS, PortMessage};
 
 use crate::baseline::Baseline;
 use crate::contact::{Force, Torque};

@@ -4,8 +4,8 @@ use protocol::fixed::Q7_8;
 use protocol::id::CellId;
 use protocol::message::{Message, NetworkPage, Ports, Tree};
 use protocol::packet::{self, Epoch};
+use protocol::port::{PORTS, PortMessage, UPLINK};
 use protocol::time::{Micros, Span};
-use protocol::wire::{PORTS, PortMessage, UPLINK};
 
 use super::{AddressClaim, Node, Storing};
 use crate::contact::Torque;

@@ -10,8 +10,8 @@ use protocol::id::{CellId, Node as Address};
 use protocol::message::{Answer, From, Joints, Message, NetworkPage, Request, SensorPage, SkinSensors};
 use protocol::packet::{Epoch, WORDS, words};
 use protocol::parameters::{Contact, Parameter, Parameters, Pose};
+use protocol::port::{Hello, PortMessage, Rank, UPLINK, Walk};
 use protocol::time::{Micros, Span};
-use protocol::wire::{Hello, PortMessage, Rank, UPLINK, Walk};
 
 const REPLY: u8 = 6;
 

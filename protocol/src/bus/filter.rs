@@ -2,7 +2,7 @@
 
 use crate::can::{ERROR, EXTENDED, EXTENDED_MASK, REMOTE, STANDARD_MASK};
 use crate::id::{Id, Kind};
-use crate::wire::LinkId;
+use crate::port::LinkId;
 
 /// A frame passes when `identifier & mask == id & mask`; with [`Filter::INVERTED`] in `id`, when not.
 ///

@@ -18,8 +18,8 @@ use crate::id::{CellId, Id, Kind};
 use crate::message::{Answer, Message, Request};
 use crate::packet::{Epoch, Length, Lengths, Packet, Reassembly, Segment, crc16, data_id};
 use crate::parameters::{Baseline, Events, Parameter, ParameterError, Parameters, Reply, Sensing, Tare};
+use crate::port::LinkId;
 use crate::time::Micros;
-use crate::wire::LinkId;
 
 const FD: &str = include_str!("../../tests/golden/fd.log");
 const LENIENT: &str = include_str!("../../tests/golden/lenient.log");

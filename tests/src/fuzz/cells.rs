@@ -10,8 +10,8 @@ use protocol::id::{CellId, Command, Id};
 use protocol::message::Message;
 use protocol::packet::Packet;
 use protocol::parameters::Parameters;
+use protocol::port::{LinkId, PORTS};
 use protocol::time::{Micros, Span};
-use protocol::wire::{LinkId, PORTS};
 
 use super::{frame, packet};
 use crate::network::Wiring;

@@ -10,8 +10,8 @@ use protocol::fixed::{Q1_14, Q3_12, Q7_8};
 use protocol::id::CellId;
 use protocol::message::{Ports, Tree};
 use protocol::parameters::{Contact, MAX_JOINTS, Parameters, Pose, Row};
+use protocol::port::{PORTS, PortMessage};
 use protocol::time::Micros;
-use protocol::wire::{PORTS, PortMessage};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 

@@ -29,9 +29,9 @@ use protocol::message::{
 };
 use protocol::packet::Epoch;
 use protocol::parameters::{Parameter, Reply as Answers, Slots};
+use protocol::port::LinkId;
 use protocol::skin::{Skin, Wires};
 use protocol::time::Micros;
-use protocol::wire::LinkId;
 use rustix::process::Signal;
 
 /// Cells in most skins.

@@ -10,7 +10,7 @@ use protocol::can::{Format, Frame};
 use protocol::factory::Factory;
 use protocol::id::CellId;
 use protocol::time::{Micros, Span};
-use protocol::wire::LinkId;
+use protocol::port::LinkId;
 
 use crate::board::{Board, LONGEST_SLEEP};
 use crate::store::{self, Found};

@@ -112,8 +112,8 @@ fn what_is_too_far_out_of_order_counts_at_a_later_time() {
 
 #[test]
 fn what_is_on_no_real_bus_takes_no_time() {
-    let bus_timing = protocol::wire::LinkId { wire: 3, back: false };
-    let wire = bus_timing.frame(protocol::wire::PortMessage::Join);
+    let bus_timing = protocol::port::LinkId { wire: 3, back: false };
+    let wire = bus_timing.frame(protocol::port::PortMessage::Join);
     let mut shadow = shadow();
     shadow.frame("vcan0", 0, &wire);
     shadow.frame("vcan0", 0, &classic(ERROR | 4, &[0; 8]));

@@ -4,7 +4,7 @@ use protocol::can::{Format, Frame};
 use protocol::candump::Timestamp;
 use protocol::id::Node;
 use protocol::message::{self, Heartbeat, Tree};
-use protocol::wire;
+use protocol::port;
 
 /// A capture that is being written.
 #[derive(Default)]
@@ -180,10 +180,10 @@ fn what_is_refused_is_counted_by_reason_and_bus() {
 #[test]
 fn wires_are_counted_apart_and_are_no_frames_of_the_bus() {
     let mut tape = Tape::default();
-    let bus_stats = wire::LinkId { wire: 3, back: false };
+    let bus_stats = port::LinkId { wire: 3, back: false };
     tape.joints(0);
-    tape.frame("vcan0", bus_stats.frame(wire::PortMessage::Join));
-    tape.frame("vcan0", bus_stats.frame(wire::PortMessage::Leave));
+    tape.frame("vcan0", bus_stats.frame(port::PortMessage::Join));
+    tape.frame("vcan0", bus_stats.frame(port::PortMessage::Leave));
     tape.joints(1);
     let bus = tape.bus();
     assert_eq!((bus.frames, bus.wires, bus.wires_per_s), (2, 2, Some(1_000.0)));

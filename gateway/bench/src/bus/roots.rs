@@ -6,9 +6,9 @@ use protocol::bus::{Bus, Filter};
 use protocol::can::{EXTENDED, Frame, REMOTE};
 use protocol::id::{CellId, Id, Kind, Node};
 use protocol::packet;
+use protocol::port::{FLAG, LinkId};
 use protocol::skin::{Reply, Skin};
 use protocol::time::Micros;
-use protocol::wire::{FLAG, LinkId};
 
 use model::network::Uplinks;
 
@@ -157,7 +157,7 @@ mod tests {
     use protocol::can::Format;
     use protocol::message::{Message, VERSION};
     use protocol::packet::Epoch;
-    use protocol::wire::{Hello, Rank};
+    use protocol::port::{Hello, Rank};
 
     fn skin(reply: &str) -> Skin {
         let head = model::testing::SKIN.replace("reply = \"torque\"", reply);
@@ -186,7 +186,7 @@ mod tests {
     fn a_gateway_takes_sums_of_roots_and_its_own_wires_and_all_that_is_no_wire() {
         let skin = skin("reply = \"sum\"\nslot_us = 1500");
         // Wire 0 is between the cells, wire 1 is the root's.
-        let wire = |wire, back| LinkId { wire, back }.frame(protocol::wire::PortMessage::Join);
+        let wire = |wire, back| LinkId { wire, back }.frame(protocol::port::PortMessage::Join);
         for everything in [false, true] {
             let receive_filter = ReceiveFilter::of(&skin, 0, everything);
             assert_eq!(receive_filter.all_sums, everything);
@@ -216,15 +216,15 @@ mod tests {
     fn a_roots_request_is_answered_and_wire_frames_are_kept_from_the_table() {
         let skin = skin("reply = \"sum\"\nslot_us = 1500");
         let mut roots = Roots::of(&skin, 0).unwrap();
-        let leave = LinkId { wire: 1, back: false }.frame(protocol::wire::PortMessage::Leave);
+        let leave = LinkId { wire: 1, back: false }.frame(protocol::port::PortMessage::Leave);
         assert!(roots.take(&leave));
         assert_eq!(roots.uplinks.poll_transmit(), None, "it does not send yet");
         roots.explore();
-        assert!(roots.take(&LinkId { wire: 0, back: false }.frame(protocol::wire::PortMessage::Join)));
+        assert!(roots.take(&LinkId { wire: 0, back: false }.frame(protocol::port::PortMessage::Join)));
         assert_eq!(roots.uplinks.poll_transmit(), None);
-        assert!(roots.take(&LinkId { wire: 1, back: false }.frame(protocol::wire::PortMessage::Join)));
+        assert!(roots.take(&LinkId { wire: 1, back: false }.frame(protocol::port::PortMessage::Join)));
         let answer = roots.uplinks.poll_transmit();
-        assert!(matches!(answer, Some((0, protocol::wire::PortMessage::Grant(_)))), "{answer:?}");
+        assert!(matches!(answer, Some((0, protocol::port::PortMessage::Grant(_)))), "{answer:?}");
         let root = CellId::new(1).unwrap();
         assert_eq!(roots.changes().collect::<Vec<_>>(), [], "a grant may be lost");
         let hello = Hello {
@@ -237,7 +237,7 @@ mod tests {
             rank: Some(Rank { round: 1, depth: 1 }),
         };
         assert!(
-            roots.take(&LinkId { wire: 1, back: false }.frame(protocol::wire::PortMessage::Hello(hello)))
+            roots.take(&LinkId { wire: 1, back: false }.frame(protocol::port::PortMessage::Hello(hello)))
         );
         assert_eq!(roots.changes().collect::<Vec<_>>(), [(root, true)]);
         assert_eq!(roots.changes().collect::<Vec<_>>(), []);

@@ -6,9 +6,9 @@ use protocol::id::{CellId, Node};
 use protocol::message::{Message, Request};
 use protocol::packet::WORDS;
 use protocol::parameters::{LinksDown, Parameter, Reply as Words, Slots};
+use protocol::port::PORTS;
 use protocol::skin::{Reply, Skin, Wires};
 use protocol::time::{Micros, Span};
-use protocol::wire::PORTS;
 use thiserror::Error;
 
 use model::network::check::{self, Difference};

@@ -6,8 +6,8 @@ use protocol::candump::{Direction, Record};
 use protocol::id::{Id, Kind};
 use protocol::message::{Message, State};
 use protocol::packet::{Bytes, PacketError};
+use protocol::port::LinkId;
 use protocol::schema::{self, Absent, Field, Format, Layout, PacketSchema, Units};
-use protocol::wire::LinkId;
 use serde::ser::{Error, Serialize, SerializeMap, Serializer};
 
 use super::fields::Name;

@@ -27,8 +27,8 @@ use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id};
 use protocol::message::{Message, MessageError};
 use protocol::packet::{Length, Lengths, Packet, PacketError, Reassembly, Segment, data_id};
+use protocol::port::{self, PortMessage};
 use protocol::time::Micros;
-use protocol::wire::{self, PortMessage};
 use std::collections::VecDeque;
 use thiserror::Error;
 
@@ -43,7 +43,7 @@ pub enum Decoded {
     /// No frame of this protocol.
     Foreign(Foreign),
     /// A message of a cell, or of the gateway, over a simulated wire. It is on no real bus.
-    Wire(wire::LinkId, PortMessage),
+    Wire(port::LinkId, PortMessage),
     /// A segment of a packet in classic frames, but the last one; from [`Decoder::decode`], a frame that may be one.
     Segment {
         /// Its identifier.
@@ -131,8 +131,8 @@ impl Decoded {
 /// The message of a frame over a simulated wire. `None` if its identifier or CRC is not that of a wire: 29 bits are
 /// common on other buses.
 #[must_use]
-pub fn wired(frame: &Frame) -> Option<(wire::LinkId, PortMessage)> {
-    let link_id = wire::LinkId::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
+pub fn wired(frame: &Frame) -> Option<(port::LinkId, PortMessage)> {
+    let link_id = port::LinkId::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
     Some((link_id, link_id.read(frame)?))
 }
 

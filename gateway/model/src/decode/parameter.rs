@@ -3,8 +3,8 @@
 use protocol::fixed::{OutOfRange, Q, Q1_14};
 use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
+use protocol::port::{PORTS, UPLINK};
 use protocol::schema::{self, Field, Format, Layout, Range};
-use protocol::wire::{PORTS, UPLINK};
 use thiserror::Error;
 
 pub use super::fields::{Name, Words};

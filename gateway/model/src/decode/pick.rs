@@ -228,8 +228,8 @@ mod tests {
     use crate::decode::{Decoder, Foreign};
     use protocol::can::{EXTENDED, Format};
     use protocol::packet::{Epoch, Packet};
+    use protocol::port;
     use protocol::time::Micros;
-    use protocol::wire;
 
     /// A packet of this identifier, or a foreign frame.
     fn frame(id: u32) -> Frame {
@@ -262,7 +262,7 @@ mod tests {
         assert_eq!(taken(&[], &["can0:12", "can1:everyone"]), [0x20C, 0x50C]);
         assert_eq!(taken(&[], &["can1:12"]), [0_u32; 0]);
         assert_eq!(taken(&["damaged"], &[]), [0_u32; 0]);
-        let wire = wire::LinkId { wire: 3, back: true }.frame(wire::PortMessage::Join);
+        let wire = port::LinkId { wire: 3, back: true }.frame(port::PortMessage::Join);
         let kinds = ["wire", "foreign", "command"];
         let of = |kind: &str| Pick { kinds: vec![kind.parse().unwrap()], ..Pick::default() };
         assert_eq!(kinds.map(|kind| takes(&of(kind), &wire)), [true, false, false]);

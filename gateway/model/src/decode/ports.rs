@@ -2,8 +2,8 @@
 
 use core::fmt::{self, Display, Formatter};
 
+use protocol::port::UPLINK;
 use protocol::schema::Field;
-use protocol::wire::UPLINK;
 
 /// A port by its number; the last one leads to the gateway's side.
 pub(super) struct Port(pub(super) i64);

@@ -4,8 +4,8 @@ use core::fmt::{self, Display, Formatter};
 
 use protocol::message::VERSION;
 use protocol::packet::{BYTES, Bytes};
+use protocol::port::{Hello, LinkId, PortMessage, Rank, Walk};
 use protocol::schema::{self, Layout};
-use protocol::wire::{Hello, LinkId, PortMessage, Rank, Walk};
 
 use super::fields::say;
 use super::ports::Port;

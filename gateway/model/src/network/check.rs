@@ -7,8 +7,8 @@ use std::fmt;
 
 use protocol::id::CellId;
 use protocol::message::{Heartbeat, Ports, State, Tree, VERSION};
+use protocol::port::PORTS;
 use protocol::skin::Wires;
-use protocol::wire::PORTS;
 use thiserror::Error;
 
 use super::tree::{Places, places};

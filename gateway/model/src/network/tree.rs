@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::id::CellId;
 use protocol::message::Tree;
-use protocol::wire::UPLINK;
+use protocol::port::UPLINK;
 
 /// Where cells are in their tree.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]

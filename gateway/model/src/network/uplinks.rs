@@ -10,8 +10,8 @@ use std::collections::{BTreeSet, VecDeque};
 
 use protocol::id::CellId;
 use protocol::message::VERSION;
+use protocol::port::{Hello, PortMessage, Rank, Walk};
 use protocol::time::{Micros, Span};
-use protocol::wire::{Hello, PortMessage, Rank, Walk};
 
 /// From one hello to the next.
 const HELLO: Span = Span::from_millis(250);

@@ -3,8 +3,8 @@
 use std::collections::HashMap;
 
 use protocol::document::{Checked, Place};
+use protocol::port::PORTS;
 use protocol::skin::{CellName, Reply, Skin};
-use protocol::wire::PORTS;
 
 use super::raw;
 use crate::listing::ranges;

@@ -14,7 +14,7 @@ use crate::parameters::{
     Baseline, Contact, Events, LinksDown, Parameter, Parameters, Pose, Reply, Row, RowKind, Sensing, Slots,
     Zeroing,
 };
-use crate::wire::{Hello, LinkId, PortMessage, Rank, Walk};
+use crate::port::{Hello, LinkId, PortMessage, Rank, Walk};
 
 /// A comment: a word, and `key=value` fields that must all be used.
 pub(crate) struct Meaning<'a> {

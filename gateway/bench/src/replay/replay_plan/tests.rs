@@ -7,7 +7,7 @@ use protocol::candump::Timestamp;
 use protocol::id::{CellId, Node};
 use protocol::message::From;
 use protocol::message::{SensorPage, SkinSensors};
-use protocol::wire;
+use protocol::port;
 
 const MS: u64 = 1_000_000;
 
@@ -152,7 +152,7 @@ fn wire_messages_are_never_sent() {
     for only in [Only::All, Only::Inputs, Only::Replies] {
         let selection = Selection { only, bus_links: vec![Some(0)], reads: true };
         let replay_plan = ReplayPlan::new(&survey, &selection);
-        let frame = wire::LinkId { wire: 9, back: false }.frame(wire::PortMessage::Join);
+        let frame = port::LinkId { wire: 9, back: false }.frame(port::PortMessage::Join);
         assert_eq!(replay_plan.unwanted(0, &frame, &decoded(&frame)), Some(reason::WIRE));
         // A damaged one proves nothing, and counts as foreign.
         let other = Frame::classic(frame.raw_id(), &[0; 8]).unwrap();

@@ -16,7 +16,7 @@ use std::collections::VecDeque;
 
 use super::{Cell, Skin};
 use crate::id::CellId;
-use crate::wire::{LinkId, MAX, PORTS, UPLINK};
+use crate::port::{LinkId, MAX, PORTS, UPLINK};
 
 /// A port of a cell; [`UPLINK`] is where a root is wired to the gateway's side.
 type End = (CellId, usize);

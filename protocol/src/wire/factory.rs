@@ -11,12 +11,12 @@
 //!        24..29 0                          30..31 CRC-16 over all bytes before it, little endian
 //! ```
 //!
-//! Only cells on a bench have wires here: they are simulated by frames ([`crate::wire`]).
+//! Only cells on a bench have wires here: they are simulated by frames ([`crate::port`]).
 
 use crate::can::Format;
 use crate::id::CellId;
 use crate::packet::crc16;
-use crate::wire::{LinkId, PORTS};
+use crate::port::{LinkId, PORTS};
 
 /// Bytes of a record.
 pub const BYTES: usize = 32;

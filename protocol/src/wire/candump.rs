@@ -255,7 +255,7 @@ mod tests {
     /// Compares lines in all manners of writing with the values in `vectors/candump.tsv`.
     #[test]
     fn lines_have_the_values_that_can_utils_and_python_can_read() {
-        let vectors = include_str!("../tests/vectors/candump.tsv");
+        let vectors = include_str!("../../tests/vectors/candump.tsv");
         let mut count = 0;
         for row in vectors.lines().filter(|row| !row.starts_with('#')) {
             let (line, expected) = row.rsplit_once("\t=> ").unwrap();

@@ -11,7 +11,7 @@ use super::field::Field;
 use crate::id::{Command, Kind};
 
 static SCHEMA: LazyLock<Schema> = LazyLock::new(|| {
-    let file: File = toml::from_str(include_str!("../../schema.toml")).expect("a test reads it");
+    let file: File = toml::from_str(include_str!("../../../schema.toml")).expect("a test reads it");
     Schema::from(file)
 });
 

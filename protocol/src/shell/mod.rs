@@ -1,0 +1,6 @@
+//! The operating system around a program: input files, command lines, requests to stop, and the reason of an exit.
+
+pub mod input;
+pub mod last_words;
+pub mod stop;
+pub mod usage;

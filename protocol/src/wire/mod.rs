@@ -1,0 +1,18 @@
+//! The bytes on the bus: frames, identifiers, packets, messages and their timing, without an operating system and without a
+//! heap. Cells, firmware and gateway share this room; only [`schema`] needs a host.
+
+pub mod can;
+pub mod candump;
+pub mod factory;
+pub mod fixed;
+pub mod id;
+pub mod message;
+pub mod packet;
+pub mod parameters;
+pub mod port;
+#[cfg(feature = "host")]
+pub mod schema;
+pub mod slcan;
+pub mod time;
+pub mod touch;
+pub mod wire_time;
