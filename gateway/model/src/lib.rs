@@ -2,7 +2,8 @@
 //!
 //! | module | what |
 //! |---|---|
-//! | [`decode`] | frames into packets, and packets into text and JSON |
+//! | [`packets`] | frames into packets and messages |
+//! | [`decode`] | classes of frames, as text and JSON |
 //! | [`tracker`] | the state of a cell from its packets: identity, restarts, losses |
 //! | [`table`] | the state of a live bus: each cell, and sums |
 //! | [`latched`] | what the cells of a bus were told and still hold |
@@ -22,6 +23,7 @@ pub mod generate;
 pub mod latched;
 pub mod listing;
 pub mod network;
+pub mod packets;
 pub mod quantiles;
 pub mod repeat;
 pub mod scenario;

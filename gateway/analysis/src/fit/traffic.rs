@@ -4,16 +4,14 @@
 //! sends stimuli, sync and report with their answers, and what stands for wires between cells.
 
 use protocol::can::{Format, Frame};
-use protocol::id::{CellId, Command, Id, Node};
+use protocol::id::{CellId, Node};
 use protocol::message::{Message, NetworkPage, SensorPage, State};
-use protocol::packet::{Epoch, Length, Lengths, Packet, Reassembly, Segment, data_id};
+use protocol::packet::Epoch;
 use protocol::time::Micros;
 use serde::Serialize;
 
 use model::decode::wired;
-
-/// Identifiers of 11 bits.
-const IDS: usize = 0x800;
+use model::packets::{Content, PacketReader};
 
 /// What only a bench sends.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
@@ -99,10 +97,7 @@ pub struct Traffic {
     /// Frames of sound packets, and 11-bit data frames that were none.
     ours: u64,
     others: u64,
-    /// By identifier.
-    segments: Vec<Segment>,
-    /// How long joints, torques and sums are, as the last joints were.
-    length: Option<Length>,
+    packets: PacketReader,
     /// By cell: replies to the bench that are outstanding.
     owed: Vec<Owed>,
 }
@@ -121,46 +116,26 @@ impl Traffic {
 
     /// Takes the next frame. On a bus of another protocol nothing is a bench's. Never panics.
     pub fn sort(&mut self, nanos: u64, frame: &Frame) -> Sorted {
-        let Ok(id) = data_id(frame) else {
-            let bench = wired(frame).map(|_| Bench::Wire);
-            return Sorted { bench, ..Sorted::OTHER };
+        let received = self.packets.read(Micros(nanos / 1_000), frame);
+        let (id, packet) = match received.content {
+            Content::NotData => {
+                let bench = wired(frame).map(|_| Bench::Wire);
+                return Sorted { bench, ..Sorted::OTHER };
+            }
+            Content::Segment(_) => return Sorted::OTHER,
+            Content::AfterLost(_) | Content::Damaged(..) => {
+                self.others += 1;
+                return Sorted::OTHER;
+            }
+            Content::Message(id, packet, _) | Content::Meaningless(id, packet, _) => (id, packet),
         };
-        let Some((packet, ends_pair)) = self.packet(nanos, id, frame) else { return Sorted::OTHER };
-        match Message::decode(&packet) {
-            Ok(message) if self.is_ours() => {
-                Sorted { ends_pair, from: id.sender(), ..self.message(&message) }
+        let is_classic = frame.format() == Format::Classic;
+        self.ours += if is_classic { packet.words.length().segments() as u64 } else { 1 };
+        match received.message() {
+            Some(message) if self.is_ours() => {
+                Sorted { ends_pair: is_classic, from: id.sender(), ..self.message(message) }
             }
             _ => Sorted::OTHER,
-        }
-    }
-
-    /// The packet that is whole with this frame.
-    fn packet(&mut self, nanos: u64, id: Id, frame: &Frame) -> Option<(Packet, bool)> {
-        if frame.format() == Format::Fd {
-            let packet = Packet::from_fd(frame).ok();
-            *(if packet.is_some() { &mut self.ours } else { &mut self.others }) += 1;
-            return Some((packet?, false));
-        }
-        if self.segments.is_empty() {
-            self.segments.resize(IDS, Segment::NONE);
-        }
-        let segment = self.segments.get_mut(usize::from(id.to_bits()))?;
-        let is_joints = id == Id::command(Command::Joints);
-        let lengths = Lengths::of_chain(self.length.filter(|_| !is_joints));
-        match segment.push(Micros(nanos / 1_000), id, lengths, frame.data()) {
-            Ok(Reassembly::Complete(packet)) => {
-                let length = packet.words.length();
-                self.ours += length.segments() as u64;
-                if is_joints {
-                    self.length = Some(length);
-                }
-                Some((packet, true))
-            }
-            Ok(Reassembly::Waiting) => None,
-            Ok(Reassembly::Incomplete | Reassembly::Ambiguous) | Err(_) => {
-                self.others += 1;
-                None
-            }
         }
     }
 

@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!   frame, time, bus ──> Decoder ──> Decoded ──> one line of text
-//!                          └ for each identifier of each bus: a waiting segment, and whether packets use it
+//!                          └ for each bus a PacketReader; for each identifier, whether packets use it
 //! ```
 //!
 //! A frame is ours as a whole packet with the right CRC, or as a segment of a classic packet. Every other
@@ -24,13 +24,15 @@ pub use error_frame::{ErrorFrame, error_classes};
 pub use text::InUnits;
 
 use protocol::can::{Format, Frame};
-use protocol::id::{Command, Id};
+use protocol::id::Id;
 use protocol::message::{Message, MessageError};
-use protocol::packet::{Length, Lengths, Packet, PacketError, Reassembly, Segment, data_id};
+use protocol::packet::{Packet, PacketError, data_id};
 use protocol::port::{self, PortMessage};
 use protocol::time::Micros;
 use std::collections::VecDeque;
 use thiserror::Error;
+
+use crate::packets::{Content, PacketReader, Received};
 
 /// Buses that are distinguished at the same time: of more, the oldest is forgotten, or they are taken together.
 pub const BUSES: usize = 64;
@@ -136,6 +138,12 @@ pub fn wired(frame: &Frame) -> Option<(port::LinkId, PortMessage)> {
     Some((link_id, link_id.read(frame)?))
 }
 
+/// Classifies a frame that never is a packet.
+fn not_data(frame: &Frame) -> Decoded {
+    let wired = wired(frame).map(|(link_id, message)| Decoded::Wire(link_id, message));
+    wired.unwrap_or_else(|| Decoded::Foreign(Foreign::of(frame)))
+}
+
 /// What came with an identifier, and so whether it is one of ours.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Traffic {
@@ -166,7 +174,7 @@ impl Traffic {
     }
 }
 
-/// Classifies frames, and reassembles segments.
+/// Classifies the frames of many buses.
 #[derive(Clone, Debug)]
 pub struct Decoder {
     format: Option<Format>,
@@ -181,16 +189,20 @@ struct Bus {
     name: String,
     /// Another one than that of any bus before it.
     number: u64,
+    packets: PacketReader,
+    classifier: Classifier,
+}
+
+/// Classifies the frames of one bus that a [`PacketReader`] has read.
+#[derive(Clone, Debug, Default)]
+struct Classifier {
     /// By identifier, of those that came: a capture may name any number of buses, each with a few of them.
     ids: Vec<Option<Box<Slot>>>,
-    /// How long joints, torques and sums are, as the joints said whose number of joints has that length.
-    length: Option<Length>,
 }
 
 /// An identifier of a bus.
 #[derive(Clone, Debug, Default)]
 struct Slot {
-    segment: Segment,
     /// The numbers of the frames that wait.
     waiting: VecDeque<u64>,
     traffic: Traffic,
@@ -198,10 +210,10 @@ struct Slot {
 
 impl Slot {
     /// Frames that waited are given up, but for so many of the newest.
-    fn drop_beyond(&mut self, kept: usize, id: Id, older: &mut Vec<(u64, Decoded)>) {
+    fn drop_beyond(&mut self, kept: usize, id: Id, settled: &mut Vec<(u64, Decoded)>) {
         for _ in kept..self.waiting.len() {
             if let Some(number) = self.waiting.pop_front() {
-                older.push((number, self.refuse(id, PacketError::Incomplete)));
+                settled.push((number, self.refuse(id, PacketError::Incomplete)));
             }
         }
     }
@@ -217,18 +229,49 @@ impl Slot {
     }
 }
 
-/// What came of a frame, and with it of the one that waited under its identifier.
-struct Taken {
-    decoded: Decoded,
-    /// On which bus it waits for its second segment.
-    waits: Option<u64>,
-    /// The numbers of frames that waited, and what they were.
-    older: Vec<(u64, Decoded)>,
-}
+/// The class of a frame, and the numbers and classes of those that waited under its identifier and are now settled.
+/// A [`Decoded::Segment`] waits itself.
+type Classified = (Decoded, Vec<(u64, Decoded)>);
 
-impl From<Decoded> for Taken {
-    fn from(decoded: Decoded) -> Self {
-        Self { decoded, waits: None, older: Vec::new() }
+impl Classifier {
+    /// Classifies a frame under a number.
+    fn take(&mut self, number: u64, received: &Received<'_>) -> Classified {
+        match received.content {
+            Content::NotData => (not_data(received.frame), Vec::new()),
+            Content::Message(id, packet, message) => (Decoded::Message(message), self.packet(id, &packet)),
+            Content::Meaningless(id, packet, error) => {
+                (Decoded::Meaningless { packet, error }, self.packet(id, &packet))
+            }
+            Content::Segment(id) | Content::AfterLost(id) => {
+                let (slot, mut settled) = (self.slot(id), Vec::new());
+                slot.waiting.push_back(number);
+                slot.drop_beyond(received.waiting, id, &mut settled);
+                (Decoded::Segment { id }, settled)
+            }
+            Content::Damaged(id, fault) => {
+                let (slot, mut settled) = (self.slot(id), Vec::new());
+                if fault == PacketError::Ambiguous {
+                    slot.drop_beyond(0, id, &mut settled);
+                }
+                (slot.refuse(id, fault), settled)
+            }
+        }
+    }
+
+    /// Counts a packet, and settles the frames that waited for it.
+    fn packet(&mut self, id: Id, packet: &Packet) -> Vec<(u64, Decoded)> {
+        let (slot, mut settled) = (self.slot(id), Vec::new());
+        slot.drop_beyond(packet.words.length().segments() - 1, id, &mut settled);
+        settled.extend(slot.waiting.drain(..).map(|number| (number, Decoded::Segment { id })));
+        slot.traffic.packet();
+        settled
+    }
+
+    fn slot(&mut self, id: Id) -> &mut Slot {
+        if self.ids.is_empty() {
+            self.ids.resize(IDS, None);
+        }
+        self.ids.get_mut(usize::from(id.to_bits())).expect("11 bits").get_or_insert_default()
     }
 }
 
@@ -239,77 +282,33 @@ impl Decoder {
         Self { format, buses: Vec::new(), seen: 0 }
     }
 
-    /// Takes the next frame. What a classic frame is may come out only later: it is told as a [`Decoded::Segment`]
-    /// until then; [`settle::Settler`] waits. Bounded memory, whatever comes. Never panics.
+    /// Takes the next frame. A classic frame may be settled only later: it is a [`Decoded::Segment`] until then;
+    /// [`settle::Settler`] waits. Bounded memory, whatever comes. Never panics.
     pub fn decode(&mut self, at: Micros, bus: &str, frame: &Frame) -> Decoded {
-        self.take(0, at, bus, frame).decoded
+        self.take(0, at, bus, frame).1.0
     }
 
-    /// Takes the next frame under a number.
-    fn take(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> Taken {
-        let Ok(id) = data_id(frame) else {
-            let wired = wired(frame).map(|(link_id, message)| Decoded::Wire(link_id, message));
-            return wired.unwrap_or_else(|| Decoded::Foreign(Foreign::of(frame))).into();
-        };
-        let format = self.format.unwrap_or_else(|| frame.format());
+    /// Takes the next frame under a number; returns the number of its bus, too.
+    fn take(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> (u64, Classified) {
+        if data_id(frame).is_err() {
+            return (0, (not_data(frame), Vec::new()));
+        }
         let bus = self.bus(bus);
-        let on = bus.number;
-        // Joints say themselves how long they are.
-        let is_joints = id == Id::command(Command::Joints);
-        let lengths = Lengths::of_chain(bus.length.filter(|_| !is_joints));
-        let slot = bus.ids.get_mut(usize::from(id.to_bits())).expect("11 bits").get_or_insert_default();
-        let mut older = Vec::new();
-        let packet = match format {
-            Format::Fd => Packet::from_fd(frame),
-            Format::Classic if frame.format() == Format::Fd => {
-                Err(PacketError::Length { expected: 8, got: frame.data().len() })
-            }
-            Format::Classic => match slot.segment.push(at, id, lengths, frame.data()) {
-                Ok(Reassembly::Waiting | Reassembly::Incomplete) => {
-                    slot.waiting.push_back(number);
-                    slot.drop_beyond(slot.segment.waiting(), id, &mut older);
-                    return Taken { decoded: Decoded::Segment { id }, waits: Some(on), older };
-                }
-                Ok(Reassembly::Complete(packet)) => {
-                    slot.drop_beyond(packet.words.length().segments() - 1, id, &mut older);
-                    older.extend(slot.waiting.drain(..).map(|older| (older, Decoded::Segment { id })));
-                    Ok(packet)
-                }
-                Ok(Reassembly::Ambiguous) => {
-                    slot.drop_beyond(0, id, &mut older);
-                    Err(PacketError::Ambiguous)
-                }
-                Err(error) => Err(error),
-            },
-        };
-        let decoded = match packet {
-            Ok(packet) => {
-                slot.traffic.packet();
-                match Message::decode(&packet) {
-                    Ok(message) => {
-                        if let Message::Joints { joints, .. } = message {
-                            bus.length = Some(Length::for_joints(joints.in_use.into()));
-                        }
-                        Decoded::Message(message)
-                    }
-                    Err(error) => Decoded::Meaningless { packet, error },
-                }
-            }
-            Err(error) => slot.refuse(id, error),
-        };
-        Taken { decoded, waits: None, older }
+        (bus.number, bus.classifier.take(number, &bus.packets.read(at, frame)))
     }
 
-    /// What a segment is when the second one does not come any more.
+    /// What a segment is when the others of its packet do not come any more.
     fn give_up(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
-        let slots = self.buses.iter_mut().find(|it| it.number == bus).map(|bus| &mut bus.ids);
-        let slot = slots.and_then(|slots| slots.get_mut(usize::from(id.to_bits()))?.as_mut());
-        let Some(slot) = slot.filter(|slot| slot.waiting.front() == Some(&number)) else {
+        let found = self.buses.iter_mut().find(|it| it.number == bus).and_then(|bus| {
+            let slot = bus.classifier.ids.get_mut(usize::from(id.to_bits()))?.as_mut()?;
+            (slot.waiting.front() == Some(&number)).then_some((slot, &mut bus.packets))
+        });
+        let Some((slot, packets)) = found else {
             return Decoded::Foreign(Foreign::Data(PacketError::Incomplete));
         };
         slot.waiting.pop_front();
         if slot.waiting.is_empty() {
-            slot.segment = Segment::NONE;
+            packets.drop_segments(id);
         }
         slot.refuse(id, PacketError::Incomplete)
     }
@@ -320,8 +319,12 @@ impl Decoder {
                 self.buses.remove(0);
             }
             self.seen += 1;
-            let ids = vec![None; IDS];
-            self.buses.push(Bus { name: name.to_owned(), number: self.seen, ids, length: None });
+            self.buses.push(Bus {
+                name: name.to_owned(),
+                number: self.seen,
+                packets: PacketReader::new(self.format),
+                classifier: Classifier::default(),
+            });
             self.buses.len() - 1
         });
         self.buses.get_mut(at).expect("found, or just made")

@@ -64,16 +64,16 @@ impl<T> Settler<T> {
     /// Takes the next frame; [`Settler::pop`] until there is none before the next one.
     pub fn push(&mut self, at: Micros, bus: &str, frame: &Frame, item: T) {
         let number = self.oldest + self.waiting.len() as u64;
-        let taken = self.decoder.take(number, at, bus, frame);
-        for (older, decoded) in taken.older {
+        let (bus, (decoded, settled)) = self.decoder.take(number, at, bus, frame);
+        for (older, decoded) in settled {
             let older = older.checked_sub(self.oldest).and_then(|index| usize::try_from(index).ok());
             if let Some(entry) = older.and_then(|index| self.waiting.get_mut(index)) {
                 entry.state = State::Settled(decoded);
             }
         }
-        let state = match (taken.decoded, taken.waits) {
-            (Decoded::Segment { id }, Some(bus)) => State::Waits(bus, id),
-            (decoded, _) => State::Settled(decoded),
+        let state = match decoded {
+            Decoded::Segment { id } => State::Waits(bus, id),
+            decoded => State::Settled(decoded),
         };
         self.now = at;
         self.is_at_end = false;

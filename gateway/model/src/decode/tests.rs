@@ -8,7 +8,7 @@ use super::*;
 use proptest::prelude::*;
 use protocol::candump::{self, Line, Timestamp};
 use protocol::fixed::TorqueFormat;
-use protocol::id::Kind;
+use protocol::id::{Command, Kind};
 use protocol::schema::Units;
 use protocol::skin::JointKind;
 
@@ -475,7 +475,7 @@ fn memory_is_bounded_whatever_buses_a_log_names() {
     }
     assert_eq!(decoder.buses.len(), BUSES);
     // Identifiers that never came cost no more than a pointer, and no time where a log names 100 000 buses.
-    let slots = decoder.buses.iter().flat_map(|bus| &bus.ids).flatten().count();
+    let slots = decoder.buses.iter().flat_map(|bus| &bus.classifier.ids).flatten().count();
     assert_eq!(slots, BUSES);
 }
 

@@ -16,10 +16,11 @@ use std::sync::Arc;
 use protocol::can::{Format, Frame};
 use protocol::id::{Id, Kind};
 use protocol::message::{Answer, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
-use protocol::packet::{self, Epoch, Lengths, Packet, Reassembly, Segment};
+use protocol::packet::{self, Epoch, PacketError, Segment};
 use protocol::parameters::Parameter;
 use protocol::time::Micros;
 
+use crate::packets::{Content, PacketReader};
 use crate::tracker::{Claim, Contact, PerCell, Word};
 
 /// A frame that was received.
@@ -82,8 +83,9 @@ pub struct Latched {
     joints: Option<(Epoch, Arc<PlacedPacket>)>,
     /// The last halt or resume.
     halt: Kept,
+    packets: PacketReader,
     /// By identifier: segments whose packet is still to come.
-    segments: Vec<(Segment, Vec<Seen>)>,
+    waiting: BTreeMap<u16, Vec<Seen>>,
     /// Identifiers of the gateway's side of which segments wait, and when the newest came, in ns since 1970.
     open: BTreeMap<u16, u64>,
 }
@@ -95,7 +97,8 @@ impl Default for Latched {
             cells: PerCell::default(),
             joints: None,
             halt: None,
-            segments: vec![(Segment::NONE, Vec::new()); 1 << 11],
+            packets: PacketReader::new(None),
+            waiting: BTreeMap::new(),
             open: BTreeMap::new(),
         }
     }
@@ -201,38 +204,30 @@ impl Latched {
             Kind::Sensors | Kind::Configured => {}
             Kind::Sum | Kind::Torque => return,
         }
-        let Some((frames, packet)) = self.packet(id, seen) else { return };
-        let Ok(message) = Message::decode(&packet) else { return };
-        self.places += 1;
-        self.hear(&message, &Arc::new(PlacedPacket { place: self.places, frames }));
-    }
-
-    /// The packet that a frame is or completes, with its frames.
-    fn packet(&mut self, id: Id, seen: Seen) -> Option<(Vec<Seen>, Packet)> {
-        if seen.frame.format() == Format::Fd {
-            return Some((vec![seen], Packet::from_fd(&seen.frame).ok()?));
-        }
-        let (segment, waiting) = self.segments.get_mut(usize::from(id.to_bits()))?;
-        // Of those that are kept only joints grow, which say themselves how long they are.
-        let reassembly =
-            segment.push(Micros(seen.at_nanos / 1_000), id, Lengths::ALL, seen.frame.data()).ok()?;
-        waiting.push(seen);
-        match reassembly {
-            Reassembly::Complete(packet) => {
-                self.open.remove(&id.to_bits());
-                let first = waiting.len().saturating_sub(packet.words.length().segments());
-                let frames = waiting.split_off(first);
-                waiting.clear();
-                Some((frames, packet))
-            }
-            Reassembly::Waiting | Reassembly::Incomplete | Reassembly::Ambiguous => {
-                waiting.drain(..waiting.len().saturating_sub(segment.waiting()));
+        let received = self.packets.read(Micros(seen.at_nanos / 1_000), &seen.frame);
+        let packet = match received.content {
+            Content::Message(_, packet, _) | Content::Meaningless(_, packet, _) => packet,
+            Content::Segment(_) | Content::AfterLost(_) | Content::Damaged(_, PacketError::Ambiguous) => {
+                let waiting = self.waiting.entry(id.to_bits()).or_default();
+                waiting.push(seen);
+                waiting.drain(..waiting.len().saturating_sub(received.waiting));
                 if !id.kind.is_from_cells() {
                     self.open.insert(id.to_bits(), seen.at_nanos);
                 }
-                None
+                return;
             }
+            Content::NotData | Content::Damaged(..) => return,
+        };
+        let mut frames = Vec::new();
+        if seen.frame.format() == Format::Classic {
+            self.open.remove(&id.to_bits());
+            frames = self.waiting.remove(&id.to_bits()).unwrap_or_default();
+            frames.drain(..(frames.len() + 1).saturating_sub(packet.words.length().segments()));
         }
+        frames.push(seen);
+        let Some(message) = received.message() else { return };
+        self.places += 1;
+        self.hear(message, &Arc::new(PlacedPacket { place: self.places, frames }));
     }
 
     /// Whether segments of a packet of the gateway's side may still come: no file should begin between them.

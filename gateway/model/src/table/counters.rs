@@ -1,6 +1,7 @@
 //! Frames by kind, and why frames could not be used.
 
 use protocol::id::Kind;
+use protocol::packet::PacketError;
 
 /// What can be unusual about a frame; each has a counter and a name.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
@@ -32,6 +33,17 @@ pub enum Event {
     OtherGateway,
     /// Another sender wrote what a cell answers, or whether it obeys stimuli.
     Switched,
+}
+
+impl From<PacketError> for Event {
+    fn from(error: PacketError) -> Self {
+        match error {
+            PacketError::Length { .. } => Self::Length,
+            PacketError::Crc { .. } => Self::Crc,
+            PacketError::Incomplete | PacketError::Ambiguous => Self::Incomplete,
+            PacketError::Foreign => Self::Foreign,
+        }
+    }
 }
 
 impl Event {

@@ -28,17 +28,18 @@ mod switched;
 
 use std::collections::VecDeque;
 
-use protocol::can::{Format, Frame};
+use protocol::can::Frame;
 use protocol::fixed::TorqueFormat;
 use protocol::id::{CellId, Command, Id, Kind, Node};
-use protocol::message::{Heartbeat, Message, SkinSensors};
-use protocol::packet::{self, Epoch, Length, Lengths, Packet, PacketError, Reassembly, Segment};
+use protocol::message::{Heartbeat, SkinSensors};
+use protocol::packet::Epoch;
 use protocol::parameters::{Events, MAX_JOINTS, Sensing};
 use protocol::skin::{Reply, Safety, Skin};
 use protocol::time::Micros;
 
 use crate::central::Central;
 use crate::network::check::Seen;
+use crate::packets::{Content, PacketReader, Received};
 
 use epoch::Broadcast;
 use held::{Change, to_nm};
@@ -130,7 +131,7 @@ pub struct Table {
     cells: Vec<Cell>,
     /// Where a node stands in `cells`.
     places: [Option<usize>; CellId::COUNT],
-    segments: Vec<Segment>,
+    packets: PacketReader,
     broadcast: Option<Broadcast>,
     /// Sums along the tree, where cells answer with them.
     root_totals: Option<RootTotals>,
@@ -151,9 +152,6 @@ pub struct Table {
 /// What the bus carries.
 #[derive(Clone, Debug)]
 struct Carried {
-    format: Format,
-    /// How long joints, torques and sums are.
-    length: Length,
     torque_format: TorqueFormat,
     /// Joints of the chain.
     joints: usize,
@@ -178,8 +176,6 @@ impl Table {
         let snapshot = Snapshot { sums: Sums::default(), sensors: vec![SkinSensors::default(); cells.len()] };
         Self {
             carried: Carried {
-                format: skin.buses.get(bus).map_or(Format::Fd, |bus| bus.format),
-                length: skin.length_of(bus),
                 torque_format: skin.buses.get(bus).map(|bus| bus.torque_format).unwrap_or_default(),
                 joints: skin.joints_of(bus).len(),
             },
@@ -190,7 +186,7 @@ impl Table {
             comparing: false,
             cells,
             places,
-            segments: vec![Segment::NONE; 1 << 11],
+            packets: PacketReader::of_skin(skin, bus),
             broadcast: None,
             root_totals: summed.then(RootTotals::default),
             outsiders: Outsiders::default(),
@@ -308,58 +304,44 @@ impl Table {
         self.notices.drain(..)
     }
 
+    /// Reassembles and decodes a frame of this bus, to be handed to [`receive`](Self::receive) and to others.
+    pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> Received<'f> {
+        self.packets.read(at, frame)
+    }
+
     /// Takes a frame that was on the bus at `at`; `own` if this gateway sent it. `positions` is asked for
     /// the positions in rad that an own broadcast's words were rounded from, if they are known.
     pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut Positions<'_>) {
-        let Ok(id) = packet::data_id(frame) else {
-            self.counters.count(if frame.is_error() { Event::ErrorFrame } else { Event::Foreign });
-            return;
-        };
-        let packet = match self.packet(at, id, frame) {
-            Ok(Some(packet)) => packet,
-            Ok(None) => return,
-            Err(_) if !own && !self.is_used(id) => return self.counters.count(Event::Foreign),
-            Err(event) => {
-                self.counters.frame(id.kind, own);
-                return self.reject(id, own, event);
-            }
-        };
-        self.counters.frame(id.kind, own);
-        match Message::decode(&packet) {
-            Err(_) => self.reject(id, own, Event::Meaning),
-            Ok(message) if own => self.hear_own(at, &message, positions),
-            Ok(message) => self.hear(at, id, &message),
-        }
+        let received = self.read(at, frame);
+        self.receive(at, own, &received, positions);
     }
 
-    /// The packet that a frame is or completes; `None` for a segment.
-    fn packet(&mut self, at: Micros, id: Id, frame: &Frame) -> Result<Option<Packet>, Event> {
-        let event = |error| match error {
-            PacketError::Length { .. } => Event::Length,
-            PacketError::Crc { .. } => Event::Crc,
-            PacketError::Incomplete | PacketError::Ambiguous => Event::Incomplete,
-            PacketError::Foreign => Event::Foreign,
-        };
-        if self.carried.format == Format::Fd {
-            let packet = Packet::from_fd(frame).map_err(event)?;
-            let has_length = packet.words.length() == self.carried.length || Lengths::of(id) != Lengths::ALL;
-            return if has_length { Ok(Some(packet)) } else { Err(Event::Length) };
-        }
-        if frame.format() != Format::Classic {
-            return Err(Event::Length);
-        }
-        let is_used = self.is_used(id);
-        let segment = self.segments.get_mut(usize::from(id.to_bits())).ok_or(Event::Foreign)?;
-        let waited = segment.is_waiting();
-        match segment.push(at, id, Lengths::only(self.carried.length), frame.data()).map_err(event)? {
-            Reassembly::Complete(packet) => Ok(Some(packet)),
-            // Foreign frames are counted each, and not as incomplete packets.
-            Reassembly::Waiting | Reassembly::Incomplete | Reassembly::Ambiguous if waited && !is_used => {
-                Err(Event::Foreign)
+    /// [`handle_frame`](Self::handle_frame), of a frame that has been [`read`](Self::read).
+    pub fn receive(&mut self, at: Micros, own: bool, received: &Received<'_>, positions: &mut Positions<'_>) {
+        let (id, event) = match received.content {
+            Content::Message(id, _, ref message) => {
+                self.counters.frame(id.kind, own);
+                return if own { self.hear_own(at, message, positions) } else { self.hear(at, id, message) };
             }
-            Reassembly::Waiting => Ok(None),
-            Reassembly::Incomplete | Reassembly::Ambiguous => Err(Event::Incomplete),
+            Content::NotData => {
+                let is_error = received.frame.is_error();
+                return self.counters.count(if is_error { Event::ErrorFrame } else { Event::Foreign });
+            }
+            Content::Segment(id) if received.waited == 0 || self.is_used(id) => return,
+            // Foreign frames are counted each, and not as incomplete packets.
+            Content::Segment(id) => (id, Event::Foreign),
+            Content::AfterLost(id) => (id, Event::Incomplete),
+            Content::Meaningless(id, ..) => {
+                self.counters.frame(id.kind, own);
+                return self.reject(id, own, Event::Meaning);
+            }
+            Content::Damaged(id, error) => (id, Event::from(error)),
+        };
+        if !own && !self.is_used(id) {
+            return self.counters.count(Event::Foreign);
         }
+        self.counters.frame(id.kind, own);
+        self.reject(id, own, event);
     }
 
     /// Returns true if the skin describes a sender with this identifier on this bus.

@@ -1,7 +1,9 @@
 //! A table of a bus whose cells answer with torques.
 
 use super::*;
-use protocol::message::{Answer, Heard, Joints, NetworkPage, Request, SensorPage, State};
+use protocol::can::Format;
+use protocol::message::{Answer, Heard, Joints, Message, NetworkPage, Request, SensorPage, State};
+use protocol::packet::{self, Packet};
 use protocol::parameters::Parameter;
 
 /// A table that received these, in the frames of the bus, the gateway's own or a cell's.

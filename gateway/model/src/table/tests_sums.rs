@@ -1,12 +1,13 @@
 //! A table of a bus whose cells answer with sums.
 
+use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10};
-use protocol::message::{From, Heard, Joints, NetworkPage, SensorPage, State, Tree};
+use protocol::message::{From, Heard, Joints, Message, NetworkPage, SensorPage, State, Tree};
+use protocol::packet::{self, Length, Words};
 use protocol::time::Span;
 
 use super::*;
 use crate::tracker::DEAD_AFTER;
-use protocol::packet::Words;
 
 /// Four cells on one bus, 1 and 2 of them roots.
 fn skin() -> Skin {

@@ -3,7 +3,8 @@
 use analysis::fit::rates::Requested;
 use bench::view::CellView;
 use model::central::Central;
-use model::decode::{Decoded, Decoder};
+use model::decode::wired;
+use model::packets::Content;
 use model::table::{Cell, Status, Table};
 use protocol::can::Frame;
 use protocol::fixed::{Q1_14, TorqueFormat};
@@ -43,7 +44,6 @@ pub(super) struct LiveBus {
     pub(super) central: Central,
     pub(super) torque_format: TorqueFormat,
     pub(super) sums: bool,
-    decoder: Decoder,
     /// The joints that cells answer, and those before them.
     pub(super) heard: Option<Heard>,
     before: Option<Heard>,
@@ -72,7 +72,6 @@ impl LiveBus {
             central: Central::new(&skin.part_on(bus)),
             torque_format: described.map(|bus| bus.torque_format).unwrap_or_default(),
             sums: described.is_some_and(|bus| bus.reply != Reply::Torque),
-            decoder: Decoder::new(described.map(|bus| bus.format)),
             heard: None,
             before: None,
             torques: [(0.0, 0.0); MAX_JOINTS],
@@ -90,9 +89,10 @@ impl LiveBus {
 
     /// A frame; whether it is joints, which begin an epoch.
     pub(super) fn frame(&mut self, at: Micros, frame: &Frame) -> bool {
-        let decoded = self.decoder.decode(at, &self.name, frame);
-        let message = decoded.message().copied();
-        if !matches!(decoded, Decoded::Wire(..)) && !matches!(message, Some(Message::Stimulus { .. })) {
+        let received = self.table.read(at, frame);
+        let message = received.message().copied();
+        let is_wire = received.content == Content::NotData && wired(frame).is_some();
+        if !is_wire && !matches!(message, Some(Message::Stimulus { .. })) {
             // Wires and stimuli are the bench's.
             let busy = self.rates.zip(Bits::of(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
             self.load.busy_s += busy;
@@ -116,7 +116,7 @@ impl LiveBus {
             Some(_) | None => {}
         }
         // Whoever sent them, joints open an epoch.
-        self.table.handle_frame(at, joints, frame, &mut |_| None);
+        self.table.receive(at, joints, &received, &mut |_| None);
         joints
     }
 

@@ -15,7 +15,6 @@ use super::touched::Touched;
 use crate::fit::rates::Chosen;
 use crate::report::thin::{Binned, Thinned};
 use model::central::Central;
-use model::decode::{Decoded, Decoder};
 use model::table::{Replies, Sums, Table};
 use trace::capture::Latched;
 
@@ -82,7 +81,6 @@ fn is_for_cells(frame: &Frame) -> bool {
 /// The state of a bus' frames so far.
 #[derive(Debug)]
 pub(super) struct Received {
-    decoder: Decoder,
     looked: Micros,
     /// Whether frames have no direction that tells the gateway's own.
     is_of_frames_only: bool,
@@ -148,7 +146,6 @@ impl LinkId {
             table,
             sums: described.is_some_and(|bus| bus.reply != Reply::Torque),
             received: Received {
-                decoder: Decoder::new(described.map(|bus| bus.format)),
                 looked: Micros(0),
                 is_of_frames_only,
                 before: Sums::default(),
@@ -195,33 +192,29 @@ impl LinkId {
             true => is_for_cells(&record.frame),
             false => record.direction == Some(Direction::Sent),
         };
-        let decoded = self.received.decoder.decode(now, &self.name, &record.frame);
-        if let Decoded::Message(message) = &decoded {
+        let read = self.table.read(now, &record.frame);
+        let message = read.message();
+        if let Some(message) = message {
             self.answer(now, message);
             self.measure(message);
         }
         let seconds = Bits::of(&record.frame).map_or(0.0, |bits| bits.seconds(self.rates.rates));
         self.load_of_all.add(at, seconds);
         let before = self.table.snapshot().sums;
-        self.table.handle_frame(now, own, &record.frame, &mut |_| None);
+        self.table.receive(now, own, &read, &mut |_| None);
         let newest = self.table.newest().map(|(number, _, _)| number);
         let is_next = newest.is_some() && newest != self.open.map(|open| open.number);
         if is_next {
             self.next(newest.unwrap_or(0), at);
             self.received.before = before;
         }
-        match decoded {
-            Decoded::Message(Message::Joints { joints, .. }) if is_next => {
+        match message {
+            Some(Message::Joints { joints, .. }) if is_next => {
                 Some(Effect::Joints(self.central.positions(&joints.positions)))
             }
-            Decoded::Message(Message::Halt) => Some(Effect::Halted(true)),
-            Decoded::Message(Message::Resume) => Some(Effect::Halted(false)),
-            Decoded::Foreign(_)
-            | Decoded::Wire(..)
-            | Decoded::Segment { .. }
-            | Decoded::Damaged { .. }
-            | Decoded::Meaningless { .. }
-            | Decoded::Message(_) => None,
+            Some(Message::Halt) => Some(Effect::Halted(true)),
+            Some(Message::Resume) => Some(Effect::Halted(false)),
+            Some(_) | None => None,
         }
     }
 
