@@ -4,7 +4,7 @@
     python3 external_controller.py SOCKET [--damping NM_S_PER_RAD]
 
 SOCKET is the path in the skin's [controller] table. The law is an admittance without inertia,
-velocity = torque / damping. The datagrams are described in docs/reference/external-controller.md.
+velocity = torque / damping. The datagrams are described in docs/how-to/external-controller.md.
 """
 
 import argparse

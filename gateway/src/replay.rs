@@ -29,7 +29,7 @@ const SEND_TIMEOUT_MS: u32 = 100;
 ///
 /// Frames go out at the capture's own times, or as fast as the bus takes them. With --only inputs the cells on the
 /// bus answer; with --expect their answers have to be the recorded ones, bit for bit or within a tolerance.
-/// docs/reference/replay.md says what is compared and how. Exit code 0: all was sent, and all answers were right; 1: not
+/// docs/how-to/replay.md says what is compared and how. Exit code 0: all was sent, and all answers were right; 1: not
 /// so; 2: wrong use.
 #[derive(Args, Debug)]
 #[command(mut_args(|arg| match arg.get_id().as_str() {
@@ -73,7 +73,7 @@ pub(crate) struct Replay {
     /// Let cells that measure obey stimuli while the replay lasts, and measure again afterwards
     #[arg(long)]
     test_mode: bool,
-    /// Write the figures of the end as JSON, - for standard output; docs/reference/replay.md explains its keys
+    /// Write the figures of the end as JSON, - for standard output; docs/how-to/replay.md explains its keys
     #[arg(long, value_name = "FILE")]
     summary: Option<PathBuf>,
     #[command(flatten)]

@@ -1,6 +1,6 @@
-//! The result of a replay: the figures of the table at its end, and of `--summary` and `--json`.
+//! The result of a replay: the figures of the table at its end, and of `--summary`.
 //!
-//! The keys of the JSON are the names of the fields here; `docs/reference/replay.md` explains them.
+//! The keys of the JSON are the names of the fields here; `docs/how-to/replay.md` explains them.
 
 use std::collections::BTreeMap;
 

@@ -8,7 +8,7 @@
 //! The answer to the last tick must be there when the next one begins, else the cycle is bad. The other
 //! program sends a hello first; the sender of the last hello is the peer, and only its answers count. No
 //! datagram can stop a tick: others are counted, by reason. The bytes are in
-//! `docs/reference/external-controller.md`.
+//! `docs/how-to/external-controller.md`.
 
 mod absence;
 mod datagram;
