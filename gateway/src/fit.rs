@@ -26,7 +26,7 @@ use super::print::list;
 /// Of a capture (a candump log or an MCAP recording, of any CAN bus), or of live buses until Ctrl-C, what became of each
 /// frame on a bus with bit rates: exact stuff bits, arbitration by identifier, no frame interrupted. A frame's time stamp
 /// counts as the time at which it was to be sent. Bench-only frames are left out, start-up is reported separately, and the
-/// worst case is added when the skin is known. docs/reference/bus-timing.md explains both.
+/// worst case is added when the skin is known. docs/how-to/size-a-bus.md explains both.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   skinbus fit gateway/examples/ur5-253.toml

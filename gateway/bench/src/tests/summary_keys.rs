@@ -144,16 +144,20 @@ fn keys(path: &str, value: &Value, maps: &BTreeSet<String>, into: &mut BTreeMap<
     into.insert(path.to_owned(), kind);
 }
 
-/// First and second column of the tables whose rows begin with a key, with the heading above them.
+/// The keys of the lists whose items begin with one, each with its type and the heading above it: "- `a`, `b` flag: ..."
+/// has two flags. A key without a type is a number.
 fn rows() -> impl Iterator<Item = (&'static str, &'static str, &'static str)> {
     let mut heading = "";
-    SUMMARY_MD.lines().filter_map(move |line| {
+    let items = SUMMARY_MD.lines().filter_map(move |line| {
         if let Some(text) = line.strip_prefix("## ") {
             heading = text;
         }
-        let mut columns = line.strip_prefix("| `")?.split(" | ");
-        let (key, kind) = (columns.next()?.trim_end_matches('`'), columns.next()?);
-        Some((heading, key, kind.trim_end_matches(" or null")))
+        let (item, _) = line.strip_prefix("- ").filter(|item| item.starts_with('`'))?.split_once(": ")?;
+        let kind = item.rsplit('`').next()?.trim().trim_end_matches("or null").trim_end();
+        Some((heading, item, if kind.is_empty() { "number" } else { kind }))
+    });
+    items.flat_map(|(heading, item, kind)| {
+        item.split('`').skip(1).step_by(2).map(move |key| (heading, key, kind))
     })
 }
 

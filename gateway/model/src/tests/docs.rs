@@ -30,13 +30,17 @@ fn scenario_text() -> &'static str {
     block(SCENARIO_MD, "# scenario.toml:")
 }
 
-/// The keys in the first column of the table under a heading.
+/// The keys under a heading: of the table's first column, or of the list before what is in parentheses and the colon.
 fn documented(page: &str, heading: &str) -> BTreeSet<String> {
     let start = page.find(&format!("\n{heading}\n")).unwrap_or_else(|| panic!("no heading {heading:?}"));
     let section = &page[start + heading.len() + 2..];
     let section = section.split("\n#").next().unwrap();
-    let rows = section.lines().filter_map(|line| line.strip_prefix("| `"));
-    rows.map(|row| row.split('`').next().unwrap().to_owned()).collect()
+    let keys = section.lines().filter_map(|line| {
+        let row = line.strip_prefix("| ").and_then(|row| row.split(" | ").next());
+        let item = line.strip_prefix("- ").and_then(|item| item.split([':', '(']).next());
+        row.or(item).filter(|keys| keys.starts_with('`'))
+    });
+    keys.flat_map(|keys| keys.split('`').skip(1).step_by(2)).map(str::to_owned).collect()
 }
 
 /// The keys that a table may have, from the error of the program on an unknown one.
