@@ -22,6 +22,8 @@ pub mod can_raw;
 pub mod cell_slot;
 #[cfg(test)]
 mod circles;
+#[cfg(test)]
+mod documents;
 pub mod fault;
 pub mod fuzz;
 pub mod gateway;

@@ -1,9 +1,8 @@
 //! The documents on files that users write match the program: their examples are
-//! read here, and their tables name every key that there is, and no other. What they link to is there.
+//! read here, and their tables name every key that there is, and no other.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
 
 use crate::scenario::Scenario;
 use protocol::skin::{ControllerKind, Skin};
@@ -165,49 +164,4 @@ fn the_external_controllers_table_fits_into_a_skin() {
     let text = [&skin_text()[..start], external, "\n\n", &skin_text()[end..]].concat();
     let skin = Skin::parse("skin.toml", &text).unwrap();
     assert!(matches!(skin.controller.kind, ControllerKind::External { .. }));
-}
-
-/// A heading as pages that show Markdown name it in a link.
-fn anchor(heading: &str) -> String {
-    let kept = heading.chars().filter(|c| c.is_alphanumeric() || " -_".contains(*c));
-    kept.collect::<String>().to_lowercase().replace(' ', "-")
-}
-
-/// Every document of the project.
-fn pages(folder: &Path) -> Vec<PathBuf> {
-    let mut pages = Vec::new();
-    for entry in std::fs::read_dir(folder).unwrap() {
-        let path = entry.unwrap().path();
-        let name = path.file_name().unwrap().to_string_lossy();
-        if path.is_dir() && !name.starts_with('.') && name != "target" {
-            pages.extend(self::pages(&path));
-        } else if name.ends_with(".md") {
-            pages.push(path);
-        }
-    }
-    pages
-}
-
-#[test]
-fn links_between_documents_lead_somewhere() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors().nth(2).unwrap();
-    let pages = pages(root);
-    assert!(pages.len() > 15, "{pages:?}");
-    let text = |path: &Path| std::fs::read_to_string(path).unwrap_or_default();
-    for page in &pages {
-        let content = text(page);
-        for link in content.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
-            if link.starts_with("https://") {
-                continue;
-            }
-            let (file, part) = link.split_once('#').unwrap_or((link, ""));
-            let target = if file.is_empty() { page.clone() } else { page.parent().unwrap().join(file) };
-            assert!(target.is_file(), "{}: {link}", page.display());
-            let mut headings = text(&target);
-            headings.retain(|c| c != '`');
-            let found = headings.lines().filter(|line| line.starts_with('#'));
-            let found = found.map(|line| anchor(line.trim_start_matches('#').trim())).any(|it| it == part);
-            assert!(part.is_empty() || found, "{}: {link}", page.display());
-        }
-    }
 }
