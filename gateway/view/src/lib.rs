@@ -40,7 +40,7 @@ pub use still::{Moved, Still};
 pub use surface::Shell;
 pub use token::Token;
 
-/// What a mutex holds, also after a thread that held it has panicked.
+/// Locks a mutex, also after a thread that held it has panicked.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

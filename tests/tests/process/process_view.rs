@@ -194,7 +194,7 @@ fn pages_that_may_only_look_press_nothing() {
     run.signal(rustix::process::Signal::INT);
     run.end();
     for (words, expected) in [
-        ("--token-file skin.toml", "--token-file skin.toml: a token has 16 to 256 letters or digits"),
+        ("--token-file skin.toml", "--token-file skin.toml: a token must consist of 16 to 256 letters or digits"),
         ("--token-file no-such-file", "--token-file no-such-file: No such file or directory"),
         ("--address-file skin.toml", "--address-file skin.toml: it exists, and is no page's address: name"),
         ("--listen nowhere", "--listen"),
@@ -349,7 +349,7 @@ fn a_token_is_taken_from_a_file_or_the_environment() {
     let refused = Running::start(command).end();
     assert_eq!(
         refused.refusal(2),
-        "skinbus: SKINBUS_TOKEN: a token has 16 to 256 letters or digits, and nothing else"
+        "skinbus: SKINBUS_TOKEN: a token must consist of 16 to 256 letters or digits"
     );
     assert!(!place.path("run.log").exists(), "nothing was done");
 }

@@ -233,7 +233,7 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
         referers.filter_map(|referer| referer.as_str()).filter(|it| !it.is_empty()).collect();
     assert_eq!(referers, Vec::<&str>::new(), "the token leaves by no Referer");
     browser.open(&format!("http://{}/", address.host));
-    browser.until("document.body.textContent.startsWith('403: without the page')");
+    browser.until("document.body.textContent.startsWith('403: the token is missing')");
     drop(browser);
     run.signal(rustix::process::Signal::INT);
     run.end();
