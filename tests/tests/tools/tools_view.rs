@@ -258,20 +258,20 @@ fn a_recording_is_gone_through_in_a_browser() {
     assert_eq!(browser.value("getComputedStyle(document.getElementById('commands')).display"), "none");
 
     // An epoch forth and back.
-    browser.value(&click("The next epoch"));
+    browser.value(&click("Next epoch"));
     browser.until(&format!("{at} > 0.9 && {at} < 0.92"));
-    browser.value(&click("The epoch before"));
+    browser.value(&click("Previous epoch"));
     browser.until(&format!("{at} < 0.91"));
     // It plays to its end, and a touch is gone back to.
     browser.value(&click("Play"));
     browser.until(&format!("{at} > 1.2"));
     browser.until(&format!("{at} > 2.1"));
-    browser.value(&click("The event before"));
+    browser.value(&click("Previous event"));
     browser.until(&format!("{at} < 2"));
     // Its torque comes within an epoch or two.
     browser.until(&format!(
         "!document.getElementById('facts').textContent.includes('In contact0') || ({}, false)",
-        click("The next epoch")
+        click("Next epoch")
     ));
     // The slider.
     browser.value("(() => { const it = document.querySelector('#time input'); it.value = 0; it.oninput(); it.onchange(); })()");
