@@ -217,7 +217,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     };
     assert_eq!(
         of(6).refusal(1),
-        "skinbus: cell 6 sends nothing on vcan0, only 5: switch it on, or give the node id that it has"
+        "skinbus: cell 6 sends nothing on vcan0, only 5: switch it on, or give its actual node id"
     );
     let words = "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml";
     let other = cell.place.start("cell-node", words);
@@ -258,7 +258,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     });
     assert_eq!(
         test.end().refusal(1),
-        "skinbus: 2 cells send as node 5 on vcan0, with the serial numbers 77 and 100005: take away all but one"
+        "skinbus: 2 cells send as node 5 on vcan0, with the serial numbers 77 and 100005: remove all but one"
     );
     // One that begins to command in the middle.
     let test = cell.conformance("");
@@ -268,7 +268,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert_eq!(
         ended.stderr,
-        "skinbus: 003##500000000000000000000000000004782 was sent by somebody else: stop the gateway that is on this bus\n"
+        "skinbus: 003##500000000000000000000000000004782 was sent by another program: stop the gateway on this bus\n"
     );
     assert_eq!(cell.has(), before);
     let test = cell.conformance("--requirement CMD");
