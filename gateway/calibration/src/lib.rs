@@ -1,7 +1,7 @@
 //! Calibration: finds the places of cells on a robot from the readings of their accelerometers while the robot moves.
 //!
 //! ```text
-//! plan ─> motion ─> a robot, real or simulated ─> joints and sensors pages ─> observe ─> calibrate ─> result
+//!   plan ─> motion ─> a robot, real or simulated ─> joints and sensors pages ─> observe ─> calibrate ─> result
 //! ```
 //!
 //! | module | content |

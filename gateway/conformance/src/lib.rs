@@ -1,9 +1,9 @@
 //! Conformance tests: take one cell, of any author and on any hardware, through the requirements of its documents.
 //!
 //! ```text
-//! checks ──> Session ──> Bus ─┬─ Live: a socket, the kernel's time stamps
-//! |          |             └─ a cell in virtual time (tests)
-//! '─ Findings: passed, failed with frames, not applicable, not tested
+//!   checks ──> Session ──> Bus ─┬─ Live: a socket, the kernel's time stamps
+//!      |          |             └─ a cell in virtual time (tests)
+//!      '─ Findings: passed, failed with frames, not applicable, not tested
 //! ```
 //!
 //! Checks send packets and compare the cell's packets with expected values. Those come from the documents: torques bit

@@ -1,7 +1,7 @@
 //! The state of a recording at a moment.
 //!
 //! ```text
-//! entries of the capture ──> push ──> Order, by time ──> advance(until) ──> Live
+//!   entries of the capture ──> push ──> Order, by time ──> advance(until) ──> Live
 //! ```
 //!
 //! The state at a moment depends only on the frames up to it, however the reader got there: the same entries and the
