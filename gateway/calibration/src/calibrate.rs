@@ -36,7 +36,7 @@ const MUCH_SHIFTED: f64 = 0.005;
 const SHIFTS: usize = 5;
 /// The logarithm of the likelihood ratio above which one joint is preferred to the next.
 const SURE: f64 = 10.0;
-/// Another described pose is the nearer one if its distance is smaller by this factor.
+/// Another described place counts as nearer only if its distance is smaller by this factor.
 const NEARER: f64 = 2.0;
 
 /// Estimates every cell.

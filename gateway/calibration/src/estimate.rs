@@ -176,7 +176,7 @@ fn first(free: &Free) -> Option<CellModel> {
     let (left, right) = (parts.u?, parts.v_t?);
     let mut turned = left * right;
     if turned.determinant() < 0.0 {
-        // The direction with the least information is reversed.
+        // The direction with the smallest singular value is reversed.
         let weakest = parts.singular_values.imin();
         let flipped =
             Matrix3::from_fn(

@@ -154,7 +154,7 @@ impl Findings {
 pub struct Only(Vec<String>);
 
 impl Only {
-    /// Selects these ids, or all ids with this prefix: `CONF-7`, `CONF`; without words, selects everything.
+    /// Selects requirements by id or by kind: `CONF-7`, `CONF`; without words, selects everything.
     ///
     /// # Errors
     /// Returns the first word that does not match a requirement.

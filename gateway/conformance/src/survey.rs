@@ -194,7 +194,12 @@ impl core::fmt::Display for Damaged {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let frames: Vec<_> = self.frames.iter().map(ToString::to_string).collect();
         let fault = self.fault.as_deref().unwrap_or("no other segment came");
-        write!(f, "none of {} frames is a valid packet, for example {}: {fault}", self.count, frames.join(" "))?;
+        write!(
+            f,
+            "none of {} frames is a valid packet, for example {}: {fault}",
+            self.count,
+            frames.join(" ")
+        )?;
         if let Some(mistake) = self.mistake() {
             write!(f, "; {mistake}")?;
         }

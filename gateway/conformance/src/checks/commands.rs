@@ -85,7 +85,7 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
         if round == 1 {
             command(session, Message::Halt, "CMD-1")?;
         } else {
-            // Only a resume ends a halt: neither a commit nor a sync does.
+            // Only a resume ends a halt: neither a commit nor an exchange does.
             session.commit(&protocol::parameters::Parameters { period_us: 46_500, ..arm::document(6) })?;
             session.commit(&arm::document(6))?;
             session.exchange_all(&[])?;

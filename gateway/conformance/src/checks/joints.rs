@@ -119,7 +119,7 @@ fn counts(session: &mut Session<'_>) -> Result<(), Stop> {
         });
         before = session.counters()?;
     }
-    // The order of the checks: impossible counts, then repetitions, then the chain.
+    // The order of a cell's checks: impossible counts, then repetitions, then the count of the chain.
     let last = session.known.last_epoch;
     for (count, is_repeated) in [(5, true), (0, false)] {
         let frames = raw(session, last, count, Length::Six);

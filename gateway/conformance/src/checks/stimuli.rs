@@ -254,8 +254,9 @@ fn measuring(session: &mut Session<'_>) -> Result<(), Stop> {
     session.known.active = None;
     session.step(&POSITIONS)?;
     let step = session.step(&POSITIONS)?;
-    session
-        .check("STIM-1", step.torque.is_none(), || "a stimulus sent outside test mode was latched".to_owned());
+    session.check("STIM-1", step.torque.is_none(), || {
+        "a stimulus sent outside test mode was latched".to_owned()
+    });
     Ok(())
 }
 

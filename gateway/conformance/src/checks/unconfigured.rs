@@ -51,7 +51,9 @@ fn staged(session: &mut Session<'_>) -> Result<(), Stop> {
     session.write(number, before.words().unwrap_or([0; WORDS]))?;
     let reply = session.set(Parameter::Commit.number(), [0])?;
     let is_refused = matches!(reply, Reply::Refused(_));
-    session.check("CONF-7", is_refused, || format!("a commit without a configuration was answered with {reply}"));
+    session.check("CONF-7", is_refused, || {
+        format!("a commit without a configuration was answered with {reply}")
+    });
     Ok(())
 }
 

@@ -55,19 +55,18 @@ impl Turned {
                 "the token is missing or outdated: open the whole address printed after `view:`, \
                  with ?token=...",
             ),
-            Self::NoFile => {
-                ("404 Not Found", "no such file: open the address printed after `view:`")
+            Self::NoFile => ("404 Not Found", "no such file: open the address printed after `view:`"),
+            Self::NoPage => {
+                ("426 Upgrade Required", "this address is the page's WebSocket, and is available")
             }
-            Self::NoPage => ("426 Upgrade Required", "this address is the page's WebSocket, and is available"),
             Self::Late => ("408 Request Timeout", "the request took longer than 5 s"),
             Self::Long => ("431 Request Header Fields Too Large", "the request is longer than 8 KiB"),
             Self::Crowded => {
                 ("503 Service Unavailable", "too many clients are connected without a request: try again")
             }
-            Self::Full => (
-                "503 Service Unavailable",
-                "16 pages are open, the maximum: close one and try again",
-            ),
+            Self::Full => {
+                ("503 Service Unavailable", "16 pages are open, the maximum: close one and try again")
+            }
         }
     }
 }

@@ -63,10 +63,7 @@ fn without_the_token_only_the_code_of_the_page_is_served() {
         for path in ["/", "/surface", "/live", "/no-such-file"] {
             let answer = get(&server, &format!("{path}{query}"));
             assert_eq!(status(&answer), "403", "{path}{query}: {answer}");
-            assert!(
-                answer.contains("\r\n\r\n403: the token is missing or outdated: open"),
-                "{answer}"
-            );
+            assert!(answer.contains("\r\n\r\n403: the token is missing or outdated: open"), "{answer}");
         }
         assert_eq!(page(&server, query).err(), Some(403), "{query}");
     }

@@ -136,7 +136,9 @@ pub(super) fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
         let claim = twin(session, serial, true);
         let at = session.say(&[claim])?;
         if at + Span::from_millis(20) >= end {
-            session.findings.not_tested("CLAIM-3", "claims with a higher serial number: the cell had stopped claiming");
+            session
+                .findings
+                .not_tested("CLAIM-3", "claims with a higher serial number: the cell had stopped claiming");
             break;
         }
         let came =
