@@ -164,8 +164,8 @@ fn documents_without_requirements_stay_short() {
     assert!(sum <= MAX_WORDS, "{sum} words; the longest pages: {:?}", &words[words.len() - 12..]);
 }
 
-/// Checks the comment before a block of commands: `<!-- not run: REASON -->`, or `<!-- run by: TEST -->` with the path of a
-/// test that names the page.
+/// Checks the comment before a block of commands: `<!-- not run: REASON -->`, or `<!-- run by: TEST -->` with the path
+/// of a test that names the page.
 fn check_mark(page: &str, mark: &str) -> Result<(), String> {
     let comment = mark.strip_prefix("<!-- ").and_then(|rest| rest.strip_suffix(" -->")).unwrap_or_default();
     if comment.strip_prefix("not run: ").is_some_and(|reason| !reason.trim().is_empty()) {

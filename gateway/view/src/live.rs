@@ -162,18 +162,19 @@ impl Live {
 
     /// Encodes the next snapshot: all values that change fast.
     ///
-    /// | bytes | what |
+    /// | bytes | content |
     /// |---|---|
     /// | 4 | its number, u32 |
     /// | 4 | joints J of the robot, u32 |
     /// | 4 | cells, u32 |
     /// | 4 | 0: a snapshot |
     /// | 8 | seconds of the run, or since the first frame, f64 |
-    /// | 12 J | of each joint position (rad or m), distributed torque, central torque (Nm or N), f32 |
+    /// | 12 J | for each joint: position (rad or m), distributed and central torque (Nm or N), f32 |
     /// | 8 for each cell | status u8, flags u8, force mN u16, proximity 2^-15 u16, temperature 0.01 °C i16 |
     ///
-    /// All are little-endian. The torques are those of the last epoch that is over. Status: 0 never heard, 1 quiet, 2 active, 3 stale, 4 dead. Flags: 1 without
-    /// parameters, 2 with others than the skin's, 4 measures, 8 halted, 16 pressed by a page, 32 stuck.
+    /// All values are little-endian. The torques are those of the last completed epoch. Status: 0 never heard, 1 quiet,
+    /// 2 active, 3 stale, 4 dead. Flags: 1 without parameters, 2 with parameters other than the skin's, 4 measures,
+    /// 8 halted, 16 pressed by a page, 32 stuck.
     pub fn snapshot(&mut self, now: Micros, pressed: &Pressed) -> Vec<u8> {
         self.number = self.number.wrapping_add(1);
         let joints = self.skin.robot.joints.len();

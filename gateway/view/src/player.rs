@@ -330,13 +330,13 @@ impl Player {
 
     /// Encodes the torques of the last seconds, little-endian:
     ///
-    /// | bytes | what |
+    /// | bytes | content |
     /// |---|---|
-    /// | 4 | how many positions were gone to, u32 |
+    /// | 4 | number of jumps, u32 |
     /// | 4 | joints J of the robot, u32 |
     /// | 4 | moments, u32 |
     /// | 4 | 1: a history |
-    /// | 8 + 8 J for each moment | s of the run, or since the first frame f64; of each joint distributed and central torque f32 |
+    /// | 8 + 8 J for each moment | s of the run, or since the first frame, f64; distributed and central torque of each joint, f32 |
     #[must_use]
     pub fn history(&self) -> Vec<u8> {
         let joints = self.skin.robot.joints.len();
