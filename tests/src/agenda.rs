@@ -8,7 +8,7 @@ use protocol::time::{Micros, Span};
 #[derive(Debug)]
 pub(crate) struct Agenda<E> {
     pub(crate) now: Micros,
-    /// By time, then by the order of entry; boxed, because a tree moves its values.
+    /// The events by time, then by the order of entry; boxed, because a tree moves its values.
     events: BTreeMap<(Micros, u64), Box<E>>,
     entered: u64,
 }

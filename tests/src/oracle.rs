@@ -54,7 +54,7 @@ pub struct Tally {
     pub frames: u64,
     /// Whole packets of other senders.
     pub packets: u64,
-    /// Those of them that are torques which count.
+    /// Whole packets that are torques which count.
     pub used: u64,
     /// Torques for an epoch that the same cell had answered already.
     pub repeated: u64,

@@ -74,10 +74,10 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Resul
 
 /// The estimates of all cells, each by itself.
 struct Seen {
-    /// By bus.
+    /// The motions of each bus' links.
     tables: Vec<Option<Table>>,
     lags: Vec<Lags>,
-    /// By cell.
+    /// The estimate of each cell.
     estimates: Vec<Option<Estimate>>,
 }
 

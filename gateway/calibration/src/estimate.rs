@@ -325,7 +325,7 @@ pub(crate) fn change(by_age: &Coefficients, moment: &Moment) -> [f64; 3] {
 /// of the newest one runs through a period again and again.
 #[derive(Clone, Debug)]
 pub(crate) struct Ages {
-    /// By distance in batches, in s².
+    /// The covariance by distance in batches, in s².
     covariance: Vec<f64>,
 }
 

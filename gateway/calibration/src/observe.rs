@@ -25,16 +25,16 @@ const LATEST: u32 = 100;
 /// The observations on all buses of a skin.
 #[derive(Clone, Debug)]
 pub struct Observations {
-    /// By bus.
+    /// The observations on each bus.
     pub buses: Vec<BusObservations>,
-    /// By cell of the skin, in the order of time.
+    /// The readings of each cell of the skin, in the order of time.
     pub cells: Vec<Vec<Reading>>,
 }
 
 /// The joints on one bus.
 #[derive(Clone, Debug)]
 pub struct BusObservations {
-    /// By broadcast, the positions in rad or m; `None` for a missing broadcast and at irregular times.
+    /// The positions at each broadcast in rad or m; `None` for a missing broadcast and at irregular times.
     pub joints: Vec<Option<[f64; MAX_JOINTS]>>,
     /// The gaps after which the next broadcast was not in time, in the order of time.
     pub gaps: Vec<Gap>,
@@ -43,7 +43,7 @@ pub struct BusObservations {
     reference: Central,
     revolute: Vec<bool>,
     nodes: Vec<Option<usize>>,
-    /// By epoch number, the newest broadcast with it.
+    /// The newest broadcast with each epoch number.
     epochs: Vec<Option<u32>>,
     /// The times of consecutive broadcasts.
     times: Vec<Micros>,

@@ -130,7 +130,7 @@ struct Candidate {
     pose: usize,
     step: Step,
     seconds: f64,
-    /// By probe cell.
+    /// The information on each probe cell.
     information: Vec<Information>,
 }
 

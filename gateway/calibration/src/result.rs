@@ -18,9 +18,9 @@ const ENOUGH: [f64; 2] = [0.02, 0.09];
 pub struct Calibration {
     /// The results for all cells together.
     pub summary: Summary,
-    /// By cell of the skin.
+    /// The result for each cell of the skin.
     pub cells: Vec<CellResult>,
-    /// By joint of the robot, if requested.
+    /// The zero offset of each joint of the robot, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_offsets: Option<Vec<ZeroOffset>>,
 }
@@ -30,9 +30,9 @@ pub struct Calibration {
 pub struct Summary {
     /// The number of cells of the skin.
     pub cells: usize,
-    /// Those of them with a pose that can be used.
+    /// The number of cells with a pose that can be used.
     pub determined: usize,
-    /// Those of them that are doubtful.
+    /// The number of cells with a diagnosis.
     pub troubled: usize,
     /// The median of the 95 % radius of positions, in mm; `None` without a pose that can be used.
     pub position_mm: Option<f64>,

@@ -16,7 +16,7 @@ pub(crate) struct Table {
     pub(crate) arm: Arm,
     /// The ages of readings relative to their joints.
     pub(crate) lags: Lags,
-    /// By joint, where 0 is the base, then by broadcast. `None` where positions nearby are missing.
+    /// The motion by joint, where 0 is the base, then by broadcast; `None` where positions nearby are missing.
     links: Vec<Vec<Option<Moment>>>,
 }
 

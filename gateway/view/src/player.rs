@@ -183,7 +183,7 @@ impl Player {
         last.max(self.first)
     }
 
-    /// Plays at a speed from now on, clamped to [`SPEEDS`]; 1 if it is not finite.
+    /// Plays at a speed from now on, clamped to 0.01 to 100; 1 if it is not finite.
     pub fn play(&mut self, speed: f64) {
         let [min, max] = SPEEDS;
         self.speed = if speed.is_finite() { speed.clamp(min, max) } else { 1.0 };

@@ -229,7 +229,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     });
     assert_eq!(
         of(5).refusal(1),
-        "skinbus: other cells are on vcan0: 3; joints and halts of the test reach them too: take them away, or say \
+        "skinbus: other cells are on vcan0: 3; joints and halts of the test reach them too: remove them, or say \
          --others-will-stop"
     );
     // A busy machine may keep the cell waiting for longer than its time to answer.

@@ -61,7 +61,7 @@ pub struct BusSaid {
     pub load: Option<f64>,
     /// Epochs in which at least one reply was due.
     pub epochs_due: u64,
-    /// Those of them in which all replies came in time.
+    /// Epochs in which all replies due came in time.
     pub epochs_complete: u64,
     /// Replies due.
     pub due: u64,
