@@ -172,7 +172,7 @@ fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
         let cell = CellId::new(mutants::NODE.into()).unwrap();
         let why = survey.check(cell, "vcan0", None, false).unwrap_err();
         assert!(why.starts_with("cell 12 on vcan0 fails SEND-1: of "), "{why}");
-        assert!(why.contains("none is a packet, as in 40C#") && why.contains(mistake), "{mistake}: {why}");
+        assert!(why.contains("is a valid packet, for example 40C#") && why.contains(mistake), "{mistake}: {why}");
     }
 }
 

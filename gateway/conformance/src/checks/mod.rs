@@ -114,7 +114,7 @@ const RESERVE: Span = Span::from_millis(20_000);
 /// The parts of requirements that cannot be tested from the bus of any cell, with the reason.
 const BEYOND: &[(&str, &str)] = &[
     ("CLAIM-8", "wires cannot be reached from the bus"),
-    ("TIME-3", "tested only for torques, answers and pages, not for packets of the tree"),
+    ("TIME-3", "the order of packets of the tree"),
     ("CONF-7", "a failing flash: the bus cannot cause it"),
     ("CONF-8", "damaged flash: the bus cannot cause it"),
     ("BEAT-1", "after a hang: the bus cannot cause it"),
