@@ -8,7 +8,7 @@ import json
 import pathlib
 import sys
 
-# What, above, below, whether more is better, what it should be.
+# Name, benchmark, reference, and the required ratio, if there is one.
 WALL = [
     ("candump reader: lines/s, of the crate socketcan's", "candump/socketcan", "candump/this reader", ">= 3"),
     ("wrench kernel: time, of nalgebra's in f64", "jacobian/wrench", "jacobian/nalgebra f64", ""),
@@ -50,7 +50,7 @@ def instructions(target):
 def main():
     target = pathlib.Path(sys.argv[1] if len(sys.argv) > 1 else "target")
     if not target.is_dir():
-        sys.exit(f"ratios: {target} is no folder; say where cargo builds")
+        sys.exit(f"ratios: {target} is not a folder; name cargo's target folder")
     lines = []
     for rows, values, unit in ((COUNTED, instructions(target), ""), (WALL, wall_times(target), " ns")):
         for what, above, below, bar in rows:
@@ -58,7 +58,7 @@ def main():
                 ratio = values[above] / values[below]
                 lines.append((what, f"{ratio:.3g}", bar, f"{values[above]:.0f} / {values[below]:.0f}{unit}"))
     if not lines:
-        sys.exit(f"ratios: no benchmark has run below {target}; run `cargo bench --workspace`")
+        sys.exit(f"ratios: there are no benchmark results below {target}; run `cargo bench --workspace`")
     print(f"\n{'ratio':<58} {'':>8}  {'bar':<7} of")
     for what, ratio, bar, of in lines:
         print(f"{what:<58} {ratio:>8}  {bar:<7} {of}")

@@ -1,4 +1,4 @@
-"""Makes what the lab machine boots from: a stock Debian kernel and a small initramfs.
+"""Creates the boot files of the lab machine: a stock Debian kernel and a small initramfs.
 
 Both are kept in the cache folder, under a name made of the kernel package's
 version and a hash of this file and of `init`:
@@ -35,7 +35,7 @@ NEEDED = {
     "dpkg-deb": "dpkg",
 }
 
-# What `init` loads: the way to the host, then CAN. `modules.dep` adds the rest.
+# The modules that `init` loads: the connection to the host, then CAN. `modules.dep` adds their dependencies.
 MODULES = ["virtio_pci", "virtio_console", "9p", "9pnet_virtio",
            "can", "can-raw", "can-gw", "vcan", "vxcan", "kvaser_pci"]
 
@@ -52,7 +52,7 @@ def which(program):
 
 
 def need_packages(say):
-    """Installs the missing packages, or says in one line which they are."""
+    """Installs the missing packages, or names them in one line."""
     missing = [package for program, package in NEEDED.items() if not which(program)]
     if not missing:
         return
@@ -71,7 +71,7 @@ def need_packages(say):
 
 
 def apt_update(say):
-    """A failed update is not yet an error: the old lists may do."""
+    """A failed update is not yet an error: the old lists may suffice."""
     if os.geteuid() == 0:
         say("apt-get update")
         subprocess.run(["apt-get", "update", "-q"], stdin=subprocess.DEVNULL, capture_output=True, check=False)
@@ -183,7 +183,7 @@ def initramfs(root):
     selected = set()
     for name in MODULES:
         if name.replace("-", "_") not in depends:
-            raise LabError(f"the kernel {modules.name} has no module {name}; a generic Debian kernel (-amd64) has, a -cloud one has not")
+            raise LabError(f"the kernel {modules.name} has no module {name}; use a generic Debian kernel (-amd64), not a -cloud one")
         path, others, _ = depends[name.replace("-", "_")]
         selected |= {path, *others}
     for path in selected:
@@ -194,7 +194,7 @@ def initramfs(root):
 
 
 def has_interpreter(elf):
-    """Whether a 64-bit ELF has a PT_INTERP program header, so needs libraries to run."""
+    """True if a 64-bit ELF has a PT_INTERP program header, and so needs libraries to run."""
     (offset,) = struct.unpack_from("<Q", elf, 0x20)
     size, count = struct.unpack_from("<HH", elf, 0x36)
     return any(struct.unpack_from("<I", elf, offset + n * size) == (3,) for n in range(count))

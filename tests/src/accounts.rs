@@ -1,4 +1,4 @@
-//! Invariants of every run, with any faults.
+//! The invariants of every run, with any faults.
 
 use model::table::{Event, Replies, Uplink};
 use protocol::can::Format;
@@ -9,7 +9,7 @@ use crate::bench::Bench;
 /// Asserts that every account of a finished run adds up.
 ///
 /// # Panics
-/// When one does not; the text says which, of which cell.
+/// Panics if an account does not add up; the message names the account and the cell.
 pub fn check(bench: &Bench) {
     cells(bench);
     torques(bench);
@@ -24,7 +24,7 @@ pub fn check(bench: &Bench) {
     assert_eq!(counters.epochs, bench.oracle.tally.broadcasts, "every broadcast is an epoch that ends");
 }
 
-/// Each cell's two accounts.
+/// Checks the two accounts of each cell.
 fn cells(bench: &Bench) {
     for (place, cell) in bench.gateway.table.cells().iter().enumerate() {
         let (uplink, replies, node) = (cell.uplink(), cell.replies, cell.node);
@@ -58,7 +58,7 @@ fn is_fd(bench: &Bench) -> bool {
     bench.skin.buses.first().is_some_and(|bus| bus.format == Format::Fd)
 }
 
-/// Every torque that came is used, or counted by the reason why not.
+/// Checks that every torque that arrived is used, or counted with a reason.
 fn torques(bench: &Bench) {
     let (table, tally) = (&bench.gateway.table, bench.oracle.tally);
     let replies = Replies::total(table.cells().iter().map(|cell| cell.replies));
@@ -72,14 +72,14 @@ fn torques(bench: &Bench) {
     }
 }
 
-/// Every frame that came is somewhere.
+/// Checks that every frame that arrived is counted somewhere.
 fn frames(bench: &Bench) {
     let (table, tally) = (&bench.gateway.table, bench.oracle.tally);
     let counters = table.counters();
     let count = |event| counters.events(event);
     let by_kind: u64 = Kind::ALL.into_iter().map(|kind| counters.received(kind) + counters.sent(kind)).sum();
     let elsewhere = count(Event::Foreign) + count(Event::ErrorFrame);
-    // Turned bits may make an identifier that nobody uses, also of a frame that is cut as well.
+    // Flipped bits may produce an unused identifier, also in a frame that is truncated.
     let foreign = count(Event::Foreign);
     if tally.babbled == 0 {
         assert!(
@@ -100,7 +100,7 @@ fn frames(bench: &Bench) {
         assert_eq!(count(Event::Incomplete), 0);
         return;
     }
-    // Two segments are a packet; an incomplete one is one segment, and each identifier may have one waiting.
+    // A packet has two segments; an incomplete one has one, and one may be waiting for each identifier.
     let odd = count(Event::Incomplete) + count(Event::Length);
     let segments = 2 * (by_kind - odd) + odd;
     let waiting = tally.frames - elsewhere - segments;

@@ -1,14 +1,14 @@
-//! What is to happen, in the order of time, on one clock that only moves when told to.
+//! Future events in the order of time, on a simulated clock.
 
 use std::collections::BTreeMap;
 
 use protocol::time::{Micros, Span};
 
-/// Events that are to come, and what time it is.
+/// The future events, and the current time.
 #[derive(Debug)]
 pub(crate) struct Agenda<E> {
     pub(crate) now: Micros,
-    /// By time, and of one time in the order in which they were entered; boxed, since a tree moves what it holds.
+    /// The events by time, then by the order of entry; boxed, because a tree moves its values.
     events: BTreeMap<(Micros, u64), Box<E>>,
     entered: u64,
 }
@@ -20,23 +20,23 @@ impl<E> Default for Agenda<E> {
 }
 
 impl<E> Agenda<E> {
-    /// Something happens at a time; now, where that has passed.
+    /// Enters an event at a time, or now if that has passed.
     pub(crate) fn enter(&mut self, at: Micros, event: E) {
         self.entered += 1;
         self.events.insert((at.max(self.now), self.entered), Box::new(event));
     }
 
-    /// Something happens in a while.
+    /// Enters an event after a delay.
     pub(crate) fn enter_in(&mut self, span: Span, event: E) {
         self.enter(self.now + span, event);
     }
 
-    /// When something happens next.
+    /// Returns the time of the next event.
     pub(crate) fn next(&self) -> Option<Micros> {
         self.events.keys().next().map(|(at, _)| *at)
     }
 
-    /// The next event up to a time, which it then is.
+    /// Removes the next event up to a time, and advances the clock to it.
     pub(crate) fn take_until(&mut self, until: Micros) -> Option<E> {
         let entry = self.events.first_entry().filter(|entry| entry.key().0 <= until)?;
         let ((at, _), event) = entry.remove_entry();

@@ -1,4 +1,4 @@
-//! Which crate may use which: the graph of `docs/explanation/architecture.md`.
+//! The allowed dependencies between crates: the graph of `docs/explanation/architecture.md`.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -12,10 +12,10 @@ use syn::{Attribute, Item};
 
 const DOCUMENT: &str = include_str!("../../docs/explanation/architecture.md");
 
-/// Who may use the cell's code directly: the gateway knows of cells what is on the bus.
+/// The crates that may use the cell's code directly. The gateway knows cells only by their frames.
 const USES_CELLS: [&str; 3] = ["paper", "reference", "skinbus-tests"];
 
-/// The crates of the document's graph, which has no cycle, and what the arrows of each lead to.
+/// Returns the crates of the document's graph, with the targets of their arrows; panics if the graph has a cycle.
 fn arrows() -> BTreeMap<&'static str, BTreeSet<&'static str>> {
     let (_, graph) = DOCUMENT.split_once("```mermaid\n").unwrap();
     let mut arrows = BTreeMap::<_, BTreeSet<_>>::new();
@@ -34,13 +34,13 @@ fn arrows() -> BTreeMap<&'static str, BTreeSet<&'static str>> {
     arrows
 }
 
-/// What an arrow leads to, and what that may use.
+/// Returns everything that arrows lead to, directly or indirectly.
 fn reach<'a>(arrows: &'a BTreeMap<&str, BTreeSet<&str>>, from: &str) -> BTreeSet<&'a str> {
     let direct = arrows[from].iter();
     direct.flat_map(|&to| reach(arrows, to).into_iter().chain([to])).collect()
 }
 
-/// Asks cargo about the workspace.
+/// Returns cargo's metadata of the workspace.
 fn metadata() -> serde_json::Value {
     let cargo = Command::new(env!("CARGO"))
         .args(["metadata", "--no-deps", "--format-version", "1", "--offline", "--manifest-path"])
@@ -51,8 +51,8 @@ fn metadata() -> serde_json::Value {
     serde_json::from_slice(&cargo.stdout).unwrap()
 }
 
-/// Lists the crates of the workspace, and what each uses of the others, its tests included. One may be its own, so that its
-/// tests have features that its programs have not.
+/// Returns the crates of the workspace, each with the other crates that it or its tests use. A crate may be listed
+/// under itself, if its tests enable features that its programs do not.
 fn used() -> BTreeMap<String, BTreeSet<String>> {
     let metadata = metadata();
     let packages = metadata["packages"].as_array().unwrap();
@@ -96,7 +96,7 @@ fn crates_use_what_the_documents_arrows_lead_to_only() {
     }
 }
 
-/// The feature `oracle` of `cell-node` is what cells are compared with, and nothing that they compute with.
+/// The feature `oracle` of `cell-node` is a reference for comparison; cells must not compute with it.
 #[test]
 fn only_the_papers_experiments_and_tests_have_the_cells_oracle() {
     let metadata = metadata();
@@ -114,7 +114,7 @@ fn only_the_papers_experiments_and_tests_have_the_cells_oracle() {
     assert_eq!(having, ["paper"]);
 }
 
-/// Rust sources of the workspace, each with its path from the top.
+/// Returns the Rust sources of the workspace, each with its path from the top.
 fn sources() -> Vec<(String, String)> {
     fn walk(folder: &Path, found: &mut Vec<PathBuf>) {
         for entry in fs::read_dir(folder).unwrap() {
@@ -148,7 +148,7 @@ fn no_file_is_longer_than_500_lines() {
     assert_eq!(long, [], "split them by what they are about");
 }
 
-/// What is printed as JSON has as many fields as that has keys.
+/// A struct that is printed as JSON has as many fields as the JSON has keys.
 #[test]
 fn no_struct_has_more_than_20_fields_but_what_is_serialised() {
     fn wide(items: &[Item], found: &mut Vec<(String, usize)>) {
@@ -177,7 +177,7 @@ fn no_struct_has_more_than_20_fields_but_what_is_serialised() {
     assert_eq!(found, Vec::<String>::new(), "give parts of them owners");
 }
 
-/// `std::thread::spawn` and a scope's `spawn` panic where the system has no thread: `thread::Builder` gives an error.
+/// `std::thread::spawn` and a scope's `spawn` panic if the system has no thread; `thread::Builder` returns an error.
 #[test]
 fn programs_start_threads_where_the_error_can_be_told() {
     let of_tests =
@@ -186,7 +186,7 @@ fn programs_start_threads_where_the_error_can_be_told() {
     for (name, text) in
         sources().into_iter().filter(|(name, _)| !of_tests(name) && !name.starts_with("tests/"))
     {
-        // Unit tests come last in a file.
+        // Unit tests are at the end of a file.
         let program = text.split("#[cfg(test)]\nmod tests {").next().unwrap_or_default();
         let lines =
             program.lines().filter(|line| line.contains("thread::spawn(") || line.contains("scope.spawn("));

@@ -3,14 +3,14 @@
 //! ```text
 //!   Send ─> wire faults ─> a place in the order ─┬─> faults of receiver 1 ─> Deliver ─> Send ...
 //!                                                └─> faults of receiver 2 ─> Deliver
-//!   Wake (a cell's timer), Tick and Look (the gateway's), Act (what a test does at a time)
+//!   Wake (a cell's timer), Tick and Look (the gateway's), Act (an action of a test)
 //! ```
 //!
-//! A receiver's frames come in the wire's order, however long each takes, unless a fault delays or
-//! reorders them. Frames that nobody's filters let through are not delivered.
+//! A receiver's frames arrive in the wire's order, however long each takes, unless a fault delays or reorders them.
+//! Frames that pass no receiver's filters are not delivered.
 //!
-//! The wire takes no time unless [`Bench::on_a_bus`] gives it bit rates: then a frame waits for its place by arbitration, takes
-//! the time of its bits, and is everywhere at its end.
+//! The wire takes no time unless [`Bench::on_a_bus`] sets bit rates. Then a frame waits for its place by arbitration,
+//! takes the time of its bits, and arrives everywhere at its end.
 
 mod wire;
 
@@ -40,10 +40,10 @@ use wire::{Delivery, Inlet, Sent};
 
 pub use wire::OnTheWire;
 
-/// How often the gateway lets time pass, and its script is looked at.
+/// The interval at which the gateway advances the time, and checks its script.
 const LOOK: Span = Span::from_millis(4);
 
-/// What a test does at a time.
+/// An action of a test at a time.
 #[derive(Clone, Copy, Debug)]
 pub enum Act {
     /// A cell loses its power.
@@ -52,13 +52,13 @@ pub enum Act {
     Start(usize),
     /// A cell hangs.
     Hang(usize),
-    /// A cell that hung goes on.
+    /// A hung cell continues.
     GoOn(usize),
-    /// The gateway sends this.
+    /// The gateway sends a message.
     Say(Message),
-    /// Somebody at a shell sends this.
+    /// Another client sends a message.
     Inject(Message),
-    /// Somebody sends this frame, whatever it is.
+    /// Another client sends any frame.
     Babble(Frame),
 }
 
@@ -69,25 +69,25 @@ enum Event {
     Wake(usize),
     Tick,
     Look,
-    /// The real bus has got on.
+    /// The model of the real bus has to be advanced.
     Bus,
     Act(Box<Act>),
 }
 
-/// A whole bench.
+/// A complete bench.
 #[derive(Debug)]
 pub struct Bench {
     /// The skin's description.
     pub skin: Skin,
     /// The gateway.
     pub gateway: Gateway,
-    /// The cells: first the skin's, in its order, then those of [`Bench::add`].
+    /// The cells: first those of the skin, in its order, then those of [`Bench::add`].
     pub cell_slots: Vec<CellSlot>,
     /// The faults.
     pub faults: Faults,
     /// A second, simpler gateway with the same input.
     pub oracle: Oracle,
-    /// All that stood on the wire.
+    /// All frames that were on the wire.
     pub wire: Vec<OnTheWire>,
     agenda: Agenda<Event>,
     format: Format,
@@ -104,16 +104,16 @@ pub struct Bench {
 }
 
 impl Bench {
-    /// A skin that nobody touches; its cells are switched on at time 0.
+    /// Creates a bench of a skin without touches; its cells are switched on at time 0.
     #[must_use]
     pub fn new(skin: &Skin, seed: u64) -> Self {
         Self::with(skin, &Scenario::idle(Span::from_millis(0)), seed, |_| Micros(0))
     }
 
-    /// A skin, what happens to it, and when each cell is switched on.
+    /// Creates a bench of a skin with a scenario; `start` returns the time at which each cell is switched on.
     ///
     /// # Panics
-    /// When the skin has no bus, or an external controller.
+    /// Panics if the skin has no bus, or an external controller.
     #[must_use]
     pub fn with(skin: &Skin, scenario: &Scenario, seed: u64, start: impl Fn(usize) -> Micros) -> Self {
         let mut gateway = Gateway::new(skin, scenario);
@@ -146,26 +146,26 @@ impl Bench {
         bench
     }
 
-    /// The same on a real bus with these bit rates, from now on.
+    /// Puts the bench on a real bus with these bit rates, from now on.
     #[must_use]
     pub fn on_a_bus(mut self, rates: BitRates) -> Self {
         self.real = Some(RealBus::new(rates));
         self
     }
 
-    /// What was asked of the real bus, in order of time.
+    /// Returns the frames requested on the real bus, in order of time.
     #[must_use]
     pub fn requested(&self) -> &[Requested] {
         self.real.as_ref().map_or(&[], |real| &real.requested)
     }
 
-    /// What has been on the real bus, in order of time; a tag is a place in [`Bench::requested`].
+    /// Returns the transmissions on the real bus, in order of time; a tag is an index into [`Bench::requested`].
     #[must_use]
     pub fn attempts(&self) -> &[Attempt] {
         self.real.as_ref().map_or(&[], |real| &real.attempts)
     }
 
-    /// One more cell, switched off; returns its slot.
+    /// Adds a cell, switched off, and returns its slot.
     pub fn add(&mut self, identity: Identity, flash: Flash) -> usize {
         let cell_slot = self.cell_slots.len();
         for id in identity.hears().into_iter().flatten() {
@@ -176,55 +176,55 @@ impl Bench {
         cell_slot
     }
 
-    /// What time it is.
+    /// Returns the current time.
     #[must_use]
     pub const fn now(&self) -> Micros {
         self.agenda.now
     }
 
-    /// From one broadcast to the next.
+    /// Returns the interval of broadcasts.
     #[must_use]
     pub fn epoch(&self) -> Span {
         Span(self.gateway.period().0 * u64::from(self.skin.timing.ticks_per_broadcast))
     }
 
-    /// From now on this goes wrong.
+    /// Adds a fault from now on.
     pub fn fault(&mut self, fault: Fault) {
         self.faults.add(fault);
     }
 
-    /// Something is done at a time.
+    /// Schedules an action.
     pub fn at(&mut self, at: Micros, act: Act) {
         self.agenda.enter(at, Event::Act(Box::new(act)));
     }
 
-    /// Something is done now.
+    /// Performs an action now.
     pub fn act(&mut self, act: Act) {
         self.at(self.agenda.now, act);
         self.run(Span(0));
     }
 
-    /// The gateway presses a cell, by its place in the skin, from the next joints on.
+    /// Makes the gateway press a cell, given by its index in the skin, from the next joints on.
     ///
     /// # Panics
-    /// When the skin has no such cell.
+    /// Panics if the skin does not have the cell.
     pub fn press(&mut self, place: usize, newtons: f64) {
         self.press_from(place, newtons, From::Next);
     }
 
-    /// The gateway presses a cell from some joints on.
+    /// Makes the gateway press a cell from given joints on.
     ///
     /// # Panics
-    /// When the skin has no such cell.
+    /// Panics if the skin does not have the cell.
     pub fn press_from(&mut self, place: usize, newtons: f64, from: From) {
         let message = self.gateway.stimulus(place, from, touch(newtons)).expect("a cell of the skin");
         self.act(Act::Say(message));
     }
 
-    /// Runs until every running cell of the skin can be expected to answer.
+    /// Runs until every running cell of the skin is expected to answer.
     ///
     /// # Panics
-    /// When that takes more than two seconds.
+    /// Panics if that takes more than two seconds.
     pub fn settle(&mut self) {
         let give_up = self.agenda.now + Span::from_millis(2_000);
         while !self.is_settled() {
@@ -239,7 +239,7 @@ impl Bench {
         started && cells.all(|(cell_slot, cell)| !cell_slot.runs() || cell.is_ready())
     }
 
-    /// The loop begins to tick now.
+    /// Starts the ticks of the loop.
     pub fn begin(&mut self) {
         if !self.ticking {
             self.ticking = true;
@@ -255,12 +255,12 @@ impl Bench {
         self
     }
 
-    /// Runs for so many epochs.
+    /// Runs for a number of epochs.
     pub fn run_epochs(&mut self, epochs: u64) {
         self.run(Span(self.epoch().0 * epochs));
     }
 
-    /// Runs for some time.
+    /// Runs for a time.
     pub fn run(&mut self, span: Span) {
         let until = self.agenda.now + span;
         while let Some(event) = self.agenda.take_until(until) {
@@ -269,7 +269,7 @@ impl Bench {
         self.agenda.now = until;
     }
 
-    /// The loop ends; the cells say their last words, as at the end of every run.
+    /// Stops the loop; the cells send their last packets, as at the end of every run.
     pub fn finish(&mut self) {
         self.ticking = false;
         self.run(Span(2 * self.epoch().0));
@@ -347,7 +347,8 @@ impl Bench {
     fn wake(&mut self, cell_slot: usize) {
         let now = self.agenda.now;
         let Some(there) = self.cell_slots.get_mut(cell_slot) else { return };
-        // A timer that has moved since wakes nobody: it would set the current one a second time, and so for ever.
+        // A timer that has moved since must not wake the cell: it would set the current timer a second time, and so on
+        // for ever.
         if there.wake.take_if(|at| *at == now).is_none() {
             return;
         }
@@ -355,7 +356,7 @@ impl Bench {
         self.sends(cell_slot, &packets);
     }
 
-    /// A cell's packets go out when it has thought, and its next timer is set.
+    /// Sends the packets of a cell after its thinking time, and sets its next timer.
     fn sends(&mut self, cell_slot: usize, packets: &[Packet]) {
         let Some(there) = self.cell_slots.get_mut(cell_slot) else { return };
         let (life, at) = (there.lives, self.agenda.now + there.thinks);
@@ -376,7 +377,7 @@ impl Bench {
         self.packets(Party::Gateway, 0, self.agenda.now, &packets);
     }
 
-    /// Everything that this run was, as text: two runs are the same if these are.
+    /// Returns the complete run as text: two runs are equal if their transcripts are.
     #[must_use]
     pub fn transcript(&self) -> String {
         let lines = self.wire.iter().map(|it| format!("{} {:?} {:?}\n", it.at.0, it.from, it.frame));
@@ -384,14 +385,14 @@ impl Bench {
         lines.chain([end]).collect()
     }
 
-    /// The complete torques of one cell on the wire: epoch and words, in their order.
+    /// Returns the complete torques of one cell on the wire, in order: epoch and words.
     #[must_use]
     pub fn torques(&self, place: usize) -> Vec<(u8, [i16; WORDS])> {
         self.oracle.torques(place)
     }
 }
 
-/// What a cell feels when it is pressed with so many newtons.
+/// Returns the sensor values of a cell that is pressed with a force.
 #[must_use]
 pub fn touch(newtons: f64) -> SkinSensors {
     let contact: [Q5_10; 3] = contact_words(newtons);

@@ -1,35 +1,35 @@
-//! The rules of `CAN_RAW` as a table, to be held against this bus and against a real kernel.
+//! The rules of `CAN_RAW` as a table, which the embedded bus and a real kernel must follow.
 
 use protocol::bus::Filter;
 use protocol::can::{ERROR, EXTENDED, EXTENDED_MASK, Frame, REMOTE};
 
-/// One client with these subscriptions, one frame, and whether the client receives it.
+/// A client with subscriptions, a frame, and the expected result.
 #[derive(Clone, Debug)]
 pub struct Case {
-    /// What is shown, as a sentence.
+    /// The rule, as a sentence.
     pub what: &'static str,
     /// The client's filters.
     pub filters: Vec<Filter>,
-    /// Whether it wants its own frames.
+    /// True if the client requests its own frames.
     pub own_frames: bool,
-    /// Whether it wants CAN FD frames.
+    /// True if the client requests CAN FD frames.
     pub fd: bool,
-    /// Which error frames it wants.
+    /// The error frames that the client requests.
     pub error_mask: u32,
-    /// Whether the client itself sends the frame; else another does.
+    /// True if the client itself sends the frame, false if another client does.
     pub from_self: bool,
-    /// What is sent.
+    /// The frame.
     pub frame: Frame,
-    /// Whether the client receives it: once, whatever the number of filters that match.
+    /// True if the client receives the frame: once, also if several filters match.
     pub received: bool,
 }
 
-/// A datagram that no `CAN_RAW` socket sends.
+/// A datagram that a `CAN_RAW` socket must not send.
 #[derive(Clone, Debug)]
 pub struct Refused {
-    /// What is wrong with it.
+    /// The defect.
     pub what: &'static str,
-    /// Whether the sender opened the bus for CAN FD.
+    /// True if the sender opened the bus for CAN FD.
     pub fd: bool,
     /// The bytes.
     pub datagram: Vec<u8>,
@@ -53,7 +53,7 @@ fn remote(id: u32) -> Frame {
     Frame::remote(id, 0).expect("nothing fits")
 }
 
-/// Every rule, each with what passes and what does not.
+/// Returns all rules, each with frames that pass and frames that do not.
 pub fn cases() -> Vec<Case> {
     let exact = |id| Filter { id, mask: Filter::EXACT_MASK };
     let masked = |id, mask| Filter { id, mask };
@@ -234,7 +234,7 @@ pub fn cases() -> Vec<Case> {
         },
         Case {
             error_mask: EXTENDED_MASK,
-            ..case("an error frame of no class is received by nobody", &all, classic(ERROR), false)
+            ..case("an error frame without a class is not received", &all, classic(ERROR), false)
         },
         case("an exact filter receives no error frame", &[exact(0x4)], classic(ERROR | 0x4), false),
         case("the error flag in a filter's identifier inverts it", &[exact(0x4 | ERROR)], classic(0x5), true),
@@ -294,7 +294,7 @@ pub fn cases() -> Vec<Case> {
         Case {
             from_self: true,
             own_frames: true,
-            ..case("who wants nothing gets no own frames", &[], classic(2), false)
+            ..case("a client without filters gets no own frames", &[], classic(2), false)
         },
         Case {
             from_self: true,
@@ -328,7 +328,7 @@ pub fn cases() -> Vec<Case> {
     ]
 }
 
-/// Every datagram that is refused.
+/// Returns all datagrams that are refused.
 pub fn refused() -> Vec<Refused> {
     let sized = |what, size| Refused { what, fd: true, datagram: vec![0; size] };
     let long = |what, frame: Frame, len: u8| {

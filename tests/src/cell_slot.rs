@@ -1,4 +1,4 @@
-//! The place of one cell: the real [`Node`] with what a process around it does.
+//! The slot of one cell: the real [`Node`], with the behaviour of the process around it.
 
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
@@ -10,37 +10,37 @@ use protocol::time::{Micros, Span};
 
 use crate::life::Life;
 
-/// Frames that a shell takes from its socket at once, before it sends what they lead to.
+/// The number of frames that the shell reads from its socket at once, before it sends the results.
 const BATCH: usize = 64;
 
-/// A frame that waits in a socket, and when it stood on the wire.
+/// A frame that waits in a socket, with its time on the wire.
 pub(crate) type Waiting = (Micros, Frame);
 
-/// A cell, or the place for one.
+/// A cell, or an empty slot for one.
 #[derive(Debug)]
 pub struct CellSlot {
     /// Its identity.
     pub identity: Identity,
-    /// What its flash holds.
+    /// The content of its flash.
     pub flash: Flash,
-    /// From receiving something to answering it.
+    /// The time from receiving a frame to answering it.
     pub thinks: Span,
-    /// How often it was switched on: packets of an earlier life are not this one's.
+    /// The number of starts. Packets of an earlier life do not belong to the present one.
     pub lives: u32,
-    /// Each of its torques has the words of the first one, as long as this is set.
+    /// While true, each of its torques has the words of the first one.
     pub is_stuck: bool,
     first: Option<Words>,
     format: Format,
-    /// While it hangs, frames gather in its socket.
+    /// While the cell hangs, frames collect in its socket.
     life: Life<Waiting>,
-    /// The serial number of another cell with its node id.
+    /// The serial number of the cell to which it gave way.
     gave_up: Option<u32>,
-    /// When it wants to be woken.
+    /// The time of its next timer.
     pub(crate) wake: Option<Micros>,
 }
 
 impl CellSlot {
-    /// A cell that is not switched on yet.
+    /// Creates a cell that is not switched on yet.
     #[must_use]
     pub const fn new(identity: Identity, flash: Flash, format: Format) -> Self {
         let thinks = Span(30);
@@ -58,25 +58,25 @@ impl CellSlot {
         }
     }
 
-    /// The cell, unless it is off or gave up.
+    /// Returns the cell, unless it is off or gave way.
     #[must_use]
     pub const fn node(&self) -> Option<&Node> {
         self.life.node()
     }
 
-    /// The serial number of the cell that it gave way to.
+    /// Returns the serial number of the cell that it gave way to.
     #[must_use]
     pub const fn gave_up(&self) -> Option<u32> {
         self.gave_up
     }
 
-    /// Whether it works.
+    /// Returns true if it works.
     #[must_use]
     pub const fn runs(&self) -> bool {
         self.life.runs()
     }
 
-    /// A packet as it sends it.
+    /// Returns a packet as the cell sends it.
     pub(crate) fn sent(&mut self, packet: Packet) -> Packet {
         if !self.is_stuck || packet.id.kind != Kind::Torque {
             return packet;
@@ -84,14 +84,14 @@ impl CellSlot {
         Packet { words: *self.first.get_or_insert(packet.words), ..packet }
     }
 
-    /// Switches it on; a simulated cell obeys stimuli from the start.
+    /// Switches it on. A simulated cell obeys stimuli from the start.
     pub(crate) fn start(&mut self, now: Micros) {
         self.lives += 1;
         self.life = Life::Runs(Box::new(Node::new(self.identity, self.format, &self.flash, true, now)));
         (self.gave_up, self.wake) = (None, None);
     }
 
-    /// Switches it off: what it knew is gone, but for its flash.
+    /// Switches it off. Only its flash remains.
     pub(crate) fn kill(&mut self) {
         (self.life, self.gave_up) = (Life::Off, None);
     }
@@ -100,7 +100,7 @@ impl CellSlot {
         self.life.hang();
     }
 
-    /// It goes on after a hang, as the shell does: timers first, then what has gathered, a batch at a time.
+    /// Continues after a hang, as the shell does: timers first, then the collected frames, batch by batch.
     pub(crate) fn go_on(&mut self, now: Micros) -> Vec<Packet> {
         let Some(mut waiting) = self.life.go_on() else { return Vec::new() };
         let mut packets = self.time(now);
@@ -111,7 +111,7 @@ impl CellSlot {
         packets
     }
 
-    /// Lets time pass; returns what it sends.
+    /// Advances the time, and returns the packets to send.
     pub(crate) fn time(&mut self, now: Micros) -> Vec<Packet> {
         if let Life::Runs(node) = &mut self.life {
             node.handle_timeout(now);
@@ -119,7 +119,7 @@ impl CellSlot {
         self.sends()
     }
 
-    /// Takes a frame that stood on the wire at `stood`; returns what it sends.
+    /// Receives a frame that was on the wire at `stood`, and returns the packets to send.
     pub(crate) fn hear(&mut self, now: Micros, stood: Micros, frame: Frame) -> Vec<Packet> {
         if let Life::Hangs(_, waiting) = &mut self.life {
             waiting.push_back((stood, frame));

@@ -1,13 +1,14 @@
-//! Circles of files: files of one crate that use each other in a ring, so that none of them can be read or changed alone.
+//! Circular dependencies between files: files of one crate that use each other in a circle, so that none can be read or
+//! changed alone.
 //!
 //! ```text
-//!   files ─> tokens: paths, imports ─> modules: arrows to what defines a name ─> circles
+//!   files ─> tokens: paths, imports ─> modules: arrows to definitions ─> circles
 //! ```
 //!
-//! An arrow leads from a file to each file that defines a name it uses; re-exports, renamed ones and globs too, are followed
-//! to the definition. A module and those inside it count as one place, so arrows between them are left out. Unit tests are
-//! too. Methods are called without the name of the file that has them: who writes those of one type in several files ties
-//! these together unseen.
+//! An arrow leads from a file to each file that defines a name it uses; re-exports, renamed ones and globs too, are
+//! followed to the definition. A module and the modules inside it count as one place, so arrows between them are left
+//! out, and so are unit tests. Method calls do not name the file that defines the method. The methods of one type in
+//! several files can therefore form circles that are not found.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(
@@ -25,13 +26,13 @@ use std::path::Path;
 
 use modules::Modules;
 
-/// Circles that stay, each with the reason.
+/// Accepted circles, each with the reason.
 const KNOWN: &[(&[&str], &str)] = &[];
 
-/// The path of a module or of an item, from the crate's root.
+/// The path of a module or an item, from the crate's root.
 type Names = Vec<String>;
 
-/// The circles of one crate, each a sorted list of its files.
+/// Returns the circles of one crate, each as a sorted list of its files.
 fn circles(modules: &Modules) -> Vec<Vec<&Path>> {
     let mut arrows = modules.arrows();
     for (from, all) in &mut arrows {
@@ -86,5 +87,5 @@ fn files_of_one_crate_use_each_other_in_one_direction() {
     let new: Vec<_> = found.iter().filter(|circle| !known.contains(circle)).collect();
     assert!(new.is_empty(), "new circles of files, see SKINBUS_CIRCLES=1 for their arrows: {new:#?}");
     let gone: Vec<_> = known.iter().filter(|circle| !found.contains(circle)).collect();
-    assert!(gone.is_empty(), "take these circles out of KNOWN, they are gone: {gone:#?}");
+    assert!(gone.is_empty(), "remove these circles from KNOWN, they are gone: {gone:#?}");
 }

@@ -1,12 +1,12 @@
-//! Documents: links lead to files and headings that exist, the pages stay short, and every block of commands is run by a
-//! test or states why not.
+//! Checks of the documents: links lead to existing files and headings, the pages stay short, and every block of
+//! commands is run by a test or states why not.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::collections::{BTreeSet, HashMap};
 use std::fs;
 use std::path::{Path, PathBuf};
 
-/// Pages with requirements, which are as long as these need.
+/// The pages with requirements; their length is not limited.
 const NORMATIVE: [&str; 6] = [
     "docs/reference/cell.md",
     "docs/reference/commissioning.md",
@@ -15,18 +15,18 @@ const NORMATIVE: [&str; 6] = [
     "docs/reference/sensing.md",
     "docs/reference/tree.md",
 ];
-/// Limit for all other pages together.
+/// The limit for all other pages together.
 const MAX_WORDS: usize = 40_000;
-/// `process_readme` runs all blocks of this page.
+/// The page whose blocks `process_readme` runs.
 const RUN_AS_A_WHOLE: &str = "README.md";
 
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap()
 }
 
-/// Document of the project.
+/// A document of the project.
 struct Page {
-    /// Path from the top of the project.
+    /// The path from the top of the project.
     name: String,
     text: String,
 }
@@ -55,13 +55,13 @@ fn pages() -> Vec<Page> {
     found.into_iter().map(read).collect()
 }
 
-/// Fenced block.
+/// A fenced block.
 #[derive(Debug, Eq, PartialEq)]
 struct Block<'a> {
     language: &'a str,
-    /// Number of the line that opens it.
+    /// The number of the line that opens it.
     line: usize,
-    /// Last line before it that is not empty.
+    /// The last non-empty line before it.
     before: &'a str,
 }
 
@@ -164,8 +164,8 @@ fn documents_without_requirements_stay_short() {
     assert!(sum <= MAX_WORDS, "{sum} words; the longest pages: {:?}", &words[words.len() - 12..]);
 }
 
-/// Checks the comment before a block of commands: `<!-- not run: REASON -->`, or `<!-- run by: TEST -->` with the path of a
-/// test that names the page.
+/// Checks the comment before a block of commands: `<!-- not run: REASON -->`, or `<!-- run by: TEST -->` with the path
+/// of a test that names the page.
 fn check_mark(page: &str, mark: &str) -> Result<(), String> {
     let comment = mark.strip_prefix("<!-- ").and_then(|rest| rest.strip_suffix(" -->")).unwrap_or_default();
     if comment.strip_prefix("not run: ").is_some_and(|reason| !reason.trim().is_empty()) {

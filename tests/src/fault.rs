@@ -1,4 +1,4 @@
-//! Faults of a bus: seeded, for all receivers or one, by sender, kind and time.
+//! Faults of a bus: seeded, for all receivers or one, selected by sender, kind and time.
 
 use std::ops::Range;
 
@@ -8,36 +8,36 @@ use protocol::time::{Micros, Span};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// Who sends or receives.
+/// A sender or receiver.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Party {
-    /// The gateway; it also reads its own frames back.
+    /// The gateway; it also receives its own frames.
     Gateway,
-    /// The cell in this slot, see [`crate::bench::Bench`].
+    /// The cell in this slot; see [`crate::bench::Bench`].
     CellSlot(usize),
-    /// A test client, another gateway, a babbling idiot: sends and does not receive.
+    /// A test client, another gateway or a babbling idiot, which sends and does not receive.
     UnknownNode,
 }
 
-/// What happens to a frame.
+/// The effect of a fault on a frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Harm {
-    /// It does not come.
+    /// The frame is lost.
     Lose,
-    /// It comes later by up to so much, and others overtake it.
+    /// The frame is late by up to this time, and others overtake it.
     Delay(Span),
-    /// It comes twice.
+    /// The frame arrives twice.
     Duplicate,
-    /// It comes after the next one.
+    /// The frame arrives after the next one.
     Reorder,
-    /// One to three of its bits are turned, in the identifier, the data or the CRC.
+    /// One to three of its bits are flipped, in the identifier, the data or the CRC.
     Flip,
     /// Its last bytes are missing.
     Truncate,
 }
 
 impl Harm {
-    /// One of each.
+    /// One of each kind.
     pub const ALL: [Self; 6] = [
         Self::Lose,
         Self::Delay(Span::from_millis(20)),
@@ -48,18 +48,18 @@ impl Harm {
     ];
 }
 
-/// Which receivers a fault affects.
+/// The receivers that a fault affects.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Hits {
-    /// The frame as it stands on the wire: everybody gets the same.
+    /// The frame on the wire: all receivers get the same.
     Wire,
-    /// Each receiver by its own chance.
+    /// Each receiver, with its own chance.
     Each,
-    /// This receiver alone.
+    /// One receiver.
     Only(Party),
 }
 
-/// One thing that goes wrong: first of each receiver by its own chance, of all frames, all the time.
+/// A fault. By default it affects all frames at all times, each receiver with its own chance.
 #[derive(Clone, Debug)]
 pub struct Fault {
     harm: Harm,
@@ -71,38 +71,38 @@ pub struct Fault {
 }
 
 impl Fault {
-    /// A frame is hit with this probability, 0 to 1.
+    /// Creates a fault that hits a frame with this probability, 0 to 1.
     #[must_use]
     pub const fn new(harm: Harm, probability: f64) -> Self {
         let during = Micros(0)..Micros(u64::MAX);
         Self { harm, probability, hits: Hits::Each, from: None, kind: None, during }
     }
 
-    /// It happens on the wire: all receivers get the same.
+    /// Moves the fault to the wire: all receivers get the same frame.
     #[must_use]
     pub fn on_the_wire(self) -> Self {
         Self { hits: Hits::Wire, ..self }
     }
 
-    /// It happens to this receiver alone.
+    /// Limits the fault to one receiver.
     #[must_use]
     pub fn at(self, receiver: Party) -> Self {
         Self { hits: Hits::Only(receiver), ..self }
     }
 
-    /// It happens to frames of this sender only.
+    /// Limits the fault to frames of one sender.
     #[must_use]
     pub fn from(self, sender: Party) -> Self {
         Self { from: Some(sender), ..self }
     }
 
-    /// It happens to frames of this kind only.
+    /// Limits the fault to frames of one kind.
     #[must_use]
     pub fn of(self, kind: Kind) -> Self {
         Self { kind: Some(kind), ..self }
     }
 
-    /// It happens at these times only.
+    /// Limits the fault to a time range.
     #[must_use]
     pub fn during(self, times: Range<Micros>) -> Self {
         Self { during: times, ..self }
@@ -122,19 +122,19 @@ impl Fault {
 /// The effect of faults on a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Effect {
-    /// The frame that comes.
+    /// The frame that arrives.
     pub frame: Frame,
-    /// How often it comes.
+    /// The number of times that it arrives.
     pub times: u8,
-    /// By how much later.
+    /// The additional delay.
     pub delay: Span,
-    /// Whether it comes after the next one.
+    /// True if it arrives after the next one.
     pub after_next: bool,
-    /// Whether it was damaged, and how.
+    /// The damage, if there is any.
     pub damage: Option<Harm>,
 }
 
-/// All that goes wrong on a bus, and the dice.
+/// All faults of a bus, and the random generator.
 #[derive(Debug)]
 pub struct Faults {
     all: Vec<Fault>,
@@ -142,23 +142,23 @@ pub struct Faults {
 }
 
 impl Faults {
-    /// Nothing goes wrong yet.
+    /// Creates a bus without faults.
     #[must_use]
     pub fn new(seed: u64) -> Self {
         Self { all: Vec::new(), dice: Pcg64Mcg::seed_from_u64(seed) }
     }
 
-    /// One more thing goes wrong.
+    /// Adds a fault.
     pub fn add(&mut self, fault: Fault) {
         self.all.push(fault);
     }
 
-    /// Nothing goes wrong any more.
+    /// Removes all faults.
     pub fn clear(&mut self) {
         self.all.clear();
     }
 
-    /// The effect on a frame on the wire (`to` is `None`), or on its way from there to a receiver.
+    /// Returns the effect on a frame on the wire (`to` is `None`), or on its way from there to a receiver.
     pub fn effect(&mut self, now: Micros, from: Party, to: Option<Party>, frame: Frame) -> Effect {
         let mut effect = Effect { frame, times: 1, delay: Span(0), after_next: false, damage: None };
         let kind = Id::from_bits(u16::try_from(frame.id()).unwrap_or(u16::MAX)).kind;
@@ -184,7 +184,7 @@ impl Faults {
     }
 }
 
-/// One to three different bits are turned; the CRC notices any three.
+/// Flips one to three different bits; the CRC detects any three.
 fn flipped(frame: Frame, dice: &mut Pcg64Mcg) -> Frame {
     const ID_BITS: usize = 11;
     let (mut id, mut data) = (frame.raw_id(), frame.data().to_vec());

@@ -1,4 +1,4 @@
-//! The gateway of a bench: the real table and the real loop, with what threads and sockets do around them.
+//! The gateway of a bench: the real table and the real loop, with simulated threads and sockets around them.
 
 use std::collections::VecDeque;
 
@@ -16,23 +16,23 @@ use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Skin;
 use protocol::time::{Micros, Span};
 
-/// Stimuli are sent so many epochs before the one from which they hold.
+/// The number of epochs that a stimulus is sent before its first epoch.
 const LEAD: u64 = 5;
 
 /// Table, loop and script.
 #[derive(Debug)]
 pub struct Gateway {
-    /// What it knows of its bus.
+    /// The state of its bus.
     pub table: Table,
-    /// What every tick was like.
+    /// The records of all ticks.
     pub records: Vec<Record>,
-    /// The notices, and when.
+    /// The notices, with their times.
     pub notices: Vec<(Micros, Notice)>,
-    /// Whether the bus works, as the loop gets it.
+    /// The state of the bus, as the loop gets it: true if it works.
     pub works: bool,
-    /// Whether it sends a restarted cell its stimulus again.
+    /// True if a restarted cell gets its stimulus again.
     pub reminds: bool,
-    /// Broadcasts skipped with their ticks.
+    /// The number of broadcasts skipped with their ticks.
     pub broadcasts_skipped: u64,
     cycle: Cycle,
     snapshot: Snapshot,
@@ -49,10 +49,10 @@ pub struct Gateway {
 }
 
 impl Gateway {
-    /// One that listens only. The scenario says how the robot moves and what touches it.
+    /// Creates a gateway that only listens. The scenario defines the motion of the robot and the touches.
     ///
     /// # Panics
-    /// When the skin's controller is another program.
+    /// Panics if the skin's controller is another program.
     #[must_use]
     pub fn new(skin: &Skin, scenario: &Scenario) -> Self {
         let table = Table::new(skin, 0);
@@ -79,30 +79,30 @@ impl Gateway {
         }
     }
 
-    /// From one tick to the next.
+    /// Returns the interval of ticks.
     #[must_use]
     pub const fn period(&self) -> Span {
         self.period
     }
 
-    /// Broadcasts so far.
+    /// Returns the number of broadcasts so far.
     #[must_use]
     pub const fn broadcasts(&self) -> u64 {
         self.cycle.broadcasts()
     }
 
-    /// The last tick's record.
+    /// Returns the last tick's record.
     #[must_use]
     pub fn last(&self) -> Option<&Record> {
         self.records.last()
     }
 
-    /// The next `ticks` do not happen.
+    /// Skips the next `ticks`.
     pub const fn skip_ticks(&mut self, ticks: u64) {
         self.skip += ticks;
     }
 
-    /// The stimulus with these sensors for a cell, by its place in the skin.
+    /// Returns the stimulus with these sensor values for a cell, given by its index in the skin.
     #[must_use]
     pub fn stimulus(&mut self, place: usize, from: From, sensors: SkinSensors) -> Option<Message> {
         *self.pressed.get_mut(place)? = sensors;
@@ -110,7 +110,7 @@ impl Gateway {
         Some(Message::Stimulus { to, from, page: SensorPage::Skin(sensors) })
     }
 
-    /// A frame comes in; `stood` is the kernel's time stamp.
+    /// Receives a frame; `stood` is the kernel's time stamp.
     pub(crate) fn hear(&mut self, stood: Micros, own: bool, frame: &Frame) {
         let queue = &mut self.positions;
         let mut positions = |epoch| {
@@ -124,7 +124,7 @@ impl Gateway {
         self.table.handle_frame(stood, own, frame, &mut positions);
     }
 
-    /// One tick; returns what it sends.
+    /// Runs one tick, and returns the messages to send.
     pub(crate) fn turn(&mut self, now: Micros) -> Vec<Message> {
         if self.skip > 0 {
             self.skip -= 1;
@@ -154,7 +154,8 @@ impl Gateway {
         messages
     }
 
-    /// Lets time pass for the table, takes its notices; returns what the script and restarts make it send.
+    /// Advances the table's time and collects its notices. Returns the messages of the script, and those for restarted
+    /// cells.
     pub(crate) fn look(&mut self, now: Micros) -> Vec<Message> {
         self.table.handle_time(now);
         let mut messages = Vec::new();
@@ -184,7 +185,7 @@ impl Gateway {
     }
 }
 
-/// The epoch of the n-th broadcast.
+/// Returns the epoch of the n-th broadcast.
 #[must_use]
 pub fn epoch_of(number: u64) -> Epoch {
     Epoch(number.to_le_bytes()[0])

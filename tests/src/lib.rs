@@ -1,5 +1,5 @@
-//! A whole bench in virtual time: the real cells, the real table and the real loop of the gateway, on a
-//! bus that is a variable.
+//! A complete bench in virtual time: the real cells, the real table and the real loop of the gateway, on a simulated
+//! bus.
 //!
 //! ```text
 //!                  +-- Bench: one queue of events, one clock, moved by the test alone ------+
@@ -10,8 +10,8 @@
 //!                  +------------------------------- an oracle compares the table's sums ----+
 //! ```
 //!
-//! Nothing sleeps, nothing reads a clock, and everything random comes from one seed: the same seed is the
-//! same run, byte for byte. [`accounts::check`] has the invariants of every run.
+//! No code sleeps or reads a clock, and all randomness comes from one seed: the same seed gives the same run, byte for
+//! byte. [`accounts::check`] has the invariants of every run.
 
 pub mod accounts;
 mod agenda;

@@ -1,22 +1,22 @@
-//! Whether a cell is off, works or hangs.
+//! The power state of a cell: off, running or hung.
 
 use std::collections::VecDeque;
 
 use cell_node::node::Node;
 
-/// How a cell is; while it hangs, what comes in gathers.
+/// The state of a cell. While it hangs, its input collects.
 #[derive(Debug)]
 pub(crate) enum Life<W> {
     /// Without power.
     Off,
-    /// As it should be.
+    /// Working normally.
     Runs(Box<Node>),
-    /// It does nothing.
+    /// Hung: it does nothing.
     Hangs(Box<Node>, VecDeque<W>),
 }
 
 impl<W> Life<W> {
-    /// The cell, unless it is off.
+    /// Returns the cell, unless it is off.
     pub(crate) const fn node(&self) -> Option<&Node> {
         match self {
             Self::Runs(node) | Self::Hangs(node, _) => Some(node),
@@ -24,12 +24,12 @@ impl<W> Life<W> {
         }
     }
 
-    /// Whether it works.
+    /// Returns true if the cell works.
     pub(crate) const fn runs(&self) -> bool {
         matches!(self, Self::Runs(_))
     }
 
-    /// It hangs, if it worked.
+    /// Hangs a working cell.
     pub(crate) fn hang(&mut self) {
         *self = match core::mem::replace(self, Self::Off) {
             Self::Runs(node) => Self::Hangs(node, VecDeque::new()),
@@ -37,7 +37,7 @@ impl<W> Life<W> {
         };
     }
 
-    /// It works again, if it hung: what has gathered.
+    /// Makes a hung cell work again, and returns the collected input.
     pub(crate) fn go_on(&mut self) -> Option<VecDeque<W>> {
         match core::mem::replace(self, Self::Off) {
             Self::Hangs(node, waiting) => {

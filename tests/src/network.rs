@@ -1,8 +1,7 @@
-//! Cells wired to each other at random, in virtual time: whether they become a tree, stay one, and never count a
-//! cell twice.
+//! Cells wired at random, in virtual time: they must become a tree, stay one, and never count a cell twice.
 //!
-//! Every cell has a random torque of its own, so that a sum shows which cells are in it: a cell's sum must be its own
-//! torque and some of its neighbours' sums of that epoch, and only one choice fits.
+//! Every cell has a random torque of its own, so that a sum shows which cells are in it: a cell's sum must consist of
+//! its own torque and some of its neighbours' sums of that epoch, and only one choice fits.
 
 #![expect(
     clippy::indexing_slicing,
@@ -41,13 +40,13 @@ use protocol::packet::padded;
 
 pub use place::Place;
 
-/// From one broadcast to the next.
+/// The interval of broadcasts.
 pub const PERIOD: Span = Span(16_000);
-/// From sending to receiving, at least and at most.
+/// The minimum and the maximum time from sending to receiving.
 const LATENCY: (u64, u64) = (10, 60);
-/// From receiving something to answering it.
+/// The time from receiving a message to answering it.
 const THINKS: Span = Span(30);
-/// The joints' positions in quarter turns, the same in every epoch.
+/// Returns the joint positions in quarter turns, the same in every epoch.
 fn positions() -> [Q1_14; WORDS] {
     let positions = [0.1, -0.7, 0.6, -0.4, 0.3, 0.2].map(Q1_14::nearest);
     std::array::from_fn(|joint| positions.get(joint).copied().unwrap_or_default())
@@ -58,7 +57,7 @@ fn positions() -> [Q1_14; WORDS] {
 pub enum End {
     /// A cell's port.
     Cell(usize, usize),
-    /// The gateway's side; the root with this place.
+    /// The gateway's side; the index of the root.
     Gateway(usize),
 }
 
@@ -71,12 +70,12 @@ enum Event {
     Joints,
 }
 
-/// What the gateway took of one epoch.
+/// The sums of one epoch that the gateway received.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Took {
-    /// Bit i: cell i is in it.
+    /// Bit i is set if the sums contain cell i.
     pub cells: u128,
-    /// Sums that came.
+    /// The number of sums.
     pub frames: u32,
 }
 
@@ -85,13 +84,13 @@ pub struct Took {
 pub struct Wiring {
     /// The cells.
     pub cells: Vec<Place>,
-    /// Which cells are wired to the gateway's side.
+    /// The cells that are wired to the gateway's side.
     pub roots: Vec<usize>,
-    /// What came of each broadcast.
+    /// The result of each broadcast.
     pub took: Vec<Took>,
-    /// Part of all messages over wires that are lost.
+    /// The part of all messages over wires that is lost.
     pub loss: f64,
-    /// The depth for which cells have slots.
+    /// The maximum depth for which cells have slots.
     pub deepest: u8,
     uplinks: Uplinks,
     root_sums: HashMap<usize, (Words, u128)>,
@@ -103,7 +102,7 @@ pub struct Wiring {
 }
 
 impl Wiring {
-    /// Cells without wires; each is switched on by [`Wiring::start`].
+    /// Creates cells without wires; [`Wiring::start`] switches each one on.
     #[must_use]
     pub fn new(cells: usize, seed: u64) -> Self {
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
@@ -126,7 +125,7 @@ impl Wiring {
         wiring
     }
 
-    /// Cells wired at random: mostly one piece, with more wires than a tree needs.
+    /// Creates cells wired at random: mostly connected, with more wires than a tree needs.
     #[must_use]
     pub fn random(seed: u64) -> Self {
         let mut dice = Pcg64Mcg::seed_from_u64(seed ^ 0xA11);
@@ -135,7 +134,7 @@ impl Wiring {
         let mut order: Vec<usize> = (0..count).collect();
         order.shuffle(&mut dice);
         for (at, &cell) in order.iter().enumerate().skip(1) {
-            // Now and then a cell is left apart.
+            // Occasionally a cell stays unconnected.
             if dice.random_bool(0.95) {
                 let other = order[dice.random_range(0..at)];
                 wiring.wire_some(cell, other, &mut dice);
@@ -166,20 +165,20 @@ impl Wiring {
         }
     }
 
-    /// A wire between two ports.
+    /// Adds a wire between two ports.
     pub fn wire(&mut self, a: usize, p: usize, b: usize, q: usize) {
         self.cells[a].wires[p] = Some(End::Cell(b, q));
         self.cells[b].wires[q] = Some(End::Cell(a, p));
     }
 
-    /// A wire to the gateway's side.
+    /// Adds a wire to the gateway's side.
     pub fn add_root(&mut self, cell: usize) {
         self.cells[cell].wires[UPLINK] = Some(End::Gateway(self.roots.len()));
         self.roots.push(cell);
         self.uplinks = Uplinks::new(self.roots.len(), 0, self.agenda.now);
     }
 
-    /// One direction of a wire goes down, or up: messages of `cell` through `port` do not arrive.
+    /// Takes one direction of a wire down, or brings it up: messages of `cell` through `port` do not arrive.
     pub fn set_link_down(&mut self, cell: usize, port: usize, is_down: bool) {
         if let Some(End::Cell(other, at)) = self.cells[cell].wires[port] {
             self.cells[other].deaf[at] = is_down;
@@ -187,7 +186,7 @@ impl Wiring {
         }
     }
 
-    /// Sends a cell which of its links are down, as the gateway does.
+    /// Sends a cell the list of its links that are down, as the gateway does.
     pub fn send_links_down(&mut self, cell: usize) {
         let place = &self.cells[cell];
         let Some(node_id) = place.node_id else { return };
@@ -199,13 +198,13 @@ impl Wiring {
         self.deliver(cell, Inlet::Frame(frame));
     }
 
-    /// What time it is.
+    /// Returns the current time.
     #[must_use]
     pub const fn now(&self) -> Micros {
         self.agenda.now
     }
 
-    /// A cell is switched on, or off and on.
+    /// Switches a cell on, or off and on.
     pub fn start(&mut self, cell: usize) {
         let (now, place) = (self.agenda.now, &mut self.cells[cell]);
         let identity = Identity { cell: place.node_id, serial: place.serial };
@@ -219,18 +218,18 @@ impl Wiring {
         self.after(cell);
     }
 
-    /// A cell loses its power.
+    /// Switches a cell off.
     pub fn kill(&mut self, cell: usize) {
         self.cells[cell].life = Life::Off;
         self.cells[cell].wake = None;
     }
 
-    /// A cell hangs.
+    /// Hangs a cell.
     pub fn hang(&mut self, cell: usize) {
         self.cells[cell].life.hang();
     }
 
-    /// A cell that hung goes on with what has gathered.
+    /// Makes a hung cell continue with its collected input.
     pub fn go_on(&mut self, cell: usize) {
         let Some(waiting) = self.cells[cell].life.go_on() else { return };
         self.pass(cell);
@@ -239,7 +238,7 @@ impl Wiring {
         }
     }
 
-    /// Runs for some time.
+    /// Runs for a time.
     pub fn run(&mut self, span: Span) {
         let until = self.agenda.now + span;
         while let Some(event) = self.agenda.take_until(until) {
@@ -272,7 +271,7 @@ impl Wiring {
         }
     }
 
-    /// What comes to a cell gathers while it hangs.
+    /// Delivers input to a cell; it collects while the cell hangs.
     fn deliver(&mut self, cell: usize, inlet: Inlet) {
         let now = self.agenda.now;
         if let Life::Hangs(_, waiting) = &mut self.cells[cell].life {
@@ -324,7 +323,7 @@ impl Wiring {
         self.after(cell);
     }
 
-    /// Takes the messages of a cell, and its next timeout.
+    /// Collects the messages of a cell, and its next timeout.
     fn after(&mut self, cell: usize) {
         let place = &mut self.cells[cell];
         let Life::Runs(node) = &mut place.life else { return };
@@ -333,7 +332,7 @@ impl Wiring {
             node.handle_stored(true);
         }
         assert_eq!(node.taken(), None, "cell {cell} gave up its node id {:?}", place.node_id);
-        // Its subscriptions are checked for each frame that comes.
+        // Its subscriptions are checked for each frame that arrives.
         let _ = node.poll_hears();
         let mut messages = Vec::new();
         while let Some(message) = node.poll_port_transmit() {
@@ -383,7 +382,7 @@ impl Wiring {
         }
     }
 
-    /// When something that is sent now arrives; messages keep their order.
+    /// Returns the arrival time of a message that is sent now; messages keep their order.
     fn arrival(&mut self, at: Option<usize>) -> Micros {
         let arrives = self.agenda.now + THINKS + Span(self.dice.random_range(LATENCY.0..=LATENCY.1));
         let newest = at.map_or(&mut self.gateway_newest, |cell| &mut self.cells[cell].newest);
@@ -402,7 +401,7 @@ impl Wiring {
         }
     }
 
-    /// The gateway sends something to every cell that receives it.
+    /// Sends a message from the gateway to every cell that receives it.
     pub fn say(&mut self, message: &Message) {
         let frame = message.encode().frames(Format::Fd).next().expect("one frame");
         for cell in 0..self.cells.len() {
@@ -421,13 +420,13 @@ impl Wiring {
         self.agenda.enter_in(PERIOD, Event::Joints);
     }
 
-    /// Joints are sent from now on.
+    /// Starts the broadcasts of joints.
     pub fn begin(&mut self) {
         self.ticking = true;
         self.agenda.enter_in(Span(0), Event::Joints);
     }
 
-    /// No more joints are sent.
+    /// Stops the broadcasts of joints.
     pub const fn stop(&mut self) {
         self.ticking = false;
     }
@@ -441,7 +440,7 @@ impl Wiring {
         self.say(&Message::Configure { to: protocol::id::Node::Everyone, tag: 0, request });
     }
 
-    /// A cell is pressed, or released, from the next joints on.
+    /// Presses or releases a cell from the next joints on.
     pub fn press(&mut self, cell: usize, pressed: bool) {
         let Some(node_id) = self.cells[cell].node_id else { return };
         let word = Q5_10::from_bits(i16::try_from(self.cells[cell].force.steps() >> 6).expect("a word"));

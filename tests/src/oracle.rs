@@ -1,6 +1,5 @@
-//! A second, simpler gateway that is told the truth about every frame: it knows which were damaged, by
-//! whom they were sent and when each cell was switched on. What the real one makes of the same frames
-//! must agree with it, whatever was broken.
+//! A second, simpler gateway that knows the truth about every frame: its damage, its sender, and the starts of each
+//! cell. The real gateway's results for the same frames must agree with it, whatever was damaged.
 
 use model::table::{Notice, Sums};
 use protocol::can::{Format, Frame};
@@ -16,58 +15,58 @@ use crate::fault::{Harm, Party};
 /// A torque may answer the newest broadcast or one of the three before it.
 const LATEST: usize = 4;
 
-/// What is true of a frame.
+/// The truth about a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Truth {
-    /// Who sent it.
+    /// The sender.
     pub from: Party,
-    /// Which life of a cell it comes from.
+    /// The life of the cell in which it was sent.
     pub life: u32,
-    /// The packet that it carries, or is a half of; none in what somebody babbles.
+    /// The packet that it carries completely or partly; `None` for a babbled frame.
     pub packet: Option<Packet>,
-    /// That packet's number on this bench; 0 for what is no packet.
+    /// The number of the packet on this bench; 0 for frames that are not packets.
     pub number: u64,
-    /// Which half of it; 0 for a whole one.
+    /// The segment of the packet; 0 for a whole one.
     pub segment: usize,
-    /// What was done to it.
+    /// The damage that was done to it.
     pub damage: Option<Harm>,
 }
 
 impl Truth {
-    /// The same after more damage; what is cut is cut, whatever else was done to it.
+    /// Adds further damage; truncation takes precedence over other damage.
     #[must_use]
     pub(crate) fn and(self, damage: Option<Harm>) -> Self {
         let link_down = [self.damage, damage].contains(&Some(Harm::Truncate));
         Self { damage: if link_down { Some(Harm::Truncate) } else { self.damage.or(damage) }, ..self }
     }
 
-    /// The same, knowing what came: bits that were turned twice are right again.
+    /// Corrects the damage by the frame that arrived: bits that were flipped twice are right again.
     fn on_arrival(self, frame: &Frame) -> Self {
         let meant = self.packet.and_then(|packet| packet.frames(frame.format()).nth(self.segment));
         if meant.is_some_and(|meant| meant == *frame) { Self { damage: None, ..self } } else { self }
     }
 }
 
-/// What was delivered to the gateway, by what ought to become of it.
+/// The frames delivered to the gateway, by their expected treatment.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Tally {
-    /// Frames.
+    /// All frames.
     pub frames: u64,
-    /// Whole packets of others.
+    /// Whole packets of other senders.
     pub packets: u64,
-    /// Of these, torques that count.
+    /// Whole packets that are torques which count.
     pub used: u64,
-    /// Torques for an epoch that was answered already, by the same cell.
+    /// Torques for an epoch that the same cell had answered already.
     pub repeated: u64,
-    /// Torques of an epoch that is over, or not begun.
+    /// Torques of an epoch that is over, or has not begun.
     pub stale: u64,
-    /// Frames with turned bits.
+    /// Frames with flipped bits.
     pub flipped: u64,
     /// Truncated frames.
     pub truncated: u64,
-    /// Frames that somebody babbled.
+    /// Babbled frames.
     pub babbled: u64,
-    /// Own broadcasts.
+    /// The gateway's own broadcasts.
     pub broadcasts: u64,
 }
 
@@ -77,33 +76,33 @@ struct Mirror {
     /// The broadcast that its newest torque answered.
     answered: Option<usize>,
     held: Option<[i32; MAX_JOINTS]>,
-    /// What of it is in the sum.
+    /// The part of it that is in the sum.
     value: [i32; MAX_JOINTS],
     torques: Vec<(u8, [i16; WORDS])>,
     arrived: u64,
-    /// The owner of the node id, by the last heartbeat that was no claim.
+    /// The owner of the node id, by the last heartbeat that was not a claim.
     holder: Option<Party>,
 }
 
 /// The oracle of one bus.
 #[derive(Debug)]
 pub struct Oracle {
-    /// What came.
+    /// The counts of frames.
     pub tally: Tally,
-    /// Whether the sum is compared; several cells with one node id are not supported.
+    /// True if the sum is compared; several cells with one node id are not supported.
     pub compares: bool,
     format: Format,
     safety: Safety,
     mirrors: Vec<Mirror>,
-    /// Where a node stands.
+    /// The index of each node id.
     places: [Option<usize>; 256],
     broadcasts: Vec<Epoch>,
-    /// The last frame of each identifier, and when it stood.
+    /// The last frame of each identifier, and its time on the wire.
     segments: Vec<Option<(Frame, Micros)>>,
 }
 
 impl Oracle {
-    /// Nothing seen yet.
+    /// Creates an oracle that has not seen a frame.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let mut places = [None; 256];
@@ -124,19 +123,19 @@ impl Oracle {
         }
     }
 
-    /// The torques that came whole from a cell.
+    /// Returns the torques of a cell that arrived complete.
     #[must_use]
     pub fn torques(&self, place: usize) -> Vec<(u8, [i16; WORDS])> {
         self.mirrors.get(place).map(|mirror| mirror.torques.clone()).unwrap_or_default()
     }
 
-    /// Whole packets that came from a cell.
+    /// Returns the number of whole packets that arrived from a cell.
     #[must_use]
     pub fn arrived(&self, place: usize) -> u64 {
         self.mirrors.get(place).map_or(0, |mirror| mirror.arrived)
     }
 
-    /// A frame was handed to the gateway.
+    /// Receives a frame that is delivered to the gateway.
     pub(crate) fn hear(&mut self, stood: Micros, truth: &Truth, frame: &Frame) {
         let truth = &truth.on_arrival(frame);
         self.tally.frames += 1;
@@ -207,11 +206,11 @@ impl Oracle {
 
     fn hear_own(&mut self, message: &Message) {
         match *message {
-            // Repeated on the way: cells drop it, and it is no epoch.
+            // A frame repeated on the way: cells drop it, and it is not an epoch.
             Message::Joints { epoch, .. } if self.broadcasts.last() == Some(&epoch) => {}
             Message::Joints { epoch, .. } => {
                 self.tally.broadcasts += 1;
-                // After so many broadcasts that were not on the bus, all torques have decayed in the loop.
+                // After that many broadcasts that were not on the bus, all torques have decayed in the loop.
                 let recent = self.broadcasts.iter().rev().take(LATEST);
                 let passed = recent.map(|&before| epoch.since(before)).min().unwrap_or(1);
                 if i64::from(passed) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1 {
@@ -237,7 +236,7 @@ impl Oracle {
         }
     }
 
-    /// Whether this frame is a packet, or completes one.
+    /// Returns true if this frame is a packet, or completes one.
     fn is_whole(&mut self, stood: Micros, truth: &Truth, frame: &Frame) -> bool {
         if self.format == Format::Fd {
             return truth.damage.is_none();
@@ -252,7 +251,7 @@ impl Oracle {
             *last = None;
             return false;
         }
-        // An equal first segment is as good as the packet's own.
+        // An equal first segment counts like the packet's own.
         let first = truth.packet.and_then(|packet| packet.frames(self.format).next());
         let in_time =
             |since| truth.packet.is_some_and(|packet| stood.since(since) <= Segment::within(packet.id));
@@ -262,7 +261,7 @@ impl Oracle {
         whole
     }
 
-    /// Takes a notice: nothing is held of a silent cell.
+    /// Handles a notice: the torque of a silent cell is released.
     pub(crate) fn notice(&mut self, notice: Notice) {
         let (Notice::Dead(cell) | Notice::Restarted(cell)) = notice else { return };
         let place = self.places.get(usize::from(cell.get())).copied().flatten();
@@ -271,7 +270,7 @@ impl Oracle {
         }
     }
 
-    /// The sum that a tick takes must be this one's, to the last bit.
+    /// Checks that the sum of a tick equals the oracle's, to the last bit.
     pub(crate) fn check_sum(&self, now: Micros, snapshot: &Sums) {
         if !self.compares {
             return;
@@ -302,11 +301,11 @@ impl Mirror {
         self.value = [0; MAX_JOINTS];
     }
 
-    /// Held, then decays to zero in equal steps.
+    /// Holds the torque, then decays it to zero in equal steps.
     fn decay(&mut self, newest: usize, safety: &Safety) {
         let (Some(held), Some(answered)) = (self.held, self.answered) else { return };
         let (hold, decay) = (safety.hold_epochs as usize, safety.decay_epochs as usize);
-        // The newest broadcast has had no time to be answered.
+        // There was no time to answer the newest broadcast.
         let unanswered = (newest - answered).saturating_sub(1);
         let remaining = (hold + decay).saturating_sub(unanswered);
         self.value = match unanswered {

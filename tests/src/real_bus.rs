@@ -7,15 +7,15 @@ use protocol::can::Frame;
 use protocol::time::Micros;
 use protocol::wire_time::{BitRates, Bits};
 
-/// A frame that was to be sent, and when.
+/// A requested frame, with the time of the request.
 pub type Requested = (Micros, Frame);
 
-/// A real bus, and what waits to go out on it.
+/// A real bus, and the frames that wait for it.
 #[derive(Debug)]
 pub(crate) struct RealBus<T> {
     model: BusModel,
     waiting: BTreeMap<u64, T>,
-    /// When it is looked at next, if that has been entered.
+    /// The time at which it is advanced next, if that has been entered.
     pub(crate) look: Option<Micros>,
     pub(crate) requested: Vec<Requested>,
     pub(crate) attempts: Vec<Attempt>,
@@ -32,7 +32,7 @@ impl<T> RealBus<T> {
         }
     }
 
-    /// A frame is to be sent now.
+    /// Requests the transmission of a frame.
     pub(crate) fn request(&mut self, now: Micros, frame: &Frame, item: T) {
         let Some(bits) = Bits::of(frame) else { return };
         let tag = u64::try_from(self.requested.len()).unwrap_or(u64::MAX);
@@ -42,7 +42,7 @@ impl<T> RealBus<T> {
         self.model.request(request);
     }
 
-    /// What has come to its end by now, and when that was, in whole µs and never too early.
+    /// Returns the frames that have ended by now, with their times in whole µs, rounded up.
     pub(crate) fn ended(&mut self, now: Micros) -> Vec<(Micros, T)> {
         self.model.run_until(now.0 * 1_000);
         let mut ended = Vec::new();
@@ -54,7 +54,7 @@ impl<T> RealBus<T> {
         ended
     }
 
-    /// When it has to be looked at next.
+    /// Returns the time at which it has to be advanced next.
     pub(crate) fn next(&self) -> Option<Micros> {
         self.model.poll_timeout().map(|nanos| Micros(nanos.div_ceil(1_000)))
     }

@@ -6,11 +6,11 @@ use std::path::Path;
 use protocol::can::Format;
 use protocol::skin::Skin;
 
-/// A UR5 with `cells` cells on one bus, spread over its joints, every one with another pose; thresholds
-/// of 0.1 N, proximity not used; torques held for 2 epochs, and decaying over 4.
+/// Returns a UR5 with `cells` cells on one bus, spread over its joints, each with a different pose; thresholds of 0.1
+/// N, proximity not used; torques are held for 2 epochs, and decay over 4.
 ///
 /// # Panics
-/// With more cells than a bus has node ids.
+/// Panics if there are more cells than a bus has node ids.
 #[must_use]
 pub fn arm(cells: u8, format: Format) -> Skin {
     let format = match format {
@@ -75,10 +75,10 @@ max_speed_rad_s = [2.0, 2.0, 2.0, 3.0, 3.0, 3.0]
     Skin::parse("arm.toml", &text).expect("the tests' skin is sound")
 }
 
-/// The 253-cell arm of the examples.
+/// Returns the 253-cell arm of the examples.
 ///
 /// # Panics
-/// When the file is not there or not sound.
+/// Panics if the file is missing or invalid.
 #[must_use]
 pub fn ur5_253() -> Skin {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../gateway/examples/ur5-253.toml");

@@ -1,5 +1,5 @@
-//! Where cells are commissioned in virtual time: real [`Node`]s, a bus that loses, repeats and damages by seeded
-//! chance, and a hand that switches cells, and the commissioning, off and on.
+//! A workshop that commissions cells in virtual time: real [`Node`]s, a bus that loses, repeats and damages frames at
+//! random from a seed, and control over the power of cells and the end of the commissioning.
 
 use cell_node::flash::Flash;
 use cell_node::identity::Identity;
@@ -18,36 +18,36 @@ use rand_pcg::Pcg64Mcg;
 
 use crate::agenda::Agenda;
 
-/// From the wire to a receiver, at least and at most.
+/// The minimum and the maximum latency from the wire to a receiver.
 const LATENCY: (u64, u64) = (40, 300);
-/// No commissioning takes longer.
+/// The time limit of a commissioning.
 const TIMEOUT: Span = Span::from_millis(60_000);
 
-/// One cell on the bench of the workshop.
+/// A cell in the workshop.
 #[derive(Debug)]
 pub struct Piece {
-    /// Who it is.
+    /// Its identity.
     pub identity: Identity,
-    /// What its flash holds.
+    /// The content of its flash.
     pub flash: Flash,
-    /// Everything that its flash has ever held, the first first.
+    /// All contents that its flash has had, oldest first.
     pub history: Vec<Flash>,
-    /// Its flash cannot be written.
+    /// True if its flash cannot be written.
     pub worn: bool,
     node: Option<Node>,
-    /// When the newest frame comes in: none overtakes another.
+    /// The arrival time of the newest frame: frames keep their order.
     newest: Micros,
 }
 
 impl Piece {
-    /// The cell, while it is on.
+    /// Returns the cell, while it is on.
     #[must_use]
     pub const fn node(&self) -> Option<&Node> {
         self.node.as_ref()
     }
 }
 
-/// What happens at a time.
+/// An event at a time.
 #[derive(Clone, Copy, Debug)]
 enum Event {
     ToCell(usize, Frame),
@@ -56,7 +56,7 @@ enum Event {
     On(usize),
 }
 
-/// Turns packets into others on their way: for cells that lie, and for damage that no CRC notices.
+/// A function that replaces packets on their way: for cells that send wrong values, and for damage that no CRC detects.
 pub type Forger = fn(Packet) -> Packet;
 
 /// The workshop.
@@ -64,15 +64,15 @@ pub type Forger = fn(Packet) -> Packet;
 pub struct Workshop {
     /// The cells.
     pub pieces: Vec<Piece>,
-    /// A frame is lost, comes twice, or has a bit turned, by these chances.
+    /// The probability that a frame is lost.
     pub loss: f64,
-    /// See `loss`.
+    /// The probability that a frame arrives twice.
     pub twice: f64,
-    /// See `loss`.
+    /// The probability that a bit of a frame is flipped.
     pub damage: f64,
-    /// What becomes of packets to cells, and of those from cells.
+    /// The forgers of packets to cells, and of packets from cells.
     pub forgers: Option<(Forger, Forger)>,
-    /// Messages that cells and the gateway's side said.
+    /// The number of messages that cells and the gateway's side have sent.
     pub said: u64,
     agenda: Agenda<Event>,
     format: Format,
@@ -81,7 +81,7 @@ pub struct Workshop {
 }
 
 impl Workshop {
-    /// An empty one.
+    /// Creates an empty workshop.
     #[must_use]
     pub fn new(format: Format, seed: u64) -> Self {
         Self {
@@ -98,7 +98,7 @@ impl Workshop {
         }
     }
 
-    /// One with a skin's cells, switched on now, with what `flash` says they have.
+    /// Creates a workshop with a skin's cells, switched on now, with the content of flash that `flash` returns.
     #[must_use]
     pub fn of(skin: &Skin, seed: u64, flash: impl Fn(usize) -> Flash) -> Self {
         let mut workshop = Self::new(skin.buses.first().map_or(Format::Fd, |bus| bus.format), seed);
@@ -108,7 +108,7 @@ impl Workshop {
         workshop
     }
 
-    /// One more cell, switched on now; its place.
+    /// Adds a cell, switched on now, and returns its index.
     pub fn add(&mut self, identity: Identity, flash: Flash) -> usize {
         let place = self.pieces.len();
         let (history, newest) = (vec![flash], Micros(0));
@@ -117,23 +117,23 @@ impl Workshop {
         place
     }
 
-    /// What time it is.
+    /// Returns the current time.
     #[must_use]
     pub const fn now(&self) -> Micros {
         self.agenda.now
     }
 
-    /// A whole number below `bound`, by chance.
+    /// Returns a random number below `bound`.
     pub fn chance(&mut self, bound: u64) -> u64 {
         self.dice.random_range(0..bound)
     }
 
-    /// Switches a cell off in a while.
+    /// Switches a cell off after a delay.
     pub fn switch_off_in(&mut self, span: Span, place: usize) {
         self.agenda.enter_in(span, Event::Off(place));
     }
 
-    /// Switches a cell on in a while; off before, if it is on.
+    /// Switches a cell on after a delay, and off before that if it is on.
     pub fn switch_on_in(&mut self, span: Span, place: usize) {
         self.agenda.enter_in(span, Event::On(place));
     }
@@ -145,7 +145,7 @@ impl Workshop {
         }
     }
 
-    /// Lets cells be for some time, with nobody who commissions them.
+    /// Runs the cells for a time without a commissioning.
     pub fn rest(&mut self, span: Span) {
         let until = self.agenda.now + span;
         while let Some(at) = self.next().filter(|&at| at <= until) {
@@ -154,10 +154,10 @@ impl Workshop {
         self.agenda.now = until;
     }
 
-    /// Commissions until it is over, or is killed after a time.
+    /// Commissions until the end, or until it is killed after a time.
     ///
     /// # Panics
-    /// When it does not end.
+    /// Panics if it does not end.
     pub fn commission(&mut self, skin: &Skin, wish: Wish, killed_after: Option<Span>) -> Report {
         let mut commission = Commission::new(skin, 0, wish, 1_000, self.agenda.now);
         let mut decoder = Decoder::new(Some(self.format));
@@ -182,7 +182,7 @@ impl Workshop {
         }
     }
 
-    /// When something happens next.
+    /// Returns the time of the next event.
     fn next(&self) -> Option<Micros> {
         let timers = self.pieces.iter().filter_map(|piece| Some(piece.node.as_ref()?.poll_timeout()));
         timers.chain(self.agenda.next()).min()
@@ -216,7 +216,7 @@ impl Workshop {
         }
     }
 
-    /// Writes what a cell has for flash, and takes what it says.
+    /// Writes the flash of a cell if it asks for that, and collects its packets.
     fn collect(&mut self, place: usize) {
         let Some(piece) = self.pieces.get_mut(place) else { return };
         let Some(node) = piece.node.as_mut() else { return };
@@ -240,7 +240,7 @@ impl Workshop {
         }
     }
 
-    /// Somebody on the gateway's side says something to the cells.
+    /// Sends a message from the gateway's side to the cells.
     pub fn say(&mut self, message: &Message) {
         let packet = message.encode();
         let packet = self.forgers.map_or(packet, |(to, _)| to(packet));
@@ -249,14 +249,14 @@ impl Workshop {
         }
     }
 
-    /// Somebody else on the bus says something, which the gateway's side hears too.
+    /// Sends a message of another client, which the gateway's side receives too.
     pub fn overhear(&mut self, message: &Message) {
         for frame in message.encode().frames(self.format) {
             self.pass(frame, Some(usize::MAX));
         }
     }
 
-    /// From one to all that hear it, each by its own chances.
+    /// Passes a frame from one party to all that receive it, each with its own chances.
     fn pass(&mut self, frame: Frame, from: Option<usize>) {
         self.said += 1;
         let id = frame.id();
@@ -286,7 +286,7 @@ impl Workshop {
         newest.map_or(at, |newest| at.max(newest))
     }
 
-    /// The copies of a frame that arrive at one receiver.
+    /// Returns the copies of a frame that arrive at one receiver.
     fn arriving(&mut self, frame: Frame) -> Vec<Frame> {
         if self.dice.random_bool(self.loss) {
             return Vec::new();
@@ -300,7 +300,7 @@ impl Workshop {
         frames
     }
 
-    /// The cells whose flash holds exactly this.
+    /// Returns the number of cells whose flash holds exactly the expected parameters.
     #[must_use]
     pub fn holding(&self, expected: impl Fn(usize) -> Parameters) -> usize {
         let holds = |(place, piece): &(usize, &Piece)| piece.flash == Flash::Sound(expected(*place));
@@ -308,7 +308,7 @@ impl Workshop {
     }
 }
 
-/// The same frame with a bit of its data turned.
+/// Returns the frame with a bit of its data flipped.
 fn damaged(frame: Frame, bit: usize) -> Frame {
     let mut data = frame.data().to_vec();
     if let Some(byte) = data.get_mut(bit / 8) {
@@ -317,10 +317,10 @@ fn damaged(frame: Frame, bit: usize) -> Frame {
     Frame::with_data(frame.raw_id(), frame.format(), frame.flags(), &data).unwrap_or(frame)
 }
 
-/// The node id of a number.
+/// Returns the node id of a number.
 ///
 /// # Panics
-/// When there is none.
+/// Panics if it is not a valid node id.
 #[must_use]
 pub fn cell(node: u8) -> CellId {
     CellId::new(node.into()).expect("a node id")

@@ -1,4 +1,4 @@
-//! Every fuzz target takes its seeds, and some changes of each: `tests/fuzz/run` is what searches.
+//! Runs every fuzz target with its seeds, and with some variations of each; `tests/fuzz/run` does the search.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use std::collections::BTreeSet;
@@ -9,7 +9,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use skinbus_tests::fuzz::TARGETS;
 
-/// Changes of each seed.
+/// The number of variations of each seed.
 const CHANGES: usize = 8;
 
 fn change(data: &mut Vec<u8>, dice: &mut Pcg64Mcg) {
@@ -34,7 +34,7 @@ fn change(data: &mut Vec<u8>, dice: &mut Pcg64Mcg) {
 
 #[test]
 fn every_target_takes_its_seeds() {
-    // A thread of a server that panics would only print it.
+    // A panic in a thread of a server would otherwise only be printed.
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(move |what| {
         hook(what);

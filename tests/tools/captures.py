@@ -1,4 +1,4 @@
-"""Captures as other people's libraries read and write them; each frame or note is one line of words.
+"""Captures as third-party libraries read and write them; each frame or note is one line of words.
 
     captures.py can-read LOG                  python-can: candump text
     captures.py can-copy LOG OUT              python-can reads and writes candump text

@@ -84,7 +84,7 @@ def ports(fields):
 
 
 def switch(fields):
-    """What is written of parameters 6 to 9, 11 and 12."""
+    """The written values of parameters 6 to 9, 11 and 12."""
     if "reply" in fields:
         said = {"reply": int(fields["reply"] == "sum")}
         keys = {"slot_us": "reply_slot", "deepest": "reply_deepest", "carry": "reply_carry"}
@@ -130,7 +130,7 @@ def parameter(fields):
 
 
 def meaning(kind, fields):
-    """The message's name and what its signals should say."""
+    """The message's name and the expected values of its signals."""
     who = fields.get("from", fields.get("to"))
     epoch = {"epoch": int(fields["epoch"])} if "epoch" in fields else {}
     match kind:
@@ -175,7 +175,7 @@ def meaning(kind, fields):
         case "stimulus":
             when = {"from_next": 1} if fields["from"] == "next" else {"from_next": 0, "epoch": int(fields["from"])}
             return f"stimulus_{fields['to']}", when | sensors_of(fields)
-    raise SystemExit(f"what is {kind}?")
+    raise SystemExit(f"unknown kind {kind}")
 
 
 def frames(path):
@@ -198,7 +198,7 @@ def main(dbc, golden):
         fields = dict(word.split("=", 1) for word in words)
         message = database.get_message_by_frame_id(identifier)
         if len(data) != 16:
-            # Of a chain of more joints than this bus has.
+            # A chain with more joints than this bus has.
             compared["longer"] = compared.get("longer", 0) + 1
             continue
         if 21 < int(fields.get("parameter", 0)) < 126:
@@ -215,7 +215,7 @@ def main(dbc, golden):
         expected["crc"] = int.from_bytes(data[14:], "little")
         for signal, value in expected.items():
             assert abs(said[signal] - value) < 1e-9, f"{comment}: {signal} is {said[signal]}, not {value}"
-        assert message.encode(said, strict=False) == data, f"{comment}: encoded otherwise"
+        assert message.encode(said, strict=False) == data, f"{comment}: encoded differently"
         compared[kind] = compared.get(kind, 0) + 1
     saturated = database.get_message_by_name("torque_254").get_signal_by_name("torque_1").choices
     assert {int(value): str(text) for value, text in saturated.items()} == {32767: "saturated", -32768: "saturated"}

@@ -1,4 +1,4 @@
-"""A run's recording as other people's libraries read it: each message is one line of its fields' values.
+"""A run's recording as third-party libraries read it: each message is one line of its fields' values.
 
     recording.py mcap MCAP        mcap and mcap-ros2-support
     recording.py bag MCAP         rosbags
@@ -87,7 +87,7 @@ class Frames:
 
 
 def rows_of(skin, chain):
-    """A chain's rows, each with its joint's place, and where the chain begins."""
+    """A chain's rows, each with the index of its joint, and the base of the chain."""
     import pinocchio as pin
 
     base = chain.get("base", {})
@@ -129,7 +129,7 @@ def skin_of(text):
 
 
 def cell_poses(skin, q):
-    """By name, a cell's place and its normal."""
+    """The position and the normal of each cell, by name."""
     import numpy as np
     import pinocchio as pin
 

@@ -1,4 +1,5 @@
-//! All cells of a skin: each by itself, then with its neighbours, then which of them to distrust.
+//! The calibration of a whole skin: estimates each cell by itself, improves positions by neighbours, and marks doubtful
+//! cells.
 
 use nalgebra::Vector3;
 use protocol::parameters::MAX_JOINTS;
@@ -19,30 +20,30 @@ use model::accelerometer::sensor::{DataSheet, rotation};
 
 pub use crate::settings::Settings;
 
-/// A cell that sends less than this part of what it could is named.
+/// A cell that sends less than this part of the expected readings is reported as silent.
 const SILENT: f64 = 0.5;
-/// A cell with fewer readings than this is not estimated.
+/// The minimum number of readings for an estimate.
 const FEWEST: usize = 200;
-/// Residuals this many times as large as those of most cells, and as the data sheet says, come from a cell that is loose
-/// or damaged.
+/// A cell is loose or damaged if its residuals exceed those of most cells, and the data sheet, by this factor.
 const ROUGH: f64 = 1.5;
-/// Residuals of most cells that are this many times as large as the data sheet says are not those of its sensors.
+/// The recording is refused if the residuals of most cells exceed the data sheet by this factor.
 const SCATTER: f64 = 1.3;
-/// Rates that differ by more than this part are not the same.
+/// The relative difference above which two rates count as different.
 const OTHER_RATE: f64 = 0.02;
-/// Shifts of more than this part of the time are too many.
+/// The maximum part of the time that may be shifted.
 const MUCH_SHIFTED: f64 = 0.005;
-/// Rounds in which shifts of stretches are improved.
+/// The number of rounds in which the shifts of stretches are improved.
 const SHIFTS: usize = 5;
-/// The logarithm of a likelihood ratio above which one joint is better than the next.
+/// The logarithm of the likelihood ratio above which one joint is preferred to the next.
 const SURE: f64 = 10.0;
-/// Another described pose is nearer if it is this many times nearer.
+/// Another described place counts as nearer only if its distance is smaller by this factor.
 const NEARER: f64 = 2.0;
 
 /// Estimates every cell.
 ///
 /// # Errors
-/// When the recording is not one of this skin with such sensors, or is too disturbed: nothing is estimated from it.
+/// Returns [`Refusal`] if the recording does not match the skin or its sensors, or is too disturbed; nothing is
+/// estimated then.
 pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Result<Calibration, Refusal> {
     let (seen_by, disturbance) = estimated(skin, seen, settings)?;
     let Seen { tables, lags, estimates } = seen_by;
@@ -71,16 +72,16 @@ pub fn calibrate(skin: &Skin, seen: &Observations, settings: &Settings) -> Resul
     Ok(Calibration { summary, cells, zero_offsets })
 }
 
-/// Estimates of all cells, each by itself.
+/// The estimates of all cells, each by itself.
 struct Seen {
-    /// By bus.
+    /// The motions of each bus' links.
     tables: Vec<Option<Table>>,
     lags: Vec<Lags>,
-    /// By cell.
+    /// The estimate of each cell.
     estimates: Vec<Option<Estimate>>,
 }
 
-/// Estimates each cell by itself, with the shifts of stretches between gaps.
+/// Estimates each cell by itself, including the shifts of stretches between gaps.
 fn estimated(skin: &Skin, seen: &Observations, settings: &Settings) -> Result<(Seen, Disturbance), Refusal> {
     checked(skin, seen)?;
     let mut lags: Vec<_> = seen.buses.iter().map(Lags::none).collect();
@@ -129,7 +130,8 @@ fn shifted(
     Refusal::Shifted { bus: name(skin, bus), at_s, ms, disturbance }
 }
 
-/// Checks that shifts between stretches are a small part of the time: of many large ones each is known too badly.
+/// Checks that shifts between stretches affect only a small part of the time: many large shifts cannot be estimated
+/// accurately.
 fn much_shifted(
     skin: &Skin,
     seen: &Observations,
@@ -149,7 +151,7 @@ fn name(skin: &Skin, bus: usize) -> String {
     skin.buses.get(bus).map_or_else(String::new, |bus| bus.name.clone())
 }
 
-/// Checks that the joints of a recording are those of the skin, at its rate.
+/// Checks that the joints of a recording match the skin, also in their rate.
 fn checked(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
     for (bus, observed) in
         seen.buses.iter().enumerate().filter(|(bus, _)| skin.cells_of(*bus).next().is_some())
@@ -168,7 +170,7 @@ fn checked(skin: &Skin, seen: &Observations) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// Returns the disturbance of a recording, unless it leaves too little.
+/// Returns the disturbance of a recording, unless too little of it remains.
 fn disturbed(skin: &Skin, seen: &Observations, tables: &[Option<Table>]) -> Result<Disturbance, Refusal> {
     let mut all = Disturbance::default();
     for (bus, (observed, table)) in seen.buses.iter().zip(tables).enumerate() {
@@ -233,14 +235,14 @@ fn each_alone(skin: &Skin, seen: &Observations, settings: &Settings, lags: Vec<L
     Seen { tables, lags, estimates }
 }
 
-/// Whether all readings are one value.
+/// Returns true if all readings are equal.
 fn is_stuck(readings: &[Reading]) -> bool {
     let mut readings = readings.iter().map(|reading| reading.g.map(f64::to_bits));
     let first = readings.next();
     readings.all(|reading| Some(reading) == first)
 }
 
-/// What is known of a cell by itself.
+/// Returns the result for a cell by itself.
 fn result(
     skin: &Skin,
     cell: &Cell,
@@ -286,7 +288,7 @@ fn result(
     result
 }
 
-/// Names cells whose readings scatter much more than those of most, and than the data sheet says.
+/// Marks cells whose readings scatter much more than those of most cells, and than the data sheet says.
 fn rough(cells: &mut [CellResult], estimates: &[Option<Estimate>]) {
     let times = |(cell, estimate): (&CellResult, &Option<Estimate>)| {
         cell.pose.as_ref().and(estimate.as_ref()).map(|estimate| estimate.rough_times)
@@ -302,7 +304,7 @@ fn rough(cells: &mut [CellResult], estimates: &[Option<Estimate>]) {
     }
 }
 
-/// Improves positions link by link; returns how many wires were used.
+/// Improves positions link by link, and returns the number of wires used.
 fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) -> usize {
     let Some(spacing) = settings.spacing else { return 0 };
     let mut used = 0;
@@ -343,7 +345,7 @@ fn with_neighbors(skin: &Skin, cells: &mut [CellResult], settings: &Settings) ->
     used
 }
 
-/// Names cells that sit where the skin has another one.
+/// Marks cells that were found at the place of another cell.
 fn confused(skin: &Skin, cells: &mut [CellResult]) {
     let found: Vec<_> =
         skin.cells.iter().zip(&*cells).map(|(cell, result)| place_of(skin, cell, result)).collect();
@@ -356,10 +358,10 @@ fn confused(skin: &Skin, cells: &mut [CellResult]) {
     }
 }
 
-/// The other cell of the same bus in whose described place a cell was found.
+/// Returns the other cell of the same bus at whose described place a cell was found.
 fn place_of(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize> {
     let pose = result.pose.as_ref().filter(|pose| pose.is_determined())?;
-    // Half a turn counts as much as a metre: an offset by a cell's width is worth 5 degrees.
+    // Half a turn counts as much as a metre: an offset by a cell's width equals 5 degrees.
     let far = |described: &Cell| {
         if described.joint != pose.joint {
             return f64::INFINITY;
@@ -379,7 +381,7 @@ fn place_of(skin: &Skin, cell: &Cell, result: &CellResult) -> Option<usize> {
     (nearest * NEARER < own && nearest * NEARER < next + 2e-3 && own > certain).then_some(index)
 }
 
-/// Says what would help where a pose is not determined.
+/// Adds advice to the cells whose pose is not determined.
 fn advise(skin: &Skin, estimates: &[Option<Estimate>], cells: &mut [CellResult], settings: &Settings) {
     let mut known: Vec<((usize, u8), Help)> = Vec::new();
     for ((cell, estimate), result) in skin.cells.iter().zip(estimates).zip(cells) {

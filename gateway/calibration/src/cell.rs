@@ -1,10 +1,10 @@
-//! What a cell would show, as a function of what is unknown of it.
+//! The model of a cell: its readings as a function of its unknowns.
 //!
-//! With `A = (I + gain + cross) R^T` it shows `A (force + gradient p) + bias`, `force` and `gradient` being those of its
-//! row. That is linear in the 12 numbers of the row's motion; so sums of their products hold all that a long
-//! recording says, and least squares need the recording only once.
+//! With `A = (I + gain + cross) R^T`, a reading is `A (force + gradient p) + bias`, where `force` and `gradient` are
+//! those of the cell's row. This is linear in the 12 numbers of the row's motion. Sums of their products therefore hold
+//! all information of a long recording, and least squares pass over the recording only once.
 //!
-//! The age of readings enters by three such sets, at three ages, between which a parabola leads.
+//! The age of readings enters by three such sets of numbers, at three ages, with a parabola between them.
 
 #![expect(clippy::indexing_slicing, reason = "matrices of constant size, with indices below it")]
 
@@ -15,38 +15,38 @@ use nalgebra::{Matrix3, SMatrix, SVector, UnitQuaternion, Vector3};
 use model::accelerometer::kinematics::RowMotion;
 use model::accelerometer::sensor::DataSheet;
 
-/// Numbers of a row's motion: its force, and its gradient by columns.
+/// The numbers of a row's motion: its force, and its gradient by columns.
 pub(crate) const ROW: usize = 12;
-/// Ages at which motions are known.
+/// The number of ages for which motions are computed.
 pub(crate) const AGES: usize = 3;
-/// From one of these ages to the next, in s.
+/// The interval between two of these ages, in s.
 pub(crate) const AGE_STEP: f64 = 0.006;
-/// Numbers of a moment: motions at all ages, and 1.
+/// The numbers of a moment: motions at all ages, and 1.
 pub(crate) const MOMENT: usize = AGES * ROW + 1;
-/// What is unknown of a cell.
+/// The number of unknowns of a cell.
 pub(crate) const UNKNOWNS: usize = 19;
 
-/// Of the unknowns: the turn from the present orientation, as a rotation vector in the frame of the cell.
+/// The unknowns of the turn from the present orientation: a rotation vector in the frame of the cell.
 pub(crate) const TURN: Range<usize> = 0..3;
-/// The position in the frame of the row.
+/// The unknowns of the position in the frame of the row.
 pub(crate) const POSITION: Range<usize> = 3..6;
 pub(crate) const BIAS: Range<usize> = 6..9;
 pub(crate) const GAIN: Range<usize> = 9..12;
-/// What axes show of each other.
+/// The unknowns of the cross-sensitivity between axes.
 const CROSS: Range<usize> = 12..18;
 pub(crate) const AGE: usize = 18;
 
-/// Row and column of each of [`CROSS`].
+/// Row and column of each element of [`CROSS`].
 const OFF_DIAGONAL: [(usize, usize); 6] = [(0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)];
 
-/// One moment's numbers.
+/// The numbers of one moment.
 pub(crate) type Moment = [f64; MOMENT];
-/// What each axis makes of them.
+/// The coefficients of each axis for these numbers.
 pub(crate) type Coefficients = SMatrix<f64, MOMENT, 3>;
 pub(crate) type Unknowns = SVector<f64, UNKNOWNS>;
 pub(crate) type Information = SMatrix<f64, UNKNOWNS, UNKNOWNS>;
 
-/// A cell as it is supposed to be.
+/// The assumed state of a cell.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct CellModel {
     pub(crate) rotation: UnitQuaternion<f64>,
@@ -54,17 +54,17 @@ pub(crate) struct CellModel {
     pub(crate) bias: Vector3<f64>,
     /// `I + gain + cross`.
     pub(crate) matrix: Matrix3<f64>,
-    /// Age of its readings less the middle one of the ages, in s.
+    /// The age of its readings minus the middle one of the ages, in s.
     pub(crate) age: f64,
 }
 
 impl CellModel {
-    /// One with a perfect sensor.
+    /// Creates a model with a perfect sensor.
     pub(crate) fn at(rotation: UnitQuaternion<f64>, position: Vector3<f64>) -> Self {
         Self { rotation, position, bias: Vector3::zeros(), matrix: Matrix3::identity(), age: 0.0 }
     }
 
-    /// What each axis makes of a moment.
+    /// Returns the coefficients of each axis for the numbers of a moment.
     pub(crate) fn coefficients(&self) -> Coefficients {
         let rotation = self.rotation.to_rotation_matrix().matrix().to_owned();
         let mut all =
@@ -73,7 +73,7 @@ impl CellModel {
         all
     }
 
-    /// How these change with each unknown.
+    /// Returns the derivatives of the coefficients by each unknown.
     pub(crate) fn derivatives(&self) -> [Coefficients; UNKNOWNS] {
         let turned = self.rotation.to_rotation_matrix().matrix().transpose();
         let axes = self.matrix * turned;
@@ -102,7 +102,7 @@ impl CellModel {
         })
     }
 
-    /// The same with other values of the unknowns.
+    /// Returns the model after a step of the unknowns.
     pub(crate) fn moved(&self, step: &Unknowns) -> Self {
         let part = |range: &Range<usize>| Vector3::from_fn(|at, _| step[range.start + at]);
         let mut matrix = self.matrix;
@@ -118,7 +118,7 @@ impl CellModel {
         }
     }
 
-    /// The unknowns that a data sheet knows something of, less what it expects of them.
+    /// Returns the deviations of the unknowns from the values that the data sheet expects.
     pub(crate) fn unexpected(&self) -> Unknowns {
         Unknowns::from_fn(|unknown, _| {
             if let Some(axis) = within(&BIAS, unknown) {
@@ -135,10 +135,10 @@ impl CellModel {
     }
 }
 
-/// What a data sheet says of the unknowns before anything is measured, by the inverse of variances. Of the pose nearly
-/// nothing: it makes the information of a direction that no motion shows regular.
+/// Returns the prior of the unknowns by the data sheet, as inverse variances. For the pose it is very weak: it keeps
+/// the information regular in directions that no motion reveals.
 pub(crate) fn expected(sheet: &DataSheet) -> Unknowns {
-    // Values that are evenly spread have a standard deviation of this part of their limit. None is exact.
+    // The standard deviation of a uniform distribution with this limit; never 0.
     let even = |limit: f64| (limit / 3.0_f64.sqrt()).max(1e-6);
     let deviation = |unknown: usize| {
         if TURN.contains(&unknown) {
@@ -158,18 +158,18 @@ pub(crate) fn expected(sheet: &DataSheet) -> Unknowns {
     Unknowns::from_fn(|unknown, _| deviation(unknown).powi(-2))
 }
 
-/// How well an orientation is known of which nothing is known, in rad.
+/// The prior standard deviation of the orientation, in rad.
 pub(crate) const WEAK_TURN: f64 = 1.0;
-/// How well a position is known of which nothing is known, in m.
+/// The prior standard deviation of the position, in m.
 pub(crate) const WEAK_POSITION: f64 = 0.5;
 
-/// The numbers of a row's motion.
+/// Returns the numbers of a row's motion.
 pub(crate) fn numbers(motion: &RowMotion) -> [f64; ROW] {
     let mut all = motion.force.iter().chain(motion.gradient.iter());
     core::array::from_fn(|_| all.next().copied().unwrap_or_default())
 }
 
-/// What axes make of a row's motion, at a position.
+/// Returns the coefficients of the axes for a row's motion, at a position.
 fn row(axes: &Matrix3<f64>, position: &Vector3<f64>) -> SMatrix<f64, ROW, 3> {
     SMatrix::from_fn(|number, axis| {
         let (block, part) = (number / 3, number % 3);
@@ -190,7 +190,7 @@ fn spread(row: &SMatrix<f64, ROW, 3>, ages: &[f64; AGES]) -> Coefficients {
     all
 }
 
-/// Which entry of the sensor's matrix an unknown is.
+/// Returns the entry of the sensor's matrix that an unknown stands for.
 fn matrix_entry(unknown: usize) -> (usize, usize) {
     within(&GAIN, unknown).map_or_else(
         || OFF_DIAGONAL.get(unknown.wrapping_sub(CROSS.start)).copied().unwrap_or((0, 0)),
@@ -202,13 +202,13 @@ fn within(range: &Range<usize>, unknown: usize) -> Option<usize> {
     range.contains(&unknown).then(|| unknown - range.start)
 }
 
-/// Weights of the motions at the three ages.
+/// Returns the weights of the motions at the three ages.
 fn parabola(age: f64) -> [f64; AGES] {
     let x = age / AGE_STEP;
     [x * (x - 1.0) / 2.0, 1.0 - x * x, x * (x + 1.0) / 2.0]
 }
 
-/// How these change with the age.
+/// Returns the derivatives of the weights by the age.
 fn slope(age: f64) -> [f64; AGES] {
     let x = age / AGE_STEP;
     [(x - 0.5) / AGE_STEP, -2.0 * x / AGE_STEP, (x + 0.5) / AGE_STEP]

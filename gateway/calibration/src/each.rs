@@ -1,10 +1,10 @@
-//! The same work for many things, on several processors.
+//! Parallel execution of independent tasks.
 
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-/// Does `work` for the numbers below `count`, by some threads at once; the results are in their order.
+/// Calls `work` for the numbers below `count` on several threads, and returns the results in order.
 pub(crate) fn each<T: Send>(count: usize, threads: usize, work: impl Fn(usize) -> T + Sync) -> Vec<T> {
     let next = AtomicUsize::new(0);
     let done = Mutex::new(Vec::with_capacity(count));
@@ -15,13 +15,13 @@ pub(crate) fn each<T: Send>(count: usize, threads: usize, work: impl Fn(usize) -
                 break;
             }
             let result = work(index);
-            // A thread that panicked has left nothing half done here.
+            // A thread that panicked leaves no partial result here.
             done.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push((index, result));
         }
     };
     thread::scope(|scope| {
         for _ in 1..threads.clamp(1, count.max(1)) {
-            // The others do the work of one that the system does not start.
+            // If the system does not start a thread, the others do its work.
             if thread::Builder::new().spawn_scoped(scope, run).is_err() {
                 break;
             }

@@ -1,4 +1,4 @@
-//! One cell: which joint moves it, where it sits, and what its sensor adds.
+//! The estimate of one cell: the joint that moves it, its pose, and the errors of its sensor.
 
 #![expect(clippy::indexing_slicing, reason = "matrices of constant size, with indices below it")]
 
@@ -11,66 +11,67 @@ use crate::sums::{Fit, Free, Sums, at_middle_age};
 use crate::table::Table;
 use model::accelerometer::sensor::DataSheet;
 
-/// Readings that are looked at to find the joint.
+/// The number of readings in the first search for the joint.
 const FIRST_LOOK: usize = 1_500;
-/// Joints that are looked at in full.
+/// The number of joints that are then fitted completely.
 const SHORTLIST: usize = 3;
-/// Times that weights are computed again.
+/// The number of times that the weights are recomputed.
 const ROUNDS: usize = 2;
-/// Residuals beyond this many standard deviations of a reading count less: [`weight`].
+/// Residuals beyond this many standard deviations get a lower weight; see [`weight`].
 const TOLERATED: f64 = 3.5;
-/// Broadcasts that are summed before their dependence on others is computed.
+/// The number of broadcasts that are summed before their correlation is computed.
 const BATCH: u32 = 4;
-/// Batches whose ages may depend on each other, about 16 s.
+/// The maximum distance of correlated batches, about 16 s.
 const BATCHES: u32 = 256;
-/// Clocks over which the dependence of ages is averaged.
+/// The number of clock rates over which the correlation of ages is averaged.
 const CLOCKS: u32 = 101;
-/// The smallest number of readings for an estimate.
+/// The minimum number of readings for an estimate.
 const FEWEST: f64 = 100.0;
 /// The median of the squared length of three standard normal numbers.
 const MEDIAN_SQUARE: f64 = 2.366;
-/// What that is below, nine of ten times.
+/// The 90 % quantile of the same.
 const MOST_SQUARE: f64 = 6.251;
-/// Errors of readings from rounding and smoothing of joints, in g.
+/// The error of readings from rounding and smoothing of joints, in g.
 const SMOOTHED_G: f64 = 1e-3;
-/// Standard deviation of a position along each axis from smoothed accelerations, in m.
+/// The standard deviation of a position along each axis from smoothed accelerations, in m.
 const SMOOTHED_M: f64 = 1e-4;
 
-/// What the readings of a cell say of it.
+/// The estimate of a cell from its readings.
 #[derive(Clone, Debug)]
 pub(crate) struct Estimate {
     /// The joint that moves it, 0 for none.
     pub(crate) joint: u8,
-    /// How much worse the next joint explains the readings: the logarithm of a likelihood ratio.
+    /// The logarithm of the likelihood ratio to the next best joint.
     pub(crate) margin: f64,
     pub(crate) model: CellModel,
-    /// Of the unknowns.
+    /// The covariance of the unknowns.
     pub(crate) covariance: Information,
-    /// Root mean square of the residuals of an axis, in g, from their median.
+    /// The root mean square of an axis' residuals, in g, derived from their median.
     pub(crate) noise_g: f64,
-    /// The same, from what nine of ten residuals are below.
+    /// The same, derived from the 90 % quantile.
     pub(crate) rough_g: f64,
-    /// The first in units of what the data sheet says of each reading, by its noise and by how fast it changes.
+    /// `noise_g` relative to the data sheet's value for each reading, which depends on the noise and on the reading's
+    /// rate of change.
     pub(crate) noise_times: f64,
-    /// The second in these units.
+    /// `rough_g` in the same units.
     pub(crate) rough_times: f64,
 }
 
 impl Estimate {
-    /// Of the position, in m2.
+    /// Returns the covariance of the position, in m².
     pub(crate) fn position_covariance(&self) -> Matrix3<f64> {
         let own: Matrix3<f64> =
             self.covariance.fixed_view::<3, 3>(POSITION.start, POSITION.start).into_owned();
         own + Matrix3::identity() * (SMOOTHED_M * SMOOTHED_M)
     }
 
-    /// Of the turn in the frame of the cell, in rad2.
+    /// Returns the covariance of the turn in the frame of the cell, in rad².
     pub(crate) fn turn_covariance(&self) -> Matrix3<f64> {
         self.covariance.fixed_view::<3, 3>(TURN.start, TURN.start).into_owned()
     }
 }
 
-/// A pose from which least squares may begin.
+/// A pose from which least squares may start.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Guess {
     pub(crate) joint: u8,
@@ -78,7 +79,7 @@ pub(crate) struct Guess {
     pub(crate) position: Vector3<f64>,
 }
 
-/// Estimates a cell; `None` if too few of its readings can be used.
+/// Estimates a cell; returns `None` if too few of its readings can be used.
 pub(crate) fn estimate(
     table: &Table,
     readings: &[Reading],
@@ -87,10 +88,10 @@ pub(crate) fn estimate(
     ages: &Ages,
 ) -> Option<Estimate> {
     let expected = expected(sheet);
-    // At the end of its range a sensor shows less than there is.
+    // At the end of its range a sensor saturates.
     let within = |reading: &&Reading| reading.g.iter().all(|axis| axis.abs() < 0.98 * sheet.range_g);
     let readings: &[Reading] = &readings.iter().filter(within).copied().collect::<Vec<_>>();
-    // The age of readings changes from one to the next, which looks like noise while the robot moves.
+    // The age of readings varies from one to the next, which looks like noise while the robot moves.
     let variance = (sheet.deviation().powi(2) + 0.002_f64.powi(2)).max(1e-8);
     let (joint, margin, start) = identify(table, readings, guess, &expected, variance)?;
     let link = table.link(joint);
@@ -121,7 +122,7 @@ pub(crate) fn estimate(
     Some(Estimate { joint, margin, model, covariance, noise_g, rough_g, noise_times, rough_times })
 }
 
-/// The joint whose motion explains the readings best.
+/// Finds the joint whose motion explains the readings best.
 fn identify(
     table: &Table,
     readings: &[Reading],
@@ -131,7 +132,8 @@ fn identify(
 ) -> Option<(u8, f64, CellModel)> {
     let stride = (readings.len() / FIRST_LOOK).max(1);
     let few: Vec<_> = readings.iter().step_by(stride).copied().collect();
-    // What fits worst without constraints fits no better with them: only the best joints get the full look.
+    // A joint that fits worst without constraints does not fit better with them: only the best ones are fitted
+    // completely.
     let mut looks = Vec::new();
     for joint in 0..=table.joints() {
         let mut sums = Sums::default();
@@ -148,7 +150,7 @@ fn identify(
         let found = first(&free).map(|start| sums.fit(start, expected, variance));
         let described = (guess.joint == joint).then(|| CellModel::at(guess.rotation, guess.position));
         let described = described.map(|start| sums.fit(start, expected, variance));
-        // Where both explain as much, what nothing tells stays as it is described.
+        // If both explain the readings equally well, the described joint is kept.
         let best = match (found, described) {
             (Some(found), Some(described)) => {
                 if described.cost < found.cost + 1.0 {
@@ -167,14 +169,14 @@ fn identify(
     Some((joint, (next - best.cost) / 2.0, best.model))
 }
 
-/// A model from what the readings say without constraints.
+/// Returns a model from the unconstrained fit.
 fn first(free: &Free) -> Option<CellModel> {
     let axes = Matrix3::from_fn(|axis, part| free[(part, axis)]);
     let parts = axes.svd(true, true);
     let (left, right) = (parts.u?, parts.v_t?);
     let mut turned = left * right;
     if turned.determinant() < 0.0 {
-        // The direction that readings say the smallest part of is reversed.
+        // The direction with the smallest singular value is reversed.
         let weakest = parts.singular_values.imin();
         let flipped =
             Matrix3::from_fn(
@@ -192,7 +194,7 @@ fn first(free: &Free) -> Option<CellModel> {
     Some(CellModel::at(UnitQuaternion::from_rotation_matrix(&rotation), position))
 }
 
-/// Readings at whose time the motion is known.
+/// Returns the readings for whose time the motion is known.
 pub(crate) fn paired<'a>(
     link: &'a [Option<Moment>],
     readings: &'a [Reading],
@@ -203,7 +205,7 @@ pub(crate) fn paired<'a>(
     })
 }
 
-/// What a reading shows more than a model makes of its moment.
+/// Returns the difference between a reading and the model at its moment.
 pub(crate) fn residual(coefficients: &Coefficients, moment: &Moment, shown: &[f64; 3]) -> [f64; 3] {
     let mut left = *shown;
     for (left, column) in left.iter_mut().zip(coefficients.column_iter()) {
@@ -216,15 +218,15 @@ fn square(of: &[f64; 3]) -> f64 {
     of.iter().map(|part| part * part).sum()
 }
 
-/// How much a reading counts: one that is further off than noise makes it counts less (Huber).
+/// Returns the weight of a reading; readings beyond the noise get a lower one (Huber).
 pub(crate) fn weight(residual: &[f64; 3], variance: f64) -> f64 {
     let off = (square(residual) / variance).sqrt();
     if off <= TOLERATED { 1.0 } else { TOLERATED / off }
 }
 
-/// The variance of an axis' residuals, from the median of their squares and from what nine of ten are below: single
-/// readings that came late, or not as they were sent, spoil neither. With a data sheet each is in units of what that
-/// says of it.
+/// Returns the variance of the axes' residuals, once from the median of their squares and once from the 90 % quantile:
+/// single readings that were late or corrupted affect neither. With a data sheet, each residual is in units of its
+/// expected value.
 fn spreads(
     link: &[Option<Moment>],
     readings: &[Reading],
@@ -251,9 +253,9 @@ fn spreads(
     [below(1, 2) / MEDIAN_SQUARE, below(9, 10) / MOST_SQUARE]
 }
 
-/// The covariance of the unknowns: what noise makes of them, and what ages of readings make of them that change as a
-/// sensor's clock drifts against the broadcasts. Such ages depend on each other over seconds, so that noise alone says
-/// too little.
+/// Returns the covariance of the unknowns. It includes the noise, and the ages of readings, which change as a sensor's
+/// clock drifts against the broadcasts. Such ages are correlated over seconds, so that noise alone gives too small a
+/// value.
 fn covariance(
     link: &[Option<Moment>],
     readings: &[Reading],
@@ -298,7 +300,7 @@ fn covariance(
         scatter.ger(1.0, score, &beside, 1.0);
         scatter.ger(1.0, &beside, score, 1.0);
     }
-    // A lag that was estimated of a stretch is off for all of it.
+    // The estimated lag of a stretch is wrong by the same amount for all of it.
     let mut by_stretch = vec![Unknowns::zeros(); lags.deviations().len()];
     for (batch, score) in &scores {
         let index = usize::try_from(batch * BATCH).unwrap_or(usize::MAX);
@@ -319,16 +321,16 @@ pub(crate) fn change(by_age: &Coefficients, moment: &Moment) -> [f64; 3] {
     all
 }
 
-/// Covariance of the ages of readings: samples come at the rate of a clock that is off by an unknown part, so
-/// that the age of the newest one runs through a period again and again.
+/// The covariance of the ages of readings. Samples come at the rate of a clock with an unknown error, so that the age
+/// of the newest one runs through a period again and again.
 #[derive(Clone, Debug)]
 pub(crate) struct Ages {
-    /// By distance in batches, in s2.
+    /// The covariance by distance in batches, in s².
     covariance: Vec<f64>,
 }
 
 impl Ages {
-    /// Those of sensors that are read with broadcasts so far apart.
+    /// Returns the covariance for sensors that are read with broadcasts at this interval.
     pub(crate) fn of(sheet: &DataSheet, broadcast_s: f64) -> Self {
         let period = sheet.period_s();
         if period <= 0.0 {

@@ -1,4 +1,4 @@
-//! Which motion would tell what the motion that was made did not.
+//! Advice: the motion that would determine a pose which the recorded motion did not.
 
 use nalgebra::{Cholesky, Matrix3};
 use protocol::skin::Skin;
@@ -11,35 +11,35 @@ use crate::plan::{AIM, SWING_S, Supposed, Swings, informed, poses};
 use crate::settings::Settings;
 use model::accelerometer::kinematics::Arm;
 
-/// What would help where a pose is not determined.
+/// The motion that would help to determine a pose.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "help", rename_all = "kebab-case")]
 pub enum Help {
-    /// A joint shall swing more.
+    /// A joint should swing more.
     Swing {
-        /// Its name.
+        /// The joint's name.
         joint: String,
     },
-    /// The robot shall stand in more poses.
+    /// The robot should stand in more poses.
     Poses,
-    /// No motion of this robot tells it.
+    /// No motion of this robot helps.
     Nothing,
 }
 
 impl core::fmt::Display for Help {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
-            Self::Swing { joint } => write!(f, "what would help most is that {joint} swings more"),
-            Self::Poses => f.write_str("what would help most are more poses"),
-            Self::Nothing => f.write_str("no motion of this robot tells more"),
+            Self::Swing { joint } => write!(f, "a larger swing of {joint} would help most"),
+            Self::Poses => f.write_str("more poses would help most"),
+            Self::Nothing => f.write_str("no motion of this robot would help"),
         }
     }
 }
 
-/// What is uncertain has to fall to this part for a motion to be called a help.
+/// A motion counts as a help if it reduces the uncertainty to this part.
 const HELP: f64 = 0.7;
 
-/// The motion that would tell most of a cell, beside what is known.
+/// Finds the motion that would add most information on a cell.
 pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &Settings) -> Help {
     let swings = Swings::new(skin, &settings.bounds);
     let arms = [(bus, Arm::new(skin, bus, settings.gravity))];
@@ -52,7 +52,7 @@ pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &S
         let steps = core::iter::once(Step::Hold { at: pose.clone() }).chain(swings.about(pose));
         for step in steps {
             let informed = informed(skin, &arms, &supposed, &step, SWING_S, &settings.sheet);
-            // As much of it as fits into a plan.
+            // As many repetitions as fit into a plan.
             let more = informed.first().copied().unwrap_or_else(Information::zeros)
                 * (settings.bounds.length_s / SWING_S);
             let left = uncertain(&(known + more)) / before;
@@ -77,7 +77,7 @@ pub(crate) fn helpful(skin: &Skin, bus: usize, estimate: &Estimate, settings: &S
     best.1
 }
 
-/// How uncertain a pose is in its worst direction: a standard deviation, in units of what shall be reached.
+/// Returns the uncertainty of a pose in its worst direction: a standard deviation, relative to the aim.
 fn uncertain(information: &Information) -> f64 {
     let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return f64::INFINITY };
     let part = |start: usize, aim: f64| {

@@ -1,22 +1,22 @@
-//! Times of readings against those of their joints, stretch by stretch.
+//! Lags: the times of readings relative to those of their joints, for each stretch of a recording.
 //!
-//! Where joints were not broadcast in time, what follows may be shifted: sensors of simulated cells follow a plan, the loop
-//! counts broadcasts. All cells of a bus are shifted alike, so that the shift of each stretch between gaps is known
-//! well from all of them, while the age that a single sensor has of its own is not touched. Long stretches are divided:
-//! broadcasts that were a little late, or clocks that differ, shift readings without a gap.
+//! Readings may be shifted after a broadcast that was not in time, because the sensors of simulated cells follow a plan
+//! while the loop counts broadcasts. All cells of a bus are shifted alike. The shift of each stretch between gaps is
+//! therefore well determined by all of them, and does not affect the individual age of a sensor. Long stretches are
+//! divided, because slightly late broadcasts and differing clocks shift readings without a gap.
 
 use crate::observe::BusObservations;
 
-/// Broadcasts of a stretch at most, about 4 s.
+/// The maximum number of broadcasts in a stretch, about 4 s.
 const LONGEST: usize = 256;
 
-/// By stretch of a bus, how much older its readings are than the others', in s.
+/// The lags of a bus: the additional age of the readings of each stretch, in s.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct Lags {
     pub(crate) by_stretch: Vec<f64>,
-    /// Standard deviations of these, in s; 0 of those that were not estimated.
+    /// The standard deviations of the lags, in s; 0 for lags that were not estimated.
     pub(crate) deviations: Vec<f64>,
-    /// The first broadcast of each stretch but the first.
+    /// The first broadcast of each stretch except the first one.
     pub(crate) starts: Vec<usize>,
 }
 
@@ -36,7 +36,7 @@ impl Lags {
         Self { by_stretch: none.clone(), deviations: none, starts }
     }
 
-    /// The stretch of a broadcast.
+    /// Returns the stretch of a broadcast.
     pub(crate) fn stretch(&self, index: usize) -> usize {
         self.starts.partition_point(|start| *start <= index)
     }
@@ -46,18 +46,18 @@ impl Lags {
         self.by_stretch.get(self.stretch(index)).copied().unwrap_or_default()
     }
 
-    /// The standard deviation of the lag of each stretch, in s.
+    /// Returns the standard deviation of the lag of each stretch, in s.
     pub(crate) fn deviations(&self) -> &[f64] {
         &self.deviations
     }
 
-    /// From the smallest lag to the largest one, in s.
+    /// Returns the difference between the largest and the smallest lag, in s.
     pub(crate) fn range(&self) -> f64 {
         let all = || self.by_stretch.iter().copied();
         (all().fold(f64::NEG_INFINITY, f64::max) - all().fold(f64::INFINITY, f64::min)).max(0.0)
     }
 
-    /// The stretch that is off most: its first broadcast, and by how much, in s.
+    /// Returns the first broadcast and the lag in s of the stretch with the largest absolute lag.
     pub(crate) fn most(&self) -> (usize, f64) {
         let all = core::iter::once(0).chain(self.starts.iter().copied()).zip(self.by_stretch.iter().copied());
         all.max_by(|(_, one), (_, other)| one.abs().total_cmp(&other.abs())).unwrap_or_default()

@@ -1,20 +1,20 @@
-//! Where cells sit, from what their accelerometers feel while the robot moves.
+//! Calibration: finds the places of cells on a robot from the readings of their accelerometers while the robot moves.
 //!
 //! ```text
 //!   plan ─> motion ─> a robot, real or simulated ─> joints and sensors pages ─> observe ─> calibrate ─> result
 //! ```
 //!
-//! | module | what |
+//! | module | content |
 //! |---|---|
-//! | [`plan`], [`motion`] | which motion to make, and where the joints are in it at a time |
+//! | [`plan`], [`motion`] | the choice of a motion, and the positions of the joints during it |
 //! | [`simulate`] | a skin of accelerometers in virtual time |
-//! | [`observe`] | what is kept of the messages of a bus |
-//! | [`mod@calibrate`] | the estimate of every cell, and which of them to distrust |
-//! | [`refusal`] | why a recording says nothing that can be trusted |
+//! | [`observe`] | the data that is kept of the messages of a bus |
+//! | [`mod@calibrate`] | the estimate of every cell, and the marks on doubtful ones |
+//! | [`refusal`] | the reasons to refuse a recording |
 //! | [`zero`] | zero offsets of the robot's joints |
-//! | [`help`] | which motion would tell what was not determined |
-//! | [`neighbors`] | positions made better by the distance of neighbours |
-//! | [`result`], [`mod@write`] | what came out, and a skin file with it |
+//! | [`help`] | the motion that would determine a missing pose |
+//! | [`neighbors`] | positions improved by the distance of neighbours |
+//! | [`result`], [`mod@write`] | the results, and a skin file with them |
 
 pub mod calibrate;
 mod cell;

@@ -1,72 +1,73 @@
-//! How the robot moves while accelerations are recorded: holds, moves from pose to pose, and swings about a pose.
+//! The motion of the robot while accelerations are recorded: holds, moves from pose to pose, and swings about a pose.
 
 use core::f64::consts::TAU;
 
 use model::accelerometer::RobotState;
 use serde::Serialize;
 
-/// How long a swing takes to reach its amplitude, and to end, in s.
+/// The time in which a swing reaches its amplitude, and in which it ends, in s.
 const RAMP_S: f64 = 0.6;
 
-/// Something that the robot does.
+/// A step of a motion.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "do", rename_all = "lowercase")]
 pub enum Step {
-    /// It stands.
+    /// The robot stands still.
     Hold {
-        /// Where.
+        /// The pose.
         at: Vec<f64>,
     },
-    /// It goes from one pose to another; speed, acceleration and jerk are zero at both ends.
+    /// The robot moves from one pose to another; speed, acceleration and jerk are zero at both ends.
     Move {
-        /// From where.
+        /// The first pose.
         from: Vec<f64>,
-        /// To where.
+        /// The last pose.
         to: Vec<f64>,
     },
     /// Joints swing about a pose.
     Swing {
         /// The pose.
         about: Vec<f64>,
-        /// How far each joint swings; 0 for those that stand.
+        /// The amplitude of each joint; 0 for joints that stand still.
         amplitude: Vec<f64>,
-        /// How often in a second.
+        /// The frequency of each joint.
         rate_hz: Vec<f64>,
     },
 }
 
-/// A step and when it is done.
+/// A step with its time.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Timed {
-    /// When it begins, in s.
+    /// The start time in s.
     pub at_s: f64,
-    /// How long it takes, in s.
+    /// The duration in s.
     pub for_s: f64,
-    /// What is done.
+    /// The step.
     #[serde(flatten)]
     pub step: Step,
 }
 
-/// What the robot does, one step after the other.
+/// A sequence of steps.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Motion {
-    /// The steps.
+    /// The steps, in order.
     pub steps: Vec<Timed>,
 }
 
 impl Motion {
-    /// Adds a step to the end.
+    /// Appends a step.
     pub fn then(&mut self, for_s: f64, step: Step) {
         self.steps.push(Timed { at_s: self.length_s(), for_s, step });
     }
 
-    /// How long all of it takes, in s.
+    /// Returns the total duration in s.
     #[must_use]
     pub fn length_s(&self) -> f64 {
         self.steps.last().map_or(0.0, |last| last.at_s + last.for_s)
     }
 
-    /// Where the joints are at a time in s, and how they move; before the first step and after the last one they stand.
+    /// Returns the positions, speeds and accelerations of the joints at a time in s; before the first step and after
+    /// the last one the robot stands still.
     #[must_use]
     pub fn at(&self, time: f64) -> RobotState {
         let index = self.steps.partition_point(|step| step.at_s <= time).saturating_sub(1);
@@ -100,7 +101,8 @@ impl Motion {
     }
 }
 
-/// From 0 to 1 within a time, with speed, acceleration and jerk zero at both ends: value and two derivatives.
+/// Rises from 0 to 1 within a time, with speed, acceleration and jerk zero at both ends; returns the value and two
+/// derivatives.
 fn rise(time: f64, length: f64) -> [f64; 3] {
     if length <= 0.0 {
         return [1.0, 0.0, 0.0];
@@ -114,10 +116,10 @@ fn rise(time: f64, length: f64) -> [f64; 3] {
     ]
 }
 
-/// What the largest speed and acceleration of a move are, of one that is 1 long and takes 1 s.
+/// The maximum speed and acceleration of a move of length 1 in 1 s.
 pub(crate) const RISE_PEAKS: [f64; 2] = [2.187_5, 7.513_2];
 
-/// Up from 0 to 1 and down again: value and two derivatives.
+/// Rises from 0 to 1 and falls again; returns the value and two derivatives.
 fn envelope(time: f64, length: f64) -> [f64; 3] {
     let ramp = RAMP_S.min(length / 2.0);
     if time < length / 2.0 {
@@ -128,7 +130,7 @@ fn envelope(time: f64, length: f64) -> [f64; 3] {
     }
 }
 
-/// A sine within an envelope: value and two derivatives.
+/// Returns a sine within an envelope: the value and two derivatives.
 fn swing([value, first, second]: [f64; 3], rate: f64, time: f64) -> [f64; 3] {
     let (sin, cos) = (rate * time).sin_cos();
     [

@@ -1,25 +1,25 @@
-//! Positions made better by what is known of neighbours: wired cells are so far apart, on a smooth surface.
+//! Positions improved by their neighbours: wired cells have a known distance, on a smooth surface.
 
 use nalgebra::{Cholesky, DMatrix, DVector, Matrix3, Vector3};
 
-/// How far wired cells are apart.
+/// The distance of wired cells.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Spacing {
-    /// From the middle of one to the middle of the other, in m.
+    /// The distance of their centres, in m.
     pub distance: f64,
     /// Its standard deviation, in m.
     pub deviation: f64,
 }
 
 impl Spacing {
-    /// Cells that are so far apart, in m, within 1 %.
+    /// Returns the spacing for a distance in m, with a deviation of 1 %.
     #[must_use]
     pub const fn of(distance: f64) -> Self {
         Self { distance, deviation: distance * 0.01 }
     }
 }
 
-/// A cell as it is known from its readings.
+/// The estimated place of a cell.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Known {
     pub(crate) position: Vector3<f64>,
@@ -27,12 +27,12 @@ pub(crate) struct Known {
     pub(crate) covariance: Matrix3<f64>,
 }
 
-/// Wires whose ends are this many standard deviations off say nothing: cables, and cells that were taken for others.
+/// Wires whose length is off by more standard deviations than this are ignored: cables, and mistaken cells.
 const OFF: f64 = 4.0;
-/// Times that the positions are computed again.
+/// The number of times that the positions are recomputed.
 const ROUNDS: usize = 3;
 
-/// Improves the positions of cells on one link; wires are pairs of indices. Returns how many wires were used.
+/// Improves the positions of the cells on one link; `wires` has pairs of indices. Returns the number of wires used.
 pub(crate) fn improve(cells: &mut [Known], wires: &[(usize, usize)], spacing: &Spacing) -> usize {
     let pair = |cells: &[Known], &(one, other): &(usize, usize)| Some((*cells.get(one)?, *cells.get(other)?));
     let fits = |wire: &&(usize, usize)| {
@@ -67,8 +67,8 @@ pub(crate) fn improve(cells: &mut [Known], wires: &[(usize, usize)], spacing: &S
             else {
                 continue;
             };
-            // As far apart as they are, and level: on an evenly curved surface the way between two cells is at a right
-            // angle to the mean of their normals.
+            // The distance, and the tilt: on an evenly curved surface, the line between two cells is at a right angle
+            // to the mean of their normals.
             for (direction, off) in [(along, way.norm() - spacing.distance), (up, way.dot(&up))] {
                 let weight = spacing.deviation.powi(-2);
                 let block = direction * direction.transpose() * weight;

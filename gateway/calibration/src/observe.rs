@@ -1,7 +1,7 @@
-//! What a calibration is made from: the positions of the joints at each broadcast, and what each cell showed then.
+//! Observations: the positions of the joints at each broadcast, and the reading of each cell.
 //!
-//! Speeds and accelerations follow from positions at regular times. So the time of each broadcast is compared with that
-//! of the one before: where a control loop skipped ticks, or frames are missing, a place without positions is left, and
+//! Speeds and accelerations follow from positions at regular times, so the time of each broadcast is compared with that
+//! of the previous one. Where a control loop skipped ticks, or frames are missing, a gap without positions remains, and
 //! no polynomial is fitted across it.
 
 use model::central::Central;
@@ -13,59 +13,59 @@ use protocol::parameters::{MAX_JOINTS, RowKind};
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-/// Readings at this value are at the end of their word.
+/// Readings at this value are saturated.
 const FULL: i16 = i16::MAX - 8;
-/// The part of a period by which a broadcast may be early or late, as its frame was received.
+/// The allowed jitter of a broadcast's receive time, in periods.
 const JITTER: f64 = 0.25;
-/// Broadcasts over which the period is measured.
+/// The number of broadcasts over which the period is measured.
 const SPAN: usize = 8;
-/// Broadcasts that a reading may come after its own.
+/// The maximum number of broadcasts between a reading's own broadcast and its arrival.
 const LATEST: u32 = 100;
 
-/// What all buses of a skin carried.
+/// The observations on all buses of a skin.
 #[derive(Clone, Debug)]
 pub struct Observations {
-    /// By bus.
+    /// The observations on each bus.
     pub buses: Vec<BusObservations>,
-    /// By cell of the skin, in the order of time.
+    /// The readings of each cell of the skin, in the order of time.
     pub cells: Vec<Vec<Reading>>,
 }
 
-/// The joints of one bus.
+/// The joints on one bus.
 #[derive(Clone, Debug)]
 pub struct BusObservations {
-    /// By broadcast, the positions in rad or m; `None` for one that is missing, and where times are not regular.
+    /// The positions at each broadcast in rad or m; `None` for a missing broadcast and at irregular times.
     pub joints: Vec<Option<[f64; MAX_JOINTS]>>,
-    /// Places at which the next broadcast was not in its time, in the order of time.
+    /// The gaps after which the next broadcast was not in time, in the order of time.
     pub gaps: Vec<Gap>,
-    /// Joints that the frames carry, where these are not those of the chain.
+    /// The number of joints in the frames, if it differs from that of the chain.
     pub(crate) other_joints: Option<u8>,
     reference: Central,
     revolute: Vec<bool>,
     nodes: Vec<Option<usize>>,
-    /// By number of an epoch, the newest broadcast with it.
+    /// The newest broadcast with each epoch number.
     epochs: Vec<Option<u32>>,
-    /// The times of broadcasts that follow each other.
+    /// The times of consecutive broadcasts.
     times: Vec<Micros>,
-    /// Durations of [`SPAN`] periods, in us.
+    /// The durations of [`SPAN`] periods, in us.
     spans: Vec<u64>,
     period_us: f64,
     first: Option<Micros>,
     last: Option<(Epoch, Micros)>,
 }
 
-/// A place at which a broadcast was not in its time.
+/// A gap: a broadcast did not come in time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Gap {
     /// The time of the broadcast before it, in s since the first one.
     pub at_s: f64,
     /// The time to the next one, in ms.
     pub took_ms: f64,
-    /// The place without positions, as an index into [`BusObservations::joints`].
+    /// The entry without positions, as an index into [`BusObservations::joints`].
     pub(crate) place: usize,
 }
 
-/// What a cell showed.
+/// A reading of a cell.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reading {
     /// The broadcast, as an index into [`BusObservations::joints`].
@@ -75,7 +75,7 @@ pub struct Reading {
 }
 
 impl Observations {
-    /// Nothing yet.
+    /// Creates empty observations.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let bus = |bus: usize| {
@@ -107,7 +107,8 @@ impl Observations {
         Self { buses: (0..skin.buses.len()).map(bus).collect(), cells: vec![Vec::new(); skin.cells.len()] }
     }
 
-    /// Takes the next message of a bus, given as an index into [`Skin::buses`], with the time at which it was on the bus.
+    /// Records the next message of a bus, given as an index into [`Skin::buses`], with the time at which it was on the
+    /// bus.
     pub fn take(&mut self, bus: usize, at: Micros, message: &Message) {
         let Some(bus) = self.buses.get_mut(bus) else { return };
         if let Message::Joints { epoch, joints } = message {
@@ -120,7 +121,7 @@ impl Observations {
             let cell = cell.and_then(|cell| self.cells.get_mut(cell));
             let full = words.iter().any(|word| word.to_bits() > FULL || word.to_bits() < -FULL);
             if let (Some(cell), Some(epoch), false) = (cell, bus.index_of(*epoch), full) {
-                // A page that repeats what an earlier one said of these joints says nothing new.
+                // A page that repeats the reading for the same joints adds no information.
                 if cell.last().is_none_or(|last| last.epoch < epoch) {
                     cell.push(Reading { epoch, g: words.map(Q::to_f64) });
                 }
@@ -134,9 +135,9 @@ impl BusObservations {
         if let Some((last, before)) = self.last {
             let periods = real(at.0.saturating_sub(before.0)) / self.period_us;
             let steps = epoch.since(last);
-            // Numbers of epochs repeat after 256 of them.
+            // Epoch numbers repeat after 256 broadcasts.
             if steps < 1 && periods < f64::from(LATEST) {
-                // The same one again, or an old one.
+                // A repeated or an old broadcast.
                 return;
             }
             let is_regular = steps >= 1 && (periods - f64::from(steps)).abs() <= JITTER;
@@ -170,7 +171,7 @@ impl BusObservations {
         self.last = Some((epoch, at));
     }
 
-    /// Measures the period over broadcasts that follow each other.
+    /// Measures the period over consecutive broadcasts.
     fn follow(&mut self, at: Micros, is_next: bool) {
         if !is_next {
             self.times.clear();
@@ -180,7 +181,7 @@ impl BusObservations {
         self.spans.extend(before.map(|before| at.0.saturating_sub(before.0)));
     }
 
-    /// The period of broadcasts as it was on the bus, in s; `None` if too few followed each other.
+    /// Returns the period of broadcasts on the bus, in s, or `None` if too few were consecutive.
     pub(crate) fn period_s(&self) -> Option<f64> {
         let mut spans = self.spans.clone();
         spans.sort_unstable();
@@ -188,12 +189,12 @@ impl BusObservations {
         Some(real(*middle) * 1e-6 / f64::from(u8::try_from(SPAN).unwrap_or(1)))
     }
 
-    /// The time of the first broadcast to another one, in s.
+    /// Returns the time since the first broadcast, in s.
     fn seconds(&self, at: Micros) -> f64 {
         real(at.0.saturating_sub(self.first.map_or(at.0, |first| first.0))) * 1e-6
     }
 
-    /// Which broadcast an epoch is: the newest one with this number.
+    /// Returns the newest broadcast with this epoch number.
     fn index_of(&self, epoch: Epoch) -> Option<u32> {
         let index = self.epochs.get(usize::from(epoch.0)).copied().flatten()?;
         let last = u32::try_from(self.joints.len()).ok()?;

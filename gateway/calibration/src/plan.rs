@@ -1,8 +1,8 @@
-//! Which motion to make: that which tells most of where cells sit, within limits and a time.
+//! The planner: finds the motion that adds most information on the places of cells, within limits and a time.
 //!
-//! Of some poses within the limits, and of swings about them, those are taken one after the other that add most to the
-//! information on cells that are supposed on each link (Fisher's information of the estimate), for the time that
-//! they take. Static poses tell orientation, bias and gain; swings tell positions.
+//! The candidates are poses within the limits, and swings about them. The planner repeatedly chooses the candidate that
+//! adds most information per time (Fisher's information of the estimate) on assumed cells on each link. Static poses
+//! determine orientation, bias and gain; swings determine positions.
 
 use core::f64::consts::TAU;
 
@@ -19,37 +19,37 @@ use crate::sums::Sums;
 use model::accelerometer::kinematics::{Arm, G};
 use model::accelerometer::sensor::DataSheet;
 
-/// How a plan may move the robot.
+/// The limits of a plan.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Bounds {
-    /// The pose about which it moves, by joint of the robot; it begins and ends there.
+    /// The pose about which the robot moves, by joint; the motion begins and ends there.
     pub center: Vec<f64>,
-    /// How far each joint may go from there, in rad or m.
+    /// The maximum distance of each joint from there, in rad or m.
     pub within: f64,
-    /// How long it may take, in s.
+    /// The maximum duration in s.
     pub length_s: f64,
     /// The part of the joints' maximum speeds that is used.
     pub speed: f64,
-    /// The largest acceleration of a joint, in rad/s2 or m/s2.
+    /// The maximum acceleration of a joint, in rad/s² or m/s².
     pub acceleration: f64,
-    /// The largest acceleration of anything on the robot by one swinging joint, in g.
+    /// The maximum acceleration at any point of the robot by one swinging joint, in g.
     pub force_g: f64,
-    /// From which poses are drawn.
+    /// The seed for drawing poses.
     pub seed: u64,
 }
 
-/// Why there is no plan.
+/// The error for a plan that cannot be made.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum PlanError {
     /// The center has too few or too many joints.
     #[error("the pose has {got} positions; the robot has {joints} joints: give one for each")]
     Joints {
-        /// Positions.
+        /// The number of positions.
         got: usize,
-        /// Joints.
+        /// The number of joints.
         joints: usize,
     },
-    /// A joint is outside of its limits.
+    /// A joint is outside its limits.
     #[error("joint {name} at {got}: its limits are {min} to {max}; choose a position between them")]
     Limits {
         /// The joint.
@@ -61,33 +61,33 @@ pub enum PlanError {
         /// Its upper limit.
         max: f64,
     },
-    /// There is no time for anything, or too much.
+    /// The duration is too short or too long.
     #[error("a motion of {got} s: 20 to 3600 s are allowed")]
     Length {
-        /// The time in s.
+        /// The duration in s.
         got: f64,
     },
 }
 
-/// Poses to choose from.
+/// The number of poses to choose from.
 const POSES: usize = 24;
-/// How long the robot stands at a pose, in s.
+/// The time that the robot stands at a pose, in s.
 const HOLD_S: f64 = 0.6;
-/// How long a swing takes, in s.
+/// The duration of a swing, in s.
 pub(crate) const SWING_S: f64 = 3.2;
-/// What a move to another pose is supposed to take, in s.
+/// The assumed duration of a move to another pose, in s.
 const MOVE_S: f64 = 1.6;
-/// How often a joint swings in a second.
+/// The frequency of a joint that swings alone.
 const RATE_HZ: f64 = 1.1;
-/// Joints that swing together have other rates, so that they can be separated.
+/// The frequencies of joints that swing together; they differ, so that the joints can be separated.
 const RATES_HZ: [f64; 7] = [0.8, 1.3, 1.0, 1.5, 0.9, 1.2, 1.4];
-/// From one looked-at moment to the next, in s.
+/// The interval of the moments that are evaluated, in s.
 const LOOK_S: f64 = 1.0 / 15.0;
-/// What an estimate shall reach: position in m, orientation in rad.
+/// The aim of an estimate: the standard deviation of the position in m, and of the orientation in rad.
 pub(crate) const AIM: [f64; 2] = [0.5e-3, 0.2 * TAU / 360.0];
 
 impl Bounds {
-    /// About the middle of the limits, or about 0 where a joint turns further than half a turn each way.
+    /// Returns limits about the middle of each joint's range, or about 0 if it turns by more than half a turn each way.
     #[must_use]
     pub fn of(skin: &Skin) -> Self {
         let middle = |[min, max]: [f64; 2], kind: JointKind| {
@@ -125,26 +125,26 @@ impl Bounds {
     }
 }
 
-/// Something that may be done: a hold at a pose, or a swing about it.
+/// A candidate step: a hold at a pose, or a swing about it.
 struct Candidate {
     pose: usize,
     step: Step,
     seconds: f64,
-    /// By supposed cell.
+    /// The information on each probe cell.
     information: Vec<Information>,
 }
 
-/// A cell that is supposed to be somewhere.
+/// A cell that is assumed at some place of a link.
 pub(crate) struct Supposed {
     pub(crate) bus: usize,
     pub(crate) row: usize,
     pub(crate) model: CellModel,
 }
 
-/// The motion that tells most within its bounds.
+/// Plans the motion with the most information within its bounds.
 ///
 /// # Errors
-/// When the bounds do not fit the robot.
+/// Returns [`PlanError`] if the bounds do not fit the robot.
 pub fn plan(skin: &Skin, bounds: &Bounds, sheet: &DataSheet, gravity: [f64; 3]) -> Result<Motion, PlanError> {
     bounds.check(skin)?;
     let swings = Swings::new(skin, bounds);
@@ -164,7 +164,7 @@ pub fn plan(skin: &Skin, bounds: &Bounds, sheet: &DataSheet, gravity: [f64; 3]) 
     Ok(ordered(skin, bounds, &poses, &candidates, &chosen))
 }
 
-/// How far and how often each joint may swing.
+/// The swing amplitude of each joint.
 pub(crate) struct Swings {
     amplitudes: Vec<f64>,
 }
@@ -184,7 +184,7 @@ impl Swings {
         Self { amplitudes: amplitudes.collect() }
     }
 
-    /// Each joint alone, and all together.
+    /// Returns swings of each joint alone, and of all together.
     pub(crate) fn about<'a>(&'a self, pose: &'a [f64]) -> impl Iterator<Item = Step> + 'a {
         let joints = self.amplitudes.len();
         let swing =
@@ -200,7 +200,7 @@ impl Swings {
     }
 }
 
-/// How far from a joint's axis something on the robot can be, in m.
+/// Returns the maximum distance of a point of the robot from a joint's axis, in m.
 fn reach(skin: &Skin, joint: usize) -> f64 {
     let of_chain = |chain: &protocol::skin::Chain| {
         let at = chain.joints.iter().position(|&it| it == joint)?;
@@ -211,7 +211,7 @@ fn reach(skin: &Skin, joint: usize) -> f64 {
     skin.robot.chains.iter().filter_map(of_chain).fold(0.1, f64::max)
 }
 
-/// Poses within the limits from which every swing stays within them too; the first is the center.
+/// Returns poses within the limits from which every swing stays within them too; the first one is the center.
 pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &Swings) -> Vec<Vec<f64>> {
     let mut dice = Pcg64Mcg::seed_from_u64(bounds.seed);
     let ranges = skin.robot.joints.iter().zip(&bounds.center).zip(&swings.amplitudes);
@@ -232,7 +232,7 @@ pub(crate) fn poses(skin: &Skin, bounds: &Bounds, swings: &Swings) -> Vec<Vec<f6
     poses
 }
 
-/// Cells on each link: near its joint, on its middle, and at its end.
+/// Returns cells on each link: near its joint, in its middle, and at its end.
 fn supposed(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<Supposed> {
     let mut all = Vec::new();
     for &(bus, _) in arms {
@@ -251,7 +251,7 @@ fn supposed(skin: &Skin, arms: &[(usize, Arm)]) -> Vec<Supposed> {
     all
 }
 
-/// What a step says of each supposed cell.
+/// Returns the information of a step on each probe cell.
 pub(crate) fn informed(
     skin: &Skin,
     arms: &[(usize, Arm)],
@@ -269,7 +269,7 @@ pub(crate) fn informed(
             let joints = &skin.chain(*bus).joints;
             let ages = [-AGE_STEP, 0.0, AGE_STEP];
             let motions = ages.map(|age| arm.rows(&motion.at((time - age).max(0.0)).of_chain(joints)));
-            // The cells of one link see the same motion: the first one's sums are those of the others.
+            // The cells of one link see the same motion: they share the sums of the first one.
             let mut seen = usize::MAX;
             for (one, sum) in supposed.iter().zip(&mut sums) {
                 if one.bus != *bus || one.row == seen {
@@ -293,20 +293,20 @@ pub(crate) fn informed(
     each.collect()
 }
 
-/// Candidates in the order in which they were chosen.
+/// Returns the chosen candidates, in the order in which they were chosen.
 fn choose(candidates: &[Candidate], supposed: &[Supposed], bounds: &Bounds, sheet: &DataSheet) -> Vec<usize> {
     let prior = Information::from_diagonal(&expected(sheet));
     let mut known = vec![prior; supposed.len()];
     let mut scores: Vec<_> = known.iter().map(score).collect();
     let mut chosen: Vec<usize> = Vec::new();
-    // The way to the center and back.
+    // The moves from the center and back.
     let mut left = bounds.length_s - 2.0 * MOVE_S;
     loop {
         let visited =
             |pose: usize| chosen.iter().any(|&it| candidates.get(it).is_some_and(|it| it.pose == pose));
         let rate = |(index, candidate): (usize, &Candidate)| {
             let seconds = candidate.seconds + if visited(candidate.pose) { 0.0 } else { MOVE_S + HOLD_S };
-            // A step that is done twice tells as much again, but of nothing else.
+            // Repeating a step adds the same information only.
             if seconds > left || chosen.contains(&index) {
                 return None;
             }
@@ -328,7 +328,7 @@ fn choose(candidates: &[Candidate], supposed: &[Supposed], bounds: &Bounds, shee
     }
 }
 
-/// How much is not known: 0 for a cell that is known exactly.
+/// Returns the remaining uncertainty: 0 for a cell that is known exactly.
 fn score(information: &Information) -> f64 {
     let Some(covariance) = Cholesky::new(*information).map(|it| it.inverse()) else { return 1e3 };
     let part = |start: usize, aim: f64| {
@@ -338,7 +338,7 @@ fn score(information: &Information) -> f64 {
     part(POSITION.start, AIM[0]) + part(TURN.start, AIM[1])
 }
 
-/// The chosen steps, pose by pose, each the nearest to the one before.
+/// Returns the chosen steps, pose by pose, each pose being the nearest to the previous one.
 fn ordered(
     skin: &Skin,
     bounds: &Bounds,
@@ -383,7 +383,7 @@ fn go(skin: &Skin, bounds: &Bounds, motion: &mut Motion, at: &mut Vec<f64>, to: 
     }
 }
 
-/// How long a move takes, in s.
+/// Returns the duration of a move, in s.
 fn travel(skin: &Skin, bounds: &Bounds, from: &[f64], to: &[f64]) -> f64 {
     let [speed_peak, acceleration_peak] = RISE_PEAKS;
     let joints = from.iter().zip(to).zip(&skin.controller.max_speed);

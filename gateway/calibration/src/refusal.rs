@@ -1,4 +1,4 @@
-//! Why a recording says nothing that can be trusted.
+//! The reasons to refuse a recording.
 
 use serde::Serialize;
 use thiserror::Error;
@@ -6,24 +6,24 @@ use thiserror::Error;
 use crate::observe::{BusObservations, Gap};
 use crate::rounded::rounded;
 
-/// Gaps in the broadcasts of a recording.
+/// The gaps in the broadcasts of a recording.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Disturbance {
-    /// Broadcasts, in time or not.
+    /// The number of broadcasts, in time or not.
     pub broadcasts: usize,
-    /// Broadcasts whose motion is unknown, and whose readings are left out: around gaps and where positions are
-    /// those of no smooth motion; the first and the last ones of a recording are always left out.
+    /// The number of broadcasts whose readings are left out because their motion is unknown: around gaps, and where
+    /// positions do not form a smooth motion. The first and the last ones of a recording are always left out.
     pub left_out: usize,
-    /// Times that the next broadcast did not come when it was due.
+    /// The number of broadcasts that were not in time.
     pub gaps: usize,
-    /// The longest of these, in ms; `None` without any.
+    /// The longest gap, in ms; `None` without a gap.
     pub longest_ms: Option<f64>,
-    /// The begin of that, in s since the first broadcast.
+    /// The start of the longest gap, in s since the first broadcast.
     pub longest_at_s: Option<f64>,
 }
 
 impl Disturbance {
-    /// Returns the disturbance of a bus, with the number of broadcasts whose motion is known.
+    /// Returns the disturbance of a bus, from the number of broadcasts whose motion is known.
     pub(crate) fn of(bus: &BusObservations, known: usize) -> Self {
         let broadcasts = bus.joints.iter().flatten().count();
         let longest = bus.gaps.iter().max_by(|one, other| one.took_ms.total_cmp(&other.took_ms));
@@ -36,7 +36,7 @@ impl Disturbance {
         }
     }
 
-    /// Adds that of another bus.
+    /// Adds the disturbance of another bus.
     pub(crate) fn and(self, other: Self) -> Self {
         let is_longer = other.longest_ms > self.longest_ms;
         let (longest_ms, longest_at_s) = if is_longer {
@@ -73,7 +73,7 @@ impl core::fmt::Display for Disturbance {
     }
 }
 
-/// The reason for which a recording is refused.
+/// The reason to refuse a recording.
 #[derive(Clone, Debug, Error, PartialEq)]
 pub enum Refusal {
     /// The joints on a bus are those of another robot.
@@ -83,12 +83,12 @@ pub enum Refusal {
     Joints {
         /// The bus.
         bus: String,
-        /// Joints in frames.
+        /// The number of joints in frames.
         got: u8,
-        /// Joints of the chain.
+        /// The number of joints of the chain.
         joints: usize,
     },
-    /// Joints are broadcast at another rate than the skin says.
+    /// The broadcast rate of joints differs from the skin's.
     #[error(
         "{bus}: joints were broadcast {got} times a second, the skin says {hz}: correct joint_broadcast_hz"
     )]
@@ -100,9 +100,9 @@ pub enum Refusal {
         /// The rate of the skin.
         hz: f64,
     },
-    /// The motion is known too seldom.
+    /// The motion is known for too few broadcasts.
     #[error(
-        "{bus}: {disturbance}: too little is left to calibrate with; record longer, with a loop that skips no ticks"
+        "{bus}: {disturbance}: too few broadcasts remain for a calibration; record longer, with a loop that skips no ticks"
     )]
     Disturbed {
         /// The bus.
@@ -110,7 +110,7 @@ pub enum Refusal {
         /// Its gaps.
         disturbance: Disturbance,
     },
-    /// Readings are not those of such sensors on such a robot.
+    /// The readings do not fit such sensors on such a robot.
     #[error(
         "readings scatter {times} times as much as the data sheet says ({noise_mg} mg; its noise is {sheet_mg} mg), so no pose can \
          be trusted; {disturbance}; record again with a loop that skips no ticks, or give the sensors' own --data-sheet"
@@ -133,7 +133,7 @@ pub enum Refusal {
     Shifted {
         /// The bus.
         bus: String,
-        /// Since when, in s since the first broadcast.
+        /// The start of the shift, in s since the first broadcast.
         at_s: f64,
         /// The shift.
         ms: f64,

@@ -1,4 +1,4 @@
-//! What a calibration found, as it is printed and written.
+//! The results of a calibration, as they are printed and written.
 
 use nalgebra::{Matrix3, SymmetricEigen, UnitQuaternion, Vector3};
 use protocol::skin::{Cell, Skin};
@@ -13,40 +13,40 @@ use model::accelerometer::kinematics::Arm;
 /// Poses that are less certain than this are not determined: in m, and in rad.
 const ENOUGH: [f64; 2] = [0.02, 0.09];
 
-/// What was found.
+/// The results of a calibration.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Calibration {
-    /// All cells together.
+    /// The results for all cells together.
     pub summary: Summary,
-    /// By cell of the skin.
+    /// The result for each cell of the skin.
     pub cells: Vec<CellResult>,
-    /// By joint of the robot, if that was asked for.
+    /// The zero offset of each joint of the robot, if requested.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub zero_offsets: Option<Vec<ZeroOffset>>,
 }
 
-/// All cells together.
+/// The results for all cells together.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Summary {
-    /// Cells of the skin.
+    /// The number of cells of the skin.
     pub cells: usize,
-    /// Of these, with a pose that can be used.
+    /// The number of cells with a pose that can be used.
     pub determined: usize,
-    /// Of these, to be distrusted.
+    /// The number of cells with a diagnosis.
     pub troubled: usize,
-    /// Median of what positions are certain within, 95 of 100 times, in mm; `None` without a pose that can be used.
+    /// The median of the 95 % radius of positions, in mm; `None` without a pose that can be used.
     pub position_mm: Option<f64>,
-    /// The same of orientations, in degrees.
+    /// The same for orientations, in degrees.
     pub orientation_deg: Option<f64>,
-    /// Median of what readings scatter, in mg.
+    /// The median of the scatter of readings, in mg.
     pub noise_mg: Option<f64>,
-    /// Gaps in the broadcasts of joints.
+    /// The gaps in the broadcasts of joints.
     pub joints: Disturbance,
-    /// Wires whose length made positions better.
+    /// The number of wires whose length improved positions.
     pub wires: usize,
 }
 
-/// One cell.
+/// The result for one cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CellResult {
     /// The name of its bus.
@@ -55,112 +55,112 @@ pub struct CellResult {
     pub node: u8,
     /// Its serial number.
     pub serial: u32,
-    /// Readings of it.
+    /// The number of its readings.
     pub readings: usize,
-    /// What is wrong with it; nothing for most.
+    /// The problems with the cell; empty for most cells.
     pub troubles: Vec<Trouble>,
-    /// Where it was found, as it is written.
+    /// Its place, as it is written to a skin file.
     #[serde(flatten)]
     pub found: Option<Found>,
     /// Its accelerometer.
     #[serde(flatten)]
     pub sensor: SensorResult,
-    /// The pose in the frame of the joint's row.
+    /// Its pose in the frame of the joint's row.
     #[serde(skip)]
     pub pose: Option<Pose>,
 }
 
-/// An accelerometer as it was found; `None` for one that was not estimated.
+/// The estimated errors of an accelerometer; `None` if it was not estimated.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct SensorResult {
-    /// What each axis shows without a force, in g.
+    /// The reading of each axis without a force, in g.
     pub bias_g: Option<[f64; 3]>,
-    /// What each axis shows of a force along it.
+    /// The reading of each axis per unit of force along it.
     pub gain: Option<[f64; 3]>,
-    /// How much a reading of an axis scatters, in g, from the median.
+    /// The scatter of an axis' readings, in g, derived from the median.
     pub noise_g: Option<f64>,
-    /// The same from what nine of ten readings are below.
+    /// The same, derived from the 90 % quantile.
     pub rough_g: Option<f64>,
 }
 
-/// Where a cell was found: what a skin file has.
+/// The place of a cell, in the terms of a skin file.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Found {
     /// The joint that moves it.
     pub joint: u8,
-    /// The row in whose frame it is.
+    /// The row in whose frame it is given.
     pub row: u8,
-    /// In m.
+    /// The position in m.
     pub position: [f64; 3],
-    /// Quaternion x, y, z, w.
+    /// The quaternion x, y, z, w.
     pub orientation: [f64; 4],
-    /// Within how much the position is certain, 95 of 100 times, in mm.
+    /// The 95 % radius of the position, in mm.
     pub position_mm: f64,
-    /// The same of the orientation, in degrees.
+    /// The 95 % angle of the orientation, in degrees.
     pub orientation_deg: f64,
-    /// How far this is from where the skin has it, in mm; `None` if that is on another link.
+    /// The distance from the described position, in mm; `None` if that is on another link.
     pub moved_mm: Option<f64>,
     /// The angle between the normals, in degrees.
     pub turned_deg: Option<f64>,
 }
 
-/// A pose with what is certain of it.
+/// A pose with its uncertainty.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
     /// The joint that moves the cell.
     pub joint: u8,
-    /// In the frame of the joint's row, in m.
+    /// The position in the frame of the joint's row, in m.
     pub position: Vector3<f64>,
-    /// From the cell's frame to that of the row.
+    /// The rotation from the cell's frame to that of the row.
     pub rotation: UnitQuaternion<f64>,
-    /// Of the position, in m2.
+    /// The covariance of the position, in m².
     pub position_covariance: Matrix3<f64>,
-    /// Of the orientation as a rotation vector in the frame of the cell, in rad2.
+    /// The covariance of the orientation as a rotation vector in the frame of the cell, in rad².
     pub turn_covariance: Matrix3<f64>,
 }
 
-/// Why a cell is to be distrusted.
+/// The reason to distrust a cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "trouble", rename_all = "kebab-case")]
 pub enum Trouble {
-    /// It sent nothing.
+    /// The cell sent nothing.
     Dead,
-    /// It sent one value only.
+    /// The cell sent only one value.
     Stuck,
-    /// It sent few readings.
+    /// The cell sent few readings.
     Silent {
         /// The part of the broadcasts that it answered.
         share: f64,
     },
-    /// No joint moves it.
+    /// No joint moves the cell.
     Still,
     /// Another joint explains its readings nearly as well.
     Joint {
-        /// The better one.
+        /// The better joint.
         joint: u8,
     },
     /// Its readings scatter.
     Loose {
-        /// So many times as much as those of most cells.
+        /// The ratio to the scatter of most cells.
         times: f64,
     },
-    /// It sits where the skin has another cell, which sits where the skin has it.
+    /// The cell and another one are at each other's described places.
     Swapped {
-        /// The other one's node id.
+        /// The node id of the other cell.
         node: u8,
     },
-    /// It sits where the skin has another cell.
+    /// The cell is at the described place of another cell.
     Elsewhere {
-        /// The other one's node id.
+        /// The node id of the other cell.
         node: u8,
     },
-    /// The motion did not tell its pose.
+    /// The motion did not determine its pose.
     NotObservable {
-        /// Within how much the position is certain, in mm.
+        /// The 95 % radius of the position, in mm.
         position_mm: f64,
-        /// The same of the orientation, in degrees.
+        /// The 95 % angle of the orientation, in degrees.
         orientation_deg: f64,
-        /// What would help.
+        /// The motion that would help.
         help: Help,
     },
 }
@@ -212,7 +212,7 @@ impl CellResult {
         }
     }
 
-    /// Whether its pose goes into a new skin file.
+    /// Returns true if its pose goes into a new skin file.
     #[must_use]
     pub fn is_written(&self) -> bool {
         let kept = |trouble: &Trouble| {
@@ -229,8 +229,8 @@ impl CellResult {
         self.found.is_some() && !self.troubles.iter().any(kept)
     }
 
-    /// The pose as a skin file has it: in the frame of the row that carries the cell by its description, if that is of
-    /// the same joint.
+    /// Stores the pose as a skin file has it: in the frame of the row that carries the cell by its description, if that
+    /// row belongs to the same joint.
     pub(crate) fn settle(&mut self, skin: &Skin, cell: &Cell, arm: Option<&Arm>) {
         let sensor = &mut self.sensor;
         sensor.bias_g = sensor.bias_g.map(|bias| bias.map(|it| rounded(it, 5)));
@@ -239,7 +239,7 @@ impl CellResult {
             (sensor.noise_g.map(|it| rounded(it, 5)), sensor.rough_g.map(|it| rounded(it, 5)));
         let (Some(pose), Some(arm)) = (&self.pose, arm) else { return };
         if self.troubles.iter().any(|trouble| matches!(trouble, Trouble::Loose { .. })) {
-            // How far its pose is certain follows from noise, which its readings are not.
+            // The uncertainty of its pose follows from noise, which these residuals are not.
             return;
         }
         let own = skin.chain(cell.bus).row_of(pose.joint).unwrap_or_default();
@@ -266,26 +266,26 @@ impl CellResult {
 }
 
 impl Pose {
-    /// The radius within which the position is, 95 of 100 times, in m.
+    /// Returns the 95 % radius of the position, in m.
     #[must_use]
     pub fn position_95(&self) -> f64 {
         radius_95(&self.position_covariance)
     }
 
-    /// The angle within which the orientation is, 95 of 100 times, in rad.
+    /// Returns the 95 % angle of the orientation, in rad.
     #[must_use]
     pub fn turn_95(&self) -> f64 {
         radius_95(&self.turn_covariance)
     }
 
-    /// Whether it is certain enough to be used.
+    /// Returns true if the pose is certain enough to be used.
     #[must_use]
     pub fn is_determined(&self) -> bool {
         let [position, turn] = ENOUGH;
         self.position_95() < position && self.turn_95() < turn
     }
 
-    /// The same, seen from another frame of the same link.
+    /// Returns the same pose, seen from another frame of the same link.
     pub(crate) fn seen_from(&self, (turn, shift): (&UnitQuaternion<f64>, &Vector3<f64>)) -> Self {
         let matrix: Matrix3<f64> = turn.to_rotation_matrix().matrix().to_owned();
         Self {
@@ -297,8 +297,8 @@ impl Pose {
     }
 }
 
-/// The radius within which a normal vector is, 95 of 100 times: the sum of squares is taken for a scaled chi-squared number
-/// with the same mean and variance (Welch and Satterthwaite), of which Wilson and Hilferty know the quantile.
+/// Returns the 95 % radius of a normally distributed vector. The sum of squares is approximated by a scaled chi-squared
+/// distribution with the same mean and variance (Welch and Satterthwaite), whose quantile follows Wilson and Hilferty.
 fn radius_95(covariance: &Matrix3<f64>) -> f64 {
     let variances = SymmetricEigen::new(*covariance).eigenvalues.map(|it| it.max(0.0));
     let (mean, half) = (variances.sum(), variances.norm_squared());

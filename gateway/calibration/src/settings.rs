@@ -1,4 +1,4 @@
-//! What is known before a calibration.
+//! The settings of a calibration.
 
 use protocol::skin::Skin;
 
@@ -7,25 +7,25 @@ use crate::plan::Bounds;
 use model::accelerometer::kinematics::G;
 use model::accelerometer::sensor::DataSheet;
 
-/// What is known before a calibration.
+/// The prior knowledge and the options of a calibration.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
-    /// Of the accelerometers.
+    /// The data sheet of the accelerometers.
     pub sheet: DataSheet,
-    /// Gravity as seen from the robot's base, in m/s2.
+    /// Gravity in the frame of the robot's base, in m/s².
     pub gravity: [f64; 3],
-    /// How far wired cells are apart, if that is known.
+    /// The distance of wired cells, if known.
     pub spacing: Option<Spacing>,
-    /// Whether zero offsets of the robot's joints are estimated too.
+    /// True to estimate zero offsets of the robot's joints too.
     pub zero_offsets: bool,
-    /// How many threads compute.
+    /// The number of threads.
     pub threads: usize,
-    /// How the robot may move: for advice only.
+    /// The limits for the robot's motion, for advice only.
     pub bounds: Bounds,
 }
 
 impl Settings {
-    /// Sensors as the default data sheet says, on a robot that stands upright.
+    /// Returns settings for sensors by the default data sheet, on a robot that stands upright.
     #[must_use]
     pub fn of(skin: &Skin) -> Self {
         Self {

@@ -1,4 +1,4 @@
-//! Shifts of the stretches of a bus, from the readings of all of its cells.
+//! The estimate of the shifts of a bus' stretches, from the readings of all of its cells.
 
 use crate::cell::AGE;
 use crate::estimate::{Estimate, change, paired, residual, weight};
@@ -6,15 +6,16 @@ use crate::lag::Lags;
 use crate::observe::Reading;
 use crate::table::Table;
 
-/// A stretch is shifted if it is off by this, in s.
+/// A stretch counts as shifted from this lag on, in s.
 const SHIFTED: f64 = 1e-3;
 /// The threshold in standard deviations.
 const CERTAIN: f64 = 5.0;
-/// Standard deviations of readings beyond which they count less.
+/// Residuals beyond this value get a lower weight.
 const CHANGING: f64 = 0.05;
 
 impl Lags {
-    /// Returns these lags with their remainder, if any of it is certain; `period` is that of the sensors' samples.
+    /// Returns these lags with the remaining shifts added, or `None` if none of them is certain; `period` is that of
+    /// the sensors' samples.
     pub(crate) fn more<'a>(
         &self,
         table: &Table,
@@ -35,7 +36,7 @@ impl Lags {
                 let Some(sum) = own.get_mut(self.stretch(index)) else { continue };
                 let change = change(&derivatives[AGE], moment);
                 let off = residual(&coefficients, moment, &reading.g);
-                // Of large shifts residuals are large too.
+                // Large shifts cause large residuals.
                 let weight = weight(&off, CHANGING * CHANGING);
                 sum.weight += weight * change.iter().map(|it| it * it).sum::<f64>();
                 sum.product += weight * change.iter().zip(off).map(|(one, other)| one * other).sum::<f64>();
@@ -49,7 +50,7 @@ impl Lags {
         }
         let weight: f64 = all.iter().map(|sum| sum.weight).sum();
         let mean = all.iter().map(|sum| sum.product).sum::<f64>() / weight.max(1e-12);
-        // Ages of single cells are anywhere: what they have in common is a shift of all stretches.
+        // The ages of single cells are arbitrary: their common part is a shift of all stretches.
         let common =
             if self.by_stretch.iter().any(|lag| *lag != 0.0) { ages / f64::max(count, 1.0) } else { 0.0 };
         let mut is_certain = false;
@@ -59,7 +60,7 @@ impl Lags {
                 return *before;
             }
             let off = sum.product / sum.weight - mean + common;
-            // Each cell's own age is anywhere in a period, all the time.
+            // Each cell's own age varies over a whole period.
             let deviation = (period * period / 12.0 * sum.squares + sum.noise).sqrt() / sum.weight;
             *own = deviation;
             is_certain |= off.abs() > SHIFTED.max(CERTAIN * deviation);
@@ -75,6 +76,6 @@ struct Sum {
     weight: f64,
     product: f64,
     squares: f64,
-    /// Variance of the product by the noise of readings.
+    /// The variance of the product due to the noise of readings.
     noise: f64,
 }

@@ -1,4 +1,4 @@
-//! What a skin would show during a motion, in virtual time: for tests, and to weigh motions.
+//! A simulated skin of accelerometers in virtual time, for tests and for comparing motions.
 
 use model::accelerometer::Accelerometers;
 use nalgebra::Vector3;
@@ -12,23 +12,23 @@ use protocol::time::Micros;
 use crate::motion::Motion;
 use crate::observe::Observations;
 
-/// How one cell differs from what the skin says.
+/// The deviation of a cell from the skin's description.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub enum Defect {
-    /// Not at all.
+    /// No deviation.
     #[default]
     None,
-    /// It sends nothing.
+    /// The cell sends nothing.
     Dead,
-    /// It sends one value for ever.
+    /// The cell always sends the same value.
     Stuck,
-    /// It sends the part of its readings that is given.
+    /// The cell sends this part of its readings.
     Silent(f64),
-    /// It tilts by so many rad, to and fro, as the robot moves.
+    /// The cell tilts to and fro by this angle in rad, as the robot moves.
     Loose(f64),
 }
 
-/// Moves a skin in virtual time; words are rounded as frames carry them.
+/// Moves a skin in virtual time; values are rounded to words as in frames.
 #[must_use]
 pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: &[Defect]) -> Observations {
     let mut seen = Observations::new(skin);
@@ -55,7 +55,7 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
             seen.take(bus, at, &Message::Joints { epoch, joints: Joints { positions, in_use } });
         }
         let tilt = |cell: usize, force: &Vector3<f64>| match defects.get(cell) {
-            // It rests on one side or on the other, as gravity pulls it.
+            // The cell rests on one side or the other, as gravity pulls it.
             Some(Defect::Loose(angle)) => {
                 let turn = Vector3::new(angle * force.x.signum(), angle * force.y.signum(), 0.0);
                 nalgebra::Rotation3::new(turn) * force
@@ -80,7 +80,7 @@ pub fn observe(skin: &Skin, motion: &Motion, sensors: &Accelerometers, defects: 
     seen
 }
 
-/// A time in s as frames are stamped.
+/// Converts a time in s to a frame's time stamp.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,

@@ -1,41 +1,41 @@
-//! Positions of joints at regular times into speeds and accelerations at any time between.
+//! Smoothing: computes speeds and accelerations from positions of joints at regular times.
 //!
 //! Joints are broadcast in steps of 96 µrad, 62.5 times a second, and second differences of such words are mostly
-//! rounding. So a polynomial is fitted to the words around each broadcast (Savitzky and Golay), and its derivatives are
-//! taken, a little earlier too: sensors are read later than they measure.
+//! rounding. A polynomial is therefore fitted to the words around each broadcast (Savitzky and Golay). Its derivatives
+//! are evaluated slightly earlier than the broadcast, because sensors are read later than they measure.
 
 use nalgebra::{SMatrix, SVector};
 use protocol::parameters::MAX_JOINTS;
 
 use model::accelerometer::kinematics::JointState;
 
-/// Broadcasts before and after the middle one.
+/// The number of broadcasts on each side of the middle one.
 pub(crate) const HALF: usize = 10;
 const WINDOW: usize = 2 * HALF + 1;
-/// Coefficients of the polynomial.
+/// The number of coefficients of the polynomial.
 const TERMS: usize = 7;
 
-/// A step of a position in rad as broadcasts carry it.
+/// The resolution of a broadcast position, in rad.
 pub(crate) const STEP_RAD: f64 = core::f64::consts::TAU / 65_536.0;
-/// A step of a position in m.
+/// The resolution of a broadcast position, in m.
 pub(crate) const STEP_M: f64 = 1.0 / 16_384.0;
 
-/// Positions of the joints of a chain at one broadcast.
+/// The positions of the joints of a chain at one broadcast.
 pub(crate) type Positions = [f64; MAX_JOINTS];
 
-/// Fits polynomials to windows of positions.
+/// A fit of polynomials to windows of positions.
 #[derive(Clone, Debug)]
 pub(crate) struct Smoother {
-    /// From positions in a window to coefficients, in units of [`HALF`] periods.
+    /// The map from positions in a window to coefficients, in units of [`HALF`] periods.
     fit: SMatrix<f64, TERMS, WINDOW>,
-    /// From positions in a window to what the polynomial leaves of them.
+    /// The map from positions in a window to the residuals of the polynomial.
     left: SMatrix<f64, WINDOW, WINDOW>,
     /// Half a window, in s.
     half_s: f64,
 }
 
 impl Smoother {
-    /// For positions that are `period_s` apart.
+    /// Creates the fit for positions at intervals of `period_s`.
     #[must_use]
     pub(crate) fn new(period_s: f64) -> Self {
         let powers = SMatrix::<f64, WINDOW, TERMS>::from_fn(|at, power| {
@@ -43,14 +43,14 @@ impl Smoother {
             x.powi(i32::try_from(power).unwrap_or_default())
         });
         let normal = powers.tr_mul(&powers);
-        // Distinct times and fewer terms than times: it has an inverse.
+        // The inverse exists: the times differ, and there are fewer terms than times.
         let fit = normal.try_inverse().map_or_else(SMatrix::zeros, |inverse| inverse * powers.transpose());
         let left = SMatrix::identity() - powers * fit;
         Self { fit, left, half_s: period_s * real(HALF) }
     }
 
-    /// Returns the distance of each of the first `joints` in a window from any smooth motion, root mean square;
-    /// `None` where the window is incomplete.
+    /// Returns the root mean square distance of each of the first `joints` in a window from a smooth motion, or `None`
+    /// if the window is incomplete.
     #[must_use]
     pub(crate) fn roughness(&self, window: &[Option<Positions>], joints: usize) -> Option<Positions> {
         let middle = window.get(HALF)?.as_ref().filter(|_| window.len() == WINDOW)?;
@@ -67,8 +67,8 @@ impl Smoother {
         Some(roughness)
     }
 
-    /// How the first `joints` move `earlier_s` before the middle of a window of positions; `None` where the window is
-    /// incomplete.
+    /// Returns the motion of the first `joints` at `earlier_s` before the middle of a window of positions, or `None` if
+    /// the window is incomplete.
     #[must_use]
     pub(crate) fn state(
         &self,
@@ -119,7 +119,7 @@ mod tests {
     use super::*;
     use core::f64::consts::TAU;
 
-    /// A swing as words, and how far the fit is off: position, speed and acceleration.
+    /// Fits a swing as words, and returns the errors of position, speed and acceleration.
     fn off(rate_hz: f64, amplitude: f64, step: f64, earlier: f64) -> [f64; 3] {
         let (period, rate) = (0.016, TAU * rate_hz);
         let smoother = Smoother::new(period);
@@ -187,7 +187,7 @@ mod tests {
             assert!(smoother.roughness(window, 1).unwrap()[0] < step / 2.0);
         }
         let mut late = words[100..100 + WINDOW].to_vec();
-        // Polynomials of so many terms follow the first and the last position.
+        // Polynomials with this number of terms follow the first and the last position.
         for place in 1..WINDOW - 1 {
             let before = late[place];
             late[place].as_mut().unwrap()[0] -= 10.0 * step;

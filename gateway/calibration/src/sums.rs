@@ -1,4 +1,4 @@
-//! Sums of products over the readings of a cell, and the least squares that they make.
+//! Sums of products over the readings of a cell, and least squares based on them.
 
 #![expect(clippy::indexing_slicing, reason = "matrices of constant size, with indices below it")]
 
@@ -6,31 +6,31 @@ use nalgebra::{Cholesky, SMatrix};
 
 use crate::cell::{CellModel, Coefficients, Information, MOMENT, Moment, ROW, UNKNOWNS, Unknowns};
 
-/// Steps of least squares at most.
+/// The maximum number of least-squares steps.
 const STEPS: usize = 60;
 
-/// What the readings of a cell say, as sums over them.
+/// The readings of a cell, as sums over them.
 #[derive(Clone, Debug)]
 pub(crate) struct Sums {
-    /// Of products of a moment's numbers.
+    /// The products of a moment's numbers.
     moments: SMatrix<f64, MOMENT, MOMENT>,
-    /// Of a moment's numbers and what each axis showed.
+    /// The products of a moment's numbers and the reading of each axis.
     shown: Coefficients,
-    /// Of squares of what was shown.
+    /// The squares of the readings.
     squares: f64,
-    /// Of the weights.
+    /// The weights.
     pub(crate) weight: f64,
 }
 
-/// Coefficients of a moment at the middle age, and of 1.
+/// Coefficients for a moment at the middle age, and for 1.
 pub(crate) type Free = SMatrix<f64, 13, 3>;
 
-/// Where a number of a moment at the middle age is among all.
+/// Returns the index of a number of the middle age among all numbers of a moment.
 const fn place(number: usize) -> usize {
     if number < ROW { ROW + number } else { MOMENT - 1 }
 }
 
-/// The same as coefficients of moments at all ages.
+/// Returns the same as coefficients for moments at all ages.
 pub(crate) fn at_middle_age(free: &Free) -> Coefficients {
     let mut all = Coefficients::zeros();
     for number in 0..=ROW {
@@ -43,7 +43,7 @@ pub(crate) fn at_middle_age(free: &Free) -> Coefficients {
 #[derive(Clone, Debug)]
 pub(crate) struct Fit {
     pub(crate) model: CellModel,
-    /// Squares of residuals in units of the noise, and of what the data sheet does not expect.
+    /// The squares of residuals in units of the noise, plus those of the deviations from the data sheet.
     pub(crate) cost: f64,
 }
 
@@ -56,7 +56,7 @@ impl Default for Sums {
 impl Sums {
     /// Adds a reading.
     pub(crate) fn add(&mut self, moment: &Moment, shown: &[f64; 3], weight: f64) {
-        // Columns of static matrices are consecutive numbers: both loops become vector instructions.
+        // Columns of static matrices are contiguous: both loops become vector instructions.
         for (column, number) in self.moments.as_mut_slice().chunks_exact_mut(MOMENT).zip(moment) {
             let scale = weight * number;
             column.iter_mut().zip(moment).for_each(|(sum, number)| *sum += scale * number);
@@ -69,7 +69,7 @@ impl Sums {
         self.weight += weight;
     }
 
-    /// The sum of squares of what is shown less what a model makes of it.
+    /// Returns the sum of squared differences between the readings and a model.
     pub(crate) fn residual(&self, coefficients: &Coefficients) -> f64 {
         let mut sum = self.squares;
         for (mine, shown) in coefficients.column_iter().zip(self.shown.column_iter()) {
@@ -78,8 +78,8 @@ impl Sums {
         sum.max(0.0)
     }
 
-    /// What the readings say of the unknowns, per variance of the noise: information, and the gradient of half of the
-    /// residual.
+    /// Returns the information of the readings on the unknowns, per variance of the noise, and the gradient of half of
+    /// the residual.
     pub(crate) fn information(&self, model: &CellModel) -> (Information, Unknowns) {
         let derivatives = model.derivatives();
         let coefficients = model.coefficients();
@@ -100,7 +100,7 @@ impl Sums {
         (information, gradient)
     }
 
-    /// The most likely model, by the method of Levenberg and Marquardt.
+    /// Finds the most likely model, by the method of Levenberg and Marquardt.
     pub(crate) fn fit(&self, start: CellModel, expected: &Unknowns, variance: f64) -> Fit {
         let cost = |model: &CellModel| {
             let unexpected = model.unexpected();
@@ -138,8 +138,8 @@ impl Sums {
         best
     }
 
-    /// Where least squares may begin: what readings say when nothing is known of how their coefficients depend on each
-    /// other, at the middle age. `ridge` holds back those of which they say nothing.
+    /// Returns a start for least squares: the coefficients at the middle age without constraints between them. `ridge`
+    /// regularises the coefficients on which the readings have no information.
     pub(crate) fn unconstrained(&self, ridge: f64) -> Option<Free> {
         let mut moments =
             SMatrix::<f64, 13, 13>::from_fn(|row, column| self.moments[(place(row), place(column))]);

@@ -14,21 +14,21 @@ use model::accelerometer::sensor::DataSheet;
 #[derive(Debug)]
 pub(crate) struct Table {
     pub(crate) arm: Arm,
-    /// Ages of readings against their joints.
+    /// The ages of readings relative to their joints.
     pub(crate) lags: Lags,
-    /// By joint, from the base, which is 0; then by broadcast. `None` where positions around it are missing.
+    /// The motion by joint, where 0 is the base, then by broadcast; `None` where positions nearby are missing.
     links: Vec<Vec<Option<Moment>>>,
 }
 
-/// Windows are left out in which a joint is rougher than this many times what rounding makes at most.
+/// Windows are left out if a joint is rougher than rounding allows, by this factor.
 const ROUGH: f64 = 1.1;
-/// The limit in units of the median window: the positions of real joints scatter.
+/// The same limit relative to the median window, because the positions of real joints scatter.
 const ROUGHER: f64 = 4.0;
 
-/// Periods that differ by less than this part are one.
+/// Periods with a smaller relative difference than this count as equal.
 const EQUAL: f64 = 5e-4;
 
-/// Returns the largest roughness of a smooth motion, by joint.
+/// Returns the maximum roughness of a smooth motion, by joint.
 fn limits(chain: &Chain, roughness: &[Option<Positions>]) -> Positions {
     let mut limits = [f64::INFINITY; MAX_JOINTS];
     let kinds = chain.rows.iter().map(|row| row.kind).filter(|kind| *kind != RowKind::Fixed);
@@ -44,7 +44,7 @@ fn limits(chain: &Chain, roughness: &[Option<Positions>]) -> Positions {
 }
 
 impl Table {
-    /// `offsets` are added to the positions of joints; readings are as much older than their joints as `lags` says.
+    /// Creates the table. `offsets` are added to the positions of joints; `lags` is the additional age of readings.
     pub(crate) fn new(
         skin: &Skin,
         bus: usize,
@@ -59,7 +59,7 @@ impl Table {
         let observed = seen.buses.get(bus);
         let nominal = 1.0 / skin.timing.broadcast_hz();
         let period = observed.and_then(BusObservations::period_s).unwrap_or(nominal);
-        // Stamps are no better than the clock that a loop follows.
+        // Time stamps are not more accurate than the clock of the loop.
         let period = if (period / nominal - 1.0).abs() < EQUAL { nominal } else { period };
         let smoother = Smoother::new(period);
         let (middle, _) = sheet.age();
@@ -75,7 +75,7 @@ impl Table {
         let is_smooth =
             |roughness: &Positions| !roughness.iter().zip(&limits).any(|(rough, limit)| rough > limit);
         for index in 0..series.len() {
-            // The window around the time of the reading, which may be that of other joints than those it came after.
+            // The window around the time of the reading, which may lie at other joints than the preceding ones.
             let lag = lags.at(index);
             let periods = (lag / period).round();
             let Some(first) =
@@ -113,29 +113,29 @@ impl Table {
         Self { arm, lags: lags.clone(), links }
     }
 
-    /// Which broadcasts have a motion.
+    /// Returns true if the motion at a reading's broadcast is known.
     pub(crate) fn is_known(&self, reading: &Reading) -> bool {
         let index = usize::try_from(reading.epoch).unwrap_or(usize::MAX);
         self.link(0).get(index).is_some_and(Option::is_some)
     }
 
-    /// Joints of the chain.
+    /// Returns the number of joints of the chain.
     pub(crate) fn joints(&self) -> u8 {
         u8::try_from(self.links.len()).unwrap_or_default().saturating_sub(1)
     }
 
-    /// The motion that a joint makes at each broadcast.
+    /// Returns the motion that a joint makes at each broadcast.
     pub(crate) fn link(&self, joint: u8) -> &[Option<Moment>] {
         self.links.get(usize::from(joint)).map_or(&[], Vec::as_slice)
     }
 
-    /// Broadcasts of which the motion is known.
+    /// Returns the number of broadcasts with a known motion.
     pub(crate) fn known(&self) -> usize {
         self.link(0).iter().flatten().count()
     }
 }
 
-/// A small number of periods.
+/// Converts a small number of periods.
 #[expect(clippy::cast_possible_truncation, reason = "casts to integers saturate")]
 const fn whole(periods: f64) -> isize {
     periods as isize

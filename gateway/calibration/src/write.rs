@@ -1,4 +1,4 @@
-//! The text of a skin with the poses that were found.
+//! The text of a skin file with the calibrated poses.
 
 use protocol::skin::Skin;
 use protocol::skin::file::{Edit, Value};
@@ -6,19 +6,19 @@ use thiserror::Error;
 
 use crate::result::{Calibration, Found};
 
-/// Why there is no text.
+/// The error for a text that cannot be written.
 #[derive(Debug, Error)]
 pub enum WriteError {
-    /// The file is no longer what was read.
+    /// The text is not that of the skin that was read.
     #[error("the skin's text is not that of the skin that was read: {0}; calibrate again")]
     Text(String),
 }
 
-/// The text of a skin with the poses that were found, and everything else as it was: comments, order, omitted keys. Cells
-/// whose pose was not determined keep theirs.
+/// Returns the text of a skin with the calibrated poses and everything else unchanged: comments, order, omitted keys.
+/// Cells without a determined pose keep theirs.
 ///
 /// # Errors
-/// When the text is not the skin's.
+/// Returns [`WriteError`] if the text does not belong to the skin.
 pub fn calibrated(skin: &Skin, text: &str, calibration: &Calibration) -> Result<String, WriteError> {
     let mut edit = Edit::new(skin, text).map_err(|error| WriteError::Text(error.to_string()))?;
     for (index, (cell, result)) in skin.cells.iter().zip(&calibration.cells).enumerate() {
@@ -29,7 +29,7 @@ pub fn calibrated(skin: &Skin, text: &str, calibration: &Calibration) -> Result<
         }
         edit.set(index, "row", Value::Integer(i64::from(row)));
         edit.set(index, "position", Value::Numbers(&position));
-        // A cell has one of the two: the orientation takes the normal's place.
+        // A cell has one of the two keys: the orientation replaces the normal.
         let orientation = Value::Numbers(&orientation);
         if edit.has(index, "normal") {
             edit.replace(index, "normal", "orientation", orientation);
@@ -40,7 +40,7 @@ pub fn calibrated(skin: &Skin, text: &str, calibration: &Calibration) -> Result<
     Ok(edit.text())
 }
 
-/// Sets a value, behind another one if the cell does not have it.
+/// Sets a value; inserts it after another key if the cell does not have it.
 fn put(edit: &mut Edit<'_>, cell: usize, key: &str, value: Value<'_>, after: &str) {
     if edit.has(cell, key) {
         edit.set(cell, key, value);

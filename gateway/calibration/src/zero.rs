@@ -1,8 +1,8 @@
-//! Zero offsets of the robot's joints: what has to be added to the positions on the bus.
+//! Zero offsets of the robot's joints: the values to add to the positions on the bus.
 //!
-//! An offset moves gravity and everything behind the joint. Much of that looks as cells that are mounted differently, so
-//! offsets are estimated together with what is unknown of every cell, of which only what the cells cannot explain is left
-//! (the Schur complement of their information).
+//! An offset moves gravity and everything beyond the joint. Much of that looks like cells that are mounted differently,
+//! so offsets are estimated together with the unknowns of every cell. Only the part that the cells cannot explain
+//! remains (the Schur complement of their information).
 
 #![expect(clippy::indexing_slicing, reason = "matrices with a row for each joint")]
 
@@ -20,27 +20,27 @@ use crate::rounded::rounded;
 use crate::settings::Settings;
 use crate::table::Table;
 
-/// Offsets that are supposed beforehand, as a standard deviation in rad or m.
+/// The prior standard deviation of offsets, in rad or m.
 const SUPPOSED: f64 = 0.1;
-/// An offset that is not certain within this, 68 of 100 times, is not observable: 1 degree, or 2 cm.
+/// An offset with a larger standard deviation than this is not observable: 1 degree, or 2 cm.
 const OBSERVED: f64 = 0.0175;
-/// The step of differences.
+/// The step of numerical derivatives.
 const STEP: f64 = 1e-5;
-/// One of so many readings is looked at.
+/// One of this many readings is used.
 const STRIDE: usize = 4;
-/// Errors of readings that are close in time depend on each other: each counts as so much of one.
+/// The errors of readings that are close in time are correlated: each counts as this part of an independent one.
 const SHARE: f64 = 0.5;
 
-/// What was found of a joint.
+/// The zero offset of a joint.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ZeroOffset {
-    /// Its name.
+    /// The name of the joint.
     pub joint: String,
     /// `rad` or `m`.
     pub unit: &'static str,
-    /// What has to be added to its positions; `None` if nothing tells.
+    /// The value to add to its positions; `None` if it is not observable.
     pub offset: Option<f64>,
-    /// The standard deviation of that.
+    /// The standard deviation of the offset.
     pub deviation: f64,
 }
 
@@ -57,13 +57,13 @@ impl core::fmt::Display for ZeroOffset {
     }
 }
 
-/// What of a cell's readings depends on offsets, when the cell has explained what it can.
+/// The part of a cell's readings that depends on offsets and cannot be explained by the cell.
 struct Remainder {
     information: DMatrix<f64>,
     gradient: DVector<f64>,
 }
 
-/// The offsets of all joints of the robot, by one step of least squares from where cells were estimated without any.
+/// Estimates the offsets of all joints of the robot, by one step of least squares from the estimates without offsets.
 pub(crate) fn zero_offsets(
     skin: &Skin,
     seen: &Observations,
@@ -114,7 +114,7 @@ pub(crate) fn zero_offsets(
     of_joint.collect()
 }
 
-/// What the readings of a cell say of offsets.
+/// Returns the information of a cell's readings on the offsets.
 fn left(
     table: &Table,
     moved: &[Table],

@@ -1,4 +1,4 @@
-//! Configurations to test with, and what the documents say of them: F_z, torque words, and J in floating point.
+//! Test configurations, and the values that the documents require for them: F_z, torque words, and J in floating point.
 
 use model::central::Central;
 use model::decode::Decoded;
@@ -11,7 +11,7 @@ use rand::seq::IndexedRandom as _;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_pcg::Pcg64Mcg;
 
-/// Numbers that look random, the same ones each time.
+/// A pseudo-random generator with a fixed seed.
 #[derive(Clone, Debug)]
 pub(crate) struct Dice(Pcg64Mcg);
 
@@ -20,31 +20,32 @@ impl Dice {
         Self(Pcg64Mcg::seed_from_u64(seed))
     }
 
-    /// Any word.
+    /// Returns any word.
     pub(crate) fn word(&mut self) -> i16 {
         self.0.random()
     }
 
-    /// A number below a bound; 0 where that is 0.
+    /// Returns a number below a bound; 0 if the bound is 0.
     pub(crate) fn below(&mut self, bound: u32) -> u32 {
         self.0.random_range(0..bound.max(1))
     }
 
-    /// A number in [-1, 1).
+    /// Returns a number in [-1, 1).
     fn unit(&mut self) -> f64 {
         f64::from(self.word()) / 32_768.0
     }
 
-    /// One of a few.
+    /// Returns one element of a slice.
     pub(crate) fn one<T: Copy + Default>(&mut self, of: &[T]) -> T {
         of.choose(&mut self.0).copied().unwrap_or_default()
     }
 }
 
-/// Joints that are older are skipped: a cell that is a process may wait for a processor.
+/// The period in the test configurations. A cell skips older joints, so it is long: a cell that is a process may wait
+/// for a processor.
 const PERIOD_US: u16 = 60_000;
 
-/// Gain 1, no proximity, no thresholds: the force is the sum of the three words.
+/// Gain 1, no proximity, no thresholds: the force is the sum of the three contact words.
 pub(crate) const PLAIN: Contact = Contact {
     alpha_c: Q3_12::from_bits(4096),
     alpha_p: Q5_10::ZERO,
@@ -58,7 +59,7 @@ fn row(a: i16, d: i16, alpha: i16, theta_offset: i16) -> Row {
     Row { kind: RowKind::Revolute, a, d, alpha, theta_offset }
 }
 
-/// The cell of the protocol's complete configuration, on joint k of a UR5, with forces that count as they are.
+/// Returns the cell of the protocol's complete configuration, on joint k of a UR5, with [`PLAIN`] contact.
 pub(crate) fn document(joint: u8) -> Parameters {
     let mut rows = [Row::default(); MAX_ROWS];
     let ur5 = [
@@ -88,12 +89,13 @@ pub(crate) fn document(joint: u8) -> Parameters {
     }
 }
 
-/// The same at 62.5 joints a second, where times matter.
+/// Returns the same at 62.5 joints a second, for checks of times.
 pub(crate) fn in_time(joint: u8) -> Parameters {
     Parameters { period_us: 16_000, ..document(joint) }
 }
 
-/// A configuration all of whose words are different, as large as the cell can have it: none is lost in flash unnoticed.
+/// Returns a configuration as large as the cell accepts, with a different value in each word, so that no word can be
+/// lost in flash unnoticed.
 pub(crate) fn distinct(abilities: Abilities) -> Parameters {
     let mut all = document(3);
     all.period_us = 55_500;
@@ -138,7 +140,7 @@ pub(crate) fn distinct(abilities: Abilities) -> Parameters {
     if abilities.lacks(&large).is_none() { large } else { all }
 }
 
-/// The gains and thresholds of the document's contact.
+/// Returns the gains and thresholds of the document's example.
 pub(crate) fn document_contact() -> Contact {
     let [alpha_c, threshold] = [4096, 0x67];
     Contact {
@@ -150,7 +152,7 @@ pub(crate) fn document_contact() -> Contact {
     }
 }
 
-/// What a chain has.
+/// The dimensions of a chain.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Shape {
     pub(crate) joints: usize,
@@ -158,7 +160,7 @@ pub(crate) struct Shape {
     pub(crate) prismatic: bool,
 }
 
-/// An arm of any shape within reach, and a cell somewhere on it.
+/// Returns an arm of a given shape and limited reach, with a cell somewhere on it.
 pub(crate) fn random(dice: &mut Dice, shape: Shape) -> Parameters {
     let mut rows = [Row::default(); MAX_ROWS];
     let fixed = shape.rows.saturating_sub(shape.joints);
@@ -208,7 +210,7 @@ pub(crate) fn random(dice: &mut Dice, shape: Shape) -> Parameters {
     }
 }
 
-/// A vector of length 1.
+/// Returns a vector of length 1.
 fn normal(dice: &mut Dice) -> [Q1_14; 3] {
     loop {
         let any = [0; 3].map(|_| dice.unit());
@@ -219,7 +221,7 @@ fn normal(dice: &mut Dice) -> [Q1_14; 3] {
     }
 }
 
-/// Joint positions for a chain: prismatic ones slide little.
+/// Returns joint positions for a chain; prismatic joints stay near 0.
 pub(crate) fn positions(dice: &mut Dice, parameters: &Parameters) -> [i16; MAX_JOINTS] {
     let moving: Vec<_> = parameters.table().iter().filter(|row| row.moves()).map(|row| row.kind).collect();
     let share = 16_384 / i16::try_from(parameters.table().len().max(1) * 3).unwrap_or(i16::MAX);
@@ -233,7 +235,7 @@ pub(crate) fn positions(dice: &mut Dice, parameters: &Parameters) -> [i16; MAX_J
     })
 }
 
-/// F_z in steps of 2^-16 N, by Algorithm 1 of the document.
+/// Computes F_z in steps of 2^-16 N, by Algorithm 1 of the document.
 pub(crate) fn force(contact: &Contact, skin: &SkinSensors) -> i64 {
     let bits = |word: i16| i64::from(word);
     let f_c: i64 = skin.contact.iter().map(|word| bits(word.to_bits())).sum();
@@ -245,14 +247,14 @@ pub(crate) fn force(contact: &Contact, skin: &SkinSensors) -> i64 {
     (f_z + 128) >> 8
 }
 
-/// A word of the torque of so many steps of 2^-16 N, from a word of J.
+/// Computes a torque word from a word of J and a force in steps of 2^-16 N.
 pub(crate) fn word(j: i16, force: i64, format: TorqueFormat) -> i16 {
     let bits = 30 - i64::from(format.fraction());
     let held = ((i64::from(j) * force + (1 << (bits - 1))) >> bits).clamp(i16::MIN.into(), i16::MAX.into());
     i16::try_from(held).unwrap_or_default()
 }
 
-/// Three contact words with this sum.
+/// Splits a sum into three contact words.
 pub(crate) fn contact(sum: i32) -> [Q5_10; 3] {
     let first = (sum / 3).clamp(i16::MIN.into(), i16::MAX.into());
     let second = ((sum - first) / 2).clamp(i16::MIN.into(), i16::MAX.into());
@@ -260,46 +262,46 @@ pub(crate) fn contact(sum: i32) -> [Q5_10; 3] {
         .map(|word| Q5_10::from_bits(i16::try_from(word).unwrap_or_default()))
 }
 
-/// Words, one after the other.
+/// Formats words, separated by spaces.
 pub(crate) fn list(words: &[i16]) -> String {
     words.iter().map(ToString::to_string).collect::<Vec<_>>().join(" ")
 }
 
-/// A sensors page in words.
+/// Formats the values of a sensors page.
 pub(crate) fn page(page: SensorPage) -> String {
     let message = Message::Sensors { from: CellId::MAX, epoch: Epoch(0), page };
     let text = Decoded::Message(message).to_string();
     text.split_once(": ").map_or_else(String::new, |(_, values)| values.to_owned())
 }
 
-/// What is latched, in words.
+/// Formats latched sensor values.
 pub(crate) fn skin(skin: Option<SkinSensors>) -> String {
     skin.map_or_else(|| "nothing".to_owned(), |skin| page(SensorPage::Skin(skin)))
 }
 
-/// A press with this sum of contact words and nothing else.
+/// Returns a press with this sum of contact words, and no other values.
 pub(crate) fn press(sum: i32) -> SkinSensors {
     SkinSensors { contact: contact(sum), ..SkinSensors::default() }
 }
 
-/// The sum of contact words at which, with [`PLAIN`], a torque word is the word of J.
+/// Returns the sum of contact words for which, with [`PLAIN`], a torque word equals the word of J.
 pub(crate) fn unit_press(format: TorqueFormat) -> i32 {
     1 << (24 - format.fraction())
 }
 
-/// J in m (of prismatic joints a number), from the words of the parameters and of the joints.
+/// Computes J in m (without a unit for prismatic joints), from the words of the parameters and of the joints.
 pub(crate) fn exact_jacobian(central: &Central, positions: &[i16; MAX_JOINTS]) -> [f64; MAX_JOINTS] {
     let words = positions.map(Q1_14::from_bits);
     central.torque(0, &central.frames(&words), 1.0)
 }
 
-/// By how many steps a word of J is off the nearest word of the exact one.
+/// Returns the distance of a word of J from the nearest word to the exact value, in steps.
 pub(crate) fn off(j: i16, exact: f64) -> u32 {
     let nearest = Q::<14>::nearest(exact).to_bits();
     i32::from(j).abs_diff(nearest.into())
 }
 
-/// By how many steps it may be off (J-3): 8, and one more for each row after the sixth.
+/// Returns the allowed distance in steps (J-3): 8, and one more for each row after the sixth.
 pub(crate) fn tolerance(parameters: &Parameters) -> u32 {
     8 + u32::try_from(parameters.chain().len().saturating_sub(6)).unwrap_or(0)
 }

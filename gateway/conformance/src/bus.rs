@@ -1,81 +1,81 @@
-//! The bus that the cell is on, as the checks see it: in virtual time or real.
+//! The bus of the cell under test, as the checks see it: real, or in virtual time.
 
 use protocol::can::{Format, Frame};
 use protocol::time::{Micros, Span};
 use thiserror::Error;
 
-/// A frame that was on the bus.
+/// A frame seen on the bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Seen {
-    /// When, on the clock of [`Bus::now`].
+    /// Its time on the clock of [`Bus::now`].
     pub at: Micros,
     /// The frame.
     pub frame: Frame,
-    /// Whether the bench sent it.
+    /// True if the bench sent it.
     pub own: bool,
 }
 
-/// A bus with the cell on it.
+/// A bus with the cell under test.
 pub trait Bus {
-    /// The time.
+    /// Returns the time.
     fn now(&self) -> Micros;
 
-    /// Whether frames of this format can be sent, whatever format the cell's are.
+    /// Returns true if frames of this format can be sent, also if the cell uses the other format.
     fn carries(&self, format: Format) -> bool;
 
-    /// Sends frames, in order. Each comes back by [`Bus::receive`], marked as own, when it was on the bus.
+    /// Sends frames, in order. [`Bus::receive`] returns each one, marked as own, once it was on the bus.
     ///
     /// # Errors
-    /// When the bus does not take them, or the test is interrupted.
+    /// Returns [`Stop`] if the bus does not accept the frames, or if the test is interrupted.
     fn send(&mut self, frames: &[Frame]) -> Result<(), Stop>;
 
-    /// The next frame, if there is one until then.
+    /// Returns the next frame, or `None` if no frame arrives by then.
     ///
     /// # Errors
-    /// When the bus is gone, or the test is interrupted.
+    /// Returns [`Stop`] if the bus is gone, or if the test is interrupted.
     fn receive(&mut self, until: Micros) -> Result<Option<Seen>, Stop>;
 
-    /// By how much the bench itself was late at most since this was called last: it is not the cell's fault.
+    /// Returns the maximum lateness of the bench itself since the last call; it does not count against the cell.
     fn lateness(&mut self) -> Span;
 
-    /// From now on no signal interrupts: the cell is put back.
+    /// Ignores signals from now on, so that the cell can be restored.
     fn finish(&mut self);
 
-    /// Whether the cell can be switched off and on.
+    /// Returns true if the cell can be switched off and on.
     fn can_restart(&self) -> bool;
 
     /// Begins to switch the cell off and on.
     ///
     /// # Errors
-    /// When it cannot be done.
+    /// Returns [`Stop`] if that is not possible.
     fn begin_restart(&mut self) -> Result<(), Stop>;
 
-    /// Whether that is still being done.
+    /// Returns true while the restart is in progress.
     ///
     /// # Errors
-    /// When it failed.
+    /// Returns [`Stop`] if the restart failed.
     fn is_restarting(&mut self) -> Result<bool, Stop>;
 }
 
-/// Why a test ends before its end.
+/// The reason why a test ends early.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 pub enum Stop {
-    /// A signal came.
+    /// A signal arrived.
     #[error("interrupted")]
     Interrupted,
     /// The bus cannot be used any more.
     #[error("{0}")]
     Bus(String),
-    /// The cell sends nothing any more.
-    #[error("the cell fell silent: nothing came for 3 s")]
+    /// The cell has stopped sending.
+    #[error("the cell fell silent: it sent nothing for 3 s")]
     Silent,
-    /// Somebody else commands cells.
-    #[error("{0} was sent by somebody else: stop the gateway that is on this bus")]
+    /// Another program commands cells on this bus.
+    #[error("{0} was sent by another program: stop the gateway on this bus")]
     Gateway(String),
     /// The command of a restart failed.
     #[error("{0}")]
     Restart(String),
-    /// The time is over.
-    #[error("the time was over")]
+    /// The time limit is reached.
+    #[error("the time limit was reached")]
     Time,
 }

@@ -1,4 +1,4 @@
-//! What was found of each requirement.
+//! The results of the checks, by requirement.
 
 use std::collections::BTreeMap;
 
@@ -7,53 +7,53 @@ use serde::Serialize;
 use crate::bus::Stop;
 use crate::requirements::{REQUIREMENTS, Requirement};
 
-/// Frames that show a failure, at most.
+/// The maximum number of frames that are shown for a failure.
 const FRAMES: usize = 24;
 
-/// What came of one requirement.
+/// The verdict on one requirement.
 #[derive(Clone, Debug, Default, Eq, PartialEq, Serialize)]
 #[serde(tag = "verdict", rename_all = "kebab-case")]
 pub enum Verdict {
-    /// Every check of it passed.
+    /// All checks of it passed.
     Passed {
-        /// How many checks.
+        /// The number of checks.
         checks: usize,
-        /// What of it could not be checked.
+        /// The part that could not be checked.
         #[serde(skip_serializing_if = "Option::is_none")]
         but: Option<String>,
     },
     /// A check of it failed.
     Failed {
-        /// What was expected, and what came.
+        /// The expectation, and the observation.
         what: String,
-        /// How many checks failed.
+        /// The number of failed checks.
         failures: usize,
-        /// The frames that show it, as candump writes them; the last ones, if there are many.
+        /// The frames that show the failure, in candump's notation; the last ones, if there are many.
         frames: Vec<String>,
     },
-    /// This cell does not have what the requirement is about.
+    /// The requirement does not apply to this cell.
     NotApplicable {
-        /// Why.
+        /// The reason.
         why: String,
     },
-    /// It could not be tested.
+    /// The requirement could not be tested.
     NotTested {
-        /// Why.
+        /// The reason.
         why: String,
     },
-    /// Nothing was found yet.
+    /// No result yet.
     #[default]
     #[serde(skip)]
     Open,
 }
 
-/// One requirement, and what came of it.
+/// A requirement and its verdict.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct Finding {
     /// The requirement.
     #[serde(flatten)]
     pub requirement: &'static Requirement,
-    /// What came of it.
+    /// The verdict.
     #[serde(flatten)]
     pub verdict: Verdict,
 }
@@ -67,22 +67,22 @@ struct Tally {
     not_tested: Option<String>,
 }
 
-/// All that was found.
+/// The results of all checks.
 #[derive(Clone, Debug, Default)]
 pub struct Findings(BTreeMap<&'static str, Tally>);
 
 impl Findings {
     fn tally(&mut self, id: &'static str) -> &mut Tally {
-        debug_assert!(REQUIREMENTS.iter().any(|it| it.id == id), "{id} is no requirement");
+        debug_assert!(REQUIREMENTS.iter().any(|it| it.id == id), "{id} is not a requirement");
         self.0.entry(id).or_default()
     }
 
-    /// A check passed.
+    /// Counts a passed check.
     pub(crate) fn pass(&mut self, id: &'static str) {
         self.tally(id).passed += 1;
     }
 
-    /// A check failed; the first failure of a requirement is kept.
+    /// Counts a failed check; the first failure of a requirement is kept.
     pub(crate) fn fail(&mut self, id: &'static str, what: String, frames: impl FnOnce() -> Vec<String>) {
         let tally = self.tally(id);
         tally.failed += 1;
@@ -93,36 +93,36 @@ impl Findings {
         });
     }
 
-    /// The cell does not have that.
+    /// Notes that the requirement does not apply to the cell.
     pub(crate) fn not_applicable(&mut self, id: &'static str, why: impl Into<String>) {
         self.tally(id).not_applicable.get_or_insert_with(|| why.into());
     }
 
-    /// It, or a part of it, could not be tested.
+    /// Notes that the requirement, or a part of it, could not be tested.
     pub(crate) fn not_tested(&mut self, id: &'static str, why: impl Into<String>) {
         self.tally(id).not_tested.get_or_insert_with(|| why.into());
     }
 
-    /// The ids of the requirements that failed.
+    /// Returns the ids of the requirements that failed.
     #[must_use]
     pub fn failed(&self) -> Vec<&'static str> {
         self.0.iter().filter(|(_, tally)| tally.failed > 0).map(|(id, _)| *id).collect()
     }
 
-    /// The ids that have failed more often than there.
+    /// Returns the ids with more failures than in `before`.
     pub(crate) fn failed_since(&self, before: &Self) -> impl Iterator<Item = &'static str> {
         let failed = |of: &Self, id| of.0.get(id).map_or(0, |tally| tally.failed);
         self.0.keys().copied().filter(move |id| failed(self, *id) > failed(before, *id))
     }
 
-    /// What failed of a requirement since then does not count.
+    /// Retracts the failures of a requirement since `before`.
     pub(crate) fn forgive(&mut self, id: &'static str, before: &Self) {
         let Tally { failed, failure, .. } = before.0.get(id).cloned().unwrap_or_default();
         let tally = self.tally(id);
         (tally.failed, tally.failure) = (failed, failure);
     }
 
-    /// What came of a requirement; `why` it was not tested if nothing says so.
+    /// Returns the verdict on a requirement; `why` is the reason for an untested one without a reason of its own.
     fn verdict(&self, id: &str, why: &str) -> Verdict {
         let tally = self.0.get(id).cloned().unwrap_or_default();
         if let Some((what, frames)) = tally.failure {
@@ -137,10 +137,11 @@ impl Findings {
         Verdict::NotTested { why: tally.not_tested.unwrap_or_else(|| why.to_owned()) }
     }
 
-    /// All requirements that are asked for, in the order of the documents, and why the test ended early, if it did.
+    /// Returns all requested requirements with their verdicts, in the order of the documents. `stopped` is the reason
+    /// why the test ended early, if it did.
     #[must_use]
     pub fn list(&self, only: &Only, stopped: Option<&Stop>) -> Vec<Finding> {
-        let why = stopped.map_or_else(|| "there is no check of it".to_owned(), ToString::to_string);
+        let why = stopped.map_or_else(|| "there is no check for it".to_owned(), ToString::to_string);
         let asked = REQUIREMENTS.iter().filter(|it| only.has(it.id));
         asked
             .map(|requirement| Finding { requirement, verdict: self.verdict(requirement.id, &why) })
@@ -148,15 +149,15 @@ impl Findings {
     }
 }
 
-/// Which requirements are asked for.
+/// The selection of requirements.
 #[derive(Clone, Debug, Default)]
 pub struct Only(Vec<String>);
 
 impl Only {
-    /// These ids, or all that begin so: `CONF-7`, `CONF`; all if there are none.
+    /// Selects requirements by id or by kind: `CONF-7`, `CONF`; without words, selects everything.
     ///
     /// # Errors
-    /// The word that names no requirement.
+    /// Returns the first word that does not match a requirement.
     pub fn new(words: &[String]) -> Result<Self, String> {
         let words: Vec<_> = words.iter().map(|word| word.to_uppercase()).collect();
         let one = |word: &String| Self(vec![word.clone()]);
@@ -166,7 +167,7 @@ impl Only {
         }
     }
 
-    /// Whether this one is asked for.
+    /// Returns true if this requirement is selected.
     #[must_use]
     pub fn has(&self, id: &str) -> bool {
         let is = |word: &String| id == word || id.split_once('-').is_some_and(|(kind, _)| kind == word);

@@ -1,4 +1,4 @@
-//! Takes one cell through the requirements of its documents: whoever wrote it, and wherever it runs.
+//! Conformance tests: take one cell, of any author and on any hardware, through the requirements of its documents.
 //!
 //! ```text
 //!   checks ──> Session ──> Bus ─┬─ Live: a socket, the kernel's time stamps
@@ -6,8 +6,8 @@
 //!      '─ Findings: passed, failed with frames, not applicable, not tested
 //! ```
 //!
-//! Checks send packets and look at what comes; expected values come from the documents, torques to the bit, J from a
-//! computation in floating point. Nothing here uses the code of a cell.
+//! Checks send packets and compare the cell's packets with expected values. Those come from the documents: torques bit
+//! for bit, J from a computation in floating point. This crate does not use any code of a cell.
 
 mod arm;
 pub mod bus;

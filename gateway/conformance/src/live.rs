@@ -17,9 +17,9 @@ use protocol::time::{Micros, Span};
 use crate::bus::{Bus, Seen, Stop};
 use probe::Probe;
 
-/// How long a signal to end may wait.
+/// The interval at which a termination signal is checked.
 const LOOK: Span = Span::from_millis(50);
-/// How long a restart may take.
+/// The time limit for a restart.
 const RESTART: Span = Span::from_millis(15_000);
 
 /// An open bus.
@@ -31,7 +31,7 @@ pub struct Live {
     stopped: Arc<AtomicBool>,
     obeys: bool,
     late: Span,
-    /// Where the cell may be a process of this computer.
+    /// Measures this computer's lateness, if the cell may be a process on it.
     probe: Option<Probe>,
     command: Option<String>,
     child: Option<(Child, Micros)>,
@@ -41,7 +41,7 @@ impl Live {
     /// Opens a bus. `stopped` interrupts the test; `command` switches the cell off and on.
     ///
     /// # Errors
-    /// When it cannot be used as requested.
+    /// Returns [`BusError`] if it cannot be used as requested.
     pub fn open(
         name: &str,
         kind: Choice,
@@ -76,7 +76,7 @@ impl Bus for Live {
     }
 
     fn carries(&self, format: Format) -> bool {
-        // A real classic bus would be disturbed.
+        // FD frames would disturb a real classic bus.
         format == Format::Classic || self.socket.carries_fd() && self.probe.is_some()
     }
 

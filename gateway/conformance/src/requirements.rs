@@ -5,7 +5,7 @@ use serde::Serialize;
 /// A document with requirements.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub enum Document {
-    /// What every cell must do.
+    /// The requirements of every cell.
     #[serde(rename = "cell.md")]
     Cell,
     /// Sensor values and stimuli.
@@ -16,14 +16,14 @@ pub enum Document {
     Tree,
 }
 
-/// One requirement.
+/// A requirement.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub struct Requirement {
     /// Its id.
     pub id: &'static str,
-    /// Where it stands.
+    /// The document that contains it.
     pub document: Document,
-    /// What it is about.
+    /// A short title.
     pub title: &'static str,
 }
 
@@ -33,10 +33,10 @@ const fn of(document: Document, id: &'static str, title: &'static str) -> Requir
 
 use Document::{Cell, Sensing, Tree};
 
-/// All of them, in the order of the documents.
+/// All requirements, in the order of the documents.
 pub const REQUIREMENTS: &[Requirement] = &[
     of(Cell, "OPT-1", "parameters of options that it does not have"),
-    of(Cell, "OPT-2", "what it does not use is ignored"),
+    of(Cell, "OPT-2", "unused contents are ignored"),
     of(Cell, "SEND-1", "only the packets of the documents, whole and in order"),
     of(Cell, "TIME-1", "clock within 1 %"),
     of(Cell, "TIME-2", "answers at once"),
@@ -45,7 +45,7 @@ pub const REQUIREMENTS: &[Requirement] = &[
     of(Cell, "ID-2", "its node id in all that it sends"),
     of(Cell, "ID-3", "node id survives a reset"),
     of(Cell, "CLAIM-1", "first packet is a heartbeat with CLAIMING"),
-    of(Cell, "CLAIM-2", "what it takes and ignores while it claims"),
+    of(Cell, "CLAIM-2", "accepted and ignored packets while it claims"),
     of(Cell, "CLAIM-3", "gives way, or stays and answers"),
     of(Cell, "CLAIM-4", "silence after it gave way"),
     of(Cell, "CLAIM-5", "end of claiming"),
@@ -63,9 +63,9 @@ pub const REQUIREMENTS: &[Requirement] = &[
     of(Cell, "CMD-2", "resume"),
     of(Cell, "CMD-3", "sync"),
     of(Cell, "CMD-4", "report"),
-    of(Cell, "JOINTS-1", "a repeated epoch is dropped, any other is taken"),
+    of(Cell, "JOINTS-1", "a repeated epoch is dropped, any other is accepted"),
     of(Cell, "JOINTS-2", "another count is dropped"),
-    of(Cell, "JOINTS-3", "last joints taken"),
+    of(Cell, "JOINTS-3", "last joints accepted"),
     of(Cell, "JOINTS-4", "joints that are too old"),
     of(Cell, "JOINTS-5", "joints are counted"),
     of(Cell, "JOINTS-6", "the answer to joints"),
@@ -80,15 +80,15 @@ pub const REQUIREMENTS: &[Requirement] = &[
     of(Cell, "CONF-3", "unused words are 0"),
     of(Cell, "CONF-4", "answers to writes"),
     of(Cell, "CONF-5", "a refused write changes nothing"),
-    of(Cell, "CONF-6", "which reason"),
+    of(Cell, "CONF-6", "the reason of a refusal"),
     of(Cell, "CONF-7", "commit"),
-    of(Cell, "CONF-8", "what was committed survives a reset"),
+    of(Cell, "CONF-8", "a committed configuration survives a reset"),
     of(Cell, "CONF-9", "volatile parameters"),
     of(Cell, "CONF-10", "ranges of volatile parameters"),
     of(Cell, "CONF-11", "to everyone"),
     of(Cell, "CONF-12", "tags"),
     of(Cell, "CONF-13", "unknown parameters"),
-    of(Cell, "COUNT-1", "what cannot be used is dropped and counted"),
+    of(Cell, "COUNT-1", "unusable packets are dropped and counted"),
     of(Cell, "COUNT-2", "a refusal is not counted"),
     of(Cell, "COUNT-3", "reassembly of segments"),
     of(Sensing, "SENSE-1", "pages on report"),
@@ -106,27 +106,27 @@ pub const REQUIREMENTS: &[Requirement] = &[
     of(Sensing, "SENSE-5", "continuous mode"),
     of(Sensing, "SENSE-6", "early pages after joints"),
     of(Sensing, "SENSE-7", "events"),
-    of(Sensing, "SENSE-8", "what was sent last"),
+    of(Sensing, "SENSE-8", "the last sent values"),
     of(Sensing, "SENSE-9", "turns"),
     of(Sensing, "SENSE-10", "pages after heartbeats"),
     of(Sensing, "SENSE-11", "halted, unconfigured and claiming cells"),
     of(Sensing, "BASE-1", "ranges of parameters 11 and 12, and without a baseline"),
     of(Sensing, "BASE-2", "the first tare"),
     of(Sensing, "BASE-3", "the zero holds under a touch"),
-    of(Sensing, "BASE-4", "the zero follows, and how quickly"),
+    of(Sensing, "BASE-4", "the zero tracks the reading, and how fast"),
     of(Sensing, "BASE-5", "the zero and the temperature"),
     of(Sensing, "BASE-6", "tare"),
     of(Sensing, "BASE-7", "sensors page 3"),
-    of(Sensing, "BASE-8", "what is subtracted from which word"),
+    of(Sensing, "BASE-8", "the subtraction from each word"),
     of(Tree, "SUM-1", "the place in the tree of an epoch"),
-    of(Tree, "SUM-2", "the own word"),
+    of(Tree, "SUM-2", "the cell's own word"),
     of(Tree, "SUM-3", "the sum"),
     of(Tree, "SUM-4", "when sums are sent"),
     of(Tree, "SUM-5", "later sums of an epoch"),
     of(Tree, "SUM-6", "the end of a contact"),
     of(Tree, "SUM-7", "when no sums are sent"),
     of(Tree, "LEASE-1", "state before sums"),
-    of(Tree, "LEASE-2", "a lease goes on epoch by epoch"),
+    of(Tree, "LEASE-2", "a lease continues epoch by epoch"),
     of(Tree, "LEASE-3", "the end of a lease"),
     of(Tree, "NACK-1", "looking back at an epoch"),
     of(Tree, "NACK-2", "not when it was late itself"),
@@ -139,7 +139,7 @@ pub const REQUIREMENTS: &[Requirement] = &[
     of(Tree, "JOIN-1", "looking for a parent"),
     of(Tree, "JOIN-2", "grant and refuse"),
     of(Tree, "JOIN-3", "a better parent"),
-    of(Tree, "JOIN-4", "which grant is taken"),
+    of(Tree, "JOIN-4", "the grant that is accepted"),
     of(Tree, "JOIN-5", "roots"),
     of(Tree, "JOIN-6", "the tree page"),
     of(Tree, "LOSS-1", "a lost parent"),
@@ -160,7 +160,7 @@ pub const REQUIREMENTS: &[Requirement] = &[
 mod tests {
     use super::*;
 
-    /// The ids of a document, in its order.
+    /// Returns the ids of a document, in its order.
     fn ids(text: &str) -> Vec<&str> {
         text.lines().filter_map(|line| Some(line.strip_prefix("- **")?.split_once("**")?.0)).collect()
     }

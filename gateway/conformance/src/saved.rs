@@ -1,4 +1,4 @@
-//! What a cell had before the test, to be put back after it.
+//! The state of a cell before the test, which is restored after it.
 
 use std::collections::BTreeMap;
 
@@ -11,14 +11,14 @@ use serde::{Deserialize, Serialize};
 use crate::bus::Stop;
 use crate::session::{Reply, Session};
 
-/// How long that may take.
+/// The time limit for restoring the state.
 const LONGEST: Span = Span::from_millis(8_000);
-/// Answers to the test have come by then.
+/// The time after which all answers to the test have come.
 const SETTLE: Span = Span::from_millis(60);
-/// Attempts to put something back.
+/// The number of attempts to restore a value.
 const ATTEMPTS: usize = 3;
 
-/// What is switched and not stored.
+/// Volatile parameters.
 const SWITCHES: [Parameter; 6] = [
     Parameter::Reply,
     Parameter::Sensing,
@@ -28,10 +28,10 @@ const SWITCHES: [Parameter; 6] = [
     Parameter::Mode,
 ];
 
-/// What a cell had.
+/// The state of a cell.
 #[derive(Clone, Debug, Deserialize, Eq, PartialEq, Serialize)]
 pub struct Saved {
-    /// The bus that it was on.
+    /// The name of its bus.
     pub bus: String,
     /// Its node id.
     pub node: u8,
@@ -39,17 +39,17 @@ pub struct Saved {
     pub serial: u32,
     /// The hash of its configuration; 0 for none.
     pub hash: u16,
-    /// Whether it was halted.
+    /// True if it was halted.
     pub halted: bool,
     /// The words of its parameters, by number.
     pub parameters: BTreeMap<u8, [i16; WORDS]>,
 }
 
 impl Session<'_> {
-    /// Reads all that the cell has; the error says what it does not answer.
+    /// Reads the state of the cell. The inner error names a parameter that the cell does not answer.
     ///
     /// # Errors
-    /// When the bus fails, or the test is interrupted.
+    /// Returns [`Stop`] if the bus fails, or if the test is interrupted.
     pub fn save(&mut self) -> Result<Result<Saved, String>, Stop> {
         let Reply::Value(identity) = self.read(Parameter::Identity.number())? else {
             return Ok(Err("it does not answer a read of parameter 0 (identity)".to_owned()));
@@ -63,7 +63,7 @@ impl Session<'_> {
             let number = parameter.number();
             match self.read(number)? {
                 Reply::Value(words) => _ = parameters.insert(number, words),
-                // It knows the protocol without it.
+                // A cell that implements the protocol without baselines.
                 Reply::Refused(Answer::UNKNOWN) if parameter == Parameter::Baseline => {}
                 Reply::Refused(_) | Reply::Nothing => {
                     return Ok(Err(format!("it does not answer a read of parameter {number}")));
@@ -77,14 +77,14 @@ impl Session<'_> {
         Ok(Ok(Saved { bus, node, serial, hash, halted, parameters }))
     }
 
-    /// Puts back what the cell had; what could not be put back.
+    /// Restores the state of the cell, and returns descriptions of the parts that could not be restored.
     ///
     /// # Errors
-    /// When the bus fails.
+    /// Returns [`Stop`] if the bus fails.
     pub fn restore(&mut self, saved: &Saved) -> Result<Vec<String>, Stop> {
         let mut left = Vec::new();
         self.extend(LONGEST);
-        // What answers the test is no answer to this.
+        // Lets late answers to the test pass, so that they do not count as answers to this.
         self.idle(SETTLE)?;
         self.start();
         self.say(&[Message::Resume])?;
@@ -95,7 +95,7 @@ impl Session<'_> {
         }
         for parameter in SWITCHES {
             let Some(words) = saved.parameters.get(&parameter.number()) else { continue };
-            // Links are written in test mode only, and are not touched by the test.
+            // Links are written in test mode only, and the test does not change them.
             if parameter == Parameter::LinksDown && *words == [0; WORDS] {
                 continue;
             }

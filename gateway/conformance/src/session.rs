@@ -1,4 +1,5 @@
-//! A conversation with the cell: sends, collects what the cell sends, and checks what holds of every packet.
+//! A conversation with the cell: sends packets, collects those of the cell, and checks the rules that hold for every
+//! packet.
 
 mod accounts;
 mod beats;
@@ -27,25 +28,25 @@ pub(crate) use known::{About, Known};
 use life::Life;
 pub(crate) use request::Reply;
 
-/// Longer than any answer takes that comes at all.
+/// The time limit for an answer.
 pub(crate) const PATIENT: Span = Span::from_millis(300);
-/// After a sync's heartbeat nothing is awaited longer than this.
+/// The additional time that answers are awaited after a sync's heartbeat.
 pub(crate) const LINGER: Span = Span::from_millis(5);
-/// What was sent is on the bus by then, whatever else this computer does.
+/// The time after which a sent frame was on the bus, even on a busy computer.
 const ON_BUS: Span = Span::from_millis(1_200);
-/// A cell that sends nothing for so long has fallen silent.
+/// A cell that sends nothing for this time has fallen silent.
 const SILENT: Span = Span::from_millis(3_000);
 
 /// A packet of the cell.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Heard {
-    /// When it, or its last segment, was on the bus.
+    /// The time at which it, or its last segment, was on the bus.
     pub(crate) at: Micros,
     pub(crate) message: Message,
 }
 
 impl Heard {
-    /// The heartbeat that it is, and its epoch byte.
+    /// Returns the heartbeat and its epoch byte, if the packet is one.
     pub(crate) const fn beat(&self) -> Option<(&Heartbeat, Epoch)> {
         if let Message::Network { page: NetworkPage::Heartbeat(beat), epoch, .. } = &self.message {
             Some((beat, *epoch))
@@ -63,66 +64,66 @@ impl Heard {
     }
 }
 
-/// Times of the conversation.
+/// The times of the conversation.
 #[derive(Clone, Copy, Debug)]
 struct Clock {
-    /// When the cell was heard last.
+    /// The time of the cell's last packet.
     last: Micros,
-    /// When the time is over.
+    /// The time at which the time limit is reached.
     end: Micros,
-    /// By how much the bench was late since the exchange began.
+    /// The maximum lateness of the bench since the exchange began.
     late: Span,
-    /// The same since a group of checks began, and ever.
+    /// The same since a group of checks began, and since the test began.
     worst: Span,
     longest: Span,
-    /// Packets whose segments came too late after each other.
+    /// The number of packets whose segments came too late after each other.
     torn: usize,
-    /// Heartbeats do not have the epoch of the last joints.
+    /// True if heartbeats do not have the epoch of the last joints.
     other_epochs: bool,
-    /// The cell is put back, whoever else is there.
+    /// True while the cell is being restored: other senders are then ignored.
     finishing: bool,
-    /// The last joints were too old when the cell came to them.
+    /// True if the last joints were too old when the cell processed them.
     skipped: bool,
-    /// What an answer takes, with the way there and back.
+    /// The time for a request and its answer.
     round_trip: Span,
 }
 
-/// Frames of the cell and of the bench.
+/// The frames of the cell and of the bench.
 #[derive(Debug, Default)]
 struct Log {
     frames: Vec<Seen>,
-    /// Where the present exchange begins: what was sent for it may come before it.
+    /// The start of the present exchange; frames that were sent for it may come before it.
     since: usize,
-    /// Where the last exchange ended.
+    /// The end of the last exchange.
     ended: usize,
 }
 
 impl Log {
-    /// Those of the present exchange.
+    /// Returns the frames of the present exchange.
     fn present(&self) -> &[Seen] {
         self.frames.get(self.since..).unwrap_or_default()
     }
 }
 
-/// The conversation.
+/// A conversation with one cell.
 pub struct Session<'a> {
     bus: &'a mut dyn Bus,
     name: String,
     pub(crate) cell: CellId,
     pub(crate) format: Format,
     log: Log,
-    /// Packets of the cell.
+    /// The packets of the cell.
     pub(crate) heard: Vec<Heard>,
-    /// Where the present exchange begins there.
+    /// The index in `heard` at which the present exchange begins.
     pub(crate) from: usize,
-    /// Up to where they were expected.
+    /// The index in `heard` up to which packets were expected.
     consumed: usize,
-    /// Joints whose answers came so late that the cell may have skipped them.
+    /// The number of joints whose answers came so late that the cell may have skipped them.
     pub(crate) skips: u16,
     life: Life,
-    /// Frames of the cell since a restart began: it is not known yet to which life they belong.
+    /// The frames of the cell since a restart began, while it is unknown to which life they belong.
     held: Option<Vec<(Seen, Id)>>,
-    /// What was found.
+    /// The results.
     pub findings: Findings,
     pub(crate) known: Known,
     pub(crate) about: About,
@@ -141,7 +142,7 @@ impl core::fmt::Debug for Session<'_> {
 }
 
 impl<'a> Session<'a> {
-    /// Speaks to a cell on a bus of this name and format for so long at most.
+    /// Creates a conversation with a cell on a bus of this name and format, with a time limit.
     pub fn new(bus: &'a mut dyn Bus, name: &str, cell: CellId, format: Format, longest: Span) -> Self {
         let now = bus.now();
         Self {
@@ -184,7 +185,7 @@ impl<'a> Session<'a> {
         self.bus.now()
     }
 
-    /// There is so much time from now on, and no signal interrupts.
+    /// Sets the remaining time, and ignores signals from now on.
     pub(crate) fn extend(&mut self, span: Span) {
         self.bus.finish();
         self.clock.finishing = true;
@@ -192,12 +193,12 @@ impl<'a> Session<'a> {
         self.clock.last = self.bus.now();
     }
 
-    /// How much time is left.
+    /// Returns the remaining time.
     pub(crate) fn left(&self) -> Span {
         self.clock.end.since(self.bus.now())
     }
 
-    /// The cell was allowed to be silent until now.
+    /// Notes that the cell was allowed to be silent until now.
     pub(crate) fn extend_life(&mut self) {
         self.clock.last = self.bus.now();
     }
@@ -210,7 +211,7 @@ impl<'a> Session<'a> {
         self.bus.can_restart()
     }
 
-    /// A check of a requirement.
+    /// Records the result of a check. Returns `is_so`.
     pub(crate) fn check(&mut self, id: &'static str, is_so: bool, what: impl FnOnce() -> String) -> bool {
         if is_so {
             self.findings.pass(id);
@@ -221,7 +222,7 @@ impl<'a> Session<'a> {
         is_so
     }
 
-    /// A new exchange begins. What came since the last one was not expected, unless a cell sends it by itself.
+    /// Begins a new exchange. Packets since the last one count as unexpected, unless a cell may send them by itself.
     pub(crate) fn mark(&mut self) {
         let strays: Vec<_> = self.heard.get(self.consumed..).unwrap_or_default().to_vec();
         for stray in strays {
@@ -233,7 +234,7 @@ impl<'a> Session<'a> {
         self.start();
     }
 
-    /// The same where what came is expected.
+    /// Begins a new exchange, and treats the packets since the last one as expected.
     pub(crate) fn start(&mut self) {
         self.clock.skipped = false;
         self.log.since = self.log.ended;
@@ -242,23 +243,23 @@ impl<'a> Session<'a> {
         self.clock.late = Span(0);
     }
 
-    /// What came since the exchange began was expected.
+    /// Marks the packets since the exchange began as expected.
     pub(crate) fn consume(&mut self) {
         self.consumed = self.heard.len();
         self.log.ended = self.log.frames.len();
     }
 
-    /// What came since the last exchange ended.
+    /// Returns the packets since the last exchange ended.
     pub(crate) fn unmarked(&self) -> Vec<Heard> {
         self.heard.get(self.consumed..).unwrap_or_default().to_vec()
     }
 
-    /// Packets of the cell since the exchange began.
+    /// Returns the cell's packets since the exchange began.
     pub(crate) fn answers(&self) -> &[Heard] {
         self.heard.get(self.from..).unwrap_or_default()
     }
 
-    /// Nothing that was written is taken for granted any more.
+    /// Discards all assumptions about values that were written before.
     pub(crate) fn forget(&mut self) {
         self.known = Known {
             last_epoch: self.known.last_epoch,
@@ -268,13 +269,13 @@ impl<'a> Session<'a> {
         };
     }
 
-    /// Sends frames, and waits until the last one was on the bus: when that was.
+    /// Sends frames, and returns the time at which the last one was on the bus.
     pub(crate) fn send(&mut self, frames: &[Frame]) -> Result<Micros, Stop> {
         let times = self.send_all(frames)?;
         Ok(times.last().copied().unwrap_or_else(|| self.now()))
     }
 
-    /// The same; when each was on the bus.
+    /// Sends frames, and returns the time at which each was on the bus.
     pub(crate) fn send_all(&mut self, frames: &[Frame]) -> Result<Vec<Micros>, Stop> {
         let Some(last) = frames.last() else { return Ok(Vec::new()) };
         let before = self.log.frames.len();
@@ -296,12 +297,12 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// The frames of a packet on this bus.
+    /// Encodes a packet as frames for this bus.
     pub(crate) fn frames(&self, message: &Message) -> Vec<Frame> {
         message.encode().frames(self.format).collect()
     }
 
-    /// Sends packets: when the first of them was on the bus as a whole.
+    /// Sends packets, and returns the time at which the first one was completely on the bus.
     pub(crate) fn say(&mut self, messages: &[Message]) -> Result<Micros, Stop> {
         let mut at = None;
         for message in messages {
@@ -312,7 +313,8 @@ impl<'a> Session<'a> {
         Ok(at.unwrap_or_else(|| self.now()))
     }
 
-    /// Receives until then, or until something is true of what has come since the exchange began.
+    /// Receives until a time, or until a condition on the packets since the exchange began is met. Returns true if it
+    /// was met.
     pub(crate) fn wait(
         &mut self,
         until: Micros,
@@ -329,20 +331,20 @@ impl<'a> Session<'a> {
         }
     }
 
-    /// Receives for so long.
+    /// Receives for a time.
     pub(crate) fn idle(&mut self, span: Span) -> Result<(), Stop> {
         let until = self.bus.now() + span;
         self.wait(until, |_| false).map(|_| ())
     }
 
-    /// What the cell sends late comes now.
+    /// Waits for late packets of the cell.
     pub(crate) fn settle(&mut self) -> Result<(), Stop> {
         self.idle(Span::from_millis(15))?;
         self.mark();
         Ok(())
     }
 
-    /// By how much the bench was late since the exchange began.
+    /// Returns the maximum lateness of the bench since the exchange began.
     pub(crate) fn lateness(&mut self) -> Span {
         self.clock.late = self.clock.late.max(self.bus.lateness());
         self.clock.worst = self.clock.worst.max(self.clock.late);
@@ -350,13 +352,13 @@ impl<'a> Session<'a> {
         self.clock.late
     }
 
-    /// By how much the bench was late since this was called last, in whatever exchange.
+    /// Returns the maximum lateness of the bench since the last call, over all exchanges.
     pub(crate) fn worst_lateness(&mut self) -> Span {
         self.lateness();
         core::mem::take(&mut self.clock.worst)
     }
 
-    /// Checks that segments followed each other: those of a few packets may wait for a processor.
+    /// Checks that segments followed each other; in a few packets they may be delayed by a busy processor.
     pub(crate) fn check_segments(&mut self) -> Result<(), Stop> {
         const FEW: usize = 3;
         if self.format == Format::Classic {
@@ -371,7 +373,7 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
-    /// Measures what an answer takes.
+    /// Measures the time for an answer.
     pub(crate) fn measure(&mut self) -> Result<(), Stop> {
         const TIMES: u64 = 8;
         let began = self.now();
@@ -382,28 +384,28 @@ impl<'a> Session<'a> {
         Ok(())
     }
 
-    /// Whether answers take so long that there is no time for all that could be tried.
+    /// Returns true if answers are so slow that checks have to be reduced.
     pub(crate) fn is_slow(&self) -> bool {
         self.clock.round_trip > Span::from_millis(4)
     }
 
-    /// So many attempts, or fewer with a slow cell.
+    /// Returns the number of attempts; fewer with a slow cell.
     pub(crate) fn attempts(&self, many: usize) -> usize {
         if self.is_slow() { many.div_ceil(4) } else { many }
     }
 
-    /// How long an answer took; not if the bench itself was late.
+    /// Records the time of an answer, unless the bench itself was late.
     pub(crate) fn note_time(&mut self, what: &'static str, asked: Micros, answered: Micros) {
         let late = self.lateness();
         self.timings.note(what, answered.since(asked), late);
     }
 
-    /// Joints of this chain.
+    /// Returns joints of the chain in use.
     pub(crate) fn joints(&self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Message {
         self.joints_of(epoch, positions, self.known.joints)
     }
 
-    /// Joints with this count; words beyond it are 0.
+    /// Returns joints with this count; further words are 0.
     pub(crate) fn joints_of(&self, epoch: u8, positions: &[i16; MAX_JOINTS], in_use: u8) -> Message {
         let mut words = *positions;
         words.iter_mut().skip(in_use.into()).for_each(|word| *word = 0);
@@ -412,7 +414,7 @@ impl<'a> Session<'a> {
     }
 }
 
-/// A frame as candump writes it, with T for what the bench sent.
+/// Formats a frame in candump's notation, with T for frames of the bench and R for others.
 fn line(name: &str, seen: &Seen) -> String {
     let time = Timestamp::six_digits(seen.at.0 * 1_000);
     let record = Record { time, interface: name, frame: seen.frame, direction: None };

@@ -1,4 +1,4 @@
-//! Who is on a bus, before anything is sent.
+//! A survey of a bus, before anything is sent: its cells, gateways and damaged frames.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,32 +11,32 @@ use protocol::time::Span;
 
 use crate::bus::{Bus, Stop};
 
-/// Longer than from one heartbeat to the next, twice.
+/// The listening time: more than two intervals of heartbeats.
 pub const LISTEN: Span = Span::from_millis(600);
 
-/// Who was received.
+/// The result of a survey.
 #[derive(Clone, Debug, Default)]
 pub struct Survey {
-    /// The serial numbers that sent under a node id, and the format of their frames.
+    /// The senders of each node id.
     pub cells: BTreeMap<CellId, Present>,
     /// A frame that only gateways send.
     pub gateway: Option<String>,
-    /// Frames under the identifiers of a node id that are no packets.
+    /// Frames under the identifiers of a node id that are not packets.
     damaged: BTreeMap<CellId, Damaged>,
 }
 
-/// Frames that are no packets.
+/// Frames that are not packets.
 #[derive(Clone, Debug)]
 struct Damaged {
     count: usize,
     /// The identifier of the first one, and the first frames under it.
     id: Id,
     frames: Vec<Frame>,
-    /// Why the first one is no packet; `None` while others of its segments may come.
+    /// The reason why the first one is not a packet; `None` while further segments may come.
     fault: Option<String>,
 }
 
-/// Who sends under a node id.
+/// The senders that use a node id.
 #[derive(Clone, Debug, Default)]
 pub struct Present {
     /// Serial numbers in heartbeats.
@@ -49,7 +49,7 @@ impl Survey {
     /// Listens for [`LISTEN`].
     ///
     /// # Errors
-    /// When the bus fails, or the test is interrupted.
+    /// Returns [`Stop`] if the bus fails, or if the test is interrupted.
     pub fn take(bus: &mut dyn Bus, name: &str) -> Result<Self, Stop> {
         let until = bus.now() + LISTEN;
         let mut decoder = Decoder::new(None);
@@ -59,7 +59,7 @@ impl Survey {
             let Ok(id) = packet::data_id(&seen.frame) else { continue };
             let message = match decoder.decode(seen.at, name, &seen.frame) {
                 Decoded::Message(message) => message,
-                // Before any packet came, frames may be those of others.
+                // Frames before the first packet may belong to other devices.
                 Decoded::Damaged { fault, .. } | Decoded::Foreign(Foreign::Data(fault)) => {
                     survey.note_damaged(id, &seen.frame, Some(fault.to_string()));
                     continue;
@@ -87,7 +87,7 @@ impl Survey {
         Ok(survey)
     }
 
-    /// Counts a frame that is no packet, or a segment that waits for the others.
+    /// Counts a frame that is not a packet, or a segment that waits for others.
     fn note_damaged(&mut self, id: Id, frame: &Frame, fault: Option<String>) {
         const KEPT: usize = 4;
         let Some(cell) = id.sender() else { return };
@@ -100,10 +100,10 @@ impl Survey {
         }
     }
 
-    /// Why the cell cannot be tested here, if so; other cells do not matter if they are `tolerated`.
+    /// Checks that the cell can be tested here; other cells are allowed if they are `tolerated`.
     ///
     /// # Errors
-    /// The reason, in one line.
+    /// Returns the reason in one line, if it cannot be tested.
     pub fn check(
         &self,
         cell: CellId,
@@ -113,7 +113,7 @@ impl Survey {
     ) -> Result<Format, String> {
         if let Some(frame) = &self.gateway {
             return Err(format!(
-                "a gateway is on {name} ({frame}): stop it, the cell has to be alone with the test"
+                "a gateway is on {name} ({frame}): stop it, because the test needs the cell for itself"
             ));
         }
         let others: Vec<_> =
@@ -128,20 +128,20 @@ impl Survey {
                 format!("only {}", others.join(", "))
             };
             return Err(format!(
-                "cell {cell} sends nothing on {name}, {there}: switch it on, or give the node id that it has"
+                "cell {cell} sends nothing on {name}, {there}: switch it on, or give its actual node id"
             ));
         };
         if present.serials.len() > 1 {
             let serials: Vec<_> = present.serials.iter().map(ToString::to_string).collect();
             return Err(format!(
-                "{} cells send as node {cell} on {name}, with the serial numbers {}: take away all but one",
+                "{} cells send as node {cell} on {name}, with the serial numbers {}: remove all but one",
                 serials.len(),
                 serials.join(" and ")
             ));
         }
         if !others.is_empty() && !tolerated {
             return Err(format!(
-                "other cells are on {name}: {}; joints and halts of the test reach them too: take them away, or say \
+                "other cells are on {name}: {}; joints and halts of the test reach them too: remove them, or say \
                  --others-will-stop",
                 others.join(", ")
             ));
@@ -159,7 +159,7 @@ impl Survey {
 }
 
 impl Damaged {
-    /// Returns the mistake of an author that explains the frames, if one of the usual ones does.
+    /// Returns the usual implementation mistake that explains the frames, if one does.
     fn mistake(&self) -> Option<&'static str> {
         let bytes = |frames: &[&Frame]| -> Vec<u8> {
             frames.iter().flat_map(|frame| frame.data()).copied().collect()
@@ -194,7 +194,12 @@ impl core::fmt::Display for Damaged {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         let frames: Vec<_> = self.frames.iter().map(ToString::to_string).collect();
         let fault = self.fault.as_deref().unwrap_or("no other segment came");
-        write!(f, "of {} frames none is a packet, as in {}: {fault}", self.count, frames.join(" "))?;
+        write!(
+            f,
+            "none of {} frames is a valid packet, for example {}: {fault}",
+            self.count,
+            frames.join(" ")
+        )?;
         if let Some(mistake) = self.mistake() {
             write!(f, "; {mistake}")?;
         }

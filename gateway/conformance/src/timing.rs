@@ -1,4 +1,4 @@
-//! Checks of how long answers take.
+//! Checks of answer times.
 
 use protocol::parameters::MAX_JOINTS;
 use protocol::time::Span;
@@ -9,8 +9,8 @@ use crate::session::Session;
 use crate::timings::{LIMITS, Times};
 
 impl Session<'_> {
-    /// Measures how long answers take at 62.5 joints a second; again what came too late, for the computer of a simulated cell
-    /// may be busy for a while.
+    /// Measures answer times at 62.5 joints a second. Late answers are measured again, because the computer of a
+    /// simulated cell may be busy for a while.
     pub(crate) fn measure_times(&mut self) -> Result<(), Stop> {
         const ATTEMPTS: usize = 4;
         const ANSWERS: usize = 150;
@@ -39,7 +39,7 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Whether answers were in time: of many, one in 50 may be late, for the computer of a simulated cell may be.
+    /// Checks that answers were in time. One in 50 may be late, because the computer of a simulated cell may be busy.
     pub(crate) fn check_times(&mut self) {
         for (name, limit) in LIMITS {
             let Some(times) = self.timings.0.get(name).copied() else { continue };

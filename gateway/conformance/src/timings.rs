@@ -1,13 +1,13 @@
-//! How long answers took.
+//! Records of answer times.
 
 use std::collections::BTreeMap;
 
 use protocol::time::Span;
 
-/// A bench that was late by more than this does not blame the cell for what was late meanwhile.
+/// Late answers do not count against the cell while the bench was late by more than this.
 const LATE: Span = Span::from_millis(1);
 
-/// What is limited by TIME-2, and by how many ms.
+/// The answers that TIME-2 limits, with the limit in ms.
 pub(crate) const LIMITS: [(&str, u64); 6] = [
     ("torque", 4),
     ("heartbeat to sync", 10),
@@ -17,22 +17,22 @@ pub(crate) const LIMITS: [(&str, u64); 6] = [
     ("report", 100),
 ];
 
-/// Answers to one thing.
+/// The times of one kind of answer.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Times {
     pub(crate) in_time: usize,
     pub(crate) late: usize,
-    /// Late, and so was the bench.
+    /// Late answers while the bench was late too.
     pub(crate) blameless: usize,
     pub(crate) longest: Span,
 }
 
-/// Times of answers by what they answer.
+/// The times of answers, by kind.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Timings(pub(crate) BTreeMap<&'static str, Times>);
 
 impl Timings {
-    /// An answer took so long, while the bench was so late itself.
+    /// Records the time of an answer, with the lateness of the bench meanwhile.
     pub(crate) fn note(&mut self, what: &'static str, took: Span, bench: Span) {
         let times = self.0.entry(what).or_default();
         let limit = LIMITS.iter().find(|(name, _)| *name == what);
@@ -49,7 +49,7 @@ impl Timings {
 }
 
 impl Times {
-    /// Of many answers one in 50 may be late.
+    /// Returns true if at most one in 50 answers was late.
     pub(crate) const fn are_right(self) -> bool {
         self.late * 50 <= self.in_time + self.late || self.late == 1 && self.in_time > 0
     }

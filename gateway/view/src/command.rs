@@ -1,78 +1,78 @@
-//! What a page asks for.
+//! The commands that a page sends.
 
 use serde::Deserialize;
 
 use crate::tape::EventKind;
 
-/// A message of the page.
+/// A command of a page.
 #[derive(Clone, Debug, Deserialize, PartialEq)]
 #[serde(tag = "do", rename_all = "lowercase", deny_unknown_fields)]
 pub enum Command {
-    /// Presses this cell, and no other of this page's.
+    /// Presses this cell, and releases any other cell that this page presses.
     Press {
-        /// Its bus, as an index into the skin's.
+        /// The cell's bus, as an index into the skin's buses.
         bus: usize,
-        /// Its node id.
+        /// The cell's node id.
         node: u8,
         /// The force in N.
         force_n: f64,
     },
-    /// Releases what this page presses.
+    /// Releases the cell that this page presses.
     Release,
     /// Halts all cells.
     Halt,
     /// Resumes all cells.
     Resume,
-    /// Asks for the details of a cell with each snapshot.
+    /// Requests the details of a cell with each status message.
     Choose(Chosen),
-    /// Asks for no details any more.
+    /// Ends the request for details.
     Unchoose,
     /// A command to the run that the page belongs to.
     Bench(bench::remote::Command),
     /// Plays a recording.
     Play {
-        /// How many seconds of it pass in one.
+        /// Playback speed: seconds of the recording per second.
         speed: f64,
     },
-    /// Stays where it is.
+    /// Pauses the playback.
     Pause,
-    /// Goes to a position.
+    /// Seeks to a position.
     Seek {
-        /// In s of the run, or since the first frame.
+        /// Seconds of the run, or since the first frame if the recording has no run.
         at_s: f64,
     },
-    /// Goes by one epoch.
+    /// Steps by one epoch.
     Step {
-        /// To the next one, else the one before.
+        /// True for the next epoch, false for the previous one.
         forward: bool,
     },
-    /// Goes to an event.
+    /// Jumps to an event.
     Jump {
-        /// Of this kind.
+        /// The kind of event.
         to: EventKind,
-        /// To the next one, else the one before.
+        /// True for the next event, false for the previous one.
         forward: bool,
     },
 }
 
-/// What a page asks about.
+/// The cell and the frame that a page shows in detail.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq)]
 #[serde(deny_unknown_fields)]
 pub struct Chosen {
-    /// The cell's bus, as an index into the skin's.
+    /// The cell's bus, as an index into the skin's buses.
     pub bus: usize,
-    /// Its node id.
+    /// The cell's node id.
     pub node: u8,
-    /// A frame of it, by its number.
+    /// The number of a frame that the page wants explained.
     #[serde(default)]
     pub frame: Option<u64>,
 }
 
-/// The longest message of a page, in bytes.
+/// The maximum length of a page's message, in bytes.
 pub const LONGEST: usize = 512;
 
 impl Command {
-    /// Reads a message; `None` of anything else.
+    /// Parses a message; returns `None` if it is not a command.
     #[must_use]
     pub fn parse(text: &str) -> Option<Self> {
         if text.len() > LONGEST {
@@ -81,13 +81,13 @@ impl Command {
         serde_json::from_str(text).ok()
     }
 
-    /// Whether it changes what cells do.
+    /// Returns true if the command changes what cells do.
     #[must_use]
     pub const fn acts(&self) -> bool {
         matches!(self, Self::Press { .. } | Self::Release | Self::Halt | Self::Resume | Self::Bench(_))
     }
 
-    /// Whether it is about the position in a recording.
+    /// Returns true if the command changes the position in a recording.
     #[must_use]
     pub const fn plays(&self) -> bool {
         matches!(

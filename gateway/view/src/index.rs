@@ -1,7 +1,8 @@
-//! What a recording says at some of its moments, and what happens in it: worked out once, from its beginning to its end.
+//! The index of a recording: snapshots of its state at intervals, and its events. One pass over the recording builds
+//! it.
 //!
-//! A moment is shown from the [`Kept`] state before it. Until the index has come to a moment, nobody knows what was
-//! counted before it.
+//! A position is shown from the last [`Kept`] state before it. The counts at a position are exact only after the index
+//! has passed it.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -12,24 +13,24 @@ use trace::capture::{CaptureError, Place, Reader};
 use crate::locked;
 use crate::tape::{Event, EventKind, Step, Tape, Watcher};
 
-/// Bytes that the kept states may take in all, about.
+/// The approximate memory limit for all kept states, in bytes.
 const BYTES: usize = 256 << 20;
-/// What a state takes for each bus and each cell, about.
+/// The approximate size of a kept state per bus and per cell.
 const BUS_BYTES: usize = 1 << 20;
 const CELL_BYTES: usize = 4 << 10;
-/// From one kept state to the next in a short recording, in ns.
+/// The initial interval between kept states, in ns. It doubles whenever the limit is reached.
 const SPACING_NS: u64 = 2_000_000_000;
 
-/// A recording up to a moment, and where it goes on.
+/// The state of a recording at a position, and the place where reading continues.
 #[derive(Debug)]
 pub struct Kept {
-    /// What is known.
+    /// The state up to this position.
     pub tape: Tape,
-    /// Where the next entry is.
+    /// The place of the next entry.
     pub place: Place,
 }
 
-/// The index of a recording, which grows in one thread and is read in another.
+/// The index of a recording. One thread builds it while another one reads it.
 #[derive(Debug, Default)]
 pub struct Index(Mutex<Inner>);
 
@@ -44,25 +45,25 @@ struct Inner {
     others: u64,
 }
 
-/// How far an index is.
+/// The progress of an index.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Progress {
-    /// Up to this moment it is known, in ns since 1970.
+    /// The position up to which the recording is indexed, in ns since 1970.
     pub at: u64,
-    /// Whether that is the end.
+    /// True if that is the end of the recording.
     pub is_over: bool,
-    /// Why nothing more can be read.
+    /// The error that ended the reading early.
     pub failed: Option<String>,
-    /// What is missing at its end.
+    /// The part that is missing at the end of the recording.
     pub unfinished: Option<String>,
-    /// Frames of buses that are not the skin's.
+    /// The number of frames on buses that the skin does not have.
     pub others: u64,
-    /// Events so far.
+    /// The number of events so far.
     pub events: usize,
 }
 
 impl Index {
-    /// Goes through a recording from its first frame, until `stop`. Times are said since `zero`.
+    /// Indexes a recording from its first frame to its end, or until `stop`. Seconds count from `zero`.
     pub fn build(&self, mut reader: Reader, skin: Skin, (first, zero): (u64, u64), stop: &AtomicBool) {
         let count = BYTES / (skin.buses.len() * BUS_BYTES + skin.cells.len() * CELL_BYTES).max(1);
         let mut spacing = SPACING_NS;
@@ -113,7 +114,7 @@ impl Index {
         locked(&self.0).failed = Some(error.to_string());
     }
 
-    /// How far it is.
+    /// Returns the progress so far.
     #[must_use]
     pub fn progress(&self) -> Progress {
         let inner = locked(&self.0);
@@ -122,7 +123,7 @@ impl Index {
         Progress { at, is_over, failed, unfinished, others, events: inner.events.len() }
     }
 
-    /// The last kept state at or before a moment.
+    /// Returns the last kept state at or before a moment.
     #[must_use]
     pub fn before(&self, at: u64) -> Option<Arc<Kept>> {
         let inner = locked(&self.0);
@@ -130,7 +131,7 @@ impl Index {
         inner.kept.get(place).cloned()
     }
 
-    /// The next event of a kind after a moment, or the last one before it.
+    /// Returns the time of the next event of a kind after a moment, or of the last one before it.
     #[must_use]
     pub fn event(&self, kind: EventKind, from: u64, forward: bool) -> Option<u64> {
         let inner = locked(&self.0);
@@ -138,7 +139,8 @@ impl Index {
         if forward { of_kind.find(|at| *at > from) } else { of_kind.rev().find(|at| *at < from) }
     }
 
-    /// In which of so many equal parts of the time between two moments there are events of a kind.
+    /// Divides the time between two moments into equal parts, and returns the numbers of the parts with events of a
+    /// kind.
     #[must_use]
     pub fn marks(&self, kind: EventKind, (from, to): (u64, u64), parts: u16) -> Vec<u16> {
         let inner = locked(&self.0);

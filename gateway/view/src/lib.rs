@@ -1,4 +1,4 @@
-//! The skin live in a browser: a page that draws it, and the server behind the page.
+//! The live view of a skin: a page that draws it in a browser, and the server of the page.
 //!
 //! ```text
 //!   buses ──> Live ── snapshot, 30 Hz ──> newest ──> a thread for each client ──> WebSocket ──> page
@@ -6,16 +6,16 @@
 //!     └── stimuli ── Pressed <──────── commands ─────────────┘
 //! ```
 //!
-//! It listens to the buses as any other node, so that a control loop beside it is not touched: what it shows is what
-//! the buses carried. Touches are stimuli on the bus, which cells in test mode obey.
+//! The view receives on the buses like any other node, so that it does not disturb a control loop beside it, and shows
+//! exactly what the buses carry. Touches are stimuli on the bus, which cells in test mode obey.
 //!
-//! A recording goes the same way: [`tape`] takes its frames up to a moment into [`Live`], [`index`] keeps states on the way,
-//! and [`player`] goes from one of them to any moment.
+//! Recordings use the same path: [`tape`] applies the frames up to a moment to [`Live`], [`index`] keeps intermediate
+//! states, and [`player`] continues from one of them to any moment.
 //!
-//! A skin without its buses is a [`Still`]: one file with the same scene and the same page's modules.
+//! A skin without its buses is a [`Still`]: one file with the same scene, drawn by the same modules of the page.
 //!
-//! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`] and [`tape`] have no socket and no clock; [`server`], [`serve`] and
-//! [`play`] are the shell.
+//! [`live`], [`pressed`], [`scene`], [`still`], [`surface`], [`command`] and [`tape`] use neither sockets nor clocks;
+//! [`server`], [`serve`] and [`play`] are the shell around them.
 
 pub mod command;
 pub mod index;
@@ -40,7 +40,7 @@ pub use still::{Moved, Still};
 pub use surface::Shell;
 pub use token::Token;
 
-/// What a mutex holds, also after a thread that held it has panicked.
+/// Locks a mutex, also after a thread that held it has panicked.
 fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,4 +1,4 @@
-//! What is known of a skin from what its buses carry.
+//! The state of a skin, built from the frames on its buses.
 
 mod bus;
 mod recent;
@@ -16,22 +16,22 @@ pub use self::said::{Answer, BusSaid, Dead, Detail, Gains, Said, Wires};
 use crate::pressed::{Place, Pressed};
 use protocol::message::SkinSensors;
 
-/// A skin as its buses say.
+/// The state of a skin, as seen on its buses.
 #[derive(Clone, Debug)]
 pub struct Live {
     skin: Skin,
     buses: Vec<LiveBus>,
-    /// By cell of the skin: its bus, and its place there.
+    /// For each cell of the skin: its bus, and its index on that bus.
     places: Vec<(usize, usize)>,
     number: u32,
-    /// When the first frame came.
+    /// The time of the first frame.
     began: Option<Micros>,
-    /// The bus whose joints count as epochs: the first one that has some.
+    /// The bus whose joints count as epochs: the first bus that carries joints.
     clock: Option<usize>,
     recent: Recent,
 }
 
-/// Flags of a cell in a snapshot.
+/// The flags of a cell in a snapshot.
 mod flag {
     pub(super) const UNCONFIGURED: u8 = 1;
     pub(super) const OTHER_CONFIGURATION: u8 = 2;
@@ -42,7 +42,7 @@ mod flag {
 }
 
 impl Live {
-    /// Before any frame.
+    /// Creates the state before any frame.
     #[must_use]
     pub fn new(skin: Skin) -> Self {
         let buses: Vec<_> = (0..skin.buses.len()).map(|bus| LiveBus::new(&skin, bus)).collect();
@@ -55,19 +55,19 @@ impl Live {
         Self { places: places.collect(), skin, buses, number: 0, began: None, clock: None, recent }
     }
 
-    /// The same; times are said since then.
+    /// Creates the state before any frame, with times that count from `began`.
     #[must_use]
     pub fn since(skin: Skin, began: Micros) -> Self {
         Self { began: Some(began), ..Self::new(skin) }
     }
 
-    /// The skin.
+    /// Returns the skin.
     #[must_use]
     pub const fn skin(&self) -> &Skin {
         &self.skin
     }
 
-    /// Takes what was latched when a recording began, as frames with their buses; no account counts it.
+    /// Applies the frames that were latched when a recording began, each with its bus index. Counters start after them.
     pub fn begin<'a>(&mut self, at: Micros, latched: impl Iterator<Item = (usize, &'a Frame)>) {
         for (index, frame) in latched {
             if let Some(bus) = self.buses.get_mut(index) {
@@ -78,7 +78,7 @@ impl Live {
         self.buses.iter_mut().for_each(LiveBus::begin_accounts);
     }
 
-    /// A frame stood on a bus; whether an epoch begins with it.
+    /// Applies a frame of a bus. Returns true if an epoch begins with it.
     pub fn frame(&mut self, bus: usize, at: Micros, frame: &Frame) -> bool {
         self.began.get_or_insert(at);
         let Some(of) = self.buses.get_mut(bus) else { return false };
@@ -90,17 +90,18 @@ impl Live {
         joints && self.clock == Some(bus)
     }
 
-    /// Forgets the frames of the last seconds.
+    /// Drops the frames of the last seconds.
     pub fn forget_recent(&mut self) {
         self.recent.forget();
     }
 
-    /// What has been lost on each bus so far, of any reason, and whether it is halted.
+    /// Returns for each bus the total of all losses so far, and true if the bus is halted.
     pub fn losses(&self) -> impl Iterator<Item = (u64, bool)> {
         self.buses.iter().map(|bus| (bus.losses(), bus.halted))
     }
 
-    /// Each bus' cells: whether each is touched, by its sensors or else by its torque, and whether it is dead.
+    /// Returns for each cell its bus, its node id, and two flags: touched (by its sensors, or by its torque if the
+    /// sensors are unknown), and dead.
     pub fn touched(&self, now: Micros) -> impl Iterator<Item = (usize, CellId, [bool; 2])> {
         self.buses.iter().enumerate().flat_map(move |(index, bus)| {
             let cells = bus.table.cells().iter().zip(bus.table.sensors(now)).enumerate();
@@ -112,13 +113,14 @@ impl Live {
         })
     }
 
-    /// Distributed and central torque of each joint of the robot in the last epoch that is over, in Nm or N.
+    /// Returns the distributed and the central torque of each joint of the robot in the last completed epoch, in Nm or
+    /// N.
     #[must_use]
     pub fn torques(&self) -> Vec<[f64; 2]> {
         self.rows().into_iter().map(|[_, distributed, central]| [distributed, central]).collect()
     }
 
-    /// Position, distributed and central torque of each joint of the robot.
+    /// Returns the position, the distributed and the central torque of each joint of the robot.
     fn rows(&self) -> Vec<[f64; 3]> {
         let mut rows = vec![[0.0_f64; 3]; self.skin.robot.joints.len()];
         for (index, bus) in self.buses.iter().enumerate() {
@@ -132,19 +134,19 @@ impl Live {
         rows
     }
 
-    /// Whether a bus is open and works, and how many frames were not received.
+    /// Sets the state of a bus: true if it is open and works, and the number of frames that were not received.
     pub fn set_bus(&mut self, bus: usize, is_up: bool, dropped: u64) {
         if let Some(bus) = self.buses.get_mut(bus) {
             bus.set_up(is_up, dropped);
         }
     }
 
-    /// Time has passed.
+    /// Advances the time.
     pub fn handle_time(&mut self, now: Micros) {
         self.buses.iter_mut().for_each(|bus| bus.handle_time(now));
     }
 
-    /// The cell of this name, if it is one of the skin's and may be pressed: it has said that it is in test mode.
+    /// Returns the key of a cell if the skin has it and it may be pressed: it has reported test mode.
     #[must_use]
     pub fn may_press(&self, bus: usize, node: u8) -> Option<Place> {
         let node = CellId::new(node.into()).ok()?;
@@ -152,26 +154,27 @@ impl Live {
         (cell.measures() == Some(false)).then_some((bus, node))
     }
 
-    /// The sensor words that a cell has latched, as far as the bus says.
+    /// Returns the sensor words that a cell has latched, as far as the bus shows them.
     #[must_use]
     pub fn latched(&self, (bus, node): Place, now: Micros) -> Option<SkinSensors> {
         self.buses.get(bus)?.sensors(node, now)
     }
 
-    /// The next snapshot: all that changes fast, as bytes.
+    /// Encodes the next snapshot: all values that change fast.
     ///
-    /// | bytes | what |
+    /// | bytes | content |
     /// |---|---|
     /// | 4 | its number, u32 |
     /// | 4 | joints J of the robot, u32 |
     /// | 4 | cells, u32 |
     /// | 4 | 0: a snapshot |
     /// | 8 | seconds of the run, or since the first frame, f64 |
-    /// | 12 J | of each joint position (rad or m), distributed torque, central torque (Nm or N), f32 |
+    /// | 12 J | for each joint: position (rad or m), distributed and central torque (Nm or N), f32 |
     /// | 8 for each cell | status u8, flags u8, force mN u16, proximity 2^-15 u16, temperature 0.01 °C i16 |
     ///
-    /// All are little-endian. The torques are those of the last epoch that is over. Status: 0 never heard, 1 quiet, 2 active, 3 stale, 4 dead. Flags: 1 without
-    /// parameters, 2 with others than the skin's, 4 measures, 8 halted, 16 pressed by a page, 32 stuck.
+    /// All values are little-endian. The torques are those of the last completed epoch. Status: 0 never heard, 1 quiet,
+    /// 2 active, 3 stale, 4 dead. Flags: 1 without parameters, 2 with parameters other than the skin's, 4 measures,
+    /// 8 halted, 16 pressed by a page, 32 stuck.
     pub fn snapshot(&mut self, now: Micros, pressed: &Pressed) -> Vec<u8> {
         self.number = self.number.wrapping_add(1);
         let joints = self.skin.robot.joints.len();

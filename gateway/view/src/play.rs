@@ -1,4 +1,4 @@
-//! The shell of a recording: its player, a thread for its index, and the server.
+//! The shell around a recording: its player, a thread for its index, and the server.
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
@@ -21,36 +21,37 @@ use crate::server::{Access, Counts, Server};
 use crate::surface::{Shell, pack};
 use crate::tape::EventKind;
 
-/// From one snapshot to the next.
+/// The interval between snapshots.
 const EVERY: Duration = Duration::from_millis(33);
-/// Snapshots from one text to the next.
+/// The number of snapshots per status message.
 const SAID_EVERY: u64 = 6;
-/// Parts of the time line in which events are marked.
+/// The number of parts of the time line in which events are marked.
 const PARTS: u16 = 600;
 
-/// What to play where.
+/// The recording to play, and the server's settings.
 #[derive(Debug)]
 pub struct Options {
     /// A candump log, or the parts of an MCAP recording.
     pub paths: Vec<PathBuf>,
-    /// The skin that it is of.
+    /// The skin that was recorded.
     pub skin: Skin,
-    /// The robot's surface, where it is known.
+    /// The robot's surface, if known.
     pub surface: Vec<Shell>,
     /// The socket that pages connect to.
     pub listener: TcpListener,
-    /// Who may use it.
+    /// The pages' rights and token.
     pub access: Access,
-    /// Where to stay at first, in s of the run, or since the first frame; else it plays from there.
+    /// The position at which to pause initially, in s of the run, or since the first frame. Without it, playback starts
+    /// at the beginning.
     pub at_s: Option<f64>,
 }
 
-/// Plays a recording until `stop`. Calls `is_served` once the page is, and `warns` with what is wrong with the recording, when that
-/// is known.
+/// Plays a recording until `stop`. Calls `is_served` once the page is served, and `warns` with each defect of the
+/// recording when it is found.
 ///
 /// # Errors
-/// When the system refuses a thread, or the recording cannot be read or is damaged: the page shows what is before
-/// that.
+/// Returns an error if the system refuses a thread, or the recording cannot be read or is damaged. Of a damaged
+/// recording, the page shows the part before the damage.
 pub fn play(
     options: Options,
     stop: &AtomicBool,
@@ -85,7 +86,7 @@ pub fn play(
     index.progress().failed.map_or_else(|| Ok(server.counts()), |what| Err(PlayError::Damaged(what).into()))
 }
 
-/// The player's position for the pages, and their commands for the player.
+/// Publishes the player's state to the pages, and carries out their commands.
 fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
     let nobody = Pressed::default();
     let (mut next, mut before) = (Instant::now(), Instant::now());
@@ -96,7 +97,7 @@ fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
         let commands: Vec<_> = server.commands().map(|(_, command)| command).collect();
         let mut is_changed = !commands.is_empty();
         for (place, command) in commands.iter().enumerate() {
-            // Of positions one after the other, as a slider gives them, only the last counts.
+            // A slider sends many positions: only the last of a series counts.
             let is_passed = matches!(commands.get(place + 1), Some(Command::Seek { .. }));
             if matches!(command, Command::Seek { .. }) && is_passed {
                 continue;
@@ -144,7 +145,7 @@ fn publish(player: &mut Player, server: &Server, stop: &AtomicBool) {
     }
 }
 
-/// Does what a page asks for.
+/// Carries out a page's command.
 fn obey(player: &mut Player, command: &Command) -> Result<(), String> {
     let done = match *command {
         Command::Play { speed } => {
@@ -158,7 +159,7 @@ fn obey(player: &mut Player, command: &Command) -> Result<(), String> {
         Command::Seek { at_s } => player.seek(at_s),
         Command::Step { forward } => player.step(forward),
         Command::Jump { to, forward } => player.jump(to, forward).map(|_| ()),
-        // Nothing can be pressed in a recording, and the server keeps the others.
+        // A recording cannot be pressed or halted, and the server handles the other commands.
         Command::Press { .. }
         | Command::Release
         | Command::Halt

@@ -1,4 +1,4 @@
-//! A recording that is played: a position in it, and what is known there.
+//! The player of a recording: a position in it, and the state there.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
@@ -14,16 +14,16 @@ use crate::index::{Index, Kept};
 use crate::live::Live;
 use crate::tape::{EventKind, Step, Tape};
 
-/// What is known of the time before a position: the plots show so much.
+/// The time before a position for which the plots have values, in ns.
 const HISTORY_NS: u64 = 10_000_000_000;
-/// The same where the index has not come to the position yet.
+/// The same where the index has not reached the position yet.
 const GLANCE_NS: u64 = 3_000_000_000;
-/// From one value of a plot to the next.
+/// The interval between two values of a plot, in ns.
 const SAMPLE_NS: u64 = 20_000_000;
-/// The slowest and the fastest speed.
+/// The minimum and the maximum speed.
 const SPEEDS: [f64; 2] = [0.01, 100.0];
 
-/// The torques of all joints at a moment: distributed and central.
+/// The time, and the distributed and the central torque of each joint.
 type Sample = (u64, Vec<[f64; 2]>);
 
 /// A recording at a position.
@@ -40,66 +40,66 @@ pub struct Player {
     zero: u64,
     /// The position, in ns since 1970.
     at: u64,
-    /// Whether all counts are those since the beginning.
+    /// True if all counts start at the beginning of the recording.
     is_exact: bool,
     playing: bool,
     speed: f64,
     history: VecDeque<Sample>,
-    /// Counts positions that were gone to: then plots begin again.
+    /// The number of jumps so far; the page clears its plots after each one.
     jumps: u64,
-    /// Why the last position cannot be shown.
+    /// The reason why the last position cannot be shown.
     failed: Option<String>,
 }
 
-/// What a page shows of a player.
+/// The player's state, as a page shows it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Playback {
-    /// The position, in s of the run, or since the first frame where there is no run.
+    /// The position, in s of the run, or since the first frame if there is no run.
     pub at_s: f64,
-    /// The position as ns since 1970.
+    /// The position in ns since 1970.
     pub at_ns: String,
-    /// The first frame, in the same s: before 0 where the loop began later.
+    /// The time of the first frame on the same scale: negative if the control loop began later.
     pub from_s: f64,
-    /// The end, in the same s.
+    /// The time of the end on the same scale.
     pub of_s: f64,
-    /// Whether it plays.
+    /// True while it plays.
     pub playing: bool,
-    /// How many s of the recording pass in one.
+    /// Seconds of the recording per second.
     pub speed: f64,
-    /// Whether all counts are those since the beginning.
+    /// True if all counts start at the beginning of the recording.
     pub exact: bool,
-    /// How much of it has been read, 0 to 1.
+    /// The share of the recording that is indexed, 0 to 1.
     pub read: f64,
-    /// Why it cannot be read further.
+    /// The reason why the recording cannot be read further.
     pub failed: Option<String>,
-    /// What is missing at its end.
+    /// The part that is missing at its end.
     pub unfinished: Option<String>,
-    /// Frames of buses that are not the skin's.
+    /// The number of frames on buses that the skin does not have.
     pub others: u64,
-    /// Events so far.
+    /// The number of events so far.
     pub events: usize,
-    /// In which of 600 equal parts of the recording there are events, by kind.
+    /// For each kind of event, those of 600 equal parts of the recording that contain one.
     pub marks: BTreeMap<EventKind, Vec<u16>>,
 }
 
 impl Playback {
-    /// With its marks.
+    /// Returns the same state with these marks.
     #[must_use]
     pub fn marked(self, marks: BTreeMap<EventKind, Vec<u16>>) -> Self {
         Self { marks, ..self }
     }
 }
 
-/// Why a recording cannot be played.
+/// The error for a recording that cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum PlayError {
-    /// It cannot be read.
+    /// The capture cannot be read.
     #[error(transparent)]
     Capture(#[from] CaptureError),
-    /// From a place on it cannot be read; what is before that was shown.
+    /// The recording is damaged; the part before the damage was shown.
     #[error("{0}")]
     Damaged(String),
-    /// There is nothing in it.
+    /// The recording has no frames.
     #[error("{0}: there is no frame in it")]
     Empty(String),
 }
@@ -108,7 +108,7 @@ impl Player {
     /// Opens a recording at its first frame.
     ///
     /// # Errors
-    /// When it cannot be read or gone back in, or has no frame.
+    /// Returns [`PlayError`] if it cannot be read, does not support seeking, or has no frame.
     pub fn open(paths: &[PathBuf], skin: Skin) -> Result<Self, PlayError> {
         let mut beginning = Reader::open_all(paths)?;
         let first = loop {
@@ -141,70 +141,70 @@ impl Player {
         })
     }
 
-    /// The index, to be built in another thread.
+    /// Returns the index, which another thread builds.
     #[must_use]
     pub fn index(&self) -> Arc<Index> {
         Arc::clone(&self.index)
     }
 
-    /// The time of the first frame, in ns since 1970.
+    /// Returns the time of the first frame, in ns since 1970.
     #[must_use]
     pub const fn first(&self) -> u64 {
         self.first
     }
 
-    /// The time that seconds count from, in ns since 1970.
+    /// Returns the time that seconds count from, in ns since 1970.
     #[must_use]
     pub const fn zero(&self) -> u64 {
         self.zero
     }
 
-    /// What is known at the position.
+    /// Returns the state at the position.
     pub const fn live(&mut self) -> &mut Live {
         self.tape.live_mut()
     }
 
-    /// The position.
+    /// Returns the position.
     #[must_use]
     pub const fn now(&self) -> Micros {
         Micros(self.at / 1_000)
     }
 
-    /// Counts the positions that were gone to.
+    /// Returns the number of jumps so far.
     #[must_use]
     pub const fn jumps(&self) -> u64 {
         self.jumps
     }
 
-    /// The end, as far as it is known.
+    /// Returns the end, as far as it is known.
     fn last(&self) -> u64 {
         let progress = self.index.progress();
         let last = if progress.is_over { progress.at } else { self.places.latest().max(progress.at) };
         last.max(self.first)
     }
 
-    /// Plays at a speed from now on; what is no speed is held within the limits.
+    /// Plays at a speed from now on, clamped to 0.01 to 100; 1 if it is not finite.
     pub fn play(&mut self, speed: f64) {
         let [min, max] = SPEEDS;
         self.speed = if speed.is_finite() { speed.clamp(min, max) } else { 1.0 };
         self.playing = true;
     }
 
-    /// The recording cannot be read there; it stays.
+    /// Pauses and reports why the recording cannot be read there.
     pub fn fail(&mut self, why: String) {
         self.playing = false;
         self.failed = Some(why);
     }
 
-    /// Stays where it is.
+    /// Pauses.
     pub const fn pause(&mut self) {
         self.playing = false;
     }
 
-    /// Time has passed; whether anything has changed.
+    /// Advances by the elapsed time. Returns true if the state has changed.
     ///
     /// # Errors
-    /// When the recording cannot be read further.
+    /// Returns [`CaptureError`] if the recording cannot be read further.
     pub fn pass(&mut self, elapsed: Duration) -> Result<bool, CaptureError> {
         if !self.is_exact && self.index_is_at(self.at) {
             self.go_to(self.at)?;
@@ -222,37 +222,37 @@ impl Player {
         Ok(true)
     }
 
-    /// Goes to a position, in s of the run, or since the first frame, within the recording.
+    /// Seeks to a position, in s of the run, or since the first frame, clamped to the recording.
     ///
     /// # Errors
-    /// When it cannot be read there.
+    /// Returns [`CaptureError`] if the recording cannot be read there.
     pub fn seek(&mut self, at_s: f64) -> Result<(), CaptureError> {
         #[expect(clippy::cast_possible_truncation, reason = "saturates")]
         let since = (at_s * 1e9).round() as i64;
         self.go_to(self.zero.saturating_add_signed(since))
     }
 
-    /// Goes to the next epoch, or the one before, and stays there.
+    /// Steps to the next or the previous epoch, and pauses.
     ///
     /// # Errors
-    /// When it cannot be read there.
+    /// Returns [`CaptureError`] if the recording cannot be read there.
     pub fn step(&mut self, forward: bool) -> Result<(), CaptureError> {
         self.playing = false;
         if forward {
             return self.advance(self.last(), true);
         }
         if self.tape.epoch_before(self.at).is_none() {
-            // What is before is read.
+            // Reads the time before the position, to find its epochs.
             self.go_back(self.at)?;
         }
         let before = self.tape.epoch_before(self.at);
         before.map_or(Ok(()), |before| self.go_to(before))
     }
 
-    /// Goes to the next event of a kind, or the last one, and stays there; whether there is one.
+    /// Jumps to the next or the previous event of a kind, and pauses. Returns true if there is one.
     ///
     /// # Errors
-    /// When it cannot be read there.
+    /// Returns [`CaptureError`] if the recording cannot be read there.
     pub fn jump(&mut self, kind: EventKind, forward: bool) -> Result<bool, CaptureError> {
         let Some(at) = self.index.event(kind, self.at, forward) else { return Ok(false) };
         self.playing = false;
@@ -274,7 +274,7 @@ impl Player {
         self.go_back(at)
     }
 
-    /// Goes to a position from what is kept before it.
+    /// Seeks to a position from the last kept state before it.
     fn go_back(&mut self, at: u64) -> Result<(), CaptureError> {
         self.is_exact = self.index_is_at(at) || at <= self.first.saturating_add(HISTORY_NS);
         let kept = self.index.before(at.saturating_sub(HISTORY_NS)).filter(|_| self.is_exact);
@@ -301,7 +301,7 @@ impl Player {
         self.advance(at, false)
     }
 
-    /// Goes on to a position, or to the first epoch before it.
+    /// Advances to a position, or to the first epoch before it.
     fn advance(&mut self, until: u64, to_epoch: bool) -> Result<(), CaptureError> {
         loop {
             match self.tape.step(until) {
@@ -328,15 +328,15 @@ impl Player {
         Ok(())
     }
 
-    /// The torques of the last seconds, as bytes, little-endian:
+    /// Encodes the torques of the last seconds, little-endian:
     ///
-    /// | bytes | what |
+    /// | bytes | content |
     /// |---|---|
-    /// | 4 | how many positions were gone to, u32 |
+    /// | 4 | number of jumps, u32 |
     /// | 4 | joints J of the robot, u32 |
     /// | 4 | moments, u32 |
     /// | 4 | 1: a history |
-    /// | 8 + 8 J for each moment | s of the run, or since the first frame f64; of each joint distributed and central torque f32 |
+    /// | 8 + 8 J for each moment | s of the run, or since the first frame, f64; distributed and central torque of each joint, f32 |
     #[must_use]
     pub fn history(&self) -> Vec<u8> {
         let joints = self.skin.robot.joints.len();
@@ -356,12 +356,12 @@ impl Player {
         bytes
     }
 
-    /// A time in s of the run, or since the first frame.
+    /// Converts a time to s of the run, or since the first frame.
     fn seconds(&self, at: u64) -> f64 {
         seconds_since(self.zero, at)
     }
 
-    /// What a page shows of it.
+    /// Returns the state for the page.
     #[must_use]
     pub fn said(&self) -> Playback {
         let progress = self.index.progress();
@@ -383,7 +383,7 @@ impl Player {
         }
     }
 
-    /// In which of so many equal parts of the recording there are events of a kind.
+    /// Divides the recording into equal parts, and returns the numbers of the parts with events of a kind.
     #[must_use]
     pub fn marks(&self, kind: EventKind, parts: u16) -> Vec<u16> {
         self.index.marks(kind, (self.first, self.last()), parts)

@@ -1,4 +1,4 @@
-//! What pages press, and the stimuli that make it so.
+//! The touches of all pages, and the stimuli that apply them.
 
 use std::collections::BTreeMap;
 
@@ -7,36 +7,36 @@ use protocol::id::CellId;
 use protocol::message::SkinSensors;
 use protocol::time::Micros;
 
-/// The largest force of a touch, in N.
+/// The maximum force of a touch, in N.
 pub const MAX_FORCE_N: f64 = 90.0;
-/// A stimulus that the cell has not latched is sent again after so long, in µs.
+/// The time after which a stimulus that the cell has not latched is sent again, in µs.
 const AGAIN_US: u64 = 150_000;
-/// As often a release is sent that is not latched: the cell may be gone.
+/// The maximum number of attempts to send a release: the cell may be gone.
 const RELEASES: u32 = 20;
 
-/// A cell: its bus, and its node id there.
+/// A cell: its bus index and its node id.
 pub type Place = (usize, CellId);
 
-/// A target for a cell.
+/// The force to apply to a cell.
 #[derive(Clone, Copy, Debug)]
 struct Target {
     force_n: f64,
     sent: Option<Micros>,
-    /// Of a release, how often it was sent.
+    /// The number of times that it was sent; this limits releases.
     tries: u32,
 }
 
 /// The touches of all pages.
 #[derive(Clone, Debug, Default)]
 pub struct Pressed {
-    /// By page.
+    /// The cell and the force of each page.
     pages: BTreeMap<u64, (Place, f64)>,
     targets: BTreeMap<Place, Target>,
 }
 
 impl Pressed {
-    /// A page presses a cell, and releases what it has pressed before. The force is held within 0 and
-    /// [`MAX_FORCE_N`]; what is not a number is 0.
+    /// Presses a cell for a page, and releases the cell that the page pressed before. The force is clamped to 0 to
+    /// [`MAX_FORCE_N`]; NaN and infinity count as 0.
     pub fn press(&mut self, page: u64, cell: Place, force_n: f64) {
         let force_n = if force_n.is_finite() { force_n.clamp(0.0, MAX_FORCE_N) } else { 0.0 };
         let before = self.pages.insert(page, (cell, force_n));
@@ -46,27 +46,28 @@ impl Pressed {
         self.aim(cell);
     }
 
-    /// A page releases its cell, or is gone.
+    /// Releases the cell of a page, also after the page has gone.
     pub fn release(&mut self, page: u64) {
         if let Some((cell, _)) = self.pages.remove(&page) {
             self.aim(cell);
         }
     }
 
-    /// The force that a cell is to feel: forces of several pages add up.
+    /// Sets the force on a cell: the sum of the forces of all pages.
     fn aim(&mut self, cell: Place) {
         let pages = self.pages.values().filter(|(of, _)| *of == cell);
         let force_n = pages.map(|(_, force_n)| force_n).sum::<f64>().min(MAX_FORCE_N);
         self.targets.insert(cell, Target { force_n, sent: None, tries: 0 });
     }
 
-    /// Whether a cell is pressed.
+    /// Returns true if a cell is pressed.
     #[must_use]
     pub fn is_pressed(&self, cell: Place) -> bool {
         self.targets.get(&cell).is_some_and(|target| target.force_n > 0.0)
     }
 
-    /// The stimuli to send now. `latched` gives the contact words that a cell has, as far as the bus says.
+    /// Returns the stimuli to send now. `latched` returns the sensor words that a cell has latched, as far as the bus
+    /// shows them.
     pub fn due(
         &mut self,
         now: Micros,

@@ -1,4 +1,4 @@
-//! What does not change while a skin is watched: its robot, and where its cells are.
+//! The scene: the parts of a skin that do not change while it is watched, its robot and the places of its cells.
 
 use std::collections::BTreeMap;
 
@@ -10,12 +10,12 @@ use serde::Serialize;
 
 use crate::surface::SceneShell;
 
-/// Of more cells, the pitch is taken from about so many.
+/// The pitch is estimated from about this many cells.
 const ASKED: usize = 200;
-/// The pitch of a skin of single cells, in m.
+/// The pitch of a skin whose cells have no neighbours, in m.
 const PITCH: f64 = 0.028;
 
-/// What the page draws; lengths in m, angles in rad.
+/// The scene that the page draws; lengths in m, angles in rad.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Scene {
     /// The skin's name.
@@ -28,13 +28,13 @@ pub struct Scene {
     pub buses: Vec<SceneBus>,
     /// The cells, in the skin's order.
     pub cells: Vec<SceneCell>,
-    /// From a cell's middle to the next one's.
+    /// The distance between the centres of neighbouring cells.
     pub pitch: f64,
-    /// Links as tubes below their cells.
+    /// Links, drawn as tubes below their cells.
     pub tubes: Vec<Tube>,
-    /// The robot's surface where it is known; [`surface`](crate::surface) has its triangles.
+    /// The robot's surface, if known; [`surface`](crate::surface) has its triangles.
     pub shells: Vec<SceneShell>,
-    /// Whether the page may press cells, halt and resume.
+    /// True if the page may press cells, halt and resume.
     pub may_press: bool,
 }
 
@@ -49,12 +49,12 @@ pub struct SceneJoint {
     pub torque_unit: &'static str,
 }
 
-/// A chain of rows.
+/// A chain of Denavit-Hartenberg rows.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SceneChain {
     /// Its name.
     pub name: String,
-    /// Frame 0 seen from the robot's base, as a matrix of 4 by 4 in columns.
+    /// The pose of frame 0 in the robot's base: a 4 by 4 matrix in column order.
     pub base: Vec<f64>,
     /// Its rows, base to tip.
     pub rows: Vec<SceneRow>,
@@ -63,9 +63,9 @@ pub struct SceneChain {
 /// A Denavit-Hartenberg row.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SceneRow {
-    /// The joint that moves it, as an index into [`Scene::joints`]; absent of a fixed row.
+    /// The joint that moves it, as an index into [`Scene::joints`]; absent for a fixed row.
     pub joint: Option<usize>,
-    /// Whether the joint's position is added to `d` in place of `theta`.
+    /// True for a prismatic joint: the position is added to `d` instead of `theta`.
     pub slides: bool,
     /// Length.
     pub a: f64,
@@ -82,28 +82,28 @@ pub struct SceneRow {
 pub struct SceneBus {
     /// Its name.
     pub name: String,
-    /// Its chain, as an index into [`Scene::chains`].
+    /// The chain, as an index into [`Scene::chains`].
     pub chain: usize,
 }
 
 /// A cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct SceneCell {
-    /// Its bus, as an index into [`Scene::buses`].
+    /// The cell's bus, as an index into [`Scene::buses`].
     pub bus: usize,
     /// Its node id.
     pub node: u8,
-    /// The row in whose frame it sits, from 1.
+    /// The row in whose frame the cell is given, from 1.
     pub row: u8,
     /// The joint of its chain that moves it, from 1.
     pub joint: u8,
-    /// Its middle in that frame.
+    /// The centre of the cell in that frame.
     pub position: [f64; 3],
-    /// Which way it faces there.
+    /// The outward normal in that frame.
     pub normal: [f64; 3],
-    /// The node ids that it is wired to, by its ports; 0 of a port without a wire.
+    /// The node id of the neighbour at each port; 0 for a port without a wire.
     pub neighbors: Vec<u8>,
-    /// Whether it is wired to the gateway.
+    /// True if the cell is wired to the gateway.
     pub root: bool,
 }
 
@@ -114,14 +114,14 @@ pub struct Tube {
     pub chain: usize,
     /// The row, from 1.
     pub row: u8,
-    /// The middles of its ends.
+    /// The centres of its two ends.
     pub ends: [[f64; 3]; 2],
     /// Its radius.
     pub radius: f64,
 }
 
 impl Scene {
-    /// That of a skin.
+    /// Returns the scene of a skin.
     #[must_use]
     pub fn of(skin: &Skin, may_press: bool) -> Self {
         let joints = skin.robot.joints.iter().map(|joint| SceneJoint {
@@ -169,7 +169,7 @@ fn chain(chain: &Chain) -> SceneChain {
     SceneChain { name: chain.name.clone(), base: chain.base.matrix().concat(), rows: rows.collect() }
 }
 
-/// The median distance from a cell to the nearest one of its link.
+/// Returns the median distance from a cell to its nearest neighbour on the same link.
 fn pitch(cells: &[SceneCell]) -> f64 {
     let nearest = |cell: &SceneCell| {
         let same = cells.iter().filter(|other| (other.bus, other.row) == (cell.bus, cell.row));
@@ -183,7 +183,7 @@ fn pitch(cells: &[SceneCell]) -> f64 {
     all.get(all.len() / 2).copied().unwrap_or(PITCH).min(0.1)
 }
 
-/// Links with many cells, as tubes.
+/// Returns tubes for the links with many cells.
 fn tubes(buses: &[SceneBus], cells: &[SceneCell]) -> Vec<Tube> {
     let mut links = BTreeMap::<(usize, u8), Vec<&SceneCell>>::new();
     for cell in cells {
@@ -193,7 +193,7 @@ fn tubes(buses: &[SceneBus], cells: &[SceneCell]) -> Vec<Tube> {
     links.into_iter().filter_map(|((chain, row), cells)| tube(chain, row, &cells)).collect()
 }
 
-/// The cylinder about these cells, a little longer and thinner, so that it is below them.
+/// Fits a cylinder to cells, and makes it a little longer and thinner, so that it lies below them.
 fn tube(chain: usize, row: u8, cells: &[&SceneCell]) -> Option<Tube> {
     let placed: Vec<_> = cells.iter().map(|cell| (cell.position, cell.normal)).collect();
     let cylinder = Cylinder::fit(&placed)?;

@@ -1,4 +1,4 @@
-//! The shell: buses, clock, and the server in one loop.
+//! The shell of the live view: buses, clock and server in one loop.
 
 use std::collections::BTreeMap;
 use std::iter;
@@ -29,40 +29,40 @@ use crate::scene::Scene;
 use crate::server::{Access, Counts, Server};
 use crate::surface::{Shell, pack};
 
-/// From one snapshot to the next.
+/// The interval between snapshots.
 const EVERY: Duration = Duration::from_millis(33);
-/// Snapshots from one text to the next.
+/// The number of snapshots per status message.
 const SAID_EVERY: u64 = 6;
-/// How long a frame is waited for.
+/// The receive timeout.
 const WAIT: Duration = Duration::from_millis(50);
-/// How long frames gather after the first one, so that one wake-up reads many.
+/// The time that frames gather after the first one, so that one wake-up reads many.
 const GATHER: Duration = Duration::from_millis(8);
 
-/// No frame waits to be read.
+/// The value of `read_to` while no frames are waiting.
 const UP_TO_DATE: u64 = u64::MAX;
 
-/// What to show where.
+/// The skin to show, and the server's settings.
 #[derive(Debug)]
 pub struct Options {
     /// The skin.
     pub skin: Skin,
-    /// The robot's surface, where it is known.
+    /// The robot's surface, if known.
     pub surface: Vec<Shell>,
-    /// Which kind each bus is.
+    /// The kind of each bus.
     pub kinds: Kinds,
-    /// Where embedded buses are, if not where they usually are.
+    /// The directory of embedded buses, if not the default one.
     pub directory: Option<PathBuf>,
     /// The socket that pages connect to.
     pub listener: TcpListener,
-    /// Who may use it.
+    /// The pages' rights and token.
     pub access: Access,
-    /// Whether a bus that is not there at the start is waited for.
+    /// True to wait for a bus that does not exist at the start.
     pub patient: bool,
-    /// The run that it belongs to, which pages command; it ends with that.
+    /// The run that the pages command; the view ends with it.
     pub bench: Option<Lines>,
 }
 
-/// Why nothing can be shown.
+/// The error for a view that cannot be served.
 #[derive(Debug, thiserror::Error)]
 pub enum ServeError {
     /// A bus cannot be opened.
@@ -71,28 +71,29 @@ pub enum ServeError {
     /// The recording cannot be played.
     #[error(transparent)]
     Play(#[from] PlayError),
-    /// The system has no thread for a bus or for the recording.
+    /// The system refuses a thread for a bus or for the recording.
     #[error("cannot start a thread: {0}")]
     Thread(std::io::Error),
-    /// The system has no thread for the server.
+    /// The server cannot be started.
     #[error("cannot serve the page: {0}")]
     Server(std::io::Error),
 }
 
-/// One bus as its thread and the main one share it.
+/// A bus, shared by its thread and the main one.
 #[derive(Debug)]
 struct Shared {
     name: String,
     format: Format,
     bus: Mutex<Option<Arc<Bus>>>,
-    /// The time of the last frame that was read while more wait, in µs; [`UP_TO_DATE`] when none do.
+    /// While more frames wait, the time of the last one that was read, in µs; otherwise [`UP_TO_DATE`].
     read_to: AtomicU64,
 }
 
-/// Shows a skin until `stop`. Calls `is_served` once the page is.
+/// Shows a skin until `stop`. Calls `is_served` once the page is served.
 ///
 /// # Errors
-/// When a bus cannot be opened at the start and is not waited for, or the system refuses a thread.
+/// Returns [`ServeError`] if a bus cannot be opened at the start and is not waited for, or if the system refuses a
+/// thread.
 pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> Result<Counts, ServeError> {
     let Options { skin, surface, kinds, directory, listener, access, patient, bench } = options;
     let may_act = access.may_act;
@@ -136,7 +137,7 @@ pub fn serve(options: Options, stop: &AtomicBool, is_served: impl FnOnce()) -> R
     Ok(server.counts())
 }
 
-/// A bus that may come later, and is opened again when it is lost.
+/// A bus that may appear later, and is reopened after it is lost.
 struct Reopened<'a, O> {
     shared: &'a Shared,
     opened: &'a O,
@@ -170,7 +171,7 @@ fn receive(
         if let Step::Gone(_) = follower.step(&mut source, WAIT) {
             *locked(&shared.bus) = None;
         }
-        // After a full batch more may wait.
+        // After a full batch more frames may be waiting.
         let last = follower.frames().last().filter(|_| follower.frames().len() == BATCH);
         let read_to = last.map_or(UP_TO_DATE, |last| last.at_nanos / 1_000);
         shared.read_to.store(read_to, Ordering::Relaxed);
@@ -184,7 +185,7 @@ fn receive(
     }
 }
 
-/// Snapshots for the pages, and their commands for the buses and for the run.
+/// Publishes snapshots to the pages, and passes their commands to the buses and to the run.
 fn publish(
     live: &Mutex<Live>,
     buses: &[Shared],
@@ -213,7 +214,7 @@ fn publish(
             }
         }
         server.gone().into_iter().for_each(|page| pressed.release(page));
-        // What cells said that is not read yet is no silence.
+        // Unread frames are pending: do not time cells out.
         let read_to = buses.iter().map(|bus| Micros(bus.read_to.load(Ordering::Relaxed))).min();
         let now = read_to.map_or_else(now, |read_to| now().min(read_to));
         let due = {
@@ -262,7 +263,7 @@ fn obey(page: u64, command: &Command, live: &Live, pressed: &mut Pressed, buses:
         Command::Release => pressed.release(page),
         Command::Halt => everywhere(&Message::Halt),
         Command::Resume => everywhere(&Message::Resume),
-        // The server keeps these, the run does them, and there is nothing to be played.
+        // The server handles the choices, the run handles its own commands, and there is no recording to play.
         Command::Choose(_)
         | Command::Unchoose
         | Command::Bench(_)
@@ -274,7 +275,7 @@ fn obey(page: u64, command: &Command, live: &Live, pressed: &mut Pressed, buses:
     }
 }
 
-/// Sends a message; a bus that does not take it is as one that loses it.
+/// Sends a message. A send error counts as a lost frame.
 fn say(shared: Option<&Shared>, message: &Message) {
     let bus = shared.and_then(|shared| Some((locked(&shared.bus).clone()?, shared.format)));
     if let Some((bus, format)) = bus {

@@ -1,8 +1,8 @@
-//! The server of the page: HTTP for its files, and a WebSocket for what changes.
+//! The server of the page: HTTP for its files, and a WebSocket for everything that changes.
 //!
-//! Requests come through a door (`door.rs`), which opens to those that ask for this host, come from a page of this server, and
-//! carry the token where there is one. Behind it each page has a thread, and gets the newest snapshot whenever it can take one; a
-//! slow or stalled page holds up only its own.
+//! The door (`door.rs`) reads all requests. It accepts those that ask for this host, come from a page of this server,
+//! and carry the token if there is one. Each page then has a thread, which sends the newest snapshot whenever the page
+//! can receive one; a slow or stalled page delays only itself.
 
 mod answer;
 mod door;
@@ -23,55 +23,55 @@ use crate::command::{Chosen, Command};
 use crate::locked;
 use crate::token::Token;
 
-/// The most pages at the same time.
+/// The maximum number of pages at the same time.
 const PAGES: usize = 16;
-/// Commands that wait; more are counted and dropped.
+/// The capacity of the command queue; further commands are counted and dropped.
 const COMMANDS: usize = 256;
 
-/// The powers of the page, and the token that they need.
+/// The rights of the pages, and the token that they need.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Access {
-    /// Pages may press cells, halt and resume, and command the bench.
+    /// True if pages may press cells, halt and resume, and command the bench.
     pub may_act: bool,
-    /// There is a recording that pages may play.
+    /// True if there is a recording that pages may play.
     pub may_play: bool,
-    /// The token of all requests that ask for more than the page's code.
+    /// The token that all requests need, except those for the page's code.
     pub token: Option<Token>,
 }
 
-/// What the server has counted.
+/// The counters of the server.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Counts {
     /// Pages that were connected.
     pub clients: u64,
-    /// Requests that were refused: another host or origin, no token, too slow or too many, no such file.
+    /// Refused requests: another host or origin, no token, too slow or too many, no such file.
     pub refused: u64,
-    /// Messages of pages that were no command, or not allowed, or for which there was no room.
+    /// Messages of pages that were not commands, were not allowed, or did not fit into the queue.
     pub ignored: u64,
 }
 
-/// The newest of everything.
+/// The newest messages to the pages.
 #[derive(Debug, Default)]
 struct Newest {
     snapshot: Bytes,
     number: u64,
-    /// What was before the first snapshot behind a jump, and how many there were.
+    /// The torques before the first snapshot after a jump, and the number of jumps.
     history: Bytes,
     jumps: u64,
-    /// For pages without a chosen cell, and for those with one.
+    /// The status for pages without a chosen cell, and for each page with one.
     said: Utf8Bytes,
     own: BTreeMap<u64, Utf8Bytes>,
     said_number: u64,
 }
 
-/// What all threads of the server share.
+/// The state that all threads of the server share.
 #[derive(Debug)]
 struct Shared {
     access: Access,
-    /// Where it listens.
+    /// The address that the server listens on.
     address: SocketAddr,
     scene: String,
-    /// What is served as /surface.
+    /// The bytes served as `/surface`.
     surface: Vec<u8>,
     newest: Mutex<Newest>,
     chosen: Mutex<BTreeMap<u64, Chosen>>,
@@ -84,7 +84,7 @@ struct Shared {
     ignored: AtomicU64,
 }
 
-/// A running server; it ends with this value.
+/// A running server; dropping it stops the server.
 #[derive(Debug)]
 pub struct Server {
     shared: Arc<Shared>,
@@ -92,10 +92,11 @@ pub struct Server {
 }
 
 impl Server {
-    /// Serves from now on whoever comes to `listener`. `scene` is the first message to every page, `surface` is what it gets as `/surface`.
+    /// Serves all clients of `listener` from now on. `scene` is the first message to every page, `surface` the content
+    /// of `/surface`.
     ///
     /// # Errors
-    /// When that is no listener, or there is no thread for it.
+    /// Returns an error if the listener cannot be set up, or if the system refuses a thread.
     pub fn start(listener: TcpListener, access: Access, scene: String, surface: Vec<u8>) -> io::Result<Self> {
         listener.set_nonblocking(true)?;
         let address = listener.local_addr()?;
@@ -124,20 +125,20 @@ impl Server {
         Ok(server)
     }
 
-    /// Returns where it listens.
+    /// Returns the address that the server listens on.
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.shared.address
     }
 
-    /// What is to be known before the next snapshot.
+    /// Publishes the torques before the next snapshot.
     pub fn publish_history(&self, history: Vec<u8>) {
         let mut newest = locked(&self.shared.newest);
         newest.jumps += 1;
         newest.history = history.into();
     }
 
-    /// A new snapshot, and now and then what is said beside it: for pages without a chosen cell, and for the others.
+    /// Publishes a snapshot, and optionally the status: for pages without a chosen cell, and for each of the others.
     pub fn publish(&self, snapshot: Vec<u8>, said: Option<(String, BTreeMap<u64, String>)>) {
         let mut newest = locked(&self.shared.newest);
         newest.number += 1;
@@ -149,7 +150,7 @@ impl Server {
         }
     }
 
-    /// The commands that pages have sent, each with the page's number.
+    /// Returns the commands that pages have sent, each with the page's number.
     pub fn commands(&self) -> impl Iterator<Item = (u64, Command)> + '_ {
         self.commands.try_iter()
     }
@@ -159,25 +160,25 @@ impl Server {
         self.shared.ignored.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Pages that have gone since the last call.
+    /// Returns the pages that have gone since the last call.
     #[must_use]
     pub fn gone(&self) -> Vec<u64> {
         std::mem::take(&mut *locked(&self.shared.gone))
     }
 
-    /// The cells that pages have chosen.
+    /// Returns the cells that pages have chosen.
     #[must_use]
     pub fn chosen(&self) -> BTreeMap<u64, Chosen> {
         locked(&self.shared.chosen).clone()
     }
 
-    /// Pages that are connected now.
+    /// Returns the number of pages that are connected now.
     #[must_use]
     pub fn pages(&self) -> usize {
         self.shared.pages.load(Ordering::Relaxed)
     }
 
-    /// What it has counted.
+    /// Returns the counters.
     #[must_use]
     pub fn counts(&self) -> Counts {
         let count = |count: &AtomicU64| count.load(Ordering::Relaxed);
@@ -192,7 +193,7 @@ impl Drop for Server {
     }
 }
 
-/// Returns the page's address for a browser on the machine that listens there.
+/// Returns the page's address for a browser on the same machine.
 #[must_use]
 pub fn url(listen: SocketAddr, token: Option<&Token>) -> String {
     let ip = match listen.ip() {

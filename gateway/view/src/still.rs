@@ -1,8 +1,8 @@
-//! A skin that stands still, as one HTML page that needs nothing else: no server, no library, no network.
+//! A skin at rest, as one self-contained HTML page: it needs no server, library or network.
 //!
-//! The page draws the same [`Scene`] with the same modules as the live one: cells are hexagons with their node ids, coloured by
-//! bus; a root has a second hexagon. It turns and zooms, and shows a cell that is chosen, searched as `bus:node`, or named behind
-//! `#` in its address.
+//! The page draws the same [`Scene`] with the same modules as the live page. Cells are hexagons with their node ids,
+//! coloured by bus; a root has a second hexagon. The view turns and zooms, and shows a cell that is clicked, searched
+//! as `bus:node`, or named after `#` in the address.
 
 use data_encoding::BASE64;
 use protocol::xml::escaped;
@@ -12,44 +12,44 @@ use crate::scene::Scene;
 use crate::surface::{Shell, pack};
 use crate::web;
 
-/// A skin as its page shows it.
+/// A skin, as its page shows it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Still {
-    /// What is drawn.
+    /// The scene to draw.
     pub scene: Scene,
-    /// The robot's surface, where it is known.
+    /// The robot's surface, if known.
     pub surface: Vec<Shell>,
     /// The position of each joint of the robot, in rad or m.
     pub positions: Vec<f64>,
-    /// More about each cell, as names and values, in the scene's order.
+    /// Further properties of each cell, as names and values, in the scene's order.
     pub details: Vec<Vec<(String, String)>>,
-    /// Cells that were somewhere else; a line leads from there to each.
+    /// Cells that were elsewhere before; the page draws a line from the former place to each.
     pub moved: Vec<Moved>,
 }
 
-/// The place where a cell was.
+/// The former place of a cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Moved {
     /// The cell, as an index into [`Scene::cells`].
     pub cell: usize,
-    /// The chain of its frame.
+    /// The chain of the frame.
     pub chain: usize,
     /// The row whose frame it is, from 1.
     pub row: u8,
-    /// Its middle there, in m.
+    /// The centre of the cell in that frame, in m.
     pub position: [f64; 3],
-    /// The direction in which it faced there.
+    /// The normal in that frame.
     pub normal: [f64; 3],
 }
 
-/// What the page's script reads.
+/// The data for the page's script.
 #[derive(Serialize)]
 struct Data<'a> {
     scene: &'a Scene,
     positions: &'a [f64],
     details: &'a [Vec<(String, String)>],
     moved: &'a [Moved],
-    /// The corners of the surface in base64, as [`pack`] has them.
+    /// The corners of the surface in base64, in the format of [`pack`].
     surface: String,
 }
 
@@ -65,10 +65,10 @@ impl Still {
             moved: &self.moved,
             surface: BASE64.encode(&corners),
         };
-        // Strings and numbers are always JSON. Without `<`, nothing in it ends the script element.
+        // Strings and numbers always serialise. Without `<`, the data cannot end the script element.
         let data = serde_json::to_string(&data).unwrap_or_default().replace('<', "\\u003c");
         let mut text = String::new();
-        // Parts are put in from left to right, so that no text is searched for marks again.
+        // The parts are inserted from left to right, so that inserted text is not searched for marks.
         for (at, piece) in web::text("still.html").unwrap_or_default().split('@').enumerate() {
             match piece {
                 "NAME" => text.push_str(&escaped(&self.scene.name)),

@@ -1,38 +1,39 @@
-//! The robot's surface as the page takes it: corners with normals, by rows.
+//! The robot's surface in the page's format: corners with normals, by rows.
 
 use std::collections::HashMap;
 
 use nalgebra::Vector3;
 use serde::Serialize;
 
-/// At edges between faces that are at a smaller angle, the surface is drawn as round; the cosine of 40 degrees.
+/// Edges between faces at a smaller angle than this are smoothed; the cosine of 40 degrees.
 const ROUND: f64 = 0.77;
 
-/// What is fixed to a row of a chain.
+/// A mesh that is fixed to a row of a chain.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Shell {
-    /// The chain, as an index into the skin's.
+    /// The chain, as an index into the skin's chains.
     pub chain: usize,
-    /// The row in whose frame it is, from 1; 0 is where the chain begins.
+    /// The row in whose frame the mesh is given, from 1; 0 is the base of the chain.
     pub row: usize,
     /// Its triangles in that frame, in m.
     pub triangles: Vec<[[f64; 3]; 3]>,
 }
 
-/// Where the corners of a shell are among those of all.
+/// The range of a shell's corners within the corners of all shells.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct SceneShell {
     /// The chain, as an index into [`Scene::chains`](crate::Scene::chains).
     pub chain: usize,
-    /// The row, from 1; 0 is where the chain begins.
+    /// The row, from 1; 0 is the base of the chain.
     pub row: usize,
-    /// The first corner.
+    /// The index of the first corner.
     pub first: usize,
-    /// How many corners: three for each triangle.
+    /// The number of corners: three for each triangle.
     pub count: usize,
 }
 
-/// The shells as a page takes them, and the bytes of all their corners: of each the place and the normal, 6 little-endian f32.
+/// Returns the shells in the page's format, and the bytes of all their corners: for each one position and normal, as 6
+/// little-endian f32.
 #[must_use]
 pub fn pack(shells: &[Shell]) -> (Vec<SceneShell>, Vec<u8>) {
     let (mut all, mut bytes) = (Vec::new(), Vec::new());
@@ -53,7 +54,8 @@ pub fn pack(shells: &[Shell]) -> (Vec<SceneShell>, Vec<u8>) {
     (all, bytes)
 }
 
-/// The normal of each corner: the mean of those of the faces there that are about its own face's.
+/// Returns the normal of each corner: the mean of the normals of the adjacent faces that deviate little from its own
+/// face.
 fn normals(triangles: &[[[f64; 3]; 3]]) -> Vec<Vector3<f64>> {
     let key = |corner: &[f64; 3]| corner.map(f64::to_bits);
     let faces: Vec<_> = triangles
@@ -87,7 +89,7 @@ mod tests {
     #[test]
     fn corners_of_flat_faces_have_their_normal_and_round_ones_the_mean() {
         let (low, high) = ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0]);
-        // Two faces at an edge: at a right angle, and at 20 degrees.
+        // Two faces share an edge: at a right angle, and at 20 degrees.
         for (turn, together) in [(90.0_f64, false), (20.0, true)] {
             let (sine, cosine) = turn.to_radians().sin_cos();
             let shell = Shell {

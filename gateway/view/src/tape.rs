@@ -1,11 +1,11 @@
-//! A recording, as its buses said it up to a moment.
+//! The state of a recording at a moment.
 //!
 //! ```text
 //!   entries of the capture ──> push ──> Order, by time ──> advance(until) ──> Live
 //! ```
 //!
-//! What is known at a moment is what all frames up to it say, whatever was read on the way: the same entries and the same
-//! moment give the same [`Live`].
+//! The state at a moment depends only on the frames up to it, however the reader got there: the same entries and the
+//! same moment give the same [`Live`].
 
 mod events;
 
@@ -20,28 +20,28 @@ use trace::order::{Order, Ordered};
 pub use self::events::{Event, EventKind, Watcher};
 use crate::live::Live;
 
-/// From one look at the time to the next, in ns: silent cells, loads.
+/// The interval at which time-dependent state (silent cells, loads) is updated, in ns.
 const LOOK_NS: u64 = 20_000_000;
-/// Of a longer pause without a frame, the rest is passed over.
+/// The part of a pause beyond this time is skipped, in ns.
 const PAUSE_NS: u64 = 60_000_000_000;
-/// Epochs whose times are kept.
+/// The number of epochs whose times are kept.
 const EPOCHS: usize = 256;
 
-/// What comes next.
+/// The result of a step.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Step {
-    /// A frame was applied; `epoch` if it is joints, and the first ones of their epoch.
+    /// A frame was applied.
     Applied {
-        /// Whether an epoch begins with it.
+        /// True if an epoch begins with the frame.
         epoch: bool,
     },
-    /// A look at the time.
+    /// Time-dependent state was updated.
     Looked,
-    /// More entries are needed.
+    /// The tape needs more entries.
     Hungry,
-    /// All up to the requested time is applied.
+    /// All frames up to the requested time are applied.
     There,
-    /// There is nothing more.
+    /// The recording is over.
     Over,
 }
 
@@ -52,20 +52,20 @@ pub struct Tape {
     names: Vec<String>,
     order: Order<Item>,
     next: Option<Ordered<Item>>,
-    /// No more entries come.
+    /// True if the reader has no more entries.
     ended: bool,
-    /// What was latched when the recording began, until its first frame.
+    /// The frames that were latched when the recording began; empty after its first frame.
     latched: Vec<Item>,
     /// The time of the first frame, in ns since 1970.
     first: Option<u64>,
-    /// Up to here all is applied.
+    /// The time up to which all frames are applied.
     at: u64,
-    /// The next look at the time.
+    /// The time of the next update of time-dependent state.
     look: u64,
     epochs: VecDeque<u64>,
-    /// Frames that the recorder lost, by bus.
+    /// The number of frames that the recorder lost, by bus.
     dropped: Vec<u64>,
-    /// Frames of buses that are not the skin's.
+    /// The number of frames on buses that the skin does not have.
     others: u64,
 }
 
@@ -76,7 +76,7 @@ struct Item {
 }
 
 impl Tape {
-    /// Before any entry. Times are said since `zero`, in ns since 1970.
+    /// Creates a tape before any entry. Seconds count from `zero`, in ns since 1970.
     #[must_use]
     pub fn new(skin: Skin, zero: u64) -> Self {
         let names: Vec<_> = skin.buses.iter().map(|bus| bus.name.clone()).collect();
@@ -98,10 +98,10 @@ impl Tape {
         }
     }
 
-    /// Takes what the reader gives next; without it, nothing more comes.
+    /// Reads the next entry of the reader; at the end, marks the tape as ended.
     ///
     /// # Errors
-    /// When the capture cannot be read, or is damaged: then it is over too.
+    /// Returns [`CaptureError`] if the capture cannot be read or is damaged; this also ends the tape.
     pub fn feed(&mut self, reader: &mut Reader) -> Result<(), CaptureError> {
         match reader.next() {
             Ok(Some(entry)) => self.push(&entry),
@@ -114,14 +114,14 @@ impl Tape {
         Ok(())
     }
 
-    /// Takes what was latched when the recording began, before its first entry.
+    /// Stores the state that was latched when the recording began; call it before the first entry.
     pub fn begin(&mut self, extras: &Extras) {
         let latched = extras.latched.iter();
         self.latched =
             latched.filter_map(|it| Some(Item { bus: self.bus(&it.bus)?, frame: it.frame })).collect();
     }
 
-    /// Takes the next entry of the capture.
+    /// Adds the next entry of the capture.
     pub fn push(&mut self, entry: &Entry<'_>) {
         match entry {
             Entry::Frame(record) => {
@@ -145,7 +145,7 @@ impl Tape {
         }
     }
 
-    /// Goes on by one frame, or one look at the time, but not beyond `until`, in ns since 1970.
+    /// Advances by one frame or one update of time-dependent state, but not beyond `until`, in ns since 1970.
     pub fn step(&mut self, until: u64) -> Step {
         if self.next.is_none() {
             self.next = if self.ended { self.order.pop_last() } else { self.order.pop() };
@@ -183,57 +183,57 @@ impl Tape {
         Step::Applied { epoch }
     }
 
-    /// A look at the time, if one is due up to this time.
+    /// Updates time-dependent state, if that is due up to this time.
     fn look_until(&mut self, until: u64) -> Option<Step> {
-        // At the end of what 64 bits of ns can say, in 2554, there is nothing more to look at.
+        // 64 bits of ns end in 2554: later updates do not exist.
         if self.look > until || self.look == u64::MAX {
             return None;
         }
         self.live.handle_time(Micros(self.look / 1_000));
         self.at = self.look;
         self.look = self.look.saturating_add(LOOK_NS);
-        // Nothing changes any more.
+        // Nothing changes during the rest of a long pause.
         if until.saturating_sub(self.look) > PAUSE_NS {
             self.look = until - PAUSE_NS;
         }
         Some(Step::Looked)
     }
 
-    /// What is known.
+    /// Returns the state.
     #[must_use]
     pub const fn live(&self) -> &Live {
         &self.live
     }
 
-    /// The same, to draw snapshots of.
+    /// Returns the state as mutable, to draw snapshots of it.
     pub const fn live_mut(&mut self) -> &mut Live {
         &mut self.live
     }
 
-    /// Up to when all is applied, in ns since 1970.
+    /// Returns the time up to which all frames are applied, in ns since 1970.
     #[must_use]
     pub const fn at(&self) -> u64 {
         self.at
     }
 
-    /// Whether all that the capture has is applied.
+    /// Returns true if all frames of the capture are applied.
     #[must_use]
     pub fn is_over(&self) -> bool {
         self.ended && self.next.is_none() && self.order.is_empty()
     }
 
-    /// When the last epoch before this moment began, as far as it is known.
+    /// Returns the start of the last epoch before this moment, if it is still kept.
     #[must_use]
     pub fn epoch_before(&self, moment: u64) -> Option<u64> {
         self.epochs.iter().rev().copied().find(|&at| at < moment)
     }
 
-    /// Forgets the frames of the last seconds: to be kept, and gone on from later.
+    /// Drops the frames of the last seconds, before the tape is kept in the index.
     pub fn forget_recent(&mut self) {
         self.live.forget_recent();
     }
 
-    /// Frames of buses that are not the skin's.
+    /// Returns the number of frames on buses that the skin does not have.
     #[must_use]
     pub const fn others(&self) -> u64 {
         self.others

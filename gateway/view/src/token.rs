@@ -1,12 +1,12 @@
-//! The secret in a page's address, without which its server answers nothing about the bench.
+//! The secret in a page's address, without which its server reveals nothing about the bench.
 
 use std::fmt;
 use std::hint::black_box;
 use std::io;
 
-/// The fewest characters of a token: 16 letters and digits are 95 bits.
+/// The minimum length of a token: 16 letters and digits are 95 bits.
 const SHORTEST: usize = 16;
-/// The most characters of a token: it is a part of a request's first line.
+/// The maximum length of a token: it is a part of a request's first line.
 const LONGEST: usize = 256;
 
 /// A secret that every request has to carry.
@@ -15,14 +15,14 @@ pub struct Token(String);
 
 /// The error for a text that cannot be a token. It does not repeat the text.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, thiserror::Error)]
-#[error("a token has 16 to 256 letters or digits, and nothing else")]
+#[error("a token must consist of 16 to 256 letters or digits")]
 pub struct TokenError;
 
 impl Token {
-    /// Checks a token that somebody has chosen.
+    /// Checks a token that a user has chosen.
     ///
     /// # Errors
-    /// When it is too short or too long, or has other characters than letters and digits.
+    /// Returns [`TokenError`] if it is too short or too long, or has other characters than letters and digits.
     pub fn parse(text: &str) -> Result<Self, TokenError> {
         let is_plain = text.bytes().all(|byte| byte.is_ascii_alphanumeric());
         let fits = (SHORTEST..=LONGEST).contains(&text.len());
@@ -32,20 +32,20 @@ impl Token {
     /// Draws a token of 128 bits from the kernel.
     ///
     /// # Errors
-    /// When the kernel has no random bytes to give.
+    /// Returns an error if the kernel has no random bytes to give.
     pub fn random() -> io::Result<Self> {
         let mut bytes = [0; 16];
         getrandom::fill(&mut bytes).map_err(io::Error::other)?;
         Ok(Self(format!("{:032x}", u128::from_ne_bytes(bytes))))
     }
 
-    /// Returns its text.
+    /// Returns the token as text.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }
 
-    /// Compares it with what a request carries, in a time that does not depend on where they differ.
+    /// Compares the token with that of a request, in a time that does not depend on where they differ.
     #[must_use]
     pub fn is(&self, given: &str) -> bool {
         let pairs = given.bytes().zip(self.0.bytes());

@@ -1,6 +1,6 @@
-//! The page's files: served one by one, or as one script in a page that stands alone.
+//! The page's files: served one by one, or bundled as one script in a self-contained page.
 
-/// The files of the live page and of the page of a skin that stands still.
+/// The files of the live page and of the page of a skin at rest.
 const FILES: [(&str, &str); 25] = [
     ("index.html", include_str!("../web/index.html")),
     ("still.html", include_str!("../web/still.html")),
@@ -34,7 +34,7 @@ pub(crate) fn text(name: &str) -> Option<&'static str> {
     FILES.iter().find(|(known, _)| *known == name).map(|(_, text)| *text)
 }
 
-/// Returns what is served under a path: its type and its bytes.
+/// Returns the media type and the bytes of a path.
 pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
     let name = if path == "/" { "index.html" } else { path.strip_prefix('/')? };
     let kind = match name.rsplit_once('.')? {
@@ -46,14 +46,14 @@ pub(crate) fn file(path: &str) -> Option<(&'static str, &'static [u8])> {
     text(name).map(|text| (kind, text.as_bytes()))
 }
 
-/// Checks that a file is a script or a style: the same for everybody, with nothing about the bench.
+/// Returns true for a script or a style: those are the same for every client and reveal nothing about the bench.
 pub(crate) fn is_code(path: &str) -> bool {
     path != "/" && file(path).is_some()
 }
 
-/// Returns a module and all that it imports as one script: each in a function of its own, behind those that it imports.
+/// Bundles a module and all its imports into one script: each module becomes a function, after those that it imports.
 ///
-/// Of a module's syntax this knows what the files here have: an import in one line, and declarations behind `export`.
+/// It supports only the syntax that the files here use: an import on one line, and declarations after `export`.
 pub(crate) fn bundle(entry: &'static str) -> String {
     let mut script = String::from("\"use strict\";\nconst modules = {};\n");
     add(entry, &mut Vec::new(), &mut script);
@@ -85,13 +85,13 @@ fn add(name: &'static str, added: &mut Vec<&'static str>, script: &mut String) {
     script.push_str(&format!("modules[\"{name}\"] = (() => {{\n{body}return {{ {exported} }};\n}})();\n"));
 }
 
-/// The names and the file of an import.
+/// Returns the names and the file of an import.
 fn import(line: &'static str) -> Option<(&'static str, &'static str)> {
     let (names, from) = line.strip_prefix("import ")?.split_once(" from \"./")?;
     Some((names, from.strip_suffix("\";")?))
 }
 
-/// The names that a declaration makes: of a function, a class, a constant, or constants in brackets.
+/// Returns the names that a declaration introduces: a function, a class, a constant, or constants in brackets.
 fn declared(declaration: &str) -> Vec<&str> {
     let Some((_, rest)) = declaration.split_once(' ') else { return Vec::new() };
     let is_of_name = |letter: char| letter.is_ascii_alphanumeric() || letter == '_';

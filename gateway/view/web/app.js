@@ -1,4 +1,4 @@
-// The page: holds the newest of everything, and draws when something changed.
+// The page: keeps the newest messages, and draws when something has changed.
 
 import { Bench } from "./bench.js";
 import { Camera } from "./camera.js";
@@ -19,7 +19,7 @@ import * as words from "./words.js";
 const $ = (id) => document.getElementById(id);
 const canvas = $("picture"), camera = new Camera();
 let picture = null, scene = null, plots = null, snapshot = null, said = null, all = null, trees = [], chosen = -1, pressed = -1;
-// For whoever looks from outside.
+// For browser tests.
 window.skinbus = { frames: 0, snapshots: 0, where, joints: () => snapshot?.joints.map((joint) => joint.position) ?? [] };
 
 function message(text) {
@@ -30,7 +30,7 @@ function message(text) {
 try {
   picture = new Picture(canvas);
 } catch (error) {
-  message(`The picture cannot be drawn: ${error.message}. The tables beside it work.`);
+  message(`The picture cannot be drawn: ${error.message}. The tables still work.`);
 }
 
 const view = () => camera.matrix(canvas.clientWidth, canvas.clientHeight);
@@ -84,7 +84,7 @@ function release() {
   link.send({ do: "release" });
 }
 
-// The middle of a cell on the screen, in CSS pixels of the picture; null where it is not seen from its front.
+// The centre of a cell on the screen, in CSS pixels of the picture; null unless its front is visible.
 function where(i) {
   const { width, height } = canvas.getBoundingClientRect(), cell = scene.cells[i];
   const at = project(view(), point(all[scene.buses[cell.bus].chain][cell.row], cell.position), width, height)?.slice(0, 2);
@@ -96,7 +96,7 @@ function drawTree() {
   picture?.ribbons($("tree").checked ? wires(scene, trees) : []);
 }
 
-// The robot's surface, once it is there; cylinders are drawn until then.
+// Loads the robot's surface; cylinders are drawn until then.
 async function surface(of) {
   const answer = await fetch(`/surface${location.search}`);
   const corners = new Float32Array(await answer.arrayBuffer());
@@ -139,7 +139,7 @@ const link = new Link({
 
 const time = new TimeBar($("time"), (command) => link.send(command));
 
-// Asks why the torque in a frame of the chosen cell is what it is; for another cell, for none.
+// Requests the explanation of the torque in a frame of the chosen cell.
 function ask(frame) {
   link.send({ do: "choose", bus: scene.cells[chosen].bus, node: scene.cells[chosen].node, frame });
 }

@@ -1,33 +1,33 @@
-// The run that this page belongs to: the process and the links of the chosen cell, the buses, and how late the control loop is.
+// The run that this page belongs to: the process and the links of the chosen cell, the buses, and the lateness of the control loop.
 
 import { element, show } from "./dom.js";
 
 const $ = (id) => document.getElementById(id);
 
-// What may be done to a process, by what it does.
+// The actions that are allowed on a process, by its phase.
 const ACTIONS = { running: ["kill", "stop", "restart"], stopped: ["kill", "continue", "restart"], ended: ["restart"] };
 const NAMES = ["kill", "stop", "continue", "restart"];
-// How long an answer is shown.
+// The time that an answer is shown.
 const SHOWN_MS = 10000;
 
 export const allowed = (process) => (process ? ACTIONS[process.phase] : []);
 
-// The process of a cell in a state; of a cell chosen before there may still be one.
+// The process of a cell in a state. The state may still list that of the cell chosen before.
 export function processOf(state, cell) {
   return state.processes.find(({ bus, nodes }) => cell && bus === cell.bus && nodes[0] <= cell.node && cell.node <= nodes[1]);
 }
 
 export function about(process) {
-  if (!process) return "This run has started no process of this cell.";
+  if (!process) return "This run did not start the process of this cell.";
   const [first, last] = process.nodes;
-  const what = first === last ? "The process of this cell" : `One process runs cells ${first} to ${last}: all of them are acted on. It`;
+  const what = first === last ? "The process of this cell" : `One process runs cells ${first} to ${last}; an action affects all of them. It`;
   return `${what} ${{ running: "is running", stopped: "is stopped", ended: "has ended" }[process.phase]}.`;
 }
 
 export const isDown = (state, bus, one, other) =>
   state.links_down.some((link) => link.bus === bus && link.nodes[0] === Math.min(one, other) && link.nodes[1] === Math.max(one, other));
 
-// Says a text, and draws nothing where it stands already.
+// Sets a text and a class, and touches nothing that is equal already.
 function write(it, text, className = "") {
   if (it.textContent !== text) it.textContent = text;
   if (it.className !== className) it.className = className;
@@ -56,8 +56,8 @@ class Switch {
   show(down, disabled) {
     this.down = down;
     write(this.state, down ? "down" : "up", down ? "bad" : "");
-    write(this.button, down ? "Take up" : "Take down");
-    this.button.setAttribute("aria-label", `Take ${down ? "up" : "down"} ${this.what}`);
+    write(this.button, down ? "Bring up" : "Take down");
+    this.button.setAttribute("aria-label", `${down ? "Bring up" : "Take down"} ${this.what}`);
     this.button.disabled = disabled;
   }
 }
@@ -68,7 +68,7 @@ export class Bench {
     this.parts = [];
   }
 
-  // Takes in the state of the run, or that there is none.
+  // Shows the state of the run; hides everything without one.
   say(scene, state, chosen) {
     if (this.scene !== scene) this.build(scene, state);
     for (const part of this.parts) part.hidden = !state;
@@ -137,7 +137,7 @@ export class Bench {
     write(this.process, about(process), "faint");
     const focused = document.activeElement;
     this.actions.forEach((it, at) => { it.disabled = !scene.may_press || !allowed(process).includes(NAMES[at]); });
-    // The keyboard stays among them.
+    // Keeps the focus on an enabled button.
     if (focused.disabled && this.actions.includes(focused)) this.actions.find((it) => !it.disabled)?.focus();
     for (const [other, it] of this.neighbors) it.show(isDown(state, cell.bus, cell.node, other), !scene.may_press);
   }
@@ -150,7 +150,7 @@ export class Bench {
       return row;
     };
     const head = element("tr");
-    head.append(...["Ticks late, µs", "p50", "p99", "max"].map((text, at) => element(at ? "td" : "th", text, "faint")));
+    head.append(...["Tick lateness, µs", "p50", "p99", "max"].map((text, at) => element(at ? "td" : "th", text, "faint")));
     const of = ({ p50, p99, max }) => [p50, p99, max].map((us) => us.toFixed(0));
     show(this.lateness, [head, line("last second", ...of(second)), line("since the start", ...of(all)),
       line("ticks skipped", "", "", String(skipped))]);

@@ -1,11 +1,12 @@
-// Where the picture is seen from.
+// The camera: the position from which the picture is seen.
 
 import { add, cross, look, perspective, times, unit } from "./math.js";
 
-// So many sizes away a sphere of that size is seen whole, and the thickness of the links around it.
+// At this distance, in sizes, a sphere of that size is completely visible, including the thickness of the links around
+// it.
 const FAR = 1.15;
 
-// Of a picture that is higher than wide the width counts.
+// In a picture that is higher than wide, the width limits the view.
 const focus = (width, height) => Math.min(2, 2 * width / Math.max(1, height));
 
 export class Camera {
@@ -13,7 +14,8 @@ export class Camera {
     Object.assign(this, { yaw: -1.0, pitch: 0.3, zoom: 1, most: 20, middle: [0, 0, 0], size: 1, moved: false, box: null });
   }
 
-  // Shows this box and all before it, unless somebody has moved the camera: it stands still once the robot has been everywhere.
+  // Fits this box and all earlier ones, unless a user has moved the camera. The camera stands still once the robot has
+  // been everywhere.
   fit({ low, high }) {
     const now = this.box ?? { low, high };
     this.box = { low: low.map((v, i) => Math.min(v, now.low[i])), high: high.map((v, i) => Math.max(v, now.high[i])) };
@@ -29,13 +31,13 @@ export class Camera {
     this.pitch = Math.min(1.5, Math.max(-1.5, this.pitch + dy * 0.008));
   }
 
-  // Shows all again, from where it is seen now.
+  // Shows everything again, in the current direction.
   whole() {
     Object.assign(this, { moved: false, zoom: 1 });
     if (this.box) this.fit(this.box);
   }
 
-  // Comes nearer by a factor; what is at a place stays there, in pixels from the middle of a picture of this size.
+  // Zooms by a factor around a point, which is given in pixels from the middle of a picture of this size.
   nearer(by, [x, y] = [0, 0], width = 1, height = 1) {
     const before = this.zoom;
     this.moved = true;
@@ -44,14 +46,14 @@ export class Camera {
     this.move(-x * grown, -y * grown, width, height);
   }
 
-  // Moves what is seen by so many pixels of a picture of this size.
+  // Pans by a distance in pixels of a picture of this size.
   move(dx, dy, width, height) {
     const grain = this.grain(width, height), to = this.toward(), right = unit(cross([0, 0, 1], to));
     this.moved = true;
     this.middle = add(add(this.middle, right, -dx * grain), cross(to, right), dy * grain);
   }
 
-  // Looks at a place from its front, near enough that a length of it is as long as so many pixels.
+  // Looks at a point along its normal, near enough that a length at the point covers a number of pixels.
   face(place, normal, length, pixels, width, height) {
     const [x, y, z] = normal;
     Object.assign(this, { moved: true, middle: place, yaw: Math.atan2(y, x) + 0.25 });
@@ -59,7 +61,7 @@ export class Camera {
     this.zoom = Math.min(this.most, Math.max(this.zoom, this.zoom * pixels * this.grain(width, height) / length));
   }
 
-  // The length of a pixel at the middle.
+  // The length of a pixel at the middle of the view.
   grain(width, height) {
     return this.distance() / focus(width, height) * 2 / Math.max(1, height);
   }
@@ -68,7 +70,7 @@ export class Camera {
     return this.size * FAR / this.zoom;
   }
 
-  // The direction from the middle to the eye.
+  // The direction from the middle of the view to the eye.
   toward() {
     const c = Math.cos(this.pitch);
     return [c * Math.cos(this.yaw), c * Math.sin(this.yaw), Math.sin(this.pitch)];

@@ -1,4 +1,4 @@
-// Colours for values: cividis, which people see alike whatever colours they see (Nunez, Anderton, Renslow 2018).
+// Colours for values: cividis, which looks the same to people with and without colour blindness (Nunez, Anderton, Renslow 2018).
 
 const STOPS = [[0, 34, 78], [18, 53, 112], [59, 73, 108], [87, 93, 109], [112, 113, 115], [138, 134, 120], [165, 156, 116], [195, 179, 105], [225, 204, 85], [254, 232, 56]];
 
@@ -7,11 +7,11 @@ export function ramp(share) {
   return STOPS[i].map((v, k) => Math.round(v + (STOPS[i + 1][k] - v) * (at - i)));
 }
 
-// Seven colours that people tell apart whatever colours they see (Okabe, Ito 2008); more buses than these share them.
+// Seven colours that colour-blind people can tell apart (Okabe, Ito 2008); with more than seven buses, colours repeat.
 export const BUSES = [[86, 180, 233], [230, 159, 0], [0, 158, 115], [240, 228, 66], [0, 114, 178], [213, 94, 0], [204, 121, 167]];
 export const busColour = (bus) => BUSES[bus % BUSES.length];
 
-// What cells can show: how a value is read from a snapshot's cell, its range, its unit.
+// The values that cells can show: how each is read from a snapshot's cell, its range and its unit.
 export const SHOWS = {
   force: { of: (cell) => cell.force / 1000, low: 0, high: 10, unit: "N", rest: (v) => v <= 0 },
   proximity: { of: (cell) => cell.proximity / 32768, low: 0, high: 1, unit: "", rest: (v) => v <= 0 },
@@ -26,16 +26,16 @@ export function colourOf(shows, cell, at) {
   return shows.rest(value) ? null : ramp((value - shows.low) / (shows.high - shows.low));
 }
 
-// What a cell's shape says, the most important first: the number is that of the shader.
+// The meanings of a cell's shape, the most important first; `shape` is the number in the shader.
 export const SHAPES = [
   { shape: 1, is: (cell) => cell.status === 4, name: "silent", mark: "cross" },
   { shape: 2, is: (cell) => cell.status === 0, name: "never heard", mark: "ring" },
   { shape: 3, is: (cell) => (cell.flags & 1) !== 0, name: "no parameters", mark: "hole" },
-  { shape: 4, is: (cell) => (cell.flags & 2) !== 0, name: "other parameters", mark: "half" },
-  { shape: 5, is: (cell) => cell.status === 3, name: "stale: no answer", mark: "bar" },
-  { shape: 7, is: (cell) => (cell.flags & 32) !== 0, name: "stuck: one value", mark: "disc" },
+  { shape: 4, is: (cell) => (cell.flags & 2) !== 0, name: "different parameters", mark: "half" },
+  { shape: 5, is: (cell) => cell.status === 3, name: "stale: no reply", mark: "bar" },
+  { shape: 7, is: (cell) => (cell.flags & 32) !== 0, name: "stuck: constant value", mark: "disc" },
   { shape: 6, is: (cell) => (cell.flags & 8) !== 0, name: "halted", mark: "square" },
-  { shape: 0, is: () => true, name: "in order", mark: "" },
+  { shape: 0, is: () => true, name: "normal", mark: "" },
 ];
 
 export const shapeOf = (cell) => SHAPES.find((it) => it.is(cell));

@@ -1,4 +1,4 @@
-// Elements of the page, made here.
+// Helpers that create and update elements of the page.
 
 export function element(tag, text, className) {
   const it = document.createElement(tag);
@@ -7,8 +7,8 @@ export function element(tag, text, className) {
   return it;
 }
 
-// Makes what is shown in a box equal to these elements, and touches nothing that is equal already: drawing text again is dear in
-// software, and would take the mark from whoever is copying it.
+// Makes the content of a box equal to these elements, and keeps elements that are equal already: drawing text again is
+// expensive in software, and would remove a user's selection.
 export function show(box, fresh) {
   while (box.childNodes.length > fresh.length) box.lastChild.remove();
   fresh.forEach((it, at) => {

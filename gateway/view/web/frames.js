@@ -1,4 +1,4 @@
-// The newest frames of the chosen cell in words, and why the torque in one of them is what it is.
+// The newest frames of the chosen cell, decoded, and the explanation of a torque among them.
 
 import { element, show } from "./dom.js";
 import { number } from "./plots.js";
@@ -6,11 +6,11 @@ import { number } from "./plots.js";
 const VERDICTS = { nearest: "nearest", saturated: "saturated", rounded: "16-bit J", unexplained: "no J near", open: "not known" };
 
 const $ = (id) => document.getElementById(id);
-// The server keeps frames for 3 s. A list under the pointer is renewed sooner, and only after this time.
+// The server keeps frames for 3 s. A list under the pointer is renewed only after this time, which is shorter.
 const STILL_MS = 2000;
-// The time for an answer about a frame.
+// The time limit for the explanation of a frame.
 const ANSWER_MS = 1500;
-// The list stands still while somebody reads it or chooses from it.
+// The list stands still while a user reads it or chooses from it.
 let held = false, asked = null, sought = null, renewed = 0;
 // A button has to be under the pointer until it is released, and rows move when new ones come.
 let isPressed = false;
@@ -63,7 +63,7 @@ function rowOf(frame, key, ask) {
   if (!frame.is_torque) return row;
   const button = element("button", "Why");
   button.type = "button";
-  button.setAttribute("aria-label", `Why is the torque at ${frame.at_s.toFixed(4)} s what it is`);
+  button.setAttribute("aria-label", `Explain the torque at ${frame.at_s.toFixed(4)} s`);
   button.onclick = () => {
     asked = sought = frame.number;
     hold(true);
@@ -86,7 +86,7 @@ function table(head, rows) {
 }
 
 function explain(why) {
-  const parts = [element("h3", `Why, epoch ${why.epoch}`)], cell = why.cell, force = cell?.force;
+  const parts = [element("h3", `Explanation, epoch ${why.epoch}`)], cell = why.cell, force = cell?.force;
   if (force) {
     parts.push(element("p", `Contact ${force.contact_n.map((v) => v.toFixed(4)).join(" + ")} = ${force.touch_n.toFixed(4)} N`),
       element("p", `Force ${force.alpha_c} × ${force.touch_n.toFixed(4)} N + ${force.alpha_p_n} N × ${force.proximity.toFixed(4)} = ${force.fused_n.toFixed(4)} N; in steps of 2⁻¹⁶ N: ${force.force_steps}`));

@@ -1,10 +1,11 @@
-// What WebGL2 is asked for: a context, programs, buffers.
+// Helpers for WebGL2: contexts, programs, buffers.
 
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 
-// A context, and whether the processor draws in it: then edges are not smoothed, which costs it most.
+// A context, and true if the processor renders it. Edges are then not smoothed, which is the most expensive step in
+// software.
 export function context(canvas) {
-  // Without transparency the browser need not mix the picture with the page below it.
+  // Without transparency the browser does not have to blend the picture with the page.
   const plain = { alpha: false, antialias: false };
   let gl = canvas.getContext("webgl2", { ...plain, antialias: true, failIfMajorPerformanceCaveat: true });
   let software = !gl;
@@ -15,7 +16,8 @@ export function context(canvas) {
   return { gl, software };
 }
 
-// A program of a vertex and a fragment shader, with the places of its uniforms; `defines` are names that its `#ifdef`s ask for.
+// A program of a vertex and a fragment shader, with the locations of its uniforms; `defines` lists names for its
+// `#ifdef`s.
 export function program(gl, sources, ...defines) {
   const head = defines.map((name) => `#define ${name}\n`).join("");
   const it = gl.createProgram();
@@ -36,7 +38,7 @@ export function program(gl, sources, ...defines) {
   return places;
 }
 
-// A buffer of floats for the vertex array that is bound; layout: [attribute, how many floats] in their order.
+// A buffer of floats for the bound vertex array; layout: [attribute, number of floats] in their order.
 export function floats(gl, data, layout) {
   const stride = layout.reduce((sum, [, n]) => sum + n, 0) * 4;
   gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());

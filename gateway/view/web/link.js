@@ -1,4 +1,4 @@
-// The connection to the server: the scene, snapshots, words; and commands.
+// The connection to the server: receives the scene, snapshots and status messages, and sends commands.
 
 import { decode, decodeHistory, isHistory } from "./snapshot.js";
 
@@ -21,7 +21,7 @@ export class Link {
       scene = true;
       this.on.scene(message);
     };
-    // It may come back: a run that was started again listens at the same address.
+    // Reconnect: a run that is started again listens at the same address.
     socket.onclose = async () => {
       this.on.closed(scene ? "" : await this.refusal());
       setTimeout(() => this.open(), this.wait);
@@ -30,7 +30,7 @@ export class Link {
     this.socket = socket;
   }
 
-  // The server's words if it refuses this page: with an old token, or as one too many.
+  // The server's reason if it refuses this page: an outdated token, or too many pages.
   async refusal() {
     try {
       const answer = await fetch(`/live${location.search}`);

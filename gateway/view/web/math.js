@@ -1,4 +1,4 @@
-// Vectors of three, and matrices of 4 by 4 in columns, as WebGL has them.
+// Vectors of three, and matrices of 4 by 4 in column order, as in WebGL.
 
 export const add = (a, b, k = 1) => [a[0] + k * b[0], a[1] + k * b[1], a[2] + k * b[2]];
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -36,7 +36,7 @@ export function look(eye, at) {
   return [x[0], y[0], z[0], 0, x[1], y[1], z[1], 0, x[2], y[2], z[2], 0, -dot(x, eye), -dot(y, eye), -dot(z, eye), 1];
 }
 
-// Where a point is on a screen of this size, and how far; null behind the eye.
+// The point's position on a screen of this size, and its distance; null behind the eye.
 export function project(m, p, width, height) {
   const w = m[3] * p[0] + m[7] * p[1] + m[11] * p[2] + m[15];
   if (w <= 0) return null;

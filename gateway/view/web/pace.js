@@ -1,8 +1,8 @@
-// When the picture is drawn, and how finely. It has no clock: times are given, in ms.
+// The times at which the picture is drawn, and its resolution. There is no clock here: times are arguments, in ms.
 
-// Where the processor draws, a bench on the same machine needs it too.
+// A bench on the same machine needs processor time while the picture is drawn in software.
 export const SOFTWARE_HZ = 15;
-// The picture is drawn sharp once nothing has moved for so long.
+// The picture is drawn in full resolution after it has stood still for this time.
 export const STILL_MS = 400;
 
 export class Pace {
@@ -10,7 +10,7 @@ export class Pace {
     Object.assign(this, { software, began: -Infinity, ended: -Infinity, cost: 0 });
   }
 
-  // How long until the next frame may begin: as long as one took, there is none after it.
+  // The time until the next frame may begin: a pause as long as the last frame took.
   wait(now) {
     const next = this.ended + 2 * this.cost, limit = this.software ? this.began + 1000 / SOFTWARE_HZ : 0;
     return Math.max(0, next - now, limit - now);
@@ -25,14 +25,14 @@ export class Pace {
     this.cost = Math.min(500, now - this.ended);
   }
 
-  // Pixels of the picture for one of the page, along each side.
+  // Pixels of the picture per pixel of the page, along each side.
   ratio(device, still) {
     return this.software ? (still ? 2 : 1) : Math.min(2, device);
   }
 }
 
-// Draws when something may have changed, as often as the machine can. `draw(ratio)` returns whether it drew, and whether it did
-// anything else that takes time.
+// Draws when something may have changed, as often as the machine can. `draw(ratio)` returns two flags: it drew, and it
+// did other work that takes time.
 export class Painter {
   constructor(software, draw) {
     Object.assign(this, { pace: new Pace(software), draw, due: false, later: 0 });

@@ -8,18 +8,18 @@ import { add } from "./math.js";
 import { axes, cylinders, neighbors, triangles } from "./robot.js";
 import { CUT, FLOATS, MOVED, ribbons } from "./wires.js";
 
-// Light is that of a vertex, not of a pixel: a software renderer has few of the one and many of the other.
+// Lighting is computed per vertex, not per pixel: for a software renderer, vertices are few and pixels are many.
 const LIGHT = "float light(vec3 n) { return max(dot(normalize(n), normalize(vec3(.4, -.5, .77))), 0.); }";
 
-// How much ink of the cell's number is at a place in its hexagon. What a pixel to the right and one upward are there says how far from
-// the middle it is on the screen: letters stand upright however the cell is turned. The numbers of small hexagons fade.
+// The share of ink of the cell's number at a point in its hexagon. The values of the pixels to the right and above tell
+// the direction on the screen: numbers stand upright however the cell is turned. The numbers of small hexagons fade.
 const NUMBERS = `#ifdef NUMBERS
 uniform highp sampler2D numbers; uniform float legible;
 float written(vec2 dx, vec2 dy) {
   float size = 1. / max(max(length(dx), length(dy)), 1e-6), turned = dx.x * dy.y - dx.y * dy.x;
   if (size < legible || abs(turned) < 1e-12) return 0.;
   vec2 far = vec2(place.x * dy.y - place.y * dy.x, dx.x * place.y - dx.y * place.x) / turned;
-  // Letters of the picture of all numbers are 48 pixels high, and tiles 128 by 64.
+  // The texture of all numbers has letters 48 pixels high, in tiles of 128 by 64.
   float scale = min(size * (node > 99 ? .58 : .74), 2.4 * legible) / 48.;
   vec2 in_tile = vec2(far.x, -far.y) / (scale * vec2(128., 64.)) + .5;
   if (min(in_tile.x, in_tile.y) < 0. || max(in_tile.x, in_tile.y) > 1.) return 0.;
@@ -34,7 +34,8 @@ void main() { c = colour * (.58 + .42 * light(mat3(m) * n)); gl_Position = view 
 `in vec3 c; out vec4 o;
 void main() { o = vec4(c, 1.); }`];
 
-// uv: the place in the hexagon, whose corners are at 1; kind: shape, and 16 if chosen, 32 if pressed, 64 if a root.
+// uv: the point in the hexagon, whose corners are at 1; kind: the shape, plus 16 if chosen, 32 if pressed, 64 if a
+// root.
 const CELL = [`layout(location=0) in vec3 at; layout(location=1) in vec3 n; layout(location=2) in vec2 uv; layout(location=3) in vec4 look; layout(location=4) in float number;
 uniform mat4 view, m; uniform vec3 edge; out vec2 place; flat out vec3 inner, rim, ink; flat out int kind, node;
 ${LIGHT}
@@ -68,14 +69,14 @@ void main() {
     if ((kind & 48) != 0 && hex > .72) c = (kind & 32) != 0 && hex < .84 ? mark : chosen;
   }
 #ifdef NUMBERS
-  // Buses have colours that are like that of what is chosen.
+  // The colours of buses are similar to that of the chosen cell.
   if ((kind & 16) != 0 && hex > .66 && hex < .76) c = ink;
   c = mix(c, ink, written(dx, dy));
 #endif
   o = vec4(c, 1.);
 }`];
 
-// A ribbon: a wire that is cut is dashed, a cell's way stands out. It is a little nearer than the cells that it leads over.
+// A ribbon. Wires that are cut are dashed. Ribbons are drawn a little nearer than the cells that they cross.
 const WIRE = [`layout(location=0) in vec3 at; layout(location=1) in vec2 how; uniform mat4 view; out vec2 kind;
 void main() { kind = how; gl_Position = view * vec4(at, 1.); gl_Position.z -= .0006 * gl_Position.w; }`,
 `in vec2 kind; uniform vec3 mark, alarm; out vec4 o;
@@ -85,21 +86,21 @@ void main() {
   o = vec4(it == ${CUT} || it == ${MOVED} ? alarm : mark, 1.);
 }`];
 
-// What a cell is drawn as: its hexagon, or a triangle around it, of which a software renderer draws the pixels in the hexagon.
+// The form of a cell: its hexagon, or a triangle around it. A software renderer fills only the pixels of the hexagon.
 const corner = (degrees, far) => [far * Math.cos(degrees * Math.PI / 180), far * Math.sin(degrees * Math.PI / 180)];
 const HEXAGON = { corners: [0, 60, 120, 180, 240, 300].map((at) => corner(at, 1)), fan: [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5] };
 const TRIANGLE = { corners: [90, 210, 330].map((at) => corner(at, Math.sqrt(3))), fan: [0, 1, 2] };
 
-// From this radius in pixels of the page on, a hexagon has its number.
+// The minimum radius of a hexagon with a number, in pixels of the page.
 const LEGIBLE = 12;
 
 export class Picture {
-  // With `numbers`, hexagons that are large enough have their cells' node ids.
+  // With `numbers`, hexagons that are large enough show their cells' node ids.
   constructor(canvas, numbers = false) {
     Object.assign(this, { canvas, numbers }, context(canvas));
   }
 
-  // Takes a scene: what does not change.
+  // Sets the scene, which does not change.
   set(scene) {
     const { gl } = this;
     [this.scene, this.before] = [scene, null];
@@ -117,7 +118,7 @@ export class Picture {
     }
     this.round = this.solids(cylinders(scene));
     this.shells = null;
-    // Cells by frame: `order` has their places in the scene.
+    // Cells by frame: `order` has their indices in the scene.
     const order = scene.cells.map((_, i) => i);
     const key = (i) => { const c = scene.cells[i]; return scene.buses[c.bus].chain * 64 + c.row; };
     order.sort((i, j) => key(i) - key(j) || i - j);
@@ -152,7 +153,7 @@ export class Picture {
     this.colours();
   }
 
-  // What has one frame is drawn at once.
+  // All cells of one frame are drawn at once.
   solids(all) {
     const { gl } = this, parts = new Map();
     for (const it of all) {
@@ -168,7 +169,7 @@ export class Picture {
     });
   }
 
-  // Takes the robot's surface, which is then drawn in place of cylinders.
+  // Sets the robot's surface, which is then drawn instead of cylinders.
   surface(corners) {
     const { gl } = this, vao = gl.createVertexArray();
     gl.bindVertexArray(vao);
@@ -177,20 +178,20 @@ export class Picture {
     this.changed = true;
   }
 
-  // Takes the ribbons that are drawn.
+  // Sets the ribbons to draw.
   ribbons(wires) {
     if (JSON.stringify(wires) === JSON.stringify(this.wires)) return;
     [this.wires, this.changed] = [wires, true];
   }
 
-  // Reads the colours again: light and dark differ.
+  // Reads the colours again, after a change between light and dark.
   colours() {
     this.changed = true;
     const colour = (name) => rgb(css(name)).map((v) => v / 255);
     this.theme = { back: colour("--back"), robot: colour("--robot"), unlit: rgb(css("--unlit")), mark: colour("--mark"), edge: colour("--edge"), chosen: colour("--chosen"), alarm: colour("--alarm") };
   }
 
-  // Takes the cells of a snapshot, in the scene's order. Those that did not change are left alone.
+  // Sets the cells of a snapshot, in the scene's order. Unchanged cells are skipped.
   update(words, shows, chosen) {
     const { gl, looks, order, scene, theme, vertices } = this, before = this.before;
     const same = before && before.shows === shows && before.theme === theme && before.words.length === words.length;
@@ -210,7 +211,7 @@ export class Picture {
     gl.bufferSubData(gl.ARRAY_BUFFER, first * vertices * 4, looks, first * vertices, (end - first) * vertices);
   }
 
-  // Draws, if anything changed since it drew last, or it is to be finer; whether it did.
+  // Draws if anything has changed since the last time, or if a finer picture is due. Returns true if it drew.
   draw(view, frames, ratio) {
     const { gl, canvas, theme, solid, cell } = this;
     const seen = [canvas.clientWidth, canvas.clientHeight, ...view, ...frames.flat(2)];
@@ -223,7 +224,7 @@ export class Picture {
     gl.enable(gl.DEPTH_TEST);
     gl.clearColor(...theme.back, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    // Cells first: what lies below them is then not drawn.
+    // Cells first, so that anything below them is not drawn.
     gl.useProgram(cell.program);
     gl.bindVertexArray(this.cells);
     gl.uniformMatrix4fv(cell.view, false, view);
@@ -249,7 +250,7 @@ export class Picture {
     gl.useProgram(solid.program);
     gl.uniformMatrix4fv(solid.view, false, view);
     gl.uniform3fv(solid.colour, theme.robot);
-    // The faces of others' meshes may be turned either way.
+    // The faces of other meshes may have either orientation.
     if (!this.shells) gl.enable(gl.CULL_FACE);
     for (const { chain, row, vao, first, count } of this.shells ?? this.round) {
       gl.bindVertexArray(vao);

@@ -1,4 +1,4 @@
-// A small plot for each joint: what the cells sent, and the central computation.
+// A small plot for each joint: the torque that the cells sent, and the central computation.
 
 import { css } from "./colours.js";
 
@@ -28,7 +28,7 @@ export class Plots {
     });
   }
 
-  // Begins again with what was before.
+  // Replaces all values by a history.
   replace(history) {
     for (const row of this.rows) row.points.length = 0;
     for (const { time, joints } of history) this.push(time, joints);
@@ -42,7 +42,7 @@ export class Plots {
       const [time, now, exact] = points[points.length - 1];
       value.textContent = `${number(now)} ${unit}, off ${number(now - exact)}`;
       if (canvas.width !== Math.round(w * ratio)) { canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio); }
-      // In memory: small lines are drawn sooner by the processor than by WebGL in software.
+      // In memory: the processor draws small lines sooner than WebGL in software.
       const pen = canvas.getContext("2d", { willReadFrequently: true });
       pen.setTransform(ratio, 0, 0, ratio, 0, 0);
       pen.clearRect(0, 0, w, h);

@@ -1,8 +1,8 @@
-// Where the links of a robot are, and what they are drawn as.
+// The poses of a robot's links, and their shapes.
 
 import { add, cross, dot, length, point, row, times, unit } from "./math.js";
 
-// The frame of each row of each chain, that of the base first.
+// The frame of each row of each chain, the base first.
 export function frames(scene, positions) {
   return scene.chains.map((chain) => {
     const all = [chain.base];
@@ -20,18 +20,19 @@ export function cylinders(scene) {
   const thick = (chain, row) => Math.min(0.045, ...all.filter((it) => it.chain === chain && it.row === row).map((it) => it.radius * 0.6));
   scene.chains.forEach((chain, c) => {
     chain.rows.forEach((it, at) => {
-      // From the frame before: along its z by d, and then along x by a.
+      // From the previous frame: by d along its z, and then by a along x.
       const [s, co] = [Math.sin(it.alpha), Math.cos(it.alpha)];
       const bend = [-it.a, 0, 0], start = [-it.a, -it.d * s, -it.d * co];
       const radius = thick(c, at + 1) * Math.max(0.55, 1 - 0.05 * at);
       if (Math.abs(it.d) > 0.005 && !it.slides) all.push({ chain: c, row: at + 1, from: start, to: bend, radius });
-      // A link may stand beside the line of its table, as a UR5's upper arm: it is drawn where its cells are.
+      // A link may lie beside the line of its Denavit-Hartenberg row, such as a UR5's upper arm: it is drawn where its
+      // cells are.
       const tube = scene.tubes.find((tube) => tube.chain === c && tube.row === at + 1);
       const path = tube ? [bend, near(tube.ends, bend), near(tube.ends, [0, 0, 0]), [0, 0, 0]] : [bend, [0, 0, 0]];
       path.slice(1).forEach((to, i) => {
         if (length(add(to, path[i], -1)) > 0.005) all.push({ chain: c, row: at + 1, from: path[i], to, radius });
       });
-      // The joint itself, about its axis.
+      // The joint itself, around its axis.
       if (it.joint !== null && at > 0) all.push({ chain: c, row: at, from: [0, 0, -radius * 1.25], to: [0, 0, radius * 1.25], radius: radius * 1.12 });
     });
     if (c === 0) all.push({ chain: 0, row: 0, from: [0, 0, -0.02], to: [0, 0, 0], radius: 0.08 });
@@ -39,16 +40,16 @@ export function cylinders(scene) {
   return all;
 }
 
-// The point of the line through these ends that is nearest to p.
+// The point nearest to p on the line through these ends.
 function near([from, to], p) {
   const along = unit(add(to, from, -1));
   return add(from, along, dot(along, add(p, from, -1)));
 }
 
-// The cells' indices by 256 times the bus plus the node id.
+// The indices of the cells, by 256 times the bus plus the node id.
 export const indices = (scene) => new Map(scene.cells.map((cell, i) => [cell.bus * 256 + cell.node, i]));
 
-// For each cell a cell that it is wired to and that is in its frame, as an index; -1 where there is none.
+// For each cell, the index of a neighbor in the same frame, or -1.
 export function neighbors(scene) {
   const at = indices(scene);
   return scene.cells.map((cell) => {
@@ -57,7 +58,7 @@ export function neighbors(scene) {
   });
 }
 
-// The axes of a cell's hexagon, whose first corner is on x: neighbors lie beyond its sides.
+// The axes of a cell's hexagon. Its first corner is on x; neighbors lie beyond its sides.
 export function axes(scene, nearest, i) {
   const { position, normal } = scene.cells[i], other = scene.cells[nearest[i]];
   const flat = (v) => add(v, normal, -dot(v, normal));
@@ -87,7 +88,7 @@ export function triangles({ from, to, radius }) {
   return out;
 }
 
-// The corners of the box around all that is drawn, where the robot stands now.
+// The corners of the box around everything that is drawn, in the current pose.
 export function extent(scene, all) {
   const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
   const take = (p) => p.forEach((v, i) => { low[i] = Math.min(low[i], v); high[i] = Math.max(high[i], v); });

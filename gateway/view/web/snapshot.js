@@ -1,4 +1,4 @@
-// What the server sends many times a second: snapshots, and what was before a position.
+// Decodes the binary messages of the server: snapshots, and the torques before a position.
 
 export function decode(buffer) {
   const data = new DataView(buffer), joints = data.getUint32(4, true), cells = data.getUint32(8, true);
@@ -11,7 +11,7 @@ export function decode(buffer) {
   return snapshot;
 }
 
-// The torques before a position that was gone to.
+// The torques before the position of a seek.
 export function decodeHistory(buffer) {
   const data = new DataView(buffer), joints = data.getUint32(4, true), moments = data.getUint32(8, true);
   if (buffer.byteLength !== 16 + moments * (8 + 8 * joints)) throw new Error("a history of another length");
@@ -28,11 +28,11 @@ export function decodeHistory(buffer) {
 
 export const isHistory = (buffer) => new DataView(buffer).getUint32(12, true) === 1;
 
-// A cell of a snapshot, which has two words of it.
+// A cell of a snapshot, which has two words for it.
 export function cellOf(words, i) {
   const [low, high] = [words[2 * i], words[2 * i + 1]];
   return { status: low & 255, flags: low >> 8 & 255, force: low >>> 16, proximity: high & 65535, temperature: high >> 16 };
 }
 
-// The words of so many cells that are in order and touch nothing.
+// The words of a number of cells that are normal and not touched.
 export const resting = (cells) => Uint32Array.from({ length: 2 * cells }, (_, word) => (word % 2 ? 0 : 2));

@@ -1,4 +1,4 @@
-// A skin that stands still: all of it is in the page, which needs no server.
+// A skin at rest: the page contains all data and needs no server.
 
 import { Camera } from "./camera.js";
 import { SHOWS, css } from "./colours.js";
@@ -15,9 +15,9 @@ import { MOVED, wired } from "./wires.js";
 const $ = (id) => document.getElementById(id);
 const { scene, positions, details, moved, surface } = JSON.parse($("skin").textContent);
 const canvas = $("picture"), camera = new Camera(), { cells } = scene, at = indices(scene);
-// The robot does not move, and no cell has a value.
+// The robot does not move, and the cells have no values.
 const all = frames(scene, positions), words = resting(cells.length), wires = wired(scene);
-// A cell that is faced has at least such a radius on the screen, in pixels.
+// The minimum radius on the screen of a cell that the camera faces, in pixels.
 const FACED = 24;
 let picture = null, chosen = -1;
 
@@ -34,7 +34,7 @@ try {
   picture.ribbons([...wires, ...moved.map(({ cell, ...from }) => ({ from, to: cell, kind: MOVED }))]);
 } catch (error) {
   picture = null;
-  $("message").textContent = `The picture cannot be drawn: ${error.message}. The tables beside it work.`;
+  $("message").textContent = `The picture cannot be drawn: ${error.message}. The tables still work.`;
   $("message").hidden = false;
 }
 camera.fit(extent(scene, all));
@@ -48,7 +48,7 @@ const painter = new Painter(picture?.software ?? false, (ratio) => {
 });
 const redraw = () => painter.redraw();
 
-// For whoever looks from outside: where a cell is in the picture, in pixels of the page; null where it is not seen from its front.
+// For browser tests: the position of a cell in the picture, in pixels of the page; null unless its front is visible.
 window.skinbus = {
   frames: 0,
   where(i) {
@@ -60,7 +60,7 @@ window.skinbus = {
 function choose(i, turn = false) {
   chosen = i;
   $("cell-title").textContent = i < 0 ? "No cell chosen" : name(cells[i]);
-  $("cell").replaceChildren(...(i < 0 ? [element("p", "Click one, or search it.", "faint")] : about(i)));
+  $("cell").replaceChildren(...(i < 0 ? [element("p", "Click a cell, or search for one.", "faint")] : about(i)));
   if (i >= 0) $("search").value = name(cells[i]);
   $("search").setAttribute("aria-invalid", "false");
   if (turn) camera.face(point(frame(cells[i]), cells[i].position), direction(frame(cells[i]), cells[i].normal), scene.pitch * 0.56, FACED, ...size());
@@ -91,13 +91,13 @@ function about(i) {
   ];
 }
 
-// The cell that a text names: by its bus and node id, or by the node id alone.
+// The index of the cell that a text names by its bus and node id, or by the node id alone; -1 without one.
 function named(text) {
   const searched = text.trim().toLowerCase(), is = (of) => cells.findIndex((cell) => of(cell).toLowerCase() === searched);
   return [name, (cell) => `${cell.bus}:${cell.node}`, (cell) => String(cell.node)].map(is).find((i) => i >= 0) ?? -1;
 }
 
-// Chooses the cell behind `#` in the address, if it is there.
+// Chooses the cell named after `#` in the address, if it exists.
 function follow() {
   const i = named(decodeURIComponent(location.hash.slice(1)));
   choose(i, i >= 0);
@@ -112,7 +112,7 @@ $("find").onsubmit = (event) => {
   $("cell").replaceChildren(element("p", `There is no cell ${text}.`, "bad"));
 };
 
-// Zooms, by default about the middle.
+// Zooms, by default around the middle.
 function zoom(by, x = canvas.clientWidth / 2, y = canvas.clientHeight / 2) {
   camera.nearer(by, [x - canvas.clientWidth / 2, y - canvas.clientHeight / 2], ...size());
   redraw();
@@ -141,8 +141,8 @@ $("buses").replaceChildren(...scene.buses.map((bus, index) => {
   item.append(busKey(index), element("span", `${bus.name}: ${count(own.length, "cell")}, ${count(roots, "root")}`));
   return item;
 }));
-const marks = [{ name: "a root", mark: "root" }, { name: "another cell", mark: "" }];
-if (moved.length) marks.push({ name: "from its description", mark: "way" });
+const marks = [{ name: "root", mark: "root" }, { name: "other cell", mark: "" }];
+if (moved.length) marks.push({ name: "moved from its described place", mark: "way" });
 shapes($("shapes"), css, marks);
 matchMedia("(prefers-color-scheme: dark)").onchange = () => { picture?.colours(); shapes($("shapes"), css, marks); redraw(); };
 follow();

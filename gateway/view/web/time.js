@@ -1,4 +1,4 @@
-// The time line of a recording: its position, what happens in it, and the commands that move in it.
+// The time line of a recording: the position, the events, and the playback controls.
 
 import { css } from "./colours.js";
 import { element } from "./dom.js";
@@ -7,14 +7,14 @@ const KINDS = { touch: "Touch", loss: "Loss", silence: "Silent cell", halt: "Hal
 const SPEEDS = [0.05, 0.1, 0.25, 0.5, 1, 2, 5, 10, 20];
 const PARTS = 600;
 
-// Minutes, seconds and thousandths of a time in s; hours where there are any. Before the loop began it is negative.
+// Minutes, seconds and thousandths of a time in s; hours if needed. Times before the loop began are negative.
 export function clock(seconds) {
   const ms = Math.round(Math.abs(seconds) * 1000), two = (v) => String(v).padStart(2, "0");
   const [h, m, s] = [Math.floor(ms / 3600000), Math.floor(ms / 60000) % 60, Math.floor(ms / 1000) % 60];
   return `${seconds < 0 && ms > 0 ? "−" : ""}${h ? `${h}:${two(m)}` : m}:${two(s)}.${String(ms % 1000).padStart(3, "0")}`;
 }
 
-// What a fragment of the address asks for, as `#at=12.5`: a position in s, or none.
+// The position in s that a fragment of the address requests, as in `#at=12.5`; null without one.
 export function requested(fragment) {
   const found = /^#at=(\d+(?:\.\d+)?)$/.exec(fragment);
   return found ? Number(found[1]) : null;
@@ -32,8 +32,8 @@ export class TimeBar {
       return it;
     };
     this.play = button("Play", "Play", () => this.toggle());
-    this.back = button("−1", "−1 epoch", () => send({ do: "step", forward: false }), "The epoch before");
-    this.forth = button("+1", "+1 epoch", () => send({ do: "step", forward: true }), "The next epoch");
+    this.back = button("−1", "−1 epoch", () => send({ do: "step", forward: false }), "Previous epoch");
+    this.forth = button("+1", "+1 epoch", () => send({ do: "step", forward: true }), "Next epoch");
     this.speed = element("select");
     this.speed.setAttribute("aria-label", "Speed");
     for (const speed of SPEEDS) {
@@ -51,8 +51,8 @@ export class TimeBar {
       this.kind.append(it);
     }
     const jump = (forward) => () => send({ do: "jump", to: this.kind.value, forward });
-    this.last = button("◂", "The event before", jump(false));
-    this.next = button("▸", "The next event", jump(true));
+    this.last = button("◂", "Previous event", jump(false));
+    this.next = button("▸", "Next event", jump(true));
     this.slider = element("input");
     Object.assign(this.slider, { type: "range", min: 0, max: 1, step: "any", value: 0 });
     this.slider.setAttribute("aria-label", "Position");
@@ -81,7 +81,7 @@ export class TimeBar {
     this.send({ do: "play", speed: Number(this.speed.value) });
   }
 
-  // Goes where the address says.
+  // Seeks to the position in the address.
   follow() {
     const at = requested(location.hash);
     if (at === null || !this.playback) return;
@@ -113,11 +113,11 @@ export class TimeBar {
     this.at.textContent = `${clock(this.dragged ?? at_s)} of ${clock(of_s)}`;
     this.slider.setAttribute("aria-valuetext", this.at.textContent);
     this.state.className = failed ? "bad" : "faint";
-    this.state.textContent = failed ?? (read < 1 ? `${Math.floor(read * 100)} % read${exact ? "" : "; counts are of the last seconds only"}`
-      : unfinished ?? (others ? `${others} frames are of buses that the skin does not have` : ""));
+    this.state.textContent = failed ?? (read < 1 ? `${Math.floor(read * 100)} % read${exact ? "" : "; counts cover the last seconds only"}`
+      : unfinished ?? (others ? `${others} frames on buses that the skin does not have` : ""));
   }
 
-  // What happens when, a row for each kind.
+  // Draws the events, one row for each kind.
   draw() {
     const { marks, read } = this.playback, w = this.marks.clientWidth, state = `${w} ${read} ${JSON.stringify(marks)}`;
     if (state === this.marked || !w) return;
@@ -133,6 +133,6 @@ export class TimeBar {
       for (const part of marks[kind] ?? []) pen.fillRect(part / PARTS * w, row * 4, Math.max(1.5, w / PARTS), 3);
     });
     const said = kinds.filter((kind) => (marks[kind] ?? []).length).map((kind) => KINDS[kind].toLowerCase());
-    this.marks.setAttribute("aria-label", said.length ? `Rows: ${said.join(", ")}` : "Nothing happens so far");
+    this.marks.setAttribute("aria-label", said.length ? `Rows: ${said.join(", ")}` : "No events so far");
   }
 }

@@ -2,8 +2,8 @@
 
 import { add, direction, dot, point, project } from "./math.js";
 
-// The cell under a place of the picture, among those that are hit from their front: of the ones nearest to the eye, which are within
-// a pitch of each other, the one whose middle is nearest to the place.
+// The cell at a point of the picture, among those that are hit from their front: of the cells within a pitch of the one nearest to
+// the eye, the one whose centre is nearest to the point.
 export function pick(scene, frames, camera, view, width, height, x, y) {
   const eye = camera.eye(), hit = [];
   scene.cells.forEach((cell, i) => {
@@ -18,11 +18,11 @@ export function pick(scene, frames, camera, view, width, height, x, y) {
   return hit.filter((it) => it.far < nearest + scene.pitch).reduce((best, it) => (it.off < best.off ? it : best), { i: -1, off: Infinity }).i;
 }
 
-// What is released within so many pixels of where it was pressed is a click.
+// A press that is released within this distance is a click, in pixels.
 const CLICK = 5;
 
-// Calls `on.at(x, y)` for the cell there, `on.press(cell)`, `on.release()`, `on.turn(dx, dy)`, `on.zoom(by, x, y)`. Where nothing can be
-// pressed there is `on.choose(cell)`, for a click, and `on.move(dx, dy)`, for a drag with shift, another button or two fingers.
+// Calls `on.at(x, y)` for the cell there, `on.press(cell)`, `on.release()`, `on.turn(dx, dy)`, `on.zoom(by, x, y)`. A page that cannot
+// press has `on.choose(cell)` for a click, and `on.move(dx, dy)` for a drag with shift, another button or two fingers.
 export function listen(canvas, on) {
   const pointers = new Map();
   let presses = false, apart = 0, travelled = 0;

@@ -1,16 +1,19 @@
-// Ribbons over the skin: the tree of sums, from each cell toward the one that it passes its sum to; wires; and cells that were moved.
+// Ribbons over the skin: the tree of sums, from each cell toward the one that it sends its sum to; wires; and the ways
+// of moved cells.
 
 import { add, cross, direction, length, point, unit } from "./math.js";
 import { indices } from "./robot.js";
 
-// What a ribbon is, as the shader has it: a branch of the tree, a wire that does not work, one of the skin, a cell's way from where it
-// was described.
+// The kinds of ribbons, as in the shader: a branch of the tree, a wire that is cut, a wire of the skin, and a line from
+// a cell's described place to its real one.
 export const [TREE, CUT, WIRE, MOVED] = [0, 1, 2, 3];
 
-// How wide they are at both ends, in pitches, and which part of the way they go: that of a wire leaves the middles free.
+// The width at both ends, in pitches, and the part of the way that the ribbon covers: a wire leaves the centres of
+// cells free.
 const FORMS = { [TREE]: [0.1, 0.03, 0, 1], [CUT]: [0.07, 0.07, 0, 1], [WIRE]: [0.05, 0.05, 0.36, 0.64], [MOVED]: [0.16, 0.02, 0, 1] };
 
-// The wires to be drawn as { from, to, kind }, with indices of cells. `trees` has of each bus the places of its cells, or null.
+// The wires to draw as { from, to, kind }, with indices of cells. `trees` has for each bus the places of its cells, or
+// null.
 export function wires(scene, trees) {
   const at = indices(scene), next = scene.buses.map(() => 0), all = [], cuts = new Set();
   const places = scene.cells.map((cell) => trees[cell.bus]?.[next[cell.bus]++] ?? null);
@@ -31,7 +34,7 @@ export function wires(scene, trees) {
   return all;
 }
 
-// Every wire of the skin, once.
+// Each wire of the skin, once.
 export function wired(scene) {
   const at = indices(scene);
   return scene.cells.flatMap((cell, from) => cell.neighbors
@@ -42,8 +45,8 @@ export function wired(scene) {
 
 export const FLOATS = 5;
 
-// Two triangles for each ribbon where the robot stands now: place, part of the way from 0 to 1, kind. An end is a cell's index, or a
-// place as { chain, row, position, normal }. A branch is wide at the cell and narrow at its parent.
+// Two triangles for each ribbon in the current pose, as position, share of the way from 0 to 1, and kind. An end is a
+// cell's index, or a place as { chain, row, position, normal }. A branch is wide at the cell and narrow at its parent.
 export function ribbons(scene, frames, all) {
   const out = new Float32Array(all.length * 6 * FLOATS), lift = scene.pitch * 0.12;
   const end = (it) => {

@@ -1,4 +1,4 @@
-// What the page says in words: facts, buses, silent cells, the chosen cell.
+// The tables of the page: facts, buses, silent cells, the chosen cell.
 
 import { BUSES } from "./colours.js";
 import { element, show, table } from "./dom.js";
@@ -7,7 +7,7 @@ import { haltedWords } from "./halted.js";
 import { busKey } from "./legend.js";
 import { number } from "./plots.js";
 
-// More buses than these have a row each in one table.
+// With more buses than this, one table has a row for each.
 const FEW_BUSES = 3;
 const $ = (id) => document.getElementById(id);
 
@@ -58,13 +58,13 @@ export function say(scene, said, ask) {
   show($("buses"), said.buses.length > FEW_BUSES ? [many(said.buses)] : said.buses.flatMap((bus) => [
     element("h3", bus.up ? bus.name : `${bus.name}: down`, bus.up ? "" : "bad"),
     table([
-      ["Load of a real bus", percent(bus.load), bus.load > 1 ? "bad" : ""],
+      ["Real bus load", percent(bus.load), bus.load > 1 ? "bad" : ""],
       ["Replies in time", `${bus.in_time} of ${bus.due}`],
       ["Late, missing", `${bus.late}, ${bus.missing}`, bus.late + bus.missing ? "bad" : ""],
       ["Packets lost, damaged", `${bus.lost}, ${bus.rejected}`, bus.lost + bus.rejected ? "bad" : ""],
       ["Saturated torques", String(bus.saturated), bus.saturated ? "bad" : ""],
       ["Mean error", bus.error_nm === null ? "–" : `${bus.error_nm.toExponential(1)} Nm`],
-      ...(bus.dropped ? [["Frames not seen here", String(bus.dropped), "bad"]] : []),
+      ...(bus.dropped ? [["Frames not received here", String(bus.dropped), "bad"]] : []),
     ]),
   ]));
   show($("dead"), [said.dead_cells.length
@@ -73,7 +73,7 @@ export function say(scene, said, ask) {
   if (said.detail) detail(scene, said.detail, ask);
 }
 
-// Where the skin has a cell: in the frame of its row.
+// The place of a cell in the skin: in the frame of its row.
 function where(scene, { bus, node }) {
   const cell = scene.cells.find((it) => it.bus === bus && it.node === node);
   if (!cell) return [];
@@ -137,7 +137,7 @@ export function link(text, isBad) {
   $("link").className = isBad ? "bad" : "";
 }
 
-// Which colour is which bus: those that share one are in one line.
+// The colours of the buses; buses that share a colour are in one line.
 export function buses(scene) {
   $("bus-colours").replaceChildren(...BUSES.slice(0, scene.buses.length).map((_, at) => {
     const same = scene.buses.filter((_, bus) => bus % BUSES.length === at).map((bus) => bus.name);

@@ -1,4 +1,4 @@
-//! One of the targets of `skinbus_tests::fuzz`, by the name in `SKINBUS_FUZZ`.
+//! A libFuzzer program for one of the targets of `skinbus_tests::fuzz`, which `SKINBUS_FUZZ` names.
 #![no_main]
 
 use std::sync::LazyLock;

@@ -9,23 +9,23 @@ use super::{Bench, Event};
 use crate::fault::Party;
 use crate::oracle::Truth;
 
-/// From one frame on the wire to the next: about what vcan needs.
+/// The time between two frames on the wire, about that of vcan.
 const FRAME: Span = Span(5);
-/// From the wire to a receiver, at least and at most, without faults.
+/// The minimum and the maximum latency from the wire to a receiver, without faults.
 const LATENCY: (u64, u64) = (10, 60);
 
-/// A frame that stood on the wire.
+/// A frame that was on the wire.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct OnTheWire {
-    /// When.
+    /// The time.
     pub at: Micros,
-    /// Whose it was.
+    /// The sender.
     pub from: Party,
-    /// What everybody could hear, but for what happened at receivers.
+    /// The frame before the faults of single receivers.
     pub frame: Frame,
 }
 
-/// A frame as it was sent, and what is true of it.
+/// A sent frame with the truth about it.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Sent {
     pub(super) frame: Frame,
@@ -41,17 +41,17 @@ pub(super) struct Delivery {
     after_next: bool,
 }
 
-/// What a receiver has, beside itself.
+/// The delivery state of a receiver.
 #[derive(Debug, Default)]
 pub(super) struct Inlet {
-    /// When its newest frame comes in, so that a later one does not overtake it.
+    /// The arrival time of its newest frame, so that a later one does not overtake it.
     newest: Micros,
-    /// A frame that comes after the next one.
+    /// A frame that is delivered after the next one.
     held: Option<Delivery>,
 }
 
 impl Bench {
-    /// Enters when the real bus is looked at next.
+    /// Enters the next advance of the real bus.
     pub(super) fn look_at_the_bus(&mut self) {
         let Some(real) = &mut self.real else { return };
         if let Some(next) = real.next()
@@ -73,7 +73,7 @@ impl Bench {
         }
     }
 
-    /// A frame wants a place on the wire.
+    /// Requests a place on the wire for a frame.
     pub(super) fn send(&mut self, mut sent: Sent, may_be_hit: bool) {
         if may_be_hit {
             let effect = self.faults.effect(self.agenda.now, sent.truth.from, None, sent.frame);
@@ -94,7 +94,7 @@ impl Bench {
         }
     }
 
-    /// A frame has its place in the order, or waits for it.
+    /// Puts a frame on the wire, or into the queue of the real bus.
     fn stand(&mut self, sent: &Sent) {
         if let Some(real) = &mut self.real {
             real.request(self.agenda.now, &sent.frame, *sent);
@@ -106,7 +106,7 @@ impl Bench {
         self.reach(stood, sent);
     }
 
-    /// A frame was on the wire, and goes to its receivers.
+    /// Distributes a frame from the wire to its receivers.
     pub(super) fn reach(&mut self, stood: Micros, sent: &Sent) {
         let from = sent.truth.from;
         self.wire.push(OnTheWire { at: stood, from, frame: sent.frame });
@@ -119,10 +119,10 @@ impl Bench {
         }
     }
 
-    /// From the wire to one receiver.
+    /// Passes a frame from the wire to one receiver.
     fn pass(&mut self, to: Party, stood: Micros, sent: &Sent) {
         let effect = self.faults.effect(self.agenda.now, sent.truth.from, Some(to), sent.frame);
-        // A real bus is everywhere at once.
+        // On a real bus a frame arrives everywhere at once.
         let latency = match self.real {
             Some(_) => Span(0),
             None => Span(self.dice.random_range(LATENCY.0..=LATENCY.1)),

@@ -1,4 +1,4 @@
-//! The modules of a crate, each with what it defines, imports and names.
+//! The modules of a crate, with the names that each defines, imports and uses.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
@@ -13,15 +13,15 @@ use super::tokens::{Named, is_of_tests};
 /// A module: a file, or a part of one in braces.
 #[derive(Default)]
 struct Module {
-    /// The module that is the file that this one stands in.
+    /// The module of the file that contains this module.
     file: Names,
-    /// Names of items, and of modules in it.
+    /// The names of items, and of modules in it.
     defined: BTreeSet<String>,
-    /// Imported names with the paths they stand for; several if functions import different ones.
+    /// Imported names with the paths that they stand for; several if functions import different ones.
     imported: BTreeMap<String, Vec<Names>>,
-    /// Modules, or enums, whose names are all imported.
+    /// Modules or enums whose names are all imported.
     globs: Vec<Names>,
-    /// Paths that occur, from the crate's root; a single name may not be there.
+    /// Paths that are used, from the crate's root; a path of a single name may not exist there.
     used: BTreeSet<Names>,
 }
 
@@ -29,14 +29,14 @@ struct Module {
 #[derive(Default)]
 pub(super) struct Modules {
     by_path: BTreeMap<Names, Module>,
-    /// The files of those that are files.
+    /// The files of the modules that are files.
     pub(super) files: BTreeMap<Names, PathBuf>,
-    /// The modules that define macros by rules: these need no import to be used.
+    /// The modules that define macros by rules, which can be used without an import.
     macros: BTreeMap<String, Names>,
 }
 
 impl Modules {
-    /// Reads a crate from the file of its root.
+    /// Reads a crate from its root file.
     pub(super) fn read(root: &Path) -> Self {
         let mut modules = Self::default();
         modules.read_file(root, &[]);
@@ -53,7 +53,7 @@ impl Modules {
         self.read_items(&parsed.items, (file, &folder), names, names);
     }
 
-    /// Reads the items of a module of a file, whose modules in files of their own are in this folder.
+    /// Reads the items of a module; `folder` contains the modules that are files of their own.
     fn read_items(
         &mut self,
         items: &[Item],
@@ -97,7 +97,7 @@ impl Modules {
         self.by_path.insert(names.to_vec(), module);
     }
 
-    /// Arrows from each file to each other one that defines a name it uses.
+    /// Returns the arrows from each file to the other files that define names it uses.
     pub(super) fn arrows(&self) -> BTreeMap<&Names, BTreeSet<&Names>> {
         let mut arrows: BTreeMap<_, BTreeSet<_>> = BTreeMap::new();
         for module in self.by_path.values() {
@@ -117,12 +117,12 @@ impl Modules {
         Some(&self.module_of(&home)?.1.file)
     }
 
-    /// The innermost module that a path leads through or to.
+    /// Returns the innermost module on a path.
     fn module_of(&self, path: &[String]) -> Option<(usize, &Module)> {
         (0..=path.len()).rev().find_map(|length| Some((length, self.by_path.get(&path[..length])?)))
     }
 
-    /// The path under which something is defined, through imports and re-exports.
+    /// Returns the path of the definition of a name, following imports and re-exports.
     fn home(&self, path: &[String], depth: usize) -> Option<Names> {
         let (length, module) = self.module_of(path).filter(|_| depth < 8)?;
         let Some(item) = path.get(length).filter(|item| !module.defined.contains(*item)) else {
@@ -132,7 +132,7 @@ impl Modules {
         match module.imported.get(item) {
             Some(all) => all.iter().find_map(|to| follow(to, length + 1)),
             None => module.globs.iter().find_map(|glob| {
-                // The variants of an enum are its own.
+                // An enum counts as the home of its variants.
                 let glob = self.home(glob, depth + 1).filter(|glob| self.by_path.contains_key(glob))?;
                 follow(&glob, length)
             }),
@@ -140,7 +140,7 @@ impl Modules {
     }
 }
 
-/// A path as it is written in a module, from the crate's root; `None` where it leads out of the crate.
+/// Resolves a path as written in a module to one from the crate's root; returns `None` if it leads out of the crate.
 fn from_root(written: &[String], here: &[String]) -> Option<Names> {
     let mut path = if written.first()? == "crate" { Vec::new() } else { here.to_vec() };
     for name in written {
@@ -154,7 +154,7 @@ fn from_root(written: &[String], here: &[String]) -> Option<Names> {
     Some(path)
 }
 
-/// The file of a module that has its own.
+/// Returns the file of a module that has its own.
 fn file_of(module: &ItemMod, file: &Path, folder: &Path) -> PathBuf {
     let name = module.ident.to_string();
     let given = module.attrs.iter().find_map(|attribute| match &attribute.meta {

@@ -1,4 +1,4 @@
-//! The counter of circles, on small crates.
+//! The search for circles, on small crates.
 
 use std::fs;
 
@@ -7,7 +7,7 @@ use tempfile::TempDir;
 use super::circles;
 use super::modules::Modules;
 
-/// The circles of a crate of these files.
+/// Returns the circles of a crate with these files.
 fn found(files: &[(&str, &str)]) -> Vec<Vec<String>> {
     let folder = TempDir::new().unwrap();
     for (name, text) in files {
@@ -20,7 +20,7 @@ fn found(files: &[(&str, &str)]) -> Vec<Vec<String>> {
     circles(&modules).into_iter().map(|files| files.into_iter().map(name).collect()).collect()
 }
 
-/// Whether `a.rs` and `b.rs` are a circle when `b.rs` needs `a.rs` and `a.rs` has this text.
+/// Returns true if `a.rs` and `b.rs` form a circle, where `b.rs` needs `a.rs` and `a.rs` has this text.
 fn is_one(root: &str, a: &str) -> bool {
     let b = "pub struct B; pub enum Kind { One } pub fn make(_: crate::a::A) {}";
     let found = found(&[("lib.rs", root), ("a.rs", &format!("{a} pub struct A;")), ("b.rs", b)]);
@@ -74,7 +74,7 @@ fn a_macro_is_used_without_an_import() {
 fn what_only_looks_like_a_use_is_none() {
     let plain = "mod a; mod b;";
     for (root, a) in [
-        // Words, and names of something else.
+        // Text, and names of other things.
         (plain, "/// [`super::b::B`], see crate::b::B.\nfn f() -> &'static str { \"super::b::B\" }"),
         (
             "mod a; mod b; use b::*;",
@@ -82,14 +82,14 @@ fn what_only_looks_like_a_use_is_none() {
         ),
         (plain, "use other::b::B; fn f(_: b::B, _: ::b::B) {}"),
         ("mod a; mod b; pub use b::B;", "use super::*; use other::B; fn f(_: B) {}"),
-        // Of tests.
+        // In tests.
         (plain, "#[cfg(test)] mod tests { use crate::b::B; }"),
         (plain, "#[cfg(test)] use crate::b::B; struct C { #[cfg(test)] b: crate::b::B, c: u8 }"),
         (plain, "impl A { #[cfg(test)] #[must_use] fn f(_: crate::b::B) -> u8 { 0 } }"),
     ] {
         assert!(!is_one(root, a), "{root}\n{a}");
     }
-    // What comes behind such a field or function counts again.
+    // Code after such a field or function counts again.
     assert!(is_one(plain, "struct C { #[cfg(test)] c: u8, b: crate::b::B }"));
     assert!(is_one(plain, "impl A { #[cfg(test)] fn f() {} fn g(_: crate::b::B) {} }"));
 }

@@ -1,4 +1,4 @@
-//! The paths and the imports in a piece of a source file, by its tokens: those in macros and attributes are among them.
+//! The paths and the imports in a piece of a source file, by its tokens; those in macros and attributes are included.
 
 use std::collections::BTreeSet;
 
@@ -6,24 +6,24 @@ use proc_macro2::{Delimiter, TokenStream, TokenTree};
 
 use super::Names;
 
-/// What a source names.
+/// The names in a source.
 #[derive(Default)]
 pub(super) struct Named {
-    /// Paths as they are written. A single name is here if it is a type, a constant or a call, whose `use` may be a glob; of a
-    /// macro it ends with `!`.
+    /// Paths as they are written. A single name is included if it is a type, a constant or a call, whose `use` may be a
+    /// glob; the name of a macro ends with `!`.
     pub(super) paths: BTreeSet<Names>,
-    /// The names that a `use` brings, at the top or in a function, with the paths that they stand for; `*` of a glob.
+    /// The names that a `use` imports, at the top or in a function, with the paths that they stand for; `*` for a glob.
     pub(super) imports: Vec<(String, Names)>,
 }
 
-/// Whether an attribute, or what stands in its brackets, says that something is for unit tests alone.
+/// Returns true if an attribute, or the text in its brackets, marks an item as a unit test.
 pub(super) fn is_of_tests(attribute: &TokenStream) -> bool {
     let text = attribute.to_string();
     text == "test" || ["cfg (test", "cfg (all (test"].iter().any(|of_tests| text.starts_with(of_tests))
 }
 
 impl Named {
-    /// Takes in what these tokens name.
+    /// Adds the names in these tokens.
     pub(super) fn take(&mut self, tokens: TokenStream) {
         let tokens: Vec<_> = tokens.into_iter().collect();
         let mut at = 0;
@@ -44,7 +44,7 @@ impl Named {
         }
     }
 
-    /// Takes in the path that begins here; where it ends.
+    /// Adds the path that begins here, and returns the index of its end.
     fn path(&mut self, tokens: &[TokenTree], from: usize) -> usize {
         let (mut path, mut at) = (vec![tokens[from].to_string()], from + 1);
         while is_joined(tokens, at)
@@ -65,7 +65,7 @@ impl Named {
         at
     }
 
-    /// Takes in a tree of a `use`, behind the names before it; where it ends.
+    /// Adds a tree of a `use`, after the names before it, and returns the index of its end.
     fn import(&mut self, tokens: &[TokenTree], mut at: usize, mut path: Names) -> usize {
         loop {
             match tokens.get(at) {
@@ -84,7 +84,7 @@ impl Named {
                     self.imports.push(("*".to_owned(), path));
                     return at + 1;
                 }
-                // `::` at the beginning, which leads to another crate.
+                // `::` at the beginning leads to another crate.
                 _ if is_joined(tokens, at) => path.push(String::new()),
                 _ => return at,
             }
@@ -103,7 +103,8 @@ impl Named {
         }
     }
 
-    /// Takes in an attribute whose brackets come next; where it ends, or where what it is of does if that is for tests.
+    /// Adds an attribute whose brackets come next. Returns the index of its end, or that of its item's end if the item
+    /// is for tests.
     fn attribute(&mut self, tokens: &[TokenTree], mut at: usize) -> usize {
         at += usize::from(is_sign(tokens, at, '!'));
         let Some(TokenTree::Group(group)) = tokens.get(at) else { return at };
@@ -124,7 +125,7 @@ impl Named {
         tokens.len()
     }
 
-    /// Takes in the paths in the texts of an attribute: `with = "super::text"`.
+    /// Adds the paths in the strings of an attribute: `with = "super::text"`.
     fn quoted(&mut self, attribute: TokenStream) {
         for token in attribute {
             match token {
@@ -146,7 +147,7 @@ impl Named {
     }
 }
 
-/// Whether a name is a field, a method, a lifetime, the end of a path, or that of a function where it is defined.
+/// Returns true if a name is a field, a method, a lifetime, the end of a path, or the name in a function definition.
 fn is_part_of_another(tokens: &[TokenTree], at: usize) -> bool {
     let before = |back: usize, sign| at.checked_sub(back).is_some_and(|at| is_sign(tokens, at, sign));
     let is_function =
@@ -159,7 +160,7 @@ fn is_sign(tokens: &[TokenTree], at: usize, sign: char) -> bool {
     matches!(tokens.get(at), Some(TokenTree::Punct(it)) if it.as_char() == sign)
 }
 
-/// Whether `::` stands here.
+/// Returns true if `::` is at this index.
 fn is_joined(tokens: &[TokenTree], at: usize) -> bool {
     is_sign(tokens, at, ':') && is_sign(tokens, at + 1, ':')
 }

@@ -1,4 +1,4 @@
-//! A cell, what is known of one, and cells wired to each other, in any order of events.
+//! Fuzz targets for a cell, the tracker of a cell, and wired cells, with any order of events.
 
 use arbitrary::{Result, Unstructured};
 use cell_node::flash::{self, Flash};
@@ -16,11 +16,11 @@ use protocol::time::{Micros, Span};
 use super::{frame, packet};
 use crate::network::Wiring;
 
-/// More than a cell has to send after one event.
+/// More packets than a cell may send after one event.
 const MANY: usize = 200;
 
-/// A cell takes any frames, messages of its ports, times and failures of flash; what it sends is always whole and of its
-/// own, and it asks for a time that is to come.
+/// Gives a cell any frames, port messages, times and flash failures. Everything that it sends must be valid and its
+/// own, and its timeouts must lie in the future.
 pub(super) fn cell(data: &[u8]) {
     let _ = run_cell(&mut Unstructured::new(data));
 }
@@ -42,7 +42,7 @@ fn run_cell(from: &mut Unstructured<'_>) -> Result<()> {
     while !from.is_empty() {
         match from.int_in_range(0..=5)? {
             0 => now.0 += u64::from(from.arbitrary::<u16>()?),
-            // A cell without a node id waits for ever.
+            // A cell without a node id has no timeout.
             1 => now = now.max(node.poll_timeout().min(now + Span::from_millis(1_000))),
             2 => {
                 let message = LinkId { wire: 0, back: false };
@@ -71,7 +71,7 @@ fn run_cell(from: &mut Unstructured<'_>) -> Result<()> {
     Ok(())
 }
 
-/// An identifier that the cell receives, mostly.
+/// Returns an identifier; mostly one that the cell receives.
 fn heard(from: &mut Unstructured<'_>, own: CellId) -> Result<Id> {
     let commands = [Command::Joints, Command::Halt, Command::Sync, Command::Resume, Command::Report];
     let ids: Vec<Id> = commands.into_iter().map(Id::command).chain(Id::of_cell(own)).collect();
@@ -105,7 +105,7 @@ fn drain(node: &mut Node, from: &mut Unstructured<'_>) -> Result<()> {
     }
 }
 
-/// What is known of a cell never loses a packet that came, and counts none twice.
+/// Checks that the tracker of a cell never loses a received packet, and never counts one twice.
 pub(super) fn tracker(data: &[u8]) {
     let _ = track(&mut Unstructured::new(data));
 }
@@ -138,7 +138,7 @@ fn track(from: &mut Unstructured<'_>) -> Result<()> {
         let uplink = cell.account.uplink();
         assert!(uplink.delivered + uplink.unsettled <= came, "{uplink:?} of {came}");
         assert!(uplink.delivered >= before.delivered, "{uplink:?} after {before:?}");
-        // A start is taken back when the heartbeats of it were another sender's.
+        // A start is retracted if its heartbeats turn out to be another sender's.
         let taken_back = before.restarts.saturating_sub(uplink.restarts);
         assert!(uplink.outsiders >= before.outsiders + u64::from(taken_back), "{uplink:?} after {before:?}");
         before = uplink;
@@ -147,8 +147,8 @@ fn track(from: &mut Unstructured<'_>) -> Result<()> {
     Ok(())
 }
 
-/// Cells wired at random, under faults: no sum has a cell twice (the wiring checks each one), and when all faults are over
-/// every cell has a route again.
+/// Wires cells at random and adds faults. No sum may contain a cell twice (the wiring checks each one), and after all
+/// faults every cell must have a route again.
 pub(super) fn tree(data: &[u8]) {
     let _ = grow(&mut Unstructured::new(data));
 }
@@ -162,7 +162,7 @@ fn grow(from: &mut Unstructured<'_>) -> Result<()> {
     }
     wiring.run(Span::from_millis(2_000));
     wiring.switch(from.int_in_range(0..=6)?, false);
-    // Only now: a press goes to a node id, and cells have theirs.
+    // A press is sent to a node id, which the cells have only now.
     (0..cells).for_each(|cell| wiring.press(cell, true));
     wiring.begin();
     for _ in 0..12 {

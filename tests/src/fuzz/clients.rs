@@ -1,4 +1,4 @@
-//! What talks to the gateway over a socket: pages in a browser, external controllers. The sockets are real.
+//! Fuzz targets for clients of the gateway's sockets: pages in a browser, external controllers. The sockets are real.
 
 use std::cell::RefCell;
 use std::io::{Read as _, Write as _};
@@ -12,7 +12,7 @@ use protocol::skin::Skin;
 use tempfile::TempDir;
 use view::server::{Access, Server};
 
-/// What a page sends to become one.
+/// Returns the request with which a client becomes a page.
 fn upgrade(port: u16) -> String {
     format!(
         "GET /live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nOrigin: http://127.0.0.1:{port}\r\nConnection: Upgrade\r\n\
@@ -20,8 +20,8 @@ fn upgrade(port: u16) -> String {
     )
 }
 
-/// A connection that sends these bytes, as a request or, if the first one is odd, as a page; the server then still
-/// answers another one.
+/// Sends these bytes, as a request or, if the first one is odd, as a page; the server must then still answer another
+/// connection.
 pub(super) fn page(data: &[u8]) {
     thread_local! {
         static SERVER: Server = {
@@ -52,7 +52,7 @@ fn talk(server: &Server, pieces: &[&[u8]]) -> std::io::Result<Vec<u8>> {
     Ok(answer)
 }
 
-/// What an external controller is to a tick.
+/// The state of an external controller during a tick.
 struct Listening {
     external: External,
     client: UnixDatagram,
@@ -71,8 +71,8 @@ impl Listening {
     }
 }
 
-/// Datagrams of any bytes: what moves the robot is finite and within the limits of speed. Each is led by its length; its
-/// magic and version are made right if that is odd.
+/// Sends datagrams of any bytes: the robot's motion must stay finite and within its speed limits. Each datagram follows
+/// its length; if that is odd, its magic and version are corrected.
 pub(super) fn controller(data: &[u8]) {
     thread_local! {
         static LISTENING: RefCell<Listening> = RefCell::new(Listening::new());
@@ -85,7 +85,7 @@ pub(super) fn controller(data: &[u8]) {
             let mut datagram = datagram.to_vec();
             if length % 2 == 1 && datagram.len() >= 16 {
                 datagram.splice(..6, *b"SKBC\x01\x00");
-                // Answers to the tick before this one are the ones that count.
+                // Only answers to the previous tick count.
                 datagram.splice(8..16, listening.tick.wrapping_sub(1).to_le_bytes());
             }
             let _ = listening.client.send_to(&datagram, listening.folder.path().join("controller"));

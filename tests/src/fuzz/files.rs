@@ -1,4 +1,4 @@
-//! What stands in files: captures, recordings, flash, descriptions, robots, meshes.
+//! Fuzz targets for files: captures, recordings, flash, descriptions, robots, meshes.
 
 use std::io::{Cursor, Write as _};
 use std::path::PathBuf;
@@ -22,7 +22,7 @@ use trace::recording::recover::recover as recover_into;
 static SKIN: LazyLock<Skin> =
     LazyLock::new(|| Skin::parse("skin.toml", include_str!("../../fuzz/seeds/skin/generated.toml")).unwrap());
 
-/// Each line on its own: a frame that it says is written as a line that says the same.
+/// Parses each line by itself: a frame must be written as a line with the same meaning.
 pub(super) fn candump(data: &[u8]) {
     for line in data.split(|&byte| byte == b'\n') {
         let Ok(Line::Frame(record)) = candump::parse_bytes(line) else { continue };
@@ -37,7 +37,7 @@ pub(super) fn candump(data: &[u8]) {
     }
 }
 
-/// Everything that comes out of a capture, with a limit so that a small file that unpacks to much ends too.
+/// Reads everything in a capture, up to a limit, so that a small file that unpacks to a large one ends too.
 fn read(reader: &mut Reader) -> u64 {
     let mut frames = 0;
     for _ in 0..100_000 {
@@ -51,7 +51,7 @@ fn read(reader: &mut Reader) -> u64 {
     frames
 }
 
-/// A file of any kind, from a pipe and from a regular file: both give the same frames.
+/// Reads a file of any kind, from a pipe and as a regular file: both must give the same frames.
 pub(super) fn capture(data: &[u8]) {
     let piped =
         Reader::from_read("data", Cursor::new(data.to_owned())).map_or(0, |mut reader| read(&mut reader));
@@ -66,7 +66,8 @@ fn file_of(data: &[u8]) -> NamedTempFile {
     file
 }
 
-/// What is recovered is a whole file, which is read without a complaint and has as many messages as were counted.
+/// Recovers a recording: the result must be a complete file that can be read without an error and has the counted
+/// number of messages.
 pub(super) fn recover(data: &[u8]) {
     let mut out = Vec::new();
     let Ok(recovered) = recover_into(Cursor::new(data), &mut out) else { return };
@@ -76,7 +77,7 @@ pub(super) fn recover(data: &[u8]) {
     while reader.next_item().is_ok_and(|item| item.is_some()) {}
 }
 
-/// A recording with any damage has a report, or one line why not.
+/// Reports a recording with any damage: there must be a report, or an error in one line.
 pub(super) fn report(data: &[u8]) {
     let file = file_of(data);
     let report = run::report(&[PathBuf::from(file.path())], &run::Options::default());
@@ -85,7 +86,7 @@ pub(super) fn report(data: &[u8]) {
     }
 }
 
-/// An image whose CRC is right is refused, or kept and written again as itself.
+/// Decodes a flash image with a correct CRC: it must be refused, or encoded as the same image again.
 pub(super) fn flash(data: &[u8]) {
     let identity = Identity { cell: CellId::new(12).ok(), serial: 0x0102_0304 };
     let _ = flash::decode(identity, data);
@@ -96,7 +97,7 @@ pub(super) fn flash(data: &[u8]) {
     assert_eq!(flash::decode(identity, &bytes), Ok(kept));
 }
 
-/// A skin that is accepted can be computed with.
+/// Parses a skin: it must be possible to compute with an accepted one.
 pub(super) fn skin(data: &[u8]) {
     let Ok(text) = std::str::from_utf8(data) else { return };
     let skin = match Skin::parse("skin.toml", text) {
@@ -109,7 +110,7 @@ pub(super) fn skin(data: &[u8]) {
     }
 }
 
-/// A scenario that is accepted belongs to its skin.
+/// Parses a scenario: an accepted one must belong to its skin.
 pub(super) fn scenario(data: &[u8]) {
     let Ok(text) = std::str::from_utf8(data) else { return };
     match Scenario::parse("scenario.toml", text, &SKIN) {
@@ -120,7 +121,7 @@ pub(super) fn scenario(data: &[u8]) {
     }
 }
 
-/// A robot whose chains are accepted is written as a skin that is accepted.
+/// Parses a robot: if its chains are accepted, the skin written from it must be accepted too.
 pub(super) fn urdf(data: &[u8]) {
     let Ok(text) = std::str::from_utf8(data) else { return };
     let Ok(urdf) = Urdf::parse("robot.urdf", text) else { return };
@@ -133,7 +134,7 @@ pub(super) fn urdf(data: &[u8]) {
     }
 }
 
-/// A mesh of any kind, by the first byte.
+/// Reads a mesh of any kind, selected by the first byte.
 pub(super) fn mesh(data: &[u8]) {
     let Some((kind, bytes)) = data.split_first() else { return };
     let name = ["mesh.stl", "mesh.dae", "mesh.obj"].get(usize::from(kind % 3)).copied().unwrap_or_default();

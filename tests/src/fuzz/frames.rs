@@ -1,4 +1,4 @@
-//! What stands on a bus: packets, segments, serial lines, the readers of traffic.
+//! Fuzz targets for the traffic of a bus: packets, segments, serial lines, the readers of traffic.
 
 use std::fmt::Write as _;
 
@@ -22,7 +22,7 @@ use vcan_setup::hosts::message;
 
 use super::{frame, packet as any_packet};
 
-/// What is read as a packet is written as the same bytes, and what is read as a message as the same packet.
+/// Decodes a packet: encoding it must give the same bytes, and encoding its message the same packet.
 pub(super) fn packet(data: &[u8]) {
     let Some((id, bytes)) = data.split_first_chunk() else { return };
     let id = Id::from_bits(u16::from_le_bytes(*id) & 0x7FF);
@@ -42,7 +42,7 @@ pub(super) fn packet(data: &[u8]) {
     }
 }
 
-/// A complete packet is one of those that were sent, and no segment is kept for ever.
+/// Reassembles segments: a complete packet must be one of those that were sent, and no segment may be kept for ever.
 pub(super) fn reassembly(data: &[u8]) {
     let _ = reassemble(&mut Unstructured::new(data));
 }
@@ -82,7 +82,8 @@ fn reassemble(from: &mut Unstructured<'_>) -> Result<()> {
     Ok(())
 }
 
-/// A frame that a line says is written as a line that says the same frame; all bytes are counted.
+/// Decodes serial lines: the frame of a line must be written as a line with the same frame, and all bytes must be
+/// counted.
 pub(super) fn slcan(data: &[u8]) {
     let mut decoder = Decoder::new();
     for &byte in data {
@@ -103,7 +104,7 @@ pub(super) fn slcan(data: &[u8]) {
     }
 }
 
-/// Messages of two hosts: all their frames are accounted for, whatever they say of themselves.
+/// Receives messages of two hosts: all their frames must be accounted for, whatever the messages state.
 pub(super) fn hosts(data: &[u8]) {
     let mut from = Unstructured::new(data);
     let (mut incoming, mut frames, mut bytes) = (Incoming::default(), Vec::new(), Vec::new());
@@ -130,7 +131,7 @@ pub(super) fn hosts(data: &[u8]) {
     let left = incoming.waiting().len();
     incoming.sent(left);
     for (_, it, _) in incoming.accounts() {
-        // What a host says may be more than can be counted.
+        // A host may state numbers whose sum overflows.
         let parts: u128 = [it.before, it.dropped_there, it.lost, it.taken].map(u128::from).iter().sum();
         assert_eq!(u128::from(it.numbered), parts.min(u64::MAX.into()));
         assert!(it.taken >= it.sent + it.dropped_here + it.refused);
@@ -144,15 +145,15 @@ fn again(frame: &protocol::can::Frame) {
     assert_eq!(lines.len(), 1, "{text:?}");
     let [Line::Frame(read)] = lines[..] else { panic!("{lines:?}") };
     let said = |it: &protocol::can::Frame| (it.id(), it.is_extended(), it.is_remote(), it.format());
-    // A sender may set bits above those of an identifier; a line has no place for them.
+    // A sender may set bits above those of an identifier, which a line cannot hold.
     assert_eq!(said(&read), said(frame));
-    // A DLC stands for a length that FD has: what is behind the data is zeros.
+    // A DLC stands for a length of FD: the bytes after the data are zeros.
     let (data, rest) = read.data().split_at_checked(frame.data().len()).unwrap();
     assert!(data == frame.data() && rest.iter().all(|&byte| byte == 0), "{read:?}");
     assert_eq!(read.data().len(), fd_len(frame.data().len()));
 }
 
-/// Some frames with their times and buses.
+/// Generates frames with their times and buses.
 fn traffic(
     from: &mut Unstructured<'_>,
     mut take: impl FnMut(&'static str, u64, protocol::can::Frame),
@@ -160,7 +161,7 @@ fn traffic(
     let mut now = 1_700_000_000_000_000_000_u64;
     while !from.is_empty() {
         let step = from.arbitrary::<u32>()?;
-        // Now and then backwards, or a long time.
+        // Occasionally backwards, or by a long time.
         now = if from.ratio(1, 16)? {
             now.wrapping_sub(u64::from(step) << 8)
         } else {
@@ -172,7 +173,7 @@ fn traffic(
     Ok(())
 }
 
-/// Every frame comes out of the decoder once, in order, with a text and as JSON.
+/// Decodes traffic: every frame must come out once, in order, as text and as JSON.
 pub(super) fn decoder(data: &[u8]) {
     let mut settler = Settler::new(None);
     let (mut sent, mut came) = (0_u64, 0_u64);
@@ -202,7 +203,7 @@ pub(super) fn decoder(data: &[u8]) {
     assert_eq!(stats.report().frames, sent);
 }
 
-/// The model of a bus ends, whatever traffic it is given, and each frame has one place in it.
+/// Runs the model of a bus: it must end for any traffic, and contain each frame exactly once.
 pub(super) fn shadow(data: &[u8]) {
     let options = Options { each_frame: true, ..Options::new(BitRates::new(1_000_000, 5_000_000).unwrap()) };
     let mut shadow = Shadow::new(options).unwrap();

@@ -1,5 +1,5 @@
-//! Fuzz targets: each takes any bytes and panics when what they lead to is wrong. `tests/fuzz/run` searches with libFuzzer;
-//! `tests/tests/fuzz_seeds.rs` runs the seeds of `tests/fuzz/seeds`, and changes of them, in every test run.
+//! Fuzz targets: each takes any bytes, and panics if an invariant is broken. `tests/fuzz/run` searches with libFuzzer;
+//! `tests/tests/fuzz_seeds.rs` runs the seeds of `tests/fuzz/seeds`, and variations of them, in every test run.
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
@@ -17,10 +17,10 @@ use protocol::can::{Format, Frame};
 use protocol::id::Id;
 use protocol::packet::{Epoch, Lengths, MAX_WORDS, Packet, Words};
 
-/// What takes any bytes.
+/// A function that takes any bytes.
 pub type Target = fn(&[u8]);
 
-/// All targets by name: the folder of their seeds.
+/// All targets by name, which is also the folder of their seeds.
 pub const TARGETS: &[(&str, Target)] = &[
     ("packet", frames::packet),
     ("reassembly", frames::reassembly),
@@ -44,7 +44,7 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("tree", cells::tree),
 ];
 
-/// Any frame: mostly of an identifier of 11 bits, now and then a whole packet with a right CRC.
+/// Returns any frame: mostly with an identifier of 11 bits, sometimes a whole packet with a correct CRC.
 fn frame(from: &mut Unstructured<'_>) -> Result<Frame> {
     let kind = from.int_in_range(0..=15_u8)?;
     let format = if from.arbitrary()? { Format::Fd } else { Format::Classic };
@@ -65,7 +65,7 @@ fn frame(from: &mut Unstructured<'_>) -> Result<Frame> {
     Ok(frame.unwrap_or_else(|_| fallback()))
 }
 
-/// Any packet with a right CRC.
+/// Returns any packet with a correct CRC.
 fn packet(from: &mut Unstructured<'_>) -> Result<Packet> {
     let id = Id::from_bits(from.arbitrary::<u16>()? & 0x7FF);
     let lengths: Vec<_> = Lengths::of(id).iter().collect();

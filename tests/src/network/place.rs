@@ -1,4 +1,4 @@
-//! One cell, and what it computes with.
+//! One cell of a wiring, and its parameters.
 
 use std::collections::{HashMap, VecDeque};
 
@@ -19,25 +19,25 @@ use super::{End, positions};
 use crate::life::Life;
 use protocol::packet::padded;
 
-/// What comes in to a cell.
+/// An input of a cell.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Inlet {
     Frame(Frame),
     Port(usize, PortMessage),
 }
 
-/// One cell.
+/// A cell of a wiring.
 #[derive(Debug)]
 pub struct Place {
     /// Its node id, once it has one; kept over restarts as in flash.
     pub node_id: Option<CellId>,
-    /// What its ports lead to.
+    /// The far ends of its ports.
     pub wires: [Option<End>; PORTS + 1],
-    /// Port p receives nothing.
+    /// True for ports that receive nothing.
     pub deaf: [bool; PORTS + 1],
-    /// The last page of its place in the tree.
+    /// The last page on its place in the tree.
     pub tree: Option<Tree>,
-    /// The last page of its ports.
+    /// The last page on its ports.
     pub ports: Option<Ports>,
     /// Its own torque, as it enters sums.
     pub(super) own: [i32; MAX_JOINTS],
@@ -46,7 +46,7 @@ pub struct Place {
     pub(super) force: Force,
     pub(super) life: Life<(Micros, Inlet)>,
     pub(super) wake: Option<Micros>,
-    /// Deferred frames, which do not wake it, and when they were on the bus.
+    /// Deferred frames, which do not wake it, with their times on the bus.
     pub(super) deferred: VecDeque<(Micros, Frame)>,
     pub(super) newest: Micros,
     /// Its sums in each of the last epochs: words, and the cells in them.

@@ -14,11 +14,11 @@ use super::place::Inlet;
 use super::{End, Event, Wiring};
 
 impl Wiring {
-    /// A cell sends a sum: finds the cells in it, and its receivers.
+    /// Handles a sum of a cell: finds the cells in it, and its receivers.
     pub(super) fn hear_sum(&mut self, cell: usize, from: CellId, epoch: Epoch, words: Words) {
         let cells = self.decode(cell, epoch, words);
         let said = &mut self.cells[cell].said;
-        // A cell that hung goes on with what was said long before.
+        // A cell that hung continues with sums from long before.
         if said.len() > 64 {
             said.retain(|of, _| Epoch(*of).since(epoch) >= -48);
         }
@@ -69,7 +69,7 @@ impl Wiring {
         }
     }
 
-    /// Which cells are in a sum: its own torque or not, and some of the sums that its neighbours said.
+    /// Returns the cells in a sum: its own torque or not, and some of its neighbours' sums.
     fn decode(&self, cell: usize, epoch: Epoch, words: Words) -> u128 {
         let place = &self.cells[cell];
         let mut heard: Vec<Vec<(Words, u128)>> = Vec::new();
@@ -88,7 +88,7 @@ impl Wiring {
             let sum = if own == 1 { place.own } else { [0; MAX_JOINTS] };
             choose(&heard, sum, own, u128::from(own) << cell, (&expected, words.count.into()), &mut found);
         }
-        // The end of a contact: zeros of its own, and no torque.
+        // The end of a contact: its own torque is zeros, and there is no other torque.
         if words.is_end() {
             return 0;
         }
@@ -104,7 +104,7 @@ impl Wiring {
     }
 }
 
-/// Instead of the cells in a sum: one of them is in it twice.
+/// The result for a sum that contains a cell twice.
 const TWICE: u128 = u128::MAX;
 
 fn frame_id(from: CellId) -> protocol::id::Id {
@@ -132,7 +132,7 @@ fn choose(
         for (sum, word) in with.iter_mut().zip(words.torque) {
             *sum += i32::from(word.to_bits());
         }
-        // Where a cell is in it twice, all the bits are set that nobody has.
+        // All bits are set if a cell is in the sum twice.
         let both = if cells & of == 0 { cells | of } else { TWICE };
         choose(rest, with, count + u32::from(words.count), both, expected, found);
     }

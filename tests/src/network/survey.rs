@@ -1,4 +1,4 @@
-//! The actual state of the cells and their wires, and what they report.
+//! The actual state of the cells and their wires, and the state that they report.
 
 use std::collections::BTreeSet;
 
@@ -8,20 +8,20 @@ use super::{End, Wiring};
 use crate::life::Life;
 
 impl Wiring {
-    /// Whether a cell works.
+    /// Returns true if a cell works.
     #[must_use]
     pub fn runs(&self, cell: usize) -> bool {
         self.cells[cell].life.runs()
     }
 
-    /// Whether a cell is woken by its children and not by joints.
+    /// Returns true if a cell is woken by its children and not by joints.
     #[must_use]
     pub fn waits_for_children(&self, cell: usize) -> bool {
         let joints = Id::command(Command::Joints);
         matches!(&self.cells[cell].life, Life::Runs(node) if node.defers(joints))
     }
 
-    /// Cells with a route to the gateway, by wires that work in both directions and cells that run.
+    /// Returns the cells with a route to the gateway, over wires that work in both directions and running cells.
     #[must_use]
     pub fn reachable(&self) -> BTreeSet<usize> {
         let mut reached = BTreeSet::new();
@@ -42,7 +42,7 @@ impl Wiring {
         reached
     }
 
-    /// The route of a cell's sums to a root, by the cells' reports; `None` without one, or in a circle.
+    /// Returns the route of a cell's sums to a root, by the cells' reports, or `None` if there is no route or a circle.
     #[must_use]
     pub fn route(&self, cell: usize) -> Option<Vec<usize>> {
         let mut route = vec![cell];
@@ -64,7 +64,7 @@ impl Wiring {
         }
     }
 
-    /// All routes, as text.
+    /// Returns all routes, as text.
     #[must_use]
     pub fn routes(&self) -> String {
         let route = |cell: usize| {
@@ -75,7 +75,7 @@ impl Wiring {
         (0..self.cells.len()).map(route).collect::<Vec<_>>().join("; ")
     }
 
-    /// The bits of some cells.
+    /// Returns the bits of some cells.
     #[must_use]
     pub fn bits(cells: &BTreeSet<usize>) -> u128 {
         cells.iter().map(|cell| 1 << cell).sum()

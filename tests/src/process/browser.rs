@@ -1,4 +1,4 @@
-//! A headless Chromium, driven by the DevTools protocol.
+//! A headless Chromium, controlled by the DevTools protocol.
 #![allow(
     dead_code,
     clippy::unwrap_used,
@@ -25,11 +25,11 @@ pub struct Browser {
     _profile: TempDir,
     socket: WebSocket<TcpStream>,
     number: u64,
-    /// What the browser has reported.
+    /// The events that the browser has reported.
     pub events: Vec<Value>,
 }
 
-/// The browser's process, which ends with this.
+/// The browser's process, which ends when this is dropped.
 struct Process(Child);
 
 impl Drop for Process {
@@ -40,7 +40,7 @@ impl Drop for Process {
 }
 
 impl Browser {
-    /// An empty page of this size.
+    /// Opens an empty page of this size.
     pub fn new(width: u32, height: u32) -> Self {
         let profile = TempDir::new().unwrap();
         let mut child = Command::new("chromium")
@@ -60,12 +60,12 @@ impl Browser {
             .spawn()
             .expect("chromium is missing: tests/tools/install makes it ready");
         let stderr = child.stderr.take().unwrap();
-        // From here on it ends, whatever fails.
+        // From here on the process ends with this value, whatever fails.
         let process = Process(child);
         let mut lines = BufReader::new(stderr).lines();
         let said = lines
             .find_map(|line| line.unwrap().strip_prefix("DevTools listening on ws://").map(str::to_owned));
-        // Whatever it says later must not fill the pipe.
+        // Its further output must not fill the pipe.
         std::thread::spawn(move || lines.for_each(drop));
         let address = said.expect("the browser ended").split('/').next().unwrap().to_owned();
         let socket = connect(&page(&address));
@@ -84,7 +84,7 @@ impl Browser {
         self.call("Emulation.setDeviceMetricsOverride", &metrics);
     }
 
-    /// Light or dark.
+    /// Selects the light or the dark scheme.
     pub fn scheme(&mut self, scheme: &str) {
         let feature = json!({ "features": [{ "name": "prefers-color-scheme", "value": scheme }] });
         self.call("Emulation.setEmulatedMedia", &feature);
@@ -94,7 +94,7 @@ impl Browser {
         self.call("Page.navigate", &json!({ "url": url }));
     }
 
-    /// Calls a method, and gives its result.
+    /// Calls a method, and returns its result.
     pub fn call(&mut self, method: &str, parameters: &Value) -> Value {
         self.number += 1;
         let message = json!({ "id": self.number, "method": method, "params": parameters });
@@ -110,7 +110,7 @@ impl Browser {
         }
     }
 
-    /// What an expression is.
+    /// Returns the value of an expression.
     pub fn value(&mut self, expression: &str) -> Value {
         let result =
             self.call("Runtime.evaluate", &json!({ "expression": expression, "returnByValue": true }));
@@ -118,7 +118,7 @@ impl Browser {
         result["result"]["value"].clone()
     }
 
-    /// Waits until an expression is true or something else than nothing, and gives it.
+    /// Waits until an expression is true or has a value, and returns it.
     pub fn until(&mut self, expression: &str) -> Value {
         let give_up = Instant::now() + TIMEOUT;
         loop {
@@ -126,12 +126,12 @@ impl Browser {
             if !value.is_null() && value != false {
                 return value;
             }
-            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {expression}");
+            assert!(Instant::now() < give_up, "not true after {TIMEOUT:?}: {expression}");
             std::thread::sleep(Duration::from_millis(50));
         }
     }
 
-    /// The left button of the mouse.
+    /// Moves, presses or releases the left button of the mouse.
     pub fn mouse(&mut self, kind: &str, [x, y]: [f64; 2]) {
         let buttons = i32::from(kind != "mouseReleased");
         let event =
@@ -143,7 +143,7 @@ impl Browser {
         self.call("Input.dispatchKeyEvent", &json!({ "type": kind, "key": key }));
     }
 
-    /// Exceptions and messages of the page, among them what its policy has refused.
+    /// Returns exceptions and messages of the page, including violations of its policy.
     pub fn complaints(&self) -> Vec<&Value> {
         let is_one = |event: &&Value| {
             event["method"] == "Runtime.exceptionThrown" || event["method"] == "Log.entryAdded"
@@ -151,7 +151,7 @@ impl Browser {
         self.events.iter().filter(is_one).collect()
     }
 
-    /// What the page asked for.
+    /// Returns the URLs that the page requested.
     pub fn requests(&self) -> Vec<&str> {
         let sent = self.events.iter().filter(|event| event["method"] == "Network.requestWillBeSent");
         sent.filter_map(|event| event["params"]["request"]["url"].as_str()).collect()
@@ -165,12 +165,12 @@ fn connect(url: &str) -> WebSocket<TcpStream> {
     client(request, stream).unwrap().0
 }
 
-/// The address of the browser's only page.
+/// Returns the address of the browser's only page.
 fn page(address: &str) -> String {
     let mut stream = TcpStream::connect(address).unwrap();
     stream.set_read_timeout(Some(TIMEOUT)).unwrap();
     write!(stream, "GET /json HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
-    // The connection stays open behind the answer.
+    // The connection stays open after the answer.
     let (mut answer, mut piece) = (Vec::new(), [0; 4096]);
     let pages: Value = loop {
         let read = stream.read(&mut piece).unwrap();

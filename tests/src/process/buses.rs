@@ -1,9 +1,9 @@
-//! Benches of several buses, of which some carry CAN FD and some classic frames.
+//! Benches with several buses, some of them with CAN FD and some with classic frames.
 
 use protocol::can::Format;
 use protocol::candump::{Line, parse};
 
-/// The same skin, with classic frames on these buses.
+/// Returns the skin with classic frames on these buses.
 pub fn mixed_skin(skin: &str, classic: &[&str]) -> String {
     let mut text = skin.to_owned();
     for bus in classic {
@@ -15,7 +15,7 @@ pub fn mixed_skin(skin: &str, classic: &[&str]) -> String {
     text
 }
 
-/// Whether a log has torques of a bus, in frames of its format and no others.
+/// Returns true if a log has torques of a bus, in frames of its format only.
 pub fn carries(log: &str, bus: &str, format: Format) -> bool {
     let frames = log.lines().filter_map(|line| match parse(line) {
         Ok(Line::Frame(record)) if record.interface == bus => Some(record.frame),

@@ -1,4 +1,4 @@
-//! What a recorded log shows of its run.
+//! A recorded log, as messages and torques with their causes.
 
 use std::collections::BTreeMap;
 
@@ -14,11 +14,11 @@ use protocol::time::Micros;
 /// A whole log.
 pub struct Log {
     pub frames: Vec<Frame>,
-    /// What could be decoded, in the bus' order, with its packet.
+    /// The decoded messages in the bus' order, each with its packet.
     pub messages: Vec<(Message, Packet)>,
 }
 
-/// What a torque is a function of, beside the cell's parameters: its node id, the joints, and its contact state.
+/// The cause of a torque, in addition to the cell's parameters: its node id, the joints, and its contact state.
 pub type Cause = (u8, [i16; MAX_JOINTS], [i16; 6]);
 
 impl Log {
@@ -50,8 +50,8 @@ impl Log {
         Self { messages: messages.collect(), frames }
     }
 
-    /// What each sender has sent, in its order; of heartbeats, which are periodic and not caused by events, only
-    /// what they report of a new cell.
+    /// Returns the messages of each sender, in order. Heartbeats are periodic and not caused by events, so only their
+    /// information on a new cell is included.
     pub fn by_sender(&self) -> BTreeMap<(Kind, u8, u8), Vec<String>> {
         let mut all = BTreeMap::<_, Vec<String>>::new();
         for (message, packet) in &self.messages {
@@ -59,7 +59,7 @@ impl Log {
                 Message::Network { page: NetworkPage::Heartbeat(heartbeat), .. } => {
                     format!("{:?}", Heartbeat { sent: 0, ..*heartbeat })
                 }
-                // The epoch of these is that of the joints before them, which depends on time.
+                // The epoch of these messages is that of the joints before them, which depends on time.
                 Message::Network { page, .. } => format!("{page:?}"),
                 Message::Sensors { page, .. } => format!("{page:?}"),
                 other => format!("{other:?}"),
@@ -74,8 +74,8 @@ impl Log {
         all
     }
 
-    /// Checks that each heartbeat counts exactly the packets of its cell before it in the log, which
-    /// begins before the cells do.
+    /// Checks that each heartbeat counts exactly the packets of its cell before it in the log, which begins before the
+    /// cells do.
     pub fn heartbeats_count_what_came(&self) {
         let mut sent = BTreeMap::<u8, u16>::new();
         for (message, packet) in &self.messages {
@@ -91,7 +91,7 @@ impl Log {
         assert!(!sent.is_empty());
     }
 
-    /// Each broadcast's words.
+    /// Returns each broadcast's words.
     pub fn joints(&self) -> Vec<[i16; MAX_JOINTS]> {
         let joints = self.messages.iter().filter_map(|(message, _)| match message {
             Message::Joints { joints, .. } => Some(joints.positions.map(Q::to_bits)),
@@ -100,14 +100,14 @@ impl Log {
         joints.collect()
     }
 
-    /// How many torques of a cell are after the message at an index.
+    /// Returns the number of a cell's torques after the message at an index.
     pub fn torques_after(&self, index: usize, cell: u8) -> usize {
         let torque =
             |message: &Message| matches!(message, Message::Torque { from, .. } if from.get() == cell);
         self.messages.iter().skip(index).filter(|(message, _)| torque(message)).count()
     }
 
-    /// Every torque with its cause and the number of the broadcast that it answers.
+    /// Returns every torque with its cause and the number of the broadcast that it answers.
     pub fn torques(&self) -> Vec<(usize, Cause, Packet)> {
         let mut contact_state: BTreeMap<u8, ContactState> = BTreeMap::new();
         let mut causes: BTreeMap<(u8, u8), (usize, Cause)> = BTreeMap::new();
@@ -144,7 +144,7 @@ fn words(skin: &SkinSensors) -> [i16; 6] {
     [a.to_bits(), b.to_bits(), c.to_bits(), proximity.to_bits(), d.to_bits(), e.to_bits()]
 }
 
-/// The contact state of a cell, by the protocol's rules, as the document has them.
+/// The contact state of a cell, by the rules of the protocol document.
 #[derive(Default)]
 struct ContactState {
     waiting: Vec<(From, SkinSensors)>,
@@ -167,8 +167,8 @@ impl ContactState {
     }
 }
 
-/// Checks that the same causes have the same torques in both runs, bit for bit, and that the same causes at the
-/// same broadcast have the same packets; returns how many causes they share, and how many the smaller has.
+/// Checks that equal causes have equal torques in both runs, bit for bit, and equal packets at the same broadcast.
+/// Returns the number of shared causes, and the number of causes in the smaller run.
 pub fn same_torques(one: &Log, other: &Log) -> (usize, usize) {
     let [one, other] = [one, other].map(Log::torques);
     let mut by_cause: BTreeMap<Cause, [i16; MAX_JOINTS]> = BTreeMap::new();

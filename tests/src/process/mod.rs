@@ -1,7 +1,7 @@
-//! A bench of real processes on a bus of its own, embedded or a real kernel's: what all tests of this kind share.
+//! Benches of real processes on a bus of their own, embedded or in a real kernel: the common parts of these tests.
 //!
-//! Nothing here waits for a fixed time: conditions are polled until they hold, or until [`TIMEOUT`]
-//! is over, which a slow machine never needs and a hanging program does.
+//! These tests do not wait for a fixed time: conditions are polled until they hold, or until [`TIMEOUT`] is over, which
+//! a slow machine never reaches and a hanging program does.
 #![allow(
     missing_docs,
     missing_debug_implementations,
@@ -49,10 +49,11 @@ pub use place::Place;
 pub use running::{Ended, Running};
 pub use summary::Summary;
 
-/// How long anything may take that should happen at once.
+/// The time limit for operations that should finish at once.
 pub const TIMEOUT: Duration = Duration::from_secs(60);
 
-/// Every cell is pressed, harder and softer, while the arm stands; longer than any machine needs for a test.
+/// A scenario that presses every cell, harder and softer, while the arm stands still; it lasts longer than any machine
+/// needs for a test.
 pub const PRESSED: &str = r#"version = 1
 duration_s = 600.0
 
@@ -72,14 +73,14 @@ force_n = 1.5
 profile = "step"
 "#;
 
-/// Polls until something is there.
+/// Polls until `look` returns a value.
 pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
     let give_up = Instant::now() + TIMEOUT;
     loop {
         if let Some(found) = look() {
             return found;
         }
-        assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
+        assert!(Instant::now() < give_up, "not there after {TIMEOUT:?}: {what}");
         std::thread::sleep(Duration::from_millis(5));
     }
 }
@@ -89,7 +90,8 @@ pub fn until<T>(what: &str, mut look: impl FnMut() -> Option<T>) -> T {
 ///
 /// # Panics
 ///
-/// If it is missing, or older than a source that it was built from; the message names the command that builds it.
+/// Panics if it is missing, or older than a source that it was built from; the message names the command that builds
+/// it.
 pub fn program(name: &str) -> PathBuf {
     static CHECKED: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
     let named = std::env::var_os("SKINBUS_PROGRAMS").map(PathBuf::from);
@@ -105,9 +107,9 @@ pub fn program(name: &str) -> PathBuf {
         Some(profile) => format!("cargo build --workspace --profile {profile}"),
     };
     let built = fs::metadata(&path).and_then(|metadata| metadata.modified());
-    let built = built.unwrap_or_else(|error| panic!("{}: {error}; `{build}` makes it", path.display()));
+    let built = built.unwrap_or_else(|error| panic!("{}: {error}; build it with `{build}`", path.display()));
     if let Some(newer) = sources(&path).into_iter().find(|source| is_newer(source, built)) {
-        panic!("{} is older than {}; `{build}` makes it again", path.display(), newer.display());
+        panic!("{} is older than {}; build it again with `{build}`", path.display(), newer.display());
     }
     if let Ok(mut checked) = CHECKED.lock() {
         checked.insert(path.clone());
@@ -115,11 +117,11 @@ pub fn program(name: &str) -> PathBuf {
     path
 }
 
-/// The files that cargo says a program was built from.
+/// Returns the files that a program was built from, according to cargo.
 fn sources(program: &Path) -> Vec<PathBuf> {
     let rule = fs::read_to_string(program.with_extension("d")).unwrap_or_default();
     let (_, sources) = rule.trim_end().split_once(": ").unwrap_or_default();
-    // A blank within a name is escaped.
+    // A space within a name is escaped.
     let names = sources.replace("\\ ", "\0");
     names.split(' ').filter(|name| !name.is_empty()).map(|name| name.replace('\0', " ").into()).collect()
 }
@@ -128,17 +130,17 @@ fn is_newer(source: &Path, than: SystemTime) -> bool {
     fs::metadata(source).and_then(|metadata| metadata.modified()).is_ok_and(|changed| changed > than)
 }
 
-/// An example of the gateway's.
+/// Returns the path of one of the gateway's examples.
 pub fn example(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../gateway/examples").join(name)
 }
 
-/// A skin's text: some cells on an arm, on one bus.
+/// Returns a skin's text: a number of cells on an arm, on one bus.
 pub fn skin(cells: usize) -> String {
     generate(&Target { cells, ..Target::default() }).unwrap()
 }
 
-/// Some cells over some buses in another format.
+/// Returns a skin's text: a number of cells on several buses, with a given format.
 pub fn skin_of(cells: usize, buses: usize, format: Format) -> String {
     generate(&Target { cells, buses, format, ..Target::default() }).unwrap()
 }
@@ -150,7 +152,7 @@ pub fn names(folder: &Path) -> Vec<String> {
     names
 }
 
-/// Whether a process is stopped.
+/// Returns true if a process is stopped.
 pub fn is_stopped(pid: Pid) -> bool {
     fs::read_to_string(proc(pid, "stat")).is_ok_and(|stat| stat.contains(") T "))
 }
@@ -159,12 +161,12 @@ pub fn signal(pid: Pid, signal: Signal) {
     kill_process(pid, signal).unwrap();
 }
 
-/// Whether a bench has reported of a cell, alone or with others, that it has done something.
+/// Returns true if a bench has reported an event of a cell, alone or with others.
 pub fn tells(text: &str, cell: u8, what: &str) -> bool {
     tells_on(text, "vcan0", cell, what)
 }
 
-/// The same on another bus.
+/// The same for another bus.
 pub fn tells_on(text: &str, bus: &str, cell: u8, what: &str) -> bool {
     let on_bus = format!(" on {bus} ha");
     let names = |line: &str| {

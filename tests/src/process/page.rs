@@ -9,7 +9,7 @@ use tungstenite::{Error, Message, WebSocket, client};
 
 use super::{Place, Running, TIMEOUT, skin, until};
 
-/// Nothing happens by itself; the arm gives way.
+/// A scenario without events; the arm gives way.
 pub const QUIET: &str = "version = 1\nduration_s = 600.0\n\n[motion]\nkind = \"kinesthetic\"\n\
                      start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n";
 
@@ -28,12 +28,12 @@ pub struct Snapshot {
     pub cells: Vec<(u8, u8, u16)>,
 }
 
-/// Where a page is.
+/// The address of a page.
 #[derive(Clone, Debug)]
 pub struct Address {
     /// `127.0.0.1:8100`.
     pub host: String,
-    /// `?token=...`, or nothing.
+    /// `?token=...`, or empty.
     pub query: String,
 }
 
@@ -50,7 +50,7 @@ impl Address {
     }
 }
 
-/// Where the server of a run or a view says that it is.
+/// Returns the address that the server of a run or a view reports.
 pub fn address(served: &Running) -> Address {
     served.hears("view: http://");
     let said = || {
@@ -61,7 +61,7 @@ pub fn address(served: &Running) -> Address {
     Address::parse(&until("the whole address", said))
 }
 
-/// Asks to be a page, with these headers more or other ones.
+/// Requests a WebSocket, with additional or different headers.
 pub fn ask(
     Address { host, query }: &Address,
     headers: &[(&'static str, &str)],
@@ -84,7 +84,7 @@ impl Page {
         Self::attempt(address).unwrap()
     }
 
-    /// A page, unless it is refused.
+    /// Opens a page, unless it is refused.
     pub fn attempt(address: &Address) -> Result<Self, Error> {
         let (mut socket, _) = ask(address, &[("Origin", &format!("http://{}", address.host))])?;
         let scene = serde_json::from_str(socket.read()?.to_text()?).unwrap();
@@ -104,12 +104,12 @@ impl Page {
         self.say(&format!(r#"{{"do":"bench",{command}}}"#));
     }
 
-    /// Does something to the process of a cell on the first bus.
+    /// Sends an action on the process of a cell on the first bus.
     pub fn act(&mut self, action: &str, node: u8) {
         self.command(&format!(r#""on":"process","action":"{action}","bus":0,"node":{node}"#));
     }
 
-    /// Waits for the answer to a command: whether it was carried out, and its text.
+    /// Waits for the answer to a command with this text; returns true if the command was carried out.
     pub fn answer(&mut self, text: &str) -> bool {
         let is_it = |answer: &&Value| answer["text"].as_str().unwrap().contains(text);
         let answers = |said: &Value| said["bench"]["answers"].as_array().cloned().unwrap_or_default();
@@ -117,12 +117,12 @@ impl Page {
         answers(&said).iter().rfind(is_it).unwrap()["done"].as_bool().unwrap()
     }
 
-    /// Waits for a snapshot at which this holds.
+    /// Waits for a snapshot for which a condition holds.
     pub fn sees(&mut self, what: &str, mut is: impl FnMut(&Snapshot) -> bool) -> Snapshot {
         let give_up = Instant::now() + TIMEOUT;
         loop {
-            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
-            // What was before a position is no snapshot.
+            assert!(Instant::now() < give_up, "not there after {TIMEOUT:?}: {what}");
+            // The history before a position is not a snapshot.
             if let Message::Binary(bytes) = self.socket.read().unwrap()
                 && bytes[12] == 0
             {
@@ -134,11 +134,11 @@ impl Page {
         }
     }
 
-    /// Waits for words at which this holds.
+    /// Waits for a status message for which a condition holds.
     pub fn hears(&mut self, what: &str, mut is: impl FnMut(&Value) -> bool) -> Value {
         let give_up = Instant::now() + TIMEOUT;
         loop {
-            assert!(Instant::now() < give_up, "waited {TIMEOUT:?} and there is still not: {what}");
+            assert!(Instant::now() < give_up, "not there after {TIMEOUT:?}: {what}");
             if let Message::Text(text) = self.socket.read().unwrap() {
                 let said = serde_json::from_str(text.as_str()).unwrap();
                 if is(&said) {
@@ -167,14 +167,14 @@ impl Snapshot {
     }
 }
 
-/// A run that is watched, and where its page is.
+/// Starts a run with a page, and returns both the run and the page's address.
 pub fn watched(place: &Place, cells: usize, more: &str) -> (Running, Address) {
-    // A busy machine halts no robot.
+    // A busy machine must not halt the robot.
     place.write("skin.toml", &(skin(cells) + "\n[safety]\nbad_cycles = 10000\n"));
     watched_skin(place, more)
 }
 
-/// The same of `skin.toml`.
+/// The same with the existing `skin.toml`.
 pub fn watched_skin(place: &Place, more: &str) -> (Running, Address) {
     place.scenario(QUIET);
     let words = format!(

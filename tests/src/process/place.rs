@@ -1,4 +1,4 @@
-//! Where a test's benches run: a directory of its own.
+//! The directory of a test, in which its benches run.
 
 use std::fs;
 use std::io::Write;
@@ -13,10 +13,10 @@ use tempfile::TempDir;
 use super::running::{Running, all_processes, command_line, proc};
 use super::{PRESSED, Summary, TIMEOUT, names, program, skin};
 
-/// A directory of its own for a test, and in it its embedded buses.
+/// A directory for one test, with its embedded buses.
 pub struct Place {
     directory: TempDir,
-    /// What its benches run on.
+    /// The kind of bus for its benches.
     kind: BusKind,
 }
 
@@ -25,12 +25,12 @@ impl Place {
         Self::on(BusKind::Embedded)
     }
 
-    /// One whose benches run on buses of this kind.
+    /// Creates a directory whose benches run on buses of this kind.
     pub(super) fn on(kind: BusKind) -> Self {
         Self { directory: TempDir::new().unwrap(), kind }
     }
 
-    /// What its benches run on.
+    /// Returns the kind of bus for its benches.
     pub const fn kind(&self) -> BusKind {
         self.kind
     }
@@ -39,7 +39,7 @@ impl Place {
         self.directory.path().join(name)
     }
 
-    /// Where its buses are: `SKINBUS_DIR`.
+    /// Returns the directory of its buses: `SKINBUS_DIR`.
     pub fn buses(&self) -> PathBuf {
         self.path("buses")
     }
@@ -50,8 +50,8 @@ impl Place {
         path
     }
 
-    /// Writes a script that can be run. A process of its own writes it: a child that another test starts meanwhile
-    /// would inherit the open file, and until its `exec` the script is busy (ETXTBSY).
+    /// Writes an executable script. A separate process writes it: a child that another test starts meanwhile would
+    /// inherit the open file, and until its `exec` the script would be busy (ETXTBSY).
     pub fn script(&self, name: &str, text: &str) -> PathBuf {
         let path = self.path(name);
         let mut writer = Command::new("install");
@@ -66,33 +66,33 @@ impl Place {
         fs::read_to_string(self.path(name)).unwrap()
     }
 
-    /// The files in it, in order.
+    /// Returns the names of the files in it, in order.
     pub fn files(&self) -> Vec<String> {
         names(self.directory.path())
     }
 
-    /// `skin.toml`: some cells on an arm, on one bus.
+    /// Writes `skin.toml`: a number of cells on an arm, on one bus.
     pub fn skin(&self, cells: usize) -> PathBuf {
         self.write("skin.toml", &skin(cells))
     }
 
-    /// `scenario.toml`.
+    /// Writes `scenario.toml`.
     pub fn scenario(&self, text: &str) -> PathBuf {
         self.write("scenario.toml", text)
     }
 
-    /// `skin.toml` and `scenario.toml` for a bench of eight cells that are all pressed.
+    /// Writes `skin.toml` and `scenario.toml` for a bench of eight cells that are all pressed.
     pub fn pressed(&self) {
         self.skin(8);
         self.scenario(PRESSED);
     }
 
-    /// A command in this place; words are parted by spaces.
+    /// Returns a command in this directory; spaces separate its arguments.
     pub fn command(&self, name: &str, words: &str) -> Command {
         self.command_of(&program(name), words)
     }
 
-    /// The same of any program. Words such as `SKINBUS_TOKEN=x` go to its environment.
+    /// The same for any program. Words such as `SKINBUS_TOKEN=x` go to its environment.
     pub fn command_of(&self, program: &Path, words: &str) -> Command {
         let mut command = Command::new(program);
         for word in words.split(' ').filter(|word| !word.is_empty()) {
@@ -109,7 +109,7 @@ impl Place {
         Running::start(self.command(name, words))
     }
 
-    /// A bench of `skin.toml` and `scenario.toml` for some seconds, with a log and a summary.
+    /// Starts a bench of `skin.toml` and `scenario.toml` for some seconds, with a log and a summary.
     pub fn bench(&self, seconds: f64, more: &str) -> Running {
         self.start(
             "skinbus",
@@ -121,19 +121,19 @@ impl Place {
         )
     }
 
-    /// The same, once its loop runs.
+    /// Starts the same bench, and waits until its loop runs.
     pub fn running_bench(&self, seconds: f64, more: &str) -> Running {
         let bench = self.bench(seconds, more);
         bench.hears_the_loop();
         bench
     }
 
-    /// What a bench left.
+    /// Returns the summary that a bench has written.
     pub fn summary(&self) -> Summary {
         Summary(serde_json::from_str(&self.read("run.json")).unwrap())
     }
 
-    /// Processes of this place that live, with their command lines.
+    /// Returns the running processes of this directory, with their command lines.
     pub fn processes(&self) -> Vec<(Pid, String)> {
         let mark = format!("SKINBUS_DIR={}", self.buses().display());
         let ours = |pid: &Pid| {
@@ -143,7 +143,7 @@ impl Place {
         all_processes().into_iter().filter(ours).map(|pid| (pid, command_line(pid))).collect()
     }
 
-    /// Checks that soon no process and no socket of this place remains.
+    /// Checks that soon no process and no socket of this directory remains.
     pub fn is_left_clean(&self) {
         let left = || {
             let processes = self.processes();

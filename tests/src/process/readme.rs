@@ -9,11 +9,11 @@ use super::{Ended, Place, Running, program};
 
 /// README.md.
 pub const README: &str = include_str!("../../../README.md");
-/// Programs that `cargo build --release` makes for the user. They are built already, so the build is replaced.
+/// The programs that `cargo build --release` builds for the user. They are built already, so the build is replaced.
 pub const PROGRAMS: [&str; 3] = ["skinbus", "cell-node", "vcan-setup"];
-/// The other programs that the commands may use. Nothing else is found.
+/// The other programs that the commands may use; no others are on the path.
 const TOOLS: [&str; 6] = ["ln", "mkdir", "python3", "sed", "sleep", "tac"];
-/// For all commands; a machine that others use too takes a tenth of it.
+/// The time limit for all commands; a shared machine takes a tenth of it.
 const LIMIT: Duration = Duration::from_secs(900);
 
 /// Returns the fenced blocks, each with its language.
@@ -36,18 +36,18 @@ fn quoted(text: &str) -> String {
     format!("'{}'", text.replace('\'', r"'\''"))
 }
 
-/// Returns true for a command that leaves something behind it that runs.
+/// Returns true for a command that starts a background process.
 fn in_background(command: &str) -> bool {
     let command = command.split(" #").next().unwrap().trim_end();
     command.ends_with(" &") || command.contains(" & ")
 }
 
-/// A script of these commands. It ends with the first one that fails, also in the background, where only `kill` may end
-/// what does not end by itself.
+/// Returns a script of these commands. It ends with the first one that fails, also in the background, where only `kill`
+/// may end processes that do not end by themselves.
 fn script(commands: &[&str]) -> String {
     let programs = PROGRAMS.map(|name| quoted(&program(name).display().to_string())).join(" ");
     let tools = TOOLS.join(" ");
-    // `tests/run` runs this test: here its script is only parsed.
+    // `tests/run` runs this test, so here its script is only parsed.
     let tests_run = quoted(&root().join("tests/run").display().to_string());
     let mut script = format!(
         "set -eu -o pipefail\n\
@@ -61,7 +61,7 @@ fn script(commands: &[&str]) -> String {
          chmod +x tools/* tests/run\n\
          PATH=$PWD/tools background=()\n\
          cargo() {{\n\
-         [ \"$*\" = 'build --release' ] || {{ echo \"cargo $*: not known how to replace\" >&2; return 1; }}\n\
+         [ \"$*\" = 'build --release' ] || {{ echo \"cargo $*: only build --release is replaced\" >&2; return 1; }}\n\
          mkdir -p target/release; ln -s {programs} target/release\n\
          }}\n"
     );
@@ -82,7 +82,7 @@ fn script(commands: &[&str]) -> String {
     script
 }
 
-/// The folder of the workspace.
+/// Returns the folder of the workspace.
 fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap()
 }
@@ -95,7 +95,7 @@ pub fn run(place: &Place, commands: &[&str]) -> Ended {
     Running::start(place.command_of(Path::new("timeout"), &words)).end_after(LIMIT)
 }
 
-/// Returns what was printed by the first command that begins so.
+/// Returns the output of the first command that begins with this text.
 pub fn printed<'a>(ended: &'a Ended, command: &str) -> &'a str {
     let mut all = ended.stdout.split("\n+ ").map(|part| part.strip_prefix("+ ").unwrap_or(part));
     all.find(|part| part.starts_with(command)).unwrap_or_else(|| panic!("{command} was not run"))

@@ -1,4 +1,4 @@
-//! A recording, read by its own definitions and without the code that wrote it.
+//! A recording, decoded by its own definitions and without the code that wrote it.
 #![allow(
     dead_code,
     clippy::unwrap_used,
@@ -19,12 +19,12 @@ use serde_json::{Map, Value, json};
 use crate::process::vcan::{Candump, same_by_sender};
 use crate::process::{PRESSED, Place};
 
-/// One message.
+/// A message of a recording.
 pub struct Message {
     pub topic: String,
-    /// By its header.
+    /// The time in its header.
     pub nanos: u64,
-    /// By the file.
+    /// The time in the file.
     pub log_nanos: u64,
     pub value: Value,
 }
@@ -37,7 +37,7 @@ pub struct Recorded {
 }
 
 impl Recorded {
-    /// Reads a file that has its end.
+    /// Reads a complete file.
     pub fn read(path: &Path) -> Self {
         let name = path.display();
         let bytes = std::fs::read(path).unwrap_or_else(|error| panic!("{name}: {error}"));
@@ -80,18 +80,18 @@ impl Recorded {
         Self { messages, attachments: attachments.collect(), metadata: metadata.collect() }
     }
 
-    /// The messages of a topic.
+    /// Returns the messages of a topic.
     pub fn on<'a>(&'a self, topic: &'a str) -> impl Iterator<Item = &'a Message> {
         self.messages.iter().filter(move |message| message.topic == topic)
     }
 
-    /// The frames of a bus as candump would write them, with 6 digits.
+    /// Returns the frames of a bus in candump's notation, with 6 digits.
     pub fn lines(&self, topic: &str) -> Vec<String> {
         self.on(topic).map(line).collect()
     }
 }
 
-/// A frame as a line, made of the message's fields alone.
+/// Formats a frame as a line, from the message's fields alone.
 fn line(message: &Message) -> String {
     let frame = &message.value;
     let (seconds, micros) = (message.nanos / 1_000_000_000, message.nanos % 1_000_000_000 / 1_000);
@@ -115,7 +115,7 @@ fn line(message: &Message) -> String {
     format!("({seconds}.{micros:06}) {bus} {id}#{body}")
 }
 
-/// The types of a schema, by name; the main one without.
+/// The types of a schema, by name; the main one has an empty name.
 struct Types(BTreeMap<String, Vec<(String, String)>>);
 
 impl Types {
@@ -176,7 +176,7 @@ impl Types {
     }
 }
 
-/// A message's bytes, behind its head.
+/// The bytes of a message, after its head.
 struct From<'a> {
     bytes: &'a [u8],
     at: usize,
@@ -195,7 +195,7 @@ impl<'a> From<'a> {
     }
 }
 
-/// Records a bench of pressed cells, and checks that the recording has exactly the frames that candump has seen.
+/// Records a bench of pressed cells, and checks that the recording has exactly the frames that candump saw.
 pub fn has_what_candump_sees(place: &Place, cells: usize, broadcast_hz: f64, more: &str) {
     let expected = Target { cells, broadcast_hz, ..Target::default() };
     place.write("skin.toml", &generate(&expected).unwrap());

@@ -16,10 +16,10 @@ use serde_json::Value;
 use super::test_client::TestClient;
 use super::{Ended, Place, Running};
 
-/// Fresh cells of the skin of the recording.
+/// The options for new cells with the recording's skin.
 pub const FRESH: &str = "--expect --spawn --skin skin.toml";
 
-/// The arm swings, and touches come and go on several cells at once.
+/// A scenario in which the arm swings, and touches come and go on several cells at once.
 pub const TOUCHED: &str = r#"version = 1
 duration_s = 4.0
 
@@ -62,8 +62,8 @@ pub fn cell(node: i64) -> CellId {
     CellId::new(node).unwrap()
 }
 
-/// What a test client sends while a run is recorded: every command, stimuli of both pages in both ways, parameters that are
-/// read, written, refused and taken into use. It needs 48 broadcasts, a fifth of those in four seconds at 62.5 Hz.
+/// Sends messages while a run is recorded: every command, stimuli of both pages in both ways, and parameters that are
+/// read, written, refused and committed. It needs 48 broadcasts, a fifth of those in four seconds at 62.5 Hz.
 pub fn says_everything(test_client: &TestClient, skin: &Path) {
     let configure = |to, tag, request| Message::Configure { to, tag, request };
     let write = |parameter: Parameter, words| Request::Write { number: parameter.number(), words };
@@ -102,13 +102,13 @@ pub fn says_everything(test_client: &TestClient, skin: &Path) {
 }
 
 impl Place {
-    /// `run.log` and `skin.toml`: a run of some cells with touches and every message.
+    /// Records `run.log` with `skin.toml`: a run of some cells with touches and every message.
     pub fn records(&self, cells: usize) {
         let skin = self.skin(cells);
         self.records_with(&skin);
     }
 
-    /// The same of a given skin.
+    /// The same with a given skin.
     pub fn records_with(&self, skin: &Path) {
         self.scenario(TOUCHED);
         let bench = self.running_bench(4.0, "");
@@ -117,7 +117,7 @@ impl Place {
         self.is_left_clean();
     }
 
-    /// A replay of a capture, with `replay.json`.
+    /// Starts a replay of a capture, with `replay.json`.
     pub fn replay(&self, file: &str, more: &str) -> Running {
         let kind = self.kind();
         self.start(
@@ -126,7 +126,7 @@ impl Place {
         )
     }
 
-    /// The same to its end, which may take so long, with its summary.
+    /// Runs the same replay to its end, and returns its summary.
     pub fn replayed(&self, file: &str, more: &str) -> (Ended, Replayed) {
         let ended = self.replay(file, more).end_after(Duration::from_secs(60));
         let text = std::fs::read_to_string(self.path("replay.json"));
@@ -135,7 +135,7 @@ impl Place {
     }
 }
 
-/// The figures of a replay's end.
+/// The summary of a replay.
 #[derive(Debug)]
 pub struct Replayed(pub Value);
 
@@ -148,33 +148,33 @@ impl Replayed {
         self.0.pointer(pointer).and_then(Value::as_str).unwrap_or_else(|| panic!("{pointer} in {:#}", self.0))
     }
 
-    /// Replies that came back as they were recorded, different ones, missing ones, extra ones.
+    /// Returns the numbers of equal, different, missing and extra replies.
     pub fn replies(&self) -> [u64; 4] {
         ["equal", "different", "missing", "extra"].map(|what| self.number(&format!("/expect/{what}")))
     }
 
-    /// Checks that all replies came back, and nothing else; returns how many.
+    /// Checks that all replies came back, and no others; returns their number.
     pub fn all_came_back(&self, ended: &Ended) -> u64 {
         let [equal, rest @ ..] = self.replies();
         assert_eq!((rest, ended.code()), ([0, 0, 0], Some(0)), "{:#} {ended:#?}", self.0);
         equal
     }
 
-    /// The same at the recording's own times, which a busy machine misses: then missing replies are those to
-    /// joints that came too late.
+    /// The same at the recording's own times, which a busy machine misses: then missing replies are those to joints
+    /// that came too late.
     pub fn all_came_back_in_time(&self, ended: &Ended) -> u64 {
         let late = self.number("/expect/joints_skipped");
         if late == 0 {
             return self.all_came_back(ended);
         }
         let [equal, different, missing, extra] = self.replies();
-        // A contact whose end falls on joints that were skipped ends with the next ones.
+        // A contact whose end falls on skipped joints ends with the next ones.
         assert!(different == 0 && missing <= late && extra <= late, "{:#} {ended:#?}", self.0);
         equal + missing
     }
 }
 
-/// Changes the `nth` packet of a log that satisfies `expected`, with its CRC corrected.
+/// Changes the `nth` packet of a log that satisfies `expected`, and corrects its CRC.
 pub fn changed(
     log: &str,
     nth: usize,
@@ -203,7 +203,7 @@ pub fn changed(
     lines.join("\n") + "\n"
 }
 
-/// A log without some of its packets.
+/// Returns a log without some of its packets.
 pub fn without(log: &str, mut unwanted: impl FnMut(&Message) -> bool) -> String {
     let keeps = |line: &&str| {
         let Ok(Line::Frame(record)) = candump::parse(line) else { return true };
@@ -213,12 +213,12 @@ pub fn without(log: &str, mut unwanted: impl FnMut(&Message) -> bool) -> String 
     log.lines().filter(keeps).map(|line| format!("{line}\n")).collect()
 }
 
-/// Whether a message is a torque of a cell that is pressed.
+/// Returns true for a torque of a pressed cell.
 pub fn is_torque(message: &Message, cell: u8) -> bool {
     matches!(message, Message::Torque { from, torque, .. } if from.get() == cell && !torque.is_zero())
 }
 
-/// The embedded bus and the cells of `skin.toml`, started by hand.
+/// Starts the embedded bus and the cells of `skin.toml` by hand.
 pub fn by_hand(place: &Place, nodes: &str) -> [Running; 2] {
     let server = place.start("vcan-setup", "serve vcan0");
     server.prints("serving vcan0 at ");

@@ -1,4 +1,4 @@
-//! Processes: their output, how they end, and which there are.
+//! Processes: their output, their ends, and the list of all.
 
 use std::fs;
 use std::io::Read;
@@ -20,7 +20,7 @@ pub struct Running {
     err: Output,
 }
 
-/// How a process ended.
+/// The result of a process.
 #[derive(Debug)]
 pub struct Ended {
     pub status: ExitStatus,
@@ -29,12 +29,12 @@ pub struct Ended {
 }
 
 impl Ended {
-    /// Its exit code.
+    /// Returns its exit code.
     pub fn code(&self) -> Option<i32> {
         self.status.code()
     }
 
-    /// The signal that ended it.
+    /// Returns the signal that ended it.
     pub fn signal(&self) -> Option<i32> {
         self.status.signal()
     }
@@ -45,13 +45,13 @@ impl Ended {
         self
     }
 
-    /// The head of the table that a run prints below its verdict.
+    /// Returns the head of the table that a run prints below its verdict.
     pub fn head(&self) -> &str {
         let mut table = self.stdout.lines().skip_while(|line| !line.starts_with('┌'));
         table.nth(1).unwrap_or_else(|| panic!("no table: {self:#?}"))
     }
 
-    /// Checks that it ended with this code and one line, and returns that.
+    /// Checks that it ended with this code and one line, and returns that line.
     pub fn refusal(&self, code: i32) -> &str {
         assert_eq!((self.code(), self.stdout.as_str()), (Some(code), ""), "{self:#?}");
         let line = self.stderr.trim_end_matches('\n');
@@ -82,17 +82,17 @@ impl Running {
         self.err.wait_for(words);
     }
 
-    /// Waits until a bench has reported of a cell that it has done something.
+    /// Waits until a bench has reported an event of a cell.
     pub fn tells(&self, cell: u8, what: &str) {
         self.err.wait_until(what, |text| tells(text, cell, what));
     }
 
-    /// The same on another bus.
+    /// The same for another bus.
     pub fn tells_on(&self, bus: &str, cell: u8, what: &str) {
         self.err.wait_until(what, |text| tells_on(text, bus, cell, what));
     }
 
-    /// Waits until a bench's loop runs: then progress lines come.
+    /// Waits until a bench's loop runs: progress lines then appear.
     pub fn hears_the_loop(&self) {
         self.err.wait_until("progress", |text| text.contains(" s  ") || text.contains("\nstarting\n"));
     }
@@ -102,7 +102,7 @@ impl Running {
         self.out.wait_for(words);
     }
 
-    /// Standard error so far.
+    /// Returns standard error so far.
     pub fn stderr(&self) -> String {
         self.err.text.lock().unwrap().clone()
     }
@@ -112,10 +112,10 @@ impl Running {
         self.end_after(Duration::ZERO)
     }
 
-    /// Waits until it has ended, which takes so long by itself.
+    /// Waits until it has ended; by itself it takes the time `run`.
     pub fn end_after(mut self, run: Duration) -> Ended {
         let give_up = Instant::now() + run + TIMEOUT;
-        // Looking costs an emulated processor 2 % of its time.
+        // Polling costs an emulated processor 2 % of its time.
         let look = Duration::from_millis(if run.is_zero() { 5 } else { 200 });
         let status = loop {
             if let Some(status) = self.child.try_wait().unwrap() {
@@ -127,7 +127,7 @@ impl Running {
         Ended { status, stdout: self.out.whole(), stderr: self.err.whole() }
     }
 
-    /// The processes of its cells, with the node ids of each.
+    /// Returns the processes of its cells, with the node ids of each.
     pub fn cells(&self) -> Vec<(Pid, String)> {
         let mark = format!("--with-parent {}", self.pid().as_raw_nonzero());
         let cell = |pid| {
@@ -139,7 +139,7 @@ impl Running {
         all_processes().into_iter().filter_map(cell).collect()
     }
 
-    /// The process of one cell.
+    /// Returns the process of one cell.
     pub fn cell(&self, node: u8) -> Pid {
         let node = node.to_string();
         let found = self.cells().into_iter().find(|(_, nodes)| *nodes == node);
@@ -154,7 +154,7 @@ impl Drop for Running {
     }
 }
 
-/// One of a process' outputs, read as it comes.
+/// An output of a process, read as it comes.
 struct Output {
     text: Arc<Mutex<String>>,
     reader: Option<JoinHandle<()>>,
@@ -192,7 +192,7 @@ impl Output {
         }
     }
 
-    /// Everything, once the other side has closed it.
+    /// Returns the complete text, once the other end has closed it.
     fn whole(&mut self) -> String {
         let reader = self.reader.take().unwrap();
         until("the end of an output: a process still has it open", || reader.is_finished().then_some(()));

@@ -1,4 +1,4 @@
-//! A server as a process: what the tests of it and those of the commands share.
+//! A server as a process, for the tests of the server and of the commands.
 
 use std::io::{BufRead, BufReader};
 use std::ops::{Deref, DerefMut};

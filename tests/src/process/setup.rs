@@ -1,4 +1,4 @@
-//! Commands as processes, and a sender on their bus: what the tests of commands share.
+//! Commands as processes, and a sender on their bus, for the tests of commands.
 
 use std::process::Command;
 use std::sync::mpsc::{RecvTimeoutError, channel};
@@ -17,7 +17,7 @@ pub struct Said {
 }
 
 impl Said {
-    /// Runs it to its end.
+    /// Runs a command to its end.
     pub fn by(command: &mut Command) -> Self {
         let output = command.output().unwrap();
         let [out, err] = [output.stdout, output.stderr].map(|text| String::from_utf8(text).unwrap());
@@ -25,11 +25,11 @@ impl Said {
     }
 }
 
-/// Does something while frames with these identifiers come on a bus all the time.
+/// Calls `act` while frames with these identifiers are sent on a bus continuously.
 pub fn while_somebody_says<T>(bus: &Bus, ids: &[Id], act: impl FnOnce() -> T) -> T {
     let frames: Vec<_> = ids.iter().map(|id| Frame::fd(id.to_bits().into(), 1, &[0; 16]).unwrap()).collect();
     std::thread::scope(|scope| {
-        // It goes when this is over, also by a panic, for which the scope would else wait without end.
+        // The sender ends when this is dropped, also by a panic; otherwise the scope would wait without end.
         let (_going, over) = channel::<()>();
         scope.spawn(move || {
             loop {

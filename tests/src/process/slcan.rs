@@ -25,7 +25,7 @@ use crate::process::until;
 pub struct Peer {
     file: File,
     decoder: Decoder,
-    /// What came so far.
+    /// All bytes so far.
     pub bytes: Vec<u8>,
     lines: Vec<Line>,
 }
@@ -34,12 +34,12 @@ pub struct Peer {
 pub struct Pty {
     pub peer: Peer,
     pub path: PathBuf,
-    /// Kept open, so that this end can be read before anybody opens it and after.
+    /// Kept open, so that this end can be read before the other one is opened, and after.
     pub slave: OwnedFd,
 }
 
 impl Pty {
-    /// One that passes bytes on as they are.
+    /// Opens a pseudoterminal that passes bytes unchanged.
     pub fn new() -> Self {
         let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC).unwrap();
         grantpt(&master).unwrap();
@@ -54,7 +54,7 @@ impl Pty {
         Self { peer: Peer::new(master), path, slave }
     }
 
-    /// One that is found under this path, whatever was there before.
+    /// Opens a pseudoterminal under this path, which is replaced.
     pub fn under(path: &Path) -> Self {
         let pty = Self::new();
         let _ = std::fs::remove_file(path);
@@ -70,7 +70,7 @@ impl Peer {
         Self { file: File::from(fd), decoder: Decoder::new(), bytes: Vec::new(), lines: Vec::new() }
     }
 
-    /// Reads what is there; whether the line is still open.
+    /// Reads the available bytes; returns true while the line is open.
     pub fn look(&mut self) -> bool {
         let mut buffer = [0; 4_096];
         loop {
@@ -96,13 +96,13 @@ impl Peer {
         });
     }
 
-    /// The frames that came so far.
+    /// Returns the frames so far.
     pub fn frames(&self) -> Vec<Frame> {
         let frame = |line: &Line| if let Line::Frame(frame) = line { Some(*frame) } else { None };
         self.lines.iter().filter_map(frame).collect()
     }
 
-    /// Waits for so many frames.
+    /// Waits for a number of frames.
     pub fn receives(&mut self, count: usize) -> Vec<Frame> {
         until("frames at the line", || {
             self.look();
@@ -132,7 +132,7 @@ impl Peer {
     }
 }
 
-/// Carries what comes at one end to the other one, until that is gone.
+/// Forwards bytes from one end to the other, until the first is closed.
 pub fn carry(from: &Peer, to: &Peer) {
     let (mut from, mut to) = (from.file.try_clone().unwrap(), to.file.try_clone().unwrap());
     std::thread::spawn(move || {

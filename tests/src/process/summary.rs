@@ -1,58 +1,57 @@
-//! The summary that a run leaves.
+//! The summary that a run writes.
 
 use serde_json::Value;
 
-/// The figures of a run's end.
+/// The summary of a run.
 #[derive(Debug)]
 pub struct Summary(pub Value);
 
 impl Summary {
-    /// A number in the first bus: `/replies/due`.
+    /// Returns a number of the first bus: `/replies/due`.
     pub fn of_bus(&self, pointer: &str) -> u64 {
         self.number(&format!("/buses/0{pointer}"))
     }
 
-    /// A number.
+    /// Returns a number.
     pub fn number(&self, pointer: &str) -> u64 {
         self.0.pointer(pointer).and_then(Value::as_u64).unwrap_or_else(|| panic!("{pointer} in {:#}", self.0))
     }
 
-    /// A number that is left out when it is zero.
+    /// Returns a number that is left out when it is zero.
     pub fn count(&self, table: &str, key: &str) -> u64 {
         self.0.pointer(table).unwrap()[key].as_u64().unwrap_or(0)
     }
 
-    /// A number with a fraction.
+    /// Returns a number with a fraction.
     pub fn figure(&self, pointer: &str) -> f64 {
         self.0.pointer(pointer).and_then(Value::as_f64).unwrap_or_else(|| panic!("{pointer} in {:#}", self.0))
     }
 
-    /// The sum of a table of counts.
+    /// Returns the sum of a table of counts.
     pub fn total(&self, table: &str) -> u64 {
         self.0.pointer(table).unwrap().as_object().unwrap().values().map(|it| it.as_u64().unwrap()).sum()
     }
 
-    /// Irregular events on a bus, without torques that came too late: those depend on the machine.
+    /// Returns the number of irregular events on a bus, without late torques: those depend on the machine.
     pub fn odd(&self, bus: usize) -> u64 {
         let table = format!("/buses/{bus}/events");
         self.total(&table) - self.count(&table, "stale torque")
     }
 
-    /// Checks that so many cells had to answer every broadcast, unless on a busy machine some counted as
-    /// dead.
+    /// Checks that this number of cells had to answer every broadcast, unless on a busy machine some counted as dead.
     pub fn all_were_due(&self, cells: u64, stderr: &str) {
         let (due, all) = (self.of_bus("/replies/due"), cells * self.number("/loop/broadcasts"));
         let away = stderr.contains("fallen silent");
         assert!(due == all || (away && due < all && due > 0), "{due} of {all} due: {:#}", self.0);
     }
 
-    /// The cells of the first bus that were silent at the end.
+    /// Returns the cells of the first bus that were silent at the end.
     pub fn silent(&self) -> Vec<u64> {
         let cells = self.0["buses"][0]["silent_cells"].as_array().unwrap();
         cells.iter().map(|cell| cell.as_u64().unwrap()).collect()
     }
 
-    /// Each cell's figures.
+    /// Returns each cell's figures.
     pub fn cells(&self) -> &[Value] {
         self.0["cells"].as_array().unwrap()
     }

@@ -1,4 +1,5 @@
-//! Cells in a grid that answer with sums along their tree, on a bus of either format: complete, with links down, and up again.
+//! Cells in a grid that answer with sums along their tree, on a bus of either format: complete, with links down, and up
+//! again.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,11 +13,11 @@ use super::buses::mixed_skin;
 use super::test_client::TestClient;
 use super::{Ended, PRESSED, Place, Running, TIMEOUT, is_stopped, until};
 
-/// Cells, in rows of four; those at two opposite corners are roots.
+/// The number of cells, in rows of four; the cells at two opposite corners are roots.
 pub const CELLS: u8 = 12;
 pub const ROOTS: [u8; 2] = [1, 12];
 
-/// Where the ports of a cell of the grid lead: left, right, up, down.
+/// Returns the neighbours at the ports of a cell of the grid: left, right, up, down.
 pub fn neighbors(cell: u8) -> [u8; 4] {
     let (row, column) = ((cell - 1) / 4, (cell - 1) % 4);
     [
@@ -27,7 +28,7 @@ pub fn neighbors(cell: u8) -> [u8; 4] {
     ]
 }
 
-/// `skin.toml`: a grid, with a joint rate so low that a busy machine keeps up.
+/// Writes `skin.toml`: a grid, with a joint rate so low that a busy machine keeps up.
 pub fn grid(place: &Place, format: Format) {
     wired(place, format, neighbors);
 }
@@ -63,7 +64,7 @@ pub fn wired(place: &Place, format: Format, neighbors: impl Fn(u8) -> [u8; 4]) {
     place.write("skin.toml", &(lines.join("\n") + "\n"));
 }
 
-/// A bench that records nothing.
+/// Starts a bench that records nothing.
 pub fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
     let words = format!(
         "run skin.toml --bus-kind {} --scenario scenario.toml --duration {seconds} --summary run.json \
@@ -73,10 +74,10 @@ pub fn unrecorded(place: &Place, seconds: f64, more: &str) -> Running {
     place.start("skinbus", &words)
 }
 
-/// Waits until the roots' sums of three epochs in a row hold so many cells.
+/// Waits until the roots' sums of three consecutive epochs hold this number of cells.
 pub fn holds(test_client: &TestClient, expected: u32) {
     let (mut epoch, mut counts, mut row) = (None, BTreeMap::<u8, u8>::new(), 0);
-    // A root that found another route is in another one's sum.
+    // A root that found another route is in another root's sum.
     let mut below = BTreeSet::new();
     test_client.sends(&Message::Report);
     let mut seen = Vec::new();
@@ -107,7 +108,7 @@ pub fn holds(test_client: &TestClient, expected: u32) {
     assert!(whole, "waited {TIMEOUT:?} for sums of {expected} cells; they were of {seen:?}");
 }
 
-/// Waits until, by the cells' reports, each of these has a route to a root over these only.
+/// Waits until, by the cells' reports, each of these has a route to a root over these cells only.
 fn have_ways(test_client: &TestClient, cells: &BTreeSet<u8>) {
     let mut parents = BTreeMap::new();
     let leads = |parents: &BTreeMap<u8, Option<u8>>, cell: u8| {
@@ -125,7 +126,7 @@ fn have_ways(test_client: &TestClient, cells: &BTreeSet<u8>) {
     assert!(all, "waited {TIMEOUT:?} for routes of {cells:?}: {parents:?}");
 }
 
-/// Ends a bench, and checks that all is accounted for.
+/// Ends a bench, and checks that everything is accounted for.
 pub fn end(place: &Place, bench: Running) -> Ended {
     bench.signal(Signal::TERM);
     let ended = bench.end().well();
@@ -134,7 +135,7 @@ pub fn end(place: &Place, bench: Running) -> Ended {
     ended
 }
 
-/// Sums bypass a cell that is killed, and one that hangs, until they come back.
+/// Checks that sums bypass a cell that is killed, and one that hangs, until they come back.
 pub fn goes_round_a_cell(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(PRESSED);
@@ -154,7 +155,7 @@ pub fn goes_round_a_cell(place: &Place, format: Format) {
     super::signal(stopped, Signal::CONT);
     holds(&test_client, 11);
 
-    // It gets its slot and its stimulus again.
+    // The restarted cell gets its slot and its stimulus again.
     let words = format!("--bus vcan0 --bus-kind {} --node 6 --skin skin.toml", place.kind());
     let again = place.start("cell-node", &words);
     bench.hears("cell 6 on vcan0 restarted");
@@ -168,7 +169,7 @@ pub fn goes_round_a_cell(place: &Place, format: Format) {
     assert!(summary.of_bus("/sums/contributions/missing") > 0, "{:#}", summary.0);
 }
 
-/// Without a touch, hellos show which cell is lost, and the rest finds another route.
+/// Checks that without a touch, hellos show which cell is lost, and the rest finds another route.
 pub fn keeps_ways_without_a_touch(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(PRESSED.split("[[touch]]").next().unwrap());
@@ -190,7 +191,7 @@ pub fn keeps_ways_without_a_touch(place: &Place, format: Format) {
     end(place, bench);
 }
 
-/// Links go down while the loop runs: one of many in one direction, and all of the cell in a corner.
+/// Faults that take links down while the loop runs: one of many in one direction, and all of the cell in a corner.
 const LINKS_DOWN: &str = r#"
 [[fault]]
 at_s = 2.0
@@ -211,7 +212,7 @@ cells = [8, 4]
 for_s = 12.0
 "#;
 
-/// An unreachable cell is named, and the rest finds another route.
+/// Checks that an unreachable cell is named, and the rest finds another route.
 pub fn goes_on_without_a_wire(place: &Place, format: Format) {
     grid(place, format);
     place.scenario(&format!("{PRESSED}{LINKS_DOWN}"));

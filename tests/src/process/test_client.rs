@@ -1,4 +1,4 @@
-//! Another client of a bench's bus, which receives and sends by the protocol.
+//! A further client of a bench's bus, which receives and sends by the protocol.
 
 use std::cell::RefCell;
 use std::collections::BTreeSet;
@@ -14,7 +14,7 @@ use protocol::time::Micros;
 
 use super::{Place, TIMEOUT, until};
 
-/// Another client of a bus of a format.
+/// A further client of a bus with a given format.
 pub struct TestClient {
     pub bus: Bus,
     format: Format,
@@ -22,7 +22,7 @@ pub struct TestClient {
 }
 
 impl Place {
-    /// Another client of its bus.
+    /// Opens a client of its bus.
     pub fn test_client(&self) -> TestClient {
         self.test_client_of(Format::Fd)
     }
@@ -45,7 +45,7 @@ impl TestClient {
         Self { bus, format, decoder: RefCell::new(Decoder::new(Some(format))) }
     }
 
-    /// The next frame, decoded.
+    /// Decodes a frame.
     pub fn decodes(&self, at: Micros, frame: &Frame) -> Decoded {
         self.decoder.borrow_mut().decode(at, self.bus.name(), frame)
     }
@@ -56,7 +56,7 @@ impl TestClient {
         self.bus.send(&frames).unwrap();
     }
 
-    /// Receives messages until `enough` holds, or until `TIMEOUT` is over: whether it held.
+    /// Receives messages until `enough` holds, or until `TIMEOUT` is over; returns true if it held.
     pub fn hears(&self, mut enough: impl FnMut(&Message) -> bool) -> bool {
         let mut inbox = Inbox::new();
         let give_up = Instant::now() + TIMEOUT;
@@ -75,7 +75,7 @@ impl TestClient {
         false
     }
 
-    /// Waits for a message at which `enough` holds.
+    /// Waits for a message for which `enough` holds.
     pub fn waits_for(&self, what: &str, enough: impl FnMut(&Message) -> bool) {
         assert!(self.hears(enough), "waited {TIMEOUT:?} for {what} on {}", self.bus.name());
     }
@@ -93,12 +93,12 @@ impl TestClient {
         });
     }
 
-    /// Waits for a sum of so many cells.
+    /// Waits for a sum of this number of cells.
     pub fn waits_for_a_sum_of(&self, cells: u8) {
         self.waits_for("a sum", |message| matches!(message, Message::Sum { count, .. } if *count == cells));
     }
 
-    /// Waits for so many joints.
+    /// Waits for a number of joints messages.
     pub fn waits_for_joints(&self, mut count: u32) {
         self.waits_for("joints", |message| {
             count -= u32::from(matches!(message, Message::Joints { .. }));
@@ -127,7 +127,7 @@ impl TestClient {
         self.waits_for(&format!("joints of epoch {number}"), there);
     }
 
-    /// Waits until the robot has been seen in four positions.
+    /// Waits until the robot has been in four positions.
     pub fn waits_for_motion(&self) {
         let mut seen = BTreeSet::new();
         self.waits_for("a robot that moves", |message| {
@@ -138,7 +138,7 @@ impl TestClient {
         });
     }
 
-    /// Waits until the cells 1 to so many have reported their node ids and parameters.
+    /// Waits until the cells from 1 to `cells` have reported their node ids and parameters.
     pub fn waits_for_settled_cells(&self, cells: usize) {
         let mut settled = BTreeSet::new();
         self.waits_for("cells that have their node ids", |message| {

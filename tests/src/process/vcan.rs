@@ -1,4 +1,4 @@
-//! A real kernel's vcan, and the stock tools beside us.
+//! A real kernel's vcan, and the standard tools.
 //!
 //! `tests/vcan` runs the tests that need it, each in a network of its own with `lo` and `vcan0` (MTU 72, up).
 
@@ -21,7 +21,7 @@ use rustix::thread::{LinkNameSpaceType, move_into_link_name_space};
 use super::{Place, until};
 
 impl Place {
-    /// One whose benches run on `vcan0` of a network that is the test's own.
+    /// Creates a directory whose benches run on `vcan0` of a network that is the test's own.
     pub fn on_vcan() -> Self {
         own_network();
         Self::on(BusKind::SocketCan)
@@ -57,14 +57,14 @@ pub fn own_network() {
     }
 }
 
-/// Another program, which must succeed: `ip link set vcan0 down`.
+/// Runs another program, which must succeed: `ip link set vcan0 down`.
 pub fn tool(words: &str) -> Output {
     let output = command(words).output().unwrap_or_else(|error| missing(words, &error));
     assert!(output.status.success(), "{words}: {output:?}");
     output
 }
 
-/// The same, to be started; words are parted by spaces.
+/// Returns a command; spaces separate its arguments.
 pub fn command(words: &str) -> Command {
     let mut words = words.split(' ');
     let mut command = Command::new(words.next().unwrap());
@@ -76,11 +76,11 @@ fn missing(words: &str, error: &std::io::Error) -> ! {
     panic!("{words}: {error}; install can-utils, iproute2 and util-linux")
 }
 
-/// An interface of a test's own, beside `vcan0`; what the kernel routes to and from it goes with it.
+/// An interface of a test's own, beside `vcan0`; the kernel's routes to and from it are removed with it.
 pub struct Vcan(&'static str);
 
 impl Vcan {
-    /// One that carries CAN FD, and is up.
+    /// Creates an interface that carries CAN FD, and is up.
     pub fn make(name: &'static str) -> Self {
         Self::with_mtu(name, 72)
     }
@@ -91,7 +91,7 @@ impl Vcan {
         Self(name)
     }
 
-    /// Removes it while it may be in use.
+    /// Removes the interface while it may be in use.
     pub fn remove(&self) {
         tool(&format!("ip link del {}", self.0));
     }
@@ -99,30 +99,30 @@ impl Vcan {
 
 impl Drop for Vcan {
     fn drop(&mut self) {
-        // It may be gone already.
+        // The interface may be gone already.
         let _ = command(&format!("ip link del {}", self.0)).stderr(Stdio::null()).status();
     }
 }
 
-/// Frames of one bus that match a filter go to the other, changed by `change`. The kernel's rules are for CAN FD
-/// frames here, and what they send is seen by every socket on that bus (vcan needs that to be asked for).
+/// Routes frames of one bus that match a filter to the other one, changed by `change`. The kernel's rules are for CAN
+/// FD frames here, and the routed frames are seen by every socket on that bus (vcan needs that to be requested).
 pub fn route(from: &str, to: &str, filter: &str, change: &str) {
     tool(format!("cangw -A -s {from} -d {to} -X -e -f {filter} {change}").trim_end());
 }
 
-/// Frames that the kernel has dropped on their way from senders to sockets, of any interface: the second
-/// column, in hexadecimal, of a line for each processor.
+/// Returns the number of frames that the kernel has dropped on their way from senders to sockets, of any interface: the
+/// second column, in hexadecimal, of a line for each processor.
 pub fn backlog_drops() -> u64 {
     let text = fs::read_to_string("/proc/net/softnet_stat").unwrap();
     text.lines().map(|line| u64::from_str_radix(line.split(' ').nth(1).unwrap(), 16).unwrap()).sum()
 }
 
-/// A skin of a few cells at a rate that an emulated machine keeps up.
+/// Returns a skin of a few cells at a rate that an emulated machine can follow.
 pub fn small_skin(cells: usize) -> String {
     generate(&Target { cells, broadcast_hz: 20.0, ..Target::default() }).unwrap()
 }
 
-/// `cansend vcan0 $(skinbus frame ...)`, as a person would.
+/// Runs `cansend vcan0 $(skinbus frame ...)`, as a user would.
 pub fn cansend(place: &Place, frame: &str) {
     let printed = place.start("skinbus", &format!("frame {frame}")).end().well().stdout;
     for line in printed.lines() {
@@ -130,13 +130,13 @@ pub fn cansend(place: &Place, frame: &str) {
     }
 }
 
-/// Counts the frames for which an interface's queue had no room, which is what ENOBUFS means.
+/// Returns the number of frames for which an interface's queue had no room, which senders see as ENOBUFS.
 pub fn refused(name: &str) -> u64 {
     let shown = tool(&format!("tc -statistics -json qdisc show dev {name}")).stdout;
     serde_json::from_slice::<serde_json::Value>(&shown).unwrap()[0]["drops"].as_u64().unwrap()
 }
 
-/// `vcan0`, which is as it should be again when this is dropped, however a test ends.
+/// `vcan0`, which is restored when this is dropped, however a test ends.
 pub struct Vcan0;
 
 impl Vcan0 {
@@ -148,8 +148,8 @@ impl Vcan0 {
         tool("ip link set vcan0 up");
     }
 
-    /// Lets it take no frame at all: a transmit queue without room, as a real controller's is without any
-    /// acknowledge. Senders get ENOBUFS.
+    /// Makes it accept no frame: a transmit queue without room, as a real controller's is without any acknowledge.
+    /// Senders get ENOBUFS.
     pub fn fill(&self) {
         tool("tc qdisc add dev vcan0 root pfifo limit 0");
     }
@@ -161,7 +161,7 @@ impl Vcan0 {
 
 impl Drop for Vcan0 {
     fn drop(&mut self) {
-        // There may be none.
+        // The queue may not exist.
         let _ = command("tc qdisc del dev vcan0 root").stderr(Stdio::null()).status();
         let _ = command("ip link set vcan0 mtu 72 up").status();
     }
@@ -185,8 +185,8 @@ impl Drop for Beside {
     }
 }
 
-/// `candump -L`, which has room for 300 MB of frames and preempts no process: on one processor it would else be
-/// woken by every single frame.
+/// `candump -L`, which has room for 300 MB of frames and preempts no process: otherwise it would be woken by every
+/// single frame on one processor.
 pub struct Candump {
     child: Beside,
     bus: String,
@@ -195,10 +195,10 @@ pub struct Candump {
 }
 
 impl Candump {
-    /// When this returns, it listens.
+    /// Starts it; it listens when this returns.
     pub fn start(bus: &str, log: &Path) -> Self {
-        // -d: what its socket drops is a line of the log, which no test that counts frames lets pass.
-        // The two filters let pass every frame, and every error frame, which are else left out.
+        // -d: frames that its socket drops are a line of the log, which fails every test that counts frames. The two
+        // filters pass every frame and every error frame, which are otherwise left out.
         let words = format!("chrt --batch 0 candump -L -d -r 300000000 {bus},0:0,#FFFFFFFF");
         let mut command = command(&words);
         command.stdout(File::create(log).unwrap()).stderr(Stdio::null());
@@ -212,7 +212,7 @@ impl Candump {
         candump
     }
 
-    /// The end of its log, which may be long.
+    /// Returns the end of its log, which may be long.
     fn tail(&self) -> String {
         let mut log = File::open(&self.log).unwrap();
         let len = log.metadata().unwrap().len();
@@ -222,8 +222,8 @@ impl Candump {
         tail
     }
 
-    /// Waits until it has seen all that was on the bus until now. This takes a frame of its own, which is
-    /// foreign to all clients and stays in its log.
+    /// Waits until it has seen all frames until now. This takes a frame of its own, which is foreign to all clients and
+    /// stays in its log.
     pub fn catch_up(&mut self) {
         self.marks += 1;
         let mark = mark(self.marks);
@@ -231,7 +231,7 @@ impl Candump {
         until("candump to see a frame", || self.tail().contains(&mark).then_some(()));
     }
 
-    /// What was on the bus from its start until now.
+    /// Returns all frames from its start until now.
     pub fn frames(mut self) -> Vec<Frame> {
         self.catch_up();
         drop(self.child);
@@ -243,12 +243,12 @@ impl Candump {
     }
 }
 
-/// A frame that no other client sends.
+/// Returns a frame that no other client sends.
 fn mark(number: u32) -> String {
     format!("1BADCAFE#{number:08X}")
 }
 
-/// The frames of a log; every other line is a mistake, `DROPCOUNT` too.
+/// Returns the frames of a log; every other line is an error, `DROPCOUNT` too.
 pub fn frames_of(log: &Path) -> Vec<Frame> {
     let text = fs::read_to_string(log).unwrap();
     let frame = |line: &str| match parse(line) {
@@ -258,7 +258,7 @@ pub fn frames_of(log: &Path) -> Vec<Frame> {
     text.lines().map(frame).collect()
 }
 
-/// Frames by sender and kind, in the order in which each was sent: what two views of a bus have in common.
+/// Groups frames by sender and kind, in the order in which each was sent: this order is the same in two views of a bus.
 pub fn by_identifier(frames: &[Frame]) -> BTreeMap<u32, Vec<Frame>> {
     let mut all = BTreeMap::<_, Vec<Frame>>::new();
     for frame in frames {
@@ -267,8 +267,8 @@ pub fn by_identifier(frames: &[Frame]) -> BTreeMap<u32, Vec<Frame>> {
     all
 }
 
-/// What the gateway keeps is what `candump` sees, in the same order by sender; but cells that are being ended may still
-/// send a heartbeat when the gateway no longer listens.
+/// Checks that the gateway records the frames that `candump` sees, in the same order by sender. Cells that are being
+/// ended may still send a heartbeat when the gateway no longer listens.
 pub fn same_by_sender(ours: &[Frame], theirs: &[Frame]) {
     let (ours, theirs) = (by_identifier(ours), by_identifier(theirs));
     assert_eq!(ours.keys().collect::<Vec<_>>(), theirs.keys().collect::<Vec<_>>());

@@ -1,4 +1,4 @@
-//! The whole skin on a real kernel's vcan: 253 processes that all answer every broadcast, and `candump` beside.
+//! The whole skin on a real kernel's vcan: 253 processes that all answer every broadcast, and `candump` beside them.
 
 use std::time::Duration;
 
@@ -12,8 +12,8 @@ use super::{Place, Running, Summary, program};
 const CELLS: u64 = 253;
 const SECONDS: u32 = 30;
 
-/// All are in contact all the time. The central computation is left out: under emulation it would take a fifth
-/// of the only processor.
+/// All cells are in contact all the time. The central computation is left out: under emulation it would take a fifth of
+/// the only processor.
 const SCENARIO: &str = r#"version = 1
 duration_s = 30.0
 
@@ -35,8 +35,8 @@ force_n = 1.5
 profile = "step"
 "#;
 
-/// Runs it for half a minute and checks that every broadcast was sent or counted as one that the machine was too
-/// late for, that no frame was lost, and that candump saw exactly what was counted.
+/// Runs it for half a minute and checks that every broadcast was sent or counted as one for which the machine was too
+/// late, that no frame was lost, and that candump saw exactly the counted frames.
 pub fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summary {
     let broadcast_hz = f64::from(broadcasts) / f64::from(SECONDS);
     let place = Place::on_vcan();
@@ -45,7 +45,7 @@ pub fn runs_for_half_a_minute(broadcasts: u32, control_hz: f64) -> Summary {
     assert!(skin.contains(usual), "{usual}");
     place.write("skin.toml", &skin.replace(usual, &format!("control_hz = {control_hz:?}")));
     place.scenario(SCENARIO);
-    // Nothing is to be read from the host's files while it runs: where time is instructions, waiting for them
+    // Everything is read from the host's files before the run: where time is counted in instructions, waiting for them
     // would let it pass.
     for name in ["skinbus", "cell-node"] {
         tool(&format!("cp {} {}", program(name).display(), place.path(name).display()));

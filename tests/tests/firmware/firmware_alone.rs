@@ -57,7 +57,7 @@ fn heartbeat(message: &Message, claiming: bool) -> Option<Heartbeat> {
 }
 
 impl Alone {
-    /// Starts cell 12 with its flash in `flash` of a folder, if anybody has written who it is.
+    /// Starts cell 12 with its flash in `flash` of a folder; `named` tells if its identity is written to it first.
     fn start(folder: &Path, named: bool) -> Self {
         let path = PathBuf::from(std::env::var_os("SKINBUS_FIRMWARE").expect("tests/firmware/run names it"));
         let factory = Factory {
@@ -100,14 +100,14 @@ impl Alone {
         }
     }
 
-    /// What comes next, within some time.
+    /// Returns the next message, if one comes in time.
     fn next(&mut self, within: Duration) -> Option<Message> {
         let give_up = Instant::now() + within;
         while self.came.is_empty() && Instant::now() < give_up {
             let mut bytes = [0; 4096];
             let Ok(count) = self.line.read(&mut bytes) else { continue };
             for line in bytes[..count].iter().filter_map(|&byte| self.decoder.push(byte)) {
-                // A reset ends a line in its middle.
+                // A reset cuts a line.
                 let Line::Frame(frame) = line else { continue };
                 self.came.push_back(Message::decode(&Packet::from_fd(&frame).unwrap()).unwrap());
             }
@@ -115,13 +115,13 @@ impl Alone {
         self.came.pop_front()
     }
 
-    /// Waits for something, and drops what comes before it.
+    /// Waits for a message, and drops those before it.
     fn waits<T>(&mut self, what: &str, look: impl Fn(&Message) -> Option<T>) -> T {
         let found = self.looks(TIMEOUT, look);
         found.unwrap_or_else(|| panic!("waited {TIMEOUT:?} for {what}"))
     }
 
-    /// Waits for something for so long, and drops what comes before it.
+    /// Waits for a message for a limited time, and drops those before it.
     fn looks<T>(&mut self, within: Duration, look: impl Fn(&Message) -> Option<T>) -> Option<T> {
         let give_up = Instant::now() + within;
         while Instant::now() < give_up {
@@ -136,8 +136,8 @@ impl Alone {
         self.waits("a heartbeat", |message| heartbeat(message, claiming))
     }
 
-    /// Presses the button until its first heartbeat is received: a reset ends a line in its middle, and what comes at once
-    /// behind that is no frame.
+    /// Presses the button until the first heartbeat is received: a reset cuts a line, and text that follows the cut
+    /// line at once is not a frame.
     fn reset(&mut self) -> Heartbeat {
         for _ in 0..12 {
             self.tell_monitor("system_reset");
@@ -168,7 +168,7 @@ impl Alone {
         self.monitor.write_all(format!("{command}\n").as_bytes()).unwrap();
     }
 
-    /// Whether joints are answered.
+    /// Checks that joints are answered.
     fn takes_joints(&mut self, epoch: u8) {
         let joints = Joints { positions: [Default::default(); MAX_JOINTS], in_use: 6 };
         self.send(&Message::Joints { epoch: Epoch(epoch), joints });
@@ -249,7 +249,7 @@ fn damaged_flash_is_noticed_and_a_commit_repairs_it() {
         drop(cell);
         assert_eq!(fs::read(&flash).unwrap(), sound);
     }
-    // A full disk, or here a folder in the way: the commit is refused, and nothing has changed.
+    // A full disk, here simulated by a folder with the file's name: the commit is refused, and nothing has changed.
     let part = folder.path().join("flash.part");
     fs::create_dir(&part).unwrap();
     let mut cell = Alone::start(folder.path(), true);
@@ -280,8 +280,8 @@ fn a_cell_that_nobody_has_named_is_silent() {
     assert_eq!(cell.next(Duration::from_secs(2)), None);
 }
 
-/// The emulator's watchdog does nothing; that it is started, and fed as long as the loop turns, shows in its log of
-/// what it does not have.
+/// The emulator's watchdog does nothing, but its log of unimplemented devices shows that it is started, and fed while
+/// the loop runs.
 #[test]
 #[ignore = "needs tests/firmware/run"]
 fn the_watchdog_is_started_and_fed() {
@@ -301,8 +301,8 @@ fn the_watchdog_is_started_and_fed() {
     assert!(written(feed) > before, "{before} before, and none since:\n{text}");
 }
 
-/// How much of the RAM was ever written, counted from its end: the emulator's begins with zeros. The cell starts without
-/// parameters and with some, takes others into use, and answers joints.
+/// Measures how much of the RAM was ever written, counted from its end: the emulator's RAM begins with zeros. The cell
+/// starts without parameters and with some, commits others, and answers joints.
 #[test]
 #[ignore = "needs tests/firmware/run"]
 fn the_stack_has_at_most_8_kib_and_the_cells_state_is_no_part_of_it() {
@@ -313,7 +313,7 @@ fn the_stack_has_at_most_8_kib_and_the_cells_state_is_no_part_of_it() {
     let mut cell = Alone::start(folder.path(), true);
     cell.heartbeat(false);
     cell.commission(&parameters());
-    // The emulator keeps the RAM at a reset: what the first start wrote counts too.
+    // The emulator keeps the RAM at a reset, so the memory written by the first start counts too.
     cell.reset();
     cell.heartbeat(false);
     cell.commission(&parameters());
@@ -333,7 +333,7 @@ fn the_stack_has_at_most_8_kib_and_the_cells_state_is_no_part_of_it() {
     println!(
         "{stack} bytes of stack; {statics} of statics, {state} of them the cell's state; {free} of {RAM} are free"
     );
-    // Where a word has 64 bits it is some hundred bytes larger.
+    // With words of 64 bits it is some hundred bytes larger.
     let here = size_of::<cell_node::node::Node>();
     assert!((here * 3 / 4..=here).contains(&state), "{state} bytes of state, {here} on this machine");
     assert!(state <= STATE, "{state} bytes of state");
@@ -341,7 +341,7 @@ fn the_stack_has_at_most_8_kib_and_the_cells_state_is_no_part_of_it() {
     assert!(statics + STACK <= RAM, "{statics} bytes of statics");
 }
 
-/// Bytes of RAM that a program's statics take.
+/// Returns the bytes of RAM of a program's statics.
 fn statics(elf: &[u8]) -> usize {
     let word = |at: usize| u32::from_le_bytes(elf[at..at + 4].try_into().unwrap()) as usize;
     let (heads, count) = (word(28), word(44) & 0xFFFF);
@@ -349,11 +349,12 @@ fn statics(elf: &[u8]) -> usize {
     heads.map(|head| word(head + 8) + word(head + 20) - 0x2000_0000).max().unwrap()
 }
 
-/// Bytes of the static that has the cell's state.
+/// Returns the size of the static that holds the cell's state.
 fn state(elf: &[u8]) -> usize {
     let word = |at: usize| u32::from_le_bytes(elf[at..at + 4].try_into().unwrap()) as usize;
     let half = |at: usize| usize::from(u16::from_le_bytes(elf[at..at + 2].try_into().unwrap()));
-    // Of a section: kind, offset and size at 4, 16 and 20; the table of symbols is of kind 2, and names its strings at 24.
+    // The fields of a section: kind, offset and size at 4, 16 and 20; the table of symbols is of kind 2, and refers to
+    // its strings at 24.
     let section = |index: usize| word(32) + half(46) * index;
     let symbols = (0..half(48)).map(section).find(|&at| word(at + 4) == 2).expect("cargo leaves the symbols");
     let names = word(section(word(symbols + 24)) + 16);

@@ -1,4 +1,4 @@
-//! Emulated cells in benches of processes: they count as any other cell.
+//! Emulated cells in benches of processes: they count like any other cell.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -13,17 +13,17 @@ use protocol::id::CellId;
 use protocol::message::Message;
 use rustix::process::Signal;
 
-/// The firmware's file.
+/// Returns the firmware's file.
 fn firmware() -> String {
     std::env::var("SKINBUS_FIRMWARE").expect("tests/firmware/run names it")
 }
 
-/// A bench whose cells of these node ids are emulated.
+/// Starts a bench in which the cells of these node ids are emulated.
 fn bench(place: &Place, seconds: f64, emulate: &str, more: &str) -> Running {
     place.bench(seconds, &format!("--firmware {} --emulate {emulate} {more}", firmware()))
 }
 
-/// Each of these cells is killed, and started again a while later.
+/// Returns faults that kill each of these cells, and start it again later.
 fn kills(cells: std::ops::RangeInclusive<u8>) -> String {
     let fault = |at: f64, kind: &str, cell: u8| {
         format!("\n[[fault]]\nat_s = {at}\nkind = \"{kind}\"\nbus = \"vcan0\"\ncells = [{cell}]\n")
@@ -60,7 +60,7 @@ fn four_emulated_and_eight_process_cells_lose_only_what_was_on_its_way_at_a_kill
     for nothing in ["/uplink/rejected", "/uplink/unknown", "/replies/unknown", "/replies/lost"] {
         assert_eq!(summary.of_bus(nothing), 0, "{nothing}: {:#}", summary.0);
     }
-    // What was due while a cell was dead is due from nobody: they are silent for 3.9 s, until they claim again.
+    // No replies are due from dead cells: they are silent for 3.9 s, until they claim again.
     let broadcasts = summary.number("/loop/broadcasts");
     for cell in summary.cells() {
         let (node, due) = (cell["node"].as_u64().unwrap(), cell["due"].as_u64().unwrap());
@@ -73,12 +73,12 @@ fn four_emulated_and_eight_process_cells_lose_only_what_was_on_its_way_at_a_kill
                 dead * 8 > broadcasts && due > 0,
                 "{node} was dead for a while, of {broadcasts}: {cell:#}"
             );
-            // 600 ms of silence pass before it counts as dead.
+            // A cell counts as dead after 600 ms of silence.
             assert!((1..=due).contains(&in_doubt), "{node}, on its way and after the kill: {cell:#}");
         }
     }
     for cell in 9..=12 {
-        // Nobody commissions them in a run: their flash did it.
+        // A run does not commission its cells: their parameters come from flash.
         assert_eq!(fs::read(place.path(&format!("flash/vcan0-{cell}.flash"))).unwrap().len(), 133);
     }
     assert!(ended.stderr.contains("cells 9, 10, 11, 12 emulated by "), "{}", ended.stderr);
@@ -94,7 +94,7 @@ fn an_emulated_cell_answers_on_fd_and_on_classic_buses() {
         bench(&place, 2.0, "2", "").end().well();
         place.is_left_clean();
         let summary = place.summary();
-        // An emulator that a busy machine stops for 15 ms between two segments loses their packet.
+        // If a busy machine stops the emulator for 15 ms between two segments, the packet is lost.
         if format == SkinFormat::Fd {
             summary.adds_up();
         }
@@ -143,7 +143,7 @@ fn emulators_end_with_a_gateway_that_is_killed_or_interrupted() {
     }
 }
 
-/// The one line of a run that does not begin.
+/// Returns the message of a run that does not begin.
 fn refused(place: &Place, words: &str) -> String {
     let ended = place.start("skinbus", &format!("run skin.toml --bus-kind embedded --quiet {words}")).end();
     ended.refusal(ended.code().unwrap()).to_owned()
@@ -170,7 +170,7 @@ fn what_cannot_be_emulated_is_refused_in_one_line() {
     place.is_left_clean();
 }
 
-/// A run whose emulator is this script.
+/// Runs a bench whose emulator is this script.
 fn with_emulator(place: &Place, script: Option<&str>) -> Ended {
     let folder = place.path("programs");
     let _ = fs::create_dir(&folder);

@@ -14,7 +14,7 @@ use protocol::can::Format;
 use protocol::factory::Factory;
 use protocol::id::CellId;
 
-/// Starts the emulator, or starts it again.
+/// A script that starts or restarts the emulator.
 const RESTART: &str = r#"#!/bin/sh
 [ -f pid ] && kill -9 $(cat pid)
 rm -f line
@@ -24,7 +24,7 @@ qemu-system-arm -M microbit -display none -monitor none -serial chardev:line -ke
 echo $! > pid
 "#;
 
-/// The emulator ends with the test.
+/// Ends the emulator with the test.
 struct Emulator<'a>(&'a Place);
 
 impl Emulator<'_> {
@@ -65,8 +65,9 @@ fn conforms(format: Format) {
             ended.stdout.lines().filter(|line| line.contains("FAILED")).map(str::to_owned).collect();
         all.iter().filter_map(|line| Some(line.split_whitespace().nth(1)?.to_owned())).collect()
     };
-    // A busy machine may stop the emulator where the documents allow a cell some milliseconds, and what a killed one has
-    // sent may still be on its way: a requirement has to be met in one of a few attempts.
+    // A busy machine may stop the emulator for longer than the few milliseconds that the documents allow a cell, and
+    // packets of a killed one may still be on their way. A requirement therefore has to be met in one of a few
+    // attempts.
     for requirement in failed(&[]) {
         let meets = || failed(&["--requirement", &requirement]).is_empty();
         assert!((0..5).any(|_| meets()), "{requirement}, six times");

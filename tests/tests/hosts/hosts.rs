@@ -26,13 +26,13 @@ use serde_json::Value;
 
 const CELLS: usize = 12;
 
-/// The program `vcan-setup`, whose command `link` runs the program that `SKINBUS_VCAN_LINK` names.
+/// Returns the program `vcan-setup`, whose command `link` runs the program that `SKINBUS_VCAN_LINK` names.
 fn link_program() -> PathBuf {
     assert!(std::env::var_os("SKINBUS_VCAN_LINK").is_some(), "tests/hosts says where vcan-link is");
     program("vcan-setup")
 }
 
-/// A port that nobody has.
+/// Returns an unused port.
 fn port() -> u16 {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
@@ -79,7 +79,7 @@ impl Host {
         self.start(&program("cell-node"), &words)
     }
 
-    /// A bench whose cells are elsewhere, once its loop runs.
+    /// Starts a bench whose cells are on another host, and waits until its loop runs.
     fn bench(&self) -> Running {
         let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --duration 600 --no-spawn --summary run.json";
         let bench = self.start(&program("skinbus"), words);
@@ -88,7 +88,7 @@ impl Host {
     }
 }
 
-/// Two hosts, their links, the cells on the one and what is between them.
+/// Two hosts with their links; the cells are on one of them, and a proxy may be between them.
 struct Pair {
     robot: Host,
     cells: Host,
@@ -110,7 +110,7 @@ impl Pair {
         Self { robot, cells, proxy, robot_link, cells_link, _cells: running }
     }
 
-    /// A bench during which something happens after its loop has begun; it ends when all cells answer after that.
+    /// Runs a bench, calls `happens` after its loop has begun, and ends it when all cells answer after that.
     fn bench(&mut self, happens: impl FnOnce(&mut Self, &Running)) -> (Ended, Value) {
         let bench = self.robot.bench();
         happens(self, &bench);
@@ -127,7 +127,7 @@ impl Pair {
         (ended, bus)
     }
 
-    /// Ends the links; what they say of the frames adds up.
+    /// Ends the links, and checks that their counts of frames add up.
     fn end(self) {
         for (link, other) in [(self.robot_link, "cells"), (self.cells_link, "robot")] {
             let report = ended_link(link);
@@ -141,7 +141,7 @@ impl Pair {
     }
 }
 
-/// A client of a host's bus that is no cell and no gateway.
+/// A client of a host's bus that is neither a cell nor a gateway.
 struct Client(Bus);
 
 impl Client {
@@ -150,7 +150,7 @@ impl Client {
         Self(Bus::open("vcan0", Choice::Only(BusKind::Embedded), &options).unwrap())
     }
 
-    /// What has come.
+    /// Returns the received frames.
     fn received(&self) -> Vec<Frame> {
         let (mut inbox, mut all) = (Inbox::new(), Vec::new());
         while self.0.receive(&mut inbox).unwrap() > 0 {
@@ -170,7 +170,7 @@ fn ended_link(link: Running) -> Value {
 fn cells_of_another_host_answer_as_if_they_were_here() {
     let mut pair = Pair::new();
     let (ended, bus) = pair.bench(|pair, _| {
-        // Who looks at the buses sees it too.
+        // `vcan-setup status` shows it too.
         let status = pair.robot.place.start("vcan-setup", "status vcan0").end().well();
         assert!(status.stdout.contains("vcan0 is linked as 'robot' with 'cells' (12 cells)"), "{status:#?}");
     });
@@ -221,7 +221,7 @@ fn links_that_are_killed_are_joined_again() {
         bench.hears("host 'cells' of vcan0 is linked");
         pair.cells_link.signal(Signal::KILL);
         bench.hears("host 'cells' of vcan0 is gone, or not reached");
-        // A link that is there again at once, after 40 ms, loses nothing that shows.
+        // A link that is back after 40 ms loses nothing visible.
         thread::sleep(Duration::from_secs(1));
         pair.cells_link = pair.cells.link(&format!("--connect tcp/127.0.0.1:{}", pair.proxy.port));
         bench.hears("host 'cells' of vcan0 is reached again");
@@ -327,7 +327,7 @@ fn a_circle_that_something_else_makes_is_cut_and_said() {
     ];
     links[0].hears("host 'two' has joined");
     links[1].hears("host 'one' has joined");
-    // A relay beside the link: whatever comes on one bus is sent on the other.
+    // A relay beside the link forwards all frames of one bus to the other.
     let relay = [&one, &two].map(Client::on);
     let (watcher, source) = (Client::on(&one), Client::on(&one));
     source.0.send(&[Frame::fd(0x8000_0777, 0, &[1, 2, 3]).unwrap()]).unwrap();

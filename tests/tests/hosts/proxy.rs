@@ -1,4 +1,4 @@
-//! A TCP proxy between two hosts that cuts, stalls and delays.
+//! A TCP proxy between two hosts that cuts, stalls and delays connections.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// What it does to what passes.
+/// The disturbances of the proxy.
 #[derive(Default)]
 struct State {
     is_cut: AtomicBool,
@@ -20,13 +20,13 @@ struct State {
 
 pub(crate) struct Proxy {
     pub(crate) port: u16,
-    /// Where it leads.
+    /// The port that it forwards to.
     pub(crate) to: u16,
     state: Arc<State>,
 }
 
 impl Proxy {
-    /// One before a port of this machine.
+    /// Creates a proxy in front of a port of this machine.
     pub(crate) fn before(port: u16) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let own = listener.local_addr().unwrap();
@@ -52,7 +52,7 @@ impl Proxy {
         Self { port: own.port(), to: port, state }
     }
 
-    /// Ends all connections, and lets no new one through until it is undone.
+    /// Cuts all connections and refuses new ones, or ends that.
     pub(crate) fn cut(&self, on: bool) {
         self.state.is_cut.store(on, Ordering::Relaxed);
         for stream in self.state.connections.lock().unwrap().drain(..).filter(|_| on) {
@@ -60,12 +60,12 @@ impl Proxy {
         }
     }
 
-    /// Lets nothing through, and says nothing; what it holds back goes on when it is undone.
+    /// Holds back all data silently, or releases it.
     pub(crate) fn stall(&self, on: bool) {
         self.state.is_stalled.store(on, Ordering::Relaxed);
     }
 
-    /// Holds back everything for so long.
+    /// Delays all data by this time.
     pub(crate) fn delay(&self, by: Duration) {
         self.state.delay_ms.store(by.as_millis().try_into().unwrap(), Ordering::Relaxed);
     }
@@ -79,7 +79,7 @@ impl Drop for Proxy {
     }
 }
 
-/// Copies one way: what was read waits for its time in a queue, so that a delay does not make the way slower.
+/// Copies one direction. Data waits for its time in a queue, so that a delay does not reduce the throughput.
 fn pump(from: &TcpStream, to: &TcpStream, state: &Arc<State>) {
     let (mut from, mut to) = (from.try_clone().unwrap(), to.try_clone().unwrap());
     let (queue, read) = channel::<(Instant, Vec<u8>)>();

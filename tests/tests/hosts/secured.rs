@@ -11,7 +11,7 @@ use super::{Host, ended_link, link_program, port};
 
 const GUIDE: &str = include_str!("../../../docs/how-to/several-hosts.md");
 
-/// The text of the code block that contains this.
+/// Returns the text of the code block that contains `mark`.
 fn block(mark: &str) -> String {
     let blocks = GUIDE.split("\n```").skip(1).step_by(2);
     let block = blocks
@@ -26,7 +26,7 @@ fn shell(folder: &Path, script: &str) {
     assert!(done.status.success(), "{script}: {}", String::from_utf8_lossy(&done.stderr));
 }
 
-/// The certificates of the guide, and its two configurations at a port of this machine.
+/// Creates the certificates of the guide, and its two configurations at a port of this machine.
 fn secured(port: u16) -> Place {
     let place = Place::new();
     let certificates = block("openssl req -x509").replace("DNS:$host.local", "DNS:localhost");
@@ -46,14 +46,14 @@ fn link(host: &Host, config: &Path) -> Running {
     host.link(&format!("--config {}", config.display()))
 }
 
-/// The links of two hosts, and what they need as long as they run.
+/// The links of two hosts, with the resources that they need while they run.
 struct Secured {
     links: [Running; 2],
     _hosts: [Host; 2],
     _place: Place,
 }
 
-/// A robot with the guide's configuration, and somebody with a changed one of the guide's.
+/// Starts a robot with the guide's configuration, and another host with a changed one.
 fn robot_and(change: impl FnOnce(&Place, String) -> String) -> Secured {
     let place = secured(port());
     let (robot, other) = (Host::new("robot", None), Host::new("cells", None));
@@ -64,7 +64,7 @@ fn robot_and(change: impl FnOnce(&Place, String) -> String) -> Secured {
     Secured { links: [robot_link, other_link], _hosts: [robot, other], _place: place }
 }
 
-/// Neither has the other.
+/// Checks that the two hosts do not connect.
 fn is_refused(secured: Secured) {
     for link in secured.links {
         assert!(!link.stderr().contains("has joined"), "{}", link.stderr());
@@ -82,7 +82,7 @@ fn the_certificates_of_the_guide_are_taken() {
     secured.links.into_iter().for_each(|link| _ = ended_link(link));
 }
 
-/// The TCP ports at which a process listens, as the kernel has them.
+/// Returns the TCP ports at which a process listens, according to the kernel.
 fn listening_ports(process: &Running) -> Vec<u16> {
     let pid = process.pid().as_raw_nonzero();
     let files = fs::read_dir(format!("/proc/{pid}/fd")).unwrap().map(|file| file.unwrap().path());
@@ -107,7 +107,7 @@ fn listening_ports(process: &Running) -> Vec<u16> {
 #[test]
 #[ignore = "tests/hosts runs it"]
 fn the_files_of_the_guide_open_one_port_with_tls() {
-    // Without the line that says so, the host of the cells listens nowhere either.
+    // Even without the line that disables listening, the host of the cells does not listen.
     let changes: [fn(String) -> String; 2] =
         [|text| text, |text| text.replace("  listen: { endpoints: [] },\n", "")];
     for change in changes {
@@ -192,7 +192,8 @@ fn a_host_that_access_control_does_not_name_is_not_heard() {
         );
         text.replace("cells.key", "intruder.key").replace("cells.pem", "intruder.pem")
     });
-    // It is connected, and learns of nobody: nothing is there to wait for. One that is named joins in less than a second.
+    // It is connected and learns of no other host, so there is no event to wait for. A named host joins in less than a
+    // second.
     thread::sleep(Duration::from_secs(3));
     let said = secured.links[1].stderr();
     assert!(!said.contains("cannot connect"), "its certificate is a good one: {said}");

@@ -1,7 +1,7 @@
-//! Frames that the kernel drops between sender and sockets while the sender gets no error: its queue
-//! of arrived packets is made so short that the torques of one cell never get through.
+//! Frames that the kernel drops between sender and sockets while the sender gets no error: its queue of arrived packets
+//! is made so short that the torques of one cell never get through.
 //!
-//! The queue is the whole machine's, so this is for the lab machine only.
+//! The queue belongs to the whole machine, so this test is for the lab machine only.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -24,8 +24,8 @@ fn what_the_backlog_dropped_is_counted_exactly_and_nothing_stays_unknown() {
     place.scenario(PRESSED);
     let (_vcan1, _vcan2) = (Vcan::make("vcan1"), Vcan::make("vcan2"));
     let _cells = place.start("cell-node", "--bus vcan0 --bus-kind socketcan --nodes 1-4 --skin cells.toml");
-    // The kernel's gateway passes all on; a torque of cell 3 it first copies ten times to where nobody is, by a
-    // filter that comes before the exact one. More than two do not find room in the queue.
+    // The kernel's gateway forwards all frames. A rule before the exact one first copies each torque of cell 3 ten
+    // times to an unused bus. The queue has room for two.
     route("vcan1", "vcan0", "0:0", "");
     route("vcan0", "vcan1", "203~C00007FF", "");
     for _ in 0..10 {
@@ -42,7 +42,7 @@ fn what_the_backlog_dropped_is_counted_exactly_and_nothing_stays_unknown() {
     let summary = place.summary();
     summary.adds_up();
     assert!(sent > 6, "{sent} torques of cell 3: {:#}", summary.0);
-    // Of each eleven copies two went in.
+    // Of each eleven copies, two were accepted.
     assert_eq!((summary.number("/backlog_dropped"), dropped), (9 * sent, 9 * sent));
     assert_eq!(summary.of_bus("/uplink/backlog"), sent, "{:#}", summary.0);
     assert_eq!(summary.of_bus("/replies/lost"), sent, "{:#}", summary.0);

@@ -12,11 +12,12 @@ use protocol::can::Format;
 use protocol::message::Message;
 use rustix::process::Signal;
 
-/// The loop goes at 100 Hz, because here a tick costs a quarter of a millisecond.
+/// The loop runs at 100 Hz, because a tick costs a quarter of a millisecond here.
 ///
-/// Left alone this machine has the last reply 27 ms after a broadcast. Whoever else uses the host makes it slower,
-/// for moments or all the time; cells then skip joints that are older than a period, and count them. So what is
-/// missing has to be just that, and everything is demanded where time is instructions (`lab_icount`).
+/// On an idle host the last reply comes 27 ms after a broadcast. Other users of the host make the machine slower, for
+/// moments or all the time; cells then skip joints that are older than a period, and count them. Missing replies must
+/// therefore match the skipped joints here; completeness is checked where time is counted in instructions
+/// (`lab_icount`).
 #[test]
 #[ignore = "needs the lab machine"]
 fn what_253_processes_do_not_answer_at_20_hz_they_were_too_late_for_and_nothing_is_lost() {
@@ -35,10 +36,10 @@ fn what_253_processes_do_not_answer_at_20_hz_they_were_too_late_for_and_nothing_
     }
 }
 
-/// With `candump` and the kernel's own part, that is all of it.
+/// With `candump` and the kernel's own share, that is all of its time.
 const SATURATED: f64 = 0.7;
 
-/// Frames have the wall clock's time, which may be set: by hand, or by NTP.
+/// Frames have the wall clock's time, which may be set by hand or by NTP.
 #[test]
 #[ignore = "needs the lab machine"]
 fn cells_and_gateway_live_through_steps_of_the_walls_clock() {

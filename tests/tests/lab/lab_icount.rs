@@ -1,4 +1,4 @@
-//! The lab machine whose time is instructions executed: the same in every repeat, however busy the host.
+//! The lab machine whose time is counted in instructions: each repetition is equal, however busy the host is.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -21,8 +21,8 @@ fn all_253_processes_answer_every_broadcast_in_time_at_the_full_rate() {
     assert_eq!(summary.number("/loop/broadcasts_skipped"), 0);
 }
 
-/// Everything moves and changes all the time, by the number of the broadcast: a robot that the torques move would
-/// go by the tick in which they come, too.
+/// Everything changes all the time, by the number of the broadcast. A robot moved by the torques would also depend on
+/// the tick in which they arrive.
 const LIVELY: &str = r#"version = 1
 duration_s = 4.0
 

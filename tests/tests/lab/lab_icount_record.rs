@@ -1,4 +1,4 @@
-//! The whole skin, a process a cell, recorded and replayed where time is instructions executed.
+//! The whole skin, one process per cell, recorded and replayed where time is counted in instructions.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -20,7 +20,7 @@ fn all_253_processes_are_recorded_as_candump_sees_them_and_answer_two_replays_bi
     for _ in 0..2 {
         let (ended, replayed) = place.replayed("run.mcap", "--expect --spawn");
         eprintln!("{}", ended.stdout);
-        // The cells' words at the start and the end are compared as well.
+        // The cells' first and last packets are compared as well.
         assert!(replayed.all_came_back(&ended) >= 253 * broadcasts, "{:#}", replayed.0);
         assert_eq!(
             (replayed.number("/expect/joints_skipped"), replayed.text("/buses/0/kind")),

@@ -32,7 +32,8 @@ use serde_json::Value;
 const CONTROLLERS: [&str; 2] = ["can0", "can1"];
 const CELLS: usize = 8;
 
-/// The joints stand still and each touch is a step, so that torques depend on little, and two runs share their causes.
+/// Returns a scenario in which the joints stand still and each touch is a step, so that torques depend on little, and
+/// two runs share their causes.
 fn scenario() -> String {
     let mut text = "version = 1\nduration_s = 600.0\n\n[motion]\nkind = \"hold\"\n\
                     start_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n"
@@ -47,12 +48,12 @@ fn scenario() -> String {
     text
 }
 
-/// Both controllers at 1 Mbit/s and up; down again with the test.
+/// Both controllers at 1 Mbit/s and up; they go down again with the test.
 struct Controllers;
 
 impl Controllers {
     fn up() -> Self {
-        // Their driver answers; vcan would take no bit rate.
+        // Their driver answers; vcan would refuse a bit rate.
         for name in CONTROLLERS {
             tool(&format!("ip link set {name} down"));
             tool(&format!("ip link set {name} type can bitrate 1000000"));
@@ -61,8 +62,8 @@ impl Controllers {
         Self
     }
 
-    /// Lets neither be heard by the processor: what they send is not seen to be sent, and their queues fill. They
-    /// have one interrupt together, so both or none.
+    /// Blocks the interrupts of both controllers: completed transmissions go unnoticed, and their queues fill. The
+    /// controllers share an interrupt, so both or none are blocked.
     fn hang(&self) -> Hanging {
         Hanging::new()
     }
@@ -76,11 +77,11 @@ impl Drop for Controllers {
     }
 }
 
-/// Controllers whose interrupts do not come through, by a bit of their PCI command registers.
+/// Controllers whose interrupts are disabled by a bit of their PCI command registers.
 struct Hanging(Vec<PathBuf>);
 
 impl Hanging {
-    /// Where the register stands, 16 bits, and its bit that disables interrupts.
+    /// The offset of the register, which has 16 bits, and its bit that disables interrupts.
     const COMMAND: u64 = 4;
     const NO_INTERRUPTS: u16 = 0x0400;
 
@@ -96,7 +97,7 @@ impl Hanging {
             let file = OpenOptions::new().read(true).write(true).open(path).unwrap();
             let mut word = [0; 2];
             file.read_exact_at(&mut word, Self::COMMAND).unwrap();
-            // Both bytes at once: the emulated bus looks at a write to the first.
+            // Both bytes at once: the emulated bus reacts to a write of the first one.
             file.write_all_at(&change(u16::from_le_bytes(word)).to_le_bytes(), Self::COMMAND).unwrap();
         }
     }
@@ -108,12 +109,12 @@ impl Drop for Hanging {
     }
 }
 
-/// The output of `ip`.
+/// Returns the output of `ip` as JSON.
 fn json(words: &str) -> Value {
     serde_json::from_slice(&tool(words).stdout).unwrap()
 }
 
-/// A controller's PCI address.
+/// Returns a controller's PCI address.
 fn address(name: &str) -> String {
     let link = json(&format!("ip -json -details link show {name}"));
     link[0]["parentdev"].as_str().unwrap_or_else(|| panic!("{name} is no PCI device: {link}")).to_owned()
@@ -127,12 +128,12 @@ fn open(name: &str, options: &Options) -> Result<Bus, BusError> {
     Bus::open(name, Choice::Only(BusKind::SocketCan), options)
 }
 
-/// A frame that contains its number.
+/// Returns a frame that contains its number.
 fn numbered(number: u32) -> Frame {
     Frame::classic(0x123, &number.to_le_bytes()).unwrap()
 }
 
-/// All numbers that have come, once the last is this one.
+/// Receives until this number, and returns all numbers.
 fn numbers_until(bus: &Bus, last: u32) -> Vec<u32> {
     let mut inbox = Inbox::new();
     let mut numbers = Vec::new();
@@ -147,7 +148,7 @@ fn numbers_until(bus: &Bus, last: u32) -> Vec<u32> {
     numbers
 }
 
-/// The files of a bench whose gateway is on one bus and whose cells are on another, which are the same to them.
+/// Writes the files of a bench whose gateway and cells are on two interfaces of the same bus.
 fn prepare(place: &Place, gateway: &str, cells: &str) {
     let target = Target { cells: CELLS, broadcast_hz: 20.0, format: Generated::Classic, ..Target::default() };
     let skin = generate(&target).unwrap();
@@ -156,7 +157,7 @@ fn prepare(place: &Place, gateway: &str, cells: &str) {
     place.scenario(&scenario());
 }
 
-/// The cells, in three processes.
+/// Starts the cells, in three processes.
 fn start_cells(place: &Place, kind: BusKind, bus: &str) -> Vec<Running> {
     let cells = ["--nodes 1-3", "--nodes 4-7", "--node 8"].map(|nodes| {
         let words = format!("--bus {bus} --bus-kind {kind} {nodes} --skin cells.toml");
@@ -165,7 +166,7 @@ fn start_cells(place: &Place, kind: BusKind, bus: &str) -> Vec<Running> {
     cells.into()
 }
 
-/// A bench with these cells.
+/// Starts a bench with these cells.
 fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
     let words = format!(
         "run skin.toml --bus-kind {kind} --scenario scenario.toml --duration {seconds} --no-spawn \
@@ -174,7 +175,7 @@ fn start_bench(place: &Place, kind: BusKind, seconds: f64) -> Running {
     place.start("skinbus", &words)
 }
 
-/// Counts the packets that a log has, beside comments of the recorder, and the segments that found no other in time.
+/// Counts the packets in a log, without comments of the recorder, and the segments without a matching one in time.
 fn pairs(log: &str) -> (u64, u64) {
     let (mut segments, mut whole, mut incomplete) = (vec![Segment::NONE; 1 << 11], 0, 0);
     for line in log.lines().filter(|line| !line.starts_with("# ")) {
@@ -196,7 +197,7 @@ fn pairs(log: &str) -> (u64, u64) {
     (whole, incomplete)
 }
 
-/// Checks that all packets of a run are accounted for, by its log; its log and its figures.
+/// Checks that all packets of a run are accounted for by its log; returns the log and the summary.
 fn packets_add_up(place: &Place) -> (Log, Summary) {
     let (summary, text) = (place.summary(), place.read("run.log"));
     let (whole, incomplete) = pairs(&text);
@@ -215,14 +216,14 @@ fn packets_add_up(place: &Place) -> (Log, Summary) {
     (Log::read(&text, Format::Classic), summary)
 }
 
-/// Sees that all packets and replies of a run are accounted for; its log.
+/// Checks that all packets and replies of a run are accounted for; returns its log.
 fn adds_up(place: &Place) -> Log {
     let (log, summary) = packets_add_up(place);
     summary.adds_up();
     log
 }
 
-/// Waits until torques of cell 1 have come, in two segments each.
+/// Waits for torques of cell 1, in two segments each.
 fn torques_come(bus: &str) {
     let torque = Filter { id: 0x201, mask: Filter::EXACT_MASK };
     let bus = open(bus, &options(&[torque])).unwrap();
@@ -233,7 +234,7 @@ fn torques_come(bus: &str) {
     });
 }
 
-/// A run across both controllers, which both see the same frames; its log.
+/// Runs a bench across both controllers, which must both see the same frames; returns its log.
 fn across_controllers() -> Log {
     let place = Place::on_vcan();
     prepare(&place, "can0", "can1");
@@ -243,7 +244,7 @@ fn across_controllers() -> Log {
     drop(cells);
     let [near, far] = candumps.map(|candump| {
         let mut frames = candump.frames();
-        // The frame at which one candump ends is seen by the other as well.
+        // Each candump ends with a frame that the other one sees as well.
         frames.retain(|frame| !frame.is_extended());
         by_identifier(&frames)
     });
@@ -254,13 +255,13 @@ fn across_controllers() -> Log {
     let ours = frames_of(&place.path("run.log"));
     assert!(ours.iter().all(|frame| frame.format() == Format::Classic && frame.len() == 8));
     for (id, ours) in by_identifier(&ours) {
-        // Cells send before the gateway listens and after.
+        // Cells send before the gateway listens and after it.
         assert!(near[&id].windows(ours.len()).any(|part| part == ours), "{id:03X} comes in another order");
     }
     adds_up(&place)
 }
 
-/// The same run on the embedded bus.
+/// Runs the same bench on the embedded bus.
 fn on_the_embedded_bus() -> Log {
     let place = Place::new();
     prepare(&place, "vcan0", "vcan0");
@@ -277,7 +278,7 @@ fn classic_cells_across_two_controllers_say_what_they_say_on_the_embedded_bus() 
     let _controllers = Controllers::up();
     let [one, other] = [across_controllers(), on_the_embedded_bus()];
     let (shared, all) = same_torques(&one, &other);
-    // A machine that is away for a while misses some of the eight steps, in either run.
+    // A machine that pauses misses some of the eight steps, in either run.
     assert!(shared >= 2 * CELLS, "{shared} of {all} causes are in both runs");
 }
 
@@ -293,7 +294,7 @@ fn a_full_queue_is_waited_for_and_nothing_is_lost_or_sent_twice() {
         let before = refused("can0");
         let hanging = controllers.hang();
         std::thread::scope(|scope| {
-            // One by one and many at once, which are different system calls.
+            // Frame by frame and in batches, which are different system calls.
             let at_once = if round % 2 == 0 { 1 } else { 100 };
             let sender = &sender;
             scope.spawn(move || part.chunks(at_once).for_each(|some| sender.send(some).unwrap()));
@@ -318,18 +319,18 @@ fn a_queue_that_stays_full_is_given_up_in_time_and_used_again() {
     let (before, began) = (refused("can0"), Instant::now());
     let error = patient.send(&frames).unwrap_err();
     assert!(began.elapsed() >= timeout);
-    // Ten in the queue, one in the controller, and where a queue is passed by while it is empty, one between.
+    // Ten frames in the queue, one in the controller, and one between them if an empty queue is bypassed.
     let sent = error.sent;
     assert!((11..=12).contains(&sent) && error.target == 40, "{error}");
     assert!(error.cause.may_pass() && matches!(error.cause, BusError::Full { .. }), "{error}");
     let said =
         "can0 took no frame for 50 ms: its queue is full; send less, or ask whether anybody is on the bus";
     assert_eq!(error.to_string(), format!("{said} ({sent} of 40 frames sent)"));
-    // It looks every half millisecond and does not spin.
+    // It polls every half millisecond, without a busy loop.
     let tries = refused("can0") - before;
     assert!((2..=102).contains(&tries), "{tries} tries in 50 ms");
 
-    // A caller with no time tries once.
+    // A caller without a time limit tries once.
     let before = refused("can0");
     let error = hasty.send(&frames[sent..]).unwrap_err();
     assert!(error.sent == 0 && matches!(error.cause, BusError::Full { .. }), "{error}");
@@ -372,7 +373,7 @@ fn controllers_that_go_down_and_up_in_mid_run_are_survived() {
     }
     let (_, summary) = packets_add_up(&place);
     assert_eq!(summary.silent().len(), 0, "{:#}", summary.0);
-    // What was sent to a controller that was down, or by one, is known to be missing, and not why.
+    // Frames that were sent to or by a controller that was down are known to be missing, without the reason.
     assert!(summary.number("/loop/unsent") > 0, "{:#}", summary.0);
 }
 
@@ -404,8 +405,8 @@ fn error_frames_of_the_driver_are_counted() {
     bench.hears_the_loop();
     for _ in 0..2 {
         torques_come("can1");
-        // The gateway's controller has room for 64 bytes, which are not taken out. What the cells' controller has
-        // sent is not reported either: it is restarted for each frame.
+        // The gateway's controller has room for 64 bytes, which are not read. The cells' controller does not report its
+        // transmissions either, and is restarted for each frame.
         let hanging = controllers.hang();
         for _ in 0..10 {
             tool("ip link set can0 down");
@@ -417,7 +418,7 @@ fn error_frames_of_the_driver_are_counted() {
         let mut inbox = Inbox::new();
         until("an error frame", || (errors.receive(&mut inbox).unwrap() > 0).then_some(()));
         let frames: Vec<_> = inbox.frames().map(|received| received.frame).collect();
-        // Of the controller (class 4), whose receive buffer overflowed (1).
+        // A controller error (class 4): the receive buffer overflowed (1).
         assert!(
             frames.iter().all(|frame| frame.is_error() && frame.raw_id() & 4 != 0 && frame.data()[1] == 1),
             "{frames:?}"
@@ -438,7 +439,7 @@ fn error_frames_of_the_driver_are_counted() {
 #[ignore = "needs Kvaser controllers"]
 fn a_controller_that_is_not_ready_is_refused_with_the_hint() {
     let _controllers = Controllers::up();
-    // A driver that has just found its hardware knows no bit timing.
+    // A driver that has just found its hardware has no bit timing yet.
     let (driver, address) = ("/sys/bus/pci/drivers/kvaser_pci", address("can0"));
     for what in ["unbind", "bind"] {
         fs::write(format!("{driver}/{what}"), &address).unwrap();

@@ -1,7 +1,6 @@
-//! Bit rates of a real driver, set and checked, and looked at with `ip`.
+//! Bit rates of a real driver: set, checked, and compared with `ip`.
 //!
-//! Needs root and the lab machine's two emulated controllers:
-//! `tests/vcan lab_kvaser_rates`.
+//! Needs root and the lab machine's two emulated controllers: `tests/vcan lab_kvaser_rates`.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use std::path::Path;
@@ -11,7 +10,7 @@ use serde_json::Value;
 use skinbus_tests::process::program;
 use tempfile::TempDir;
 
-/// A skin on can0, of classic format with this bit rate, in a folder of its own.
+/// A folder with a skin on can0, of classic format with this bit rate.
 struct Bench(TempDir);
 
 impl Bench {
@@ -27,7 +26,7 @@ impl Bench {
         std::fs::write(self.0.path().join("skin.toml"), text).unwrap();
     }
 
-    /// Exit code, standard output, and the line on standard error.
+    /// Returns the exit code, standard output, and the line on standard error.
     fn run(&self, arguments: &str) -> (i32, String, String) {
         let mut command = Command::new(program("vcan-setup"));
         command.args(arguments.split_whitespace()).current_dir(self.0.path());
@@ -43,7 +42,7 @@ fn ip(arguments: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// Whether can0 is up, and its bit rate.
+/// Returns true if can0 is up, and its bit rate.
 fn can0() -> (bool, Value) {
     let links: Vec<Value> = serde_json::from_str(&ip("-json -details link show can0")).unwrap();
     let up = links[0]["flags"].as_array().unwrap().iter().any(|flag| flag == "UP");
@@ -114,7 +113,7 @@ fn what_the_hardware_cannot_do_leaves_it_as_it_was() {
     assert_eq!((code, out.as_str(), err.as_str()), (1, "", expected));
     assert_eq!(can0(), before);
 
-    // A clock of 8 MHz has 888888 bit/s, and nothing nearer.
+    // A clock of 8 MHz can produce 888888 bit/s, and no rate nearer to the requested one.
     bench.write("format = \"classic\"\nbitrate = 930000");
     let (code, _, err) = bench.run("up skin.toml --set-bit-rates");
     assert!(code == 1 && err.starts_with("cannot set can0 to 930 kbit/s: "), "{err}");

@@ -7,7 +7,7 @@ use skinbus_tests::process;
 use process::Place;
 use process::readme::{README, commands, run};
 
-/// The built programs run there; how well 253 processes keep time is what the machine makes of it.
+/// The built programs run there; the timing of 253 processes depends on the machine, so it is not checked.
 #[test]
 #[ignore = "needs the lab machine"]
 fn every_command_works_where_the_kernel_has_can() {

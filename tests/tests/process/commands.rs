@@ -1,4 +1,4 @@
-//! The commands as processes, as far as they need no CAN in the kernel and change no interface.
+//! The commands as processes, as far as they need neither CAN in the kernel nor changes of an interface.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process::program;
@@ -16,14 +16,14 @@ use serde_json::Value;
 use served::Served;
 use tempfile::TempDir;
 
-/// A folder with a copy of the program, and nothing beside it unless it is put there.
+/// A folder with a copy of the program, and otherwise only the files that a test adds.
 struct Folder(TempDir);
 
 impl Folder {
     fn new() -> Self {
         let folder = Self(TempDir::new().unwrap());
-        // By a process of its own: a child that another test starts while this one has the copy open for writing
-        // would keep it open for a moment, and until then it is "busy" and cannot be run.
+        // A separate process copies it: a child that another test starts meanwhile would inherit the open file, and
+        // until its `exec` the copy would be busy and could not be run.
         let mut copy = Command::new("cp");
         copy.arg(program("vcan-setup")).arg(folder.program());
         assert!(copy.status().unwrap().success());
@@ -53,7 +53,7 @@ impl Folder {
         std::fs::write(self.0.path().join(name), text).unwrap();
     }
 
-    /// Serves a bus, and returns when it is served.
+    /// Serves a bus, and returns once it is served.
     fn serve(&self, name: &str) -> Served {
         let (served, line) = Served::start(&mut self.command(&format!("serve {name}")));
         assert!(line.starts_with("serving "), "{line}");
@@ -61,7 +61,7 @@ impl Folder {
     }
 }
 
-/// The skin of the README, with some lines changed.
+/// Returns the skin of the README, with some lines changed.
 fn skin(changes: &[(&str, &str)]) -> String {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap();
     let text = std::fs::read_to_string(root.join("gateway/examples/ur5-253.toml")).unwrap();
@@ -178,7 +178,7 @@ fn names_that_are_not_utf_8_are_files_and_no_buses() {
     assert!([1, 2].contains(&space.code) && !space.err.contains("panicked"), "{space:?}");
 }
 
-/// A stack for which no address space has room: the system starts no thread.
+/// A stack size for which no address space has room: the system starts no thread.
 #[test]
 fn without_threads_nothing_panics() {
     let folder = Folder::new();
@@ -229,7 +229,7 @@ fn status_shows_embedded_buses_and_which_are_served() {
     assert_eq!(status("nosuchcan2").1, serde_json::json!([]));
 }
 
-/// The findings of one level, of a doctor who looks at the embedded bus.
+/// Returns the findings of one level that `doctor` reports on the embedded bus.
 fn findings(said: &Said, level: &str) -> Vec<String> {
     let json: Value = serde_json::from_str(&said.out).unwrap();
     assert_eq!(json["bus_kind"], "embedded");
@@ -272,7 +272,7 @@ fn the_doctor_rates_the_kernel_by_the_choice() {
     assert_eq!((said.code, said.err.as_str()), (1, ""));
 }
 
-/// Runs the doctor while a process sends on the bus all the time.
+/// Runs the doctor while a process sends on the bus continuously.
 fn doctor_hears(folder: &Folder, arguments: &str, ids: &[Id]) -> Said {
     let options = Options { filters: vec![], directory: Some(folder.buses()), ..Options::default() };
     let bus = Bus::open("nosuchcan1", Choice::Only(BusKind::Embedded), &options).unwrap();

@@ -20,11 +20,11 @@ use skinbus_tests::can_raw as cases;
 mod place;
 
 const BUS: &str = "vcan0";
-/// Longer than anything takes; nothing waits that long unless it fails.
+/// A time limit that only failures reach.
 const LONG: Duration = Duration::from_secs(60);
-/// What marks the end of what a test waits for.
+/// The identifier of the frame that marks the end of a test's frames.
 const LAST: u32 = 0x7FF;
-/// What passes the time until the bus has seen to everything; not looked at.
+/// The identifier of ignored frames, which are sent until the bus has processed everything.
 const MEANWHILE: u32 = 0x6FF;
 
 /// A bus of its own for each test, in a directory that does not exist yet.
@@ -65,7 +65,7 @@ impl Bench {
         socket
     }
 
-    /// Stops the bus; nothing may be left behind, and every frame is accounted for.
+    /// Stops the bus, and checks that no file is left and every frame is accounted for.
     fn end(self) -> Totals {
         let totals = self.served.stop().unwrap();
         assert_eq!(std::fs::read_dir(self.parent.path()).unwrap().count(), 0, "the directory is removed too");
@@ -82,7 +82,7 @@ fn frame(id: u32, number: u32) -> Frame {
     Frame::fd(id, 1, &number.to_le_bytes()).unwrap()
 }
 
-/// Everything up to and without the frame [`LAST`], and without [`MEANWHILE`].
+/// Returns all frames before [`LAST`], except [`MEANWHILE`].
 fn read(bus: &Bus, inbox: &mut Inbox) -> Vec<Frame> {
     let mut frames = Vec::new();
     loop {
@@ -146,7 +146,7 @@ fn every_senders_order_is_kept_and_all_receivers_see_the_same() {
 fn every_rule_of_can_raw_holds() {
     let bench = Bench::new();
     for case in cases::cases() {
-        // The end marker passes the same door, so the case's filters get one more that lets it in.
+        // The end marker passes the same filters, so the case gets one more filter that accepts it.
         let filters = [&case.filters[..], &[exact(LAST)]].concat();
         let (own_frames, fd, error_mask) = (case.own_frames, case.fd, case.error_mask);
         let client = bench.open_with(Options { filters, own_frames, fd, error_mask, ..bench.options() });
@@ -162,7 +162,7 @@ fn every_rule_of_can_raw_holds() {
     bench.end();
 }
 
-/// When this returns, all frames sent before have been routed: it was read in the same or an earlier round.
+/// Waits until all frames sent before have been routed: this one is read in the same round or a later one.
 fn wait_until_routed(bench: &Bench) {
     let (a, b) = (bench.open(&[]), bench.open(&[exact(MEANWHILE)]));
     for _ in 0..2 {
@@ -178,13 +178,13 @@ fn filters_change_in_order_with_the_frames() {
     let other = bench.open(&[]);
     let client =
         bench.open_with(Options { own_frames: true, filters: vec![exact(1), exact(2)], ..bench.options() });
-    // What it sends itself is in order with its filters.
+    // The order between its own frames and its filters is kept.
     client.send(&[frame(1, 1), frame(3, 1)]).unwrap();
     client.set_filters(&[exact(2), exact(3), exact(LAST)]).unwrap();
     client.send(&[frame(1, 2), frame(2, 2), frame(3, 2)]).unwrap();
     client.set_filters(&[]).unwrap();
     client.send(&[frame(1, 3), frame(2, 3), frame(3, 3)]).unwrap();
-    // More of them than one datagram holds, the ones that matter at both ends.
+    // More filters than one datagram holds, with the relevant ones at both ends.
     let many: Vec<_> = [3, LAST].into_iter().chain(0x100..0x200).chain([1]).map(exact).collect();
     client.set_filters(&many).unwrap();
     wait_until_routed(&bench);
@@ -254,7 +254,7 @@ fn what_a_client_does_not_read_is_dropped_and_counted_exactly() {
     }
     wait_until_routed(&bench);
 
-    // Every frame that comes is preceded by the number of those that are missing.
+    // Every frame that arrives is preceded by the number of missing ones.
     let mut inbox = Inbox::new();
     let mut heard = 0;
     while heard + inbox.dropped() < SENT {
@@ -268,7 +268,7 @@ fn what_a_client_does_not_read_is_dropped_and_counted_exactly() {
     assert!(heard > 100 && inbox.dropped() > 1000, "{heard} heard, {} dropped", inbox.dropped());
     assert_eq!(heard + inbox.dropped(), SENT);
 
-    // And then all is as before.
+    // After that, everything is as before.
     sender.send(&[frame(2, 0), frame(LAST, 0)]).unwrap();
     assert_eq!(read(&slow, &mut inbox), [frame(2, 0)]);
     let dropped = inbox.dropped();
@@ -301,7 +301,7 @@ fn a_client_that_vanishes_has_said_what_it_said_and_the_rest_go_on() {
         let goes = bench.open(&[Filter::ALL]);
         stays.send(&[frame(3, 0), frame(3, 1)]).unwrap();
         goes.send(&[frame(1, round), frame(LAST, 0)]).unwrap();
-        // It goes without reading, so the system reports an error to the server before the end.
+        // The client leaves without reading, so the system reports an error to the server before the end.
         drop(goes);
         assert_eq!(read_all(&stays), [frame(1, round)]);
     }
@@ -393,7 +393,7 @@ fn a_bus_that_ends_is_read_to_its_end_and_then_closed() {
     assert!(bus.wait(Some(LONG)).unwrap(), "the end can be waited for too");
     let error = bus.receive(&mut inbox).unwrap_err();
     assert!(matches!(error, BusError::Closed { .. }) && error.is_closed(), "{error}");
-    // A child that another test has just forked holds the server's end open until it executes.
+    // A child that another test has just forked holds the server's end open until its `exec`.
     let error = until("an error", || idle.send(&[frame(1, 3), frame(1, 4)]).err());
     assert_eq!(error.to_string(), "the embedded bus vcan0 was closed: its server ended (0 of 2 frames sent)");
 }
@@ -418,7 +418,7 @@ fn a_client_that_alone_is_hung_up_on_is_not_told_that_the_server_ended() {
 #[test]
 fn a_server_that_lets_nobody_in_is_given_up_on() {
     let parent = TempDir::new().unwrap();
-    // Bound and never run, as a process that is stopped: no client is accepted.
+    // Bound but not running, like a stopped process: it accepts no client.
     let server = vcan_setup::embedded::Server::bind_in(&parent.path().join("skinbus"), BUS).unwrap();
     let directory = Some(parent.path().join("skinbus"));
     let error = Bus::open(BUS, Choice::Only(BusKind::Embedded), &Options { directory, ..Options::default() });

@@ -1,4 +1,5 @@
-//! Several buses, some of CAN FD and some classic: losing one does not affect the others, and it comes back.
+//! Several buses, some with CAN FD and some with classic frames: losing one does not affect the others, and it comes
+//! back.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(clippy::wildcard_enum_match_arm, reason = "a test looks for what it looks for")]
 
@@ -27,7 +28,7 @@ const BUSES: [(&str, Format); 3] = [("vcan0", Format::Fd), ("vcan1", Format::Cla
 const CELLS: usize = 12;
 const LOST: &str = "the embedded bus vcan1 was closed: its server ended; the others go on";
 
-/// Twelve cells on three buses, all pressed, and an arm that this moves.
+/// Creates twelve cells on three buses, all pressed, and an arm that moves under the touch.
 fn place() -> Place {
     let place = Place::new();
     place.write("skin.toml", &mixed_skin(&skin_of(CELLS, 3, Wire::Fd), &["vcan1"]));
@@ -35,26 +36,26 @@ fn place() -> Place {
     place
 }
 
-/// Serves a bus as another program would.
+/// Serves a bus, as another program would.
 fn serve(place: &Place, bus: &str) -> Running {
     let server = place.start("vcan-setup", &format!("serve {bus}"));
     server.prints(&format!("serving {bus} at "));
     server
 }
 
-/// The process that serves a bus for the gateway.
+/// Returns the process that serves a bus for the gateway.
 fn server(place: &Place, bus: &str) -> Pid {
     let found = || place.processes().into_iter().find(|(_, line)| line.contains(&format!(" serve {bus} ")));
     until("a server", found).0
 }
 
-/// Listens on each bus.
+/// Opens a client on each bus.
 fn test_clients(place: &Place) -> [TestClient; 3] {
     BUSES.map(|(bus, format)| TestClient::on(place, bus, format))
 }
 
-/// Ends a bench and the server of vcan1; checks that all counts add up on all buses, and that only vcan1 was lost,
-/// so often.
+/// Ends a bench and the server of vcan1; checks that all counts add up on all buses, and that only vcan1 was lost, this
+/// number of times.
 fn ended_well(place: &Place, bench: Running, server: Option<Running>, times: u64) {
     bench.signal(Signal::TERM);
     let ended = bench.end().well();
@@ -103,7 +104,7 @@ fn a_bus_of_ours_that_ends_is_served_and_opened_again_and_its_cells_are_the_same
     let summary = place.summary();
     assert_eq!(summary.total("/loop/bad_cycles"), 0, "{:#}", summary.0);
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
-    // What the cells answer now was lost with the bus then, and is no difference.
+    // The cells' answers in that time were lost with the bus, and do not count as differences.
     for capture in ["run.mcap", "run.log"] {
         place.start("skinbus", &format!("convert {capture} notes.log --overwrite")).end().well();
         let lines = place.read("notes.log");
@@ -156,7 +157,7 @@ fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() 
         test_client.waits_for_joints(30);
         test_client.waits_for_torques(1..=4);
     }
-    // The robot is halted and resumed while the bus does not receive it.
+    // The robot is halted and resumed while the bus does not receive that.
     place.start("skinbus", "frame halt --bus vcan0 --bus-kind embedded").end().well();
     bench.hears("the robot is halted: somebody sent a halt frame; `skinbus frame resume --bus vcan0 --bus-kind embedded`");
     let second = serve(&place, "vcan1");
@@ -171,7 +172,7 @@ fn while_a_bus_is_away_the_others_go_on_and_changes_are_sent_to_it_afterwards() 
     ended_well(&place, bench, Some(second), 1);
     assert_eq!(place.summary().total("/loop/bad_cycles"), 0, "{:#}", place.summary().0);
     assert!(place.summary().number("/loop/unsent") > 0, "{:#}", place.summary().0);
-    // All that was on the buses is in the log, each frame under its bus.
+    // All frames of the buses are in the log, each with its bus.
     let log = place.read("run.log");
     for (bus, format) in BUSES {
         assert!(carries(&log, bus, format), "{bus}");
@@ -197,7 +198,7 @@ fn cells_that_were_away_receive_a_missed_resume_and_a_missed_touch() {
     bench.hears(LOST);
     place.start("skinbus", "frame resume --bus vcan0 --bus-kind embedded").end().well();
     bench.hears("the robot goes on");
-    // More than the two seconds after which the cells that are away are touched.
+    // More than the two seconds after which the absent cells are touched.
     TestClient::on(&place, "vcan2", Format::Fd).waits_for_joints(150);
     let second = serve(&place, "vcan1");
     test_clients(&place).iter().for_each(|bus| bus.waits_for_torques(1..=4));
@@ -289,7 +290,7 @@ fn each_bus_has_the_requested_kind() {
     );
     let said = refused("--bus-kind vcan1=vcan");
     assert!(said.contains("\"vcan1=vcan\" is no kind of bus: auto, socketcan and embedded are"), "{said}");
-    // Whatever the kernel has, it has no vcan1 of ours.
+    // Whatever interfaces the kernel has, it does not have this vcan1.
     let said = refused("--bus-kind embedded --bus-kind vcan1=socketcan");
     assert!(
         said.starts_with("skinbus: vcan1: this kernel has no") || said.contains("no interface vcan1"),
@@ -299,11 +300,11 @@ fn each_bus_has_the_requested_kind() {
     place.is_left_clean();
 }
 
-/// A server of vcan0 that this test plays.
+/// A server of vcan0 that the test itself plays.
 struct PlayedServer {
     listener: OwnedFd,
     decoder: Decoder,
-    /// Packets that came.
+    /// The number of received packets.
     packets: u16,
 }
 
@@ -318,7 +319,7 @@ impl PlayedServer {
         Self { listener, decoder: Decoder::new(None), packets: 0 }
     }
 
-    /// Lets a client in; one that only looks whether somebody listens sends no hello.
+    /// Accepts a client. A client that only checks for a listener sends no hello.
     fn admits(&self) -> OwnedFd {
         let client = loop {
             let client = rustix::net::accept(&self.listener).unwrap();
@@ -333,7 +334,7 @@ impl PlayedServer {
         client
     }
 
-    /// Waits for the next message of a cell; nothing when it has sent all that it can.
+    /// Returns the next message of a cell, or `None` after it has sent everything that it can.
     fn receives(&mut self, client: &OwnedFd) -> Option<Message> {
         loop {
             let mut bytes = [0; 72];
@@ -359,7 +360,7 @@ fn what_a_cell_counts_as_sent_was_taken_by_its_bus_however_often_it_is_hung_up_o
     let request = Request::Read { number: Parameter::Reply.number() };
     let request = Message::Configure { to: Node::Everyone, tag: 1, request }.encode();
     for _ in 0..4 {
-        // The one that wakes it, and the one for what may wait.
+        // The connection that wakes the cell, and the one for deferred frames.
         let [bus, deferred] = [(); 2].map(|()| server.admits());
         let mut heartbeats = 0;
         while heartbeats < 3 {
@@ -367,11 +368,11 @@ fn what_a_cell_counts_as_sent_was_taken_by_its_bus_however_often_it_is_hung_up_o
             heartbeats +=
                 u32::from(matches!(message, Message::Network { page: NetworkPage::Heartbeat(_), .. }));
         }
-        // From here on it cannot send, and it does not know that before it answers.
+        // From here on the cell cannot send; it notices that when it answers.
         rustix::net::shutdown(&bus, Shutdown::Read).unwrap();
         while server.receives(&bus).is_some() {}
         for frame in request.frames(Format::Fd) {
-            // Its heartbeat may have been first, and then it is gone.
+            // Its heartbeat may have come first, and then the connection is gone already.
             let _ = rustix::net::send(&bus, &frame.to_bytes()[..frame.byte_len()], SendFlags::NOSIGNAL);
         }
         drop((bus, deferred));

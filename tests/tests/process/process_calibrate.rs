@@ -1,4 +1,4 @@
-//! Calibrations of simulated cells over a bus: the robot moves, a recording is kept, and says the same again.
+//! Calibrations of simulated cells over a bus: the robot moves, and the recording gives the same result again.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -9,7 +9,7 @@ use serde_json::Value;
 
 const START: [&str; 2] = ["--start", "0 -1.2 1.0 -1.4 -1.57 0"];
 
-/// Exit code, result unless it was refused, and standard error.
+/// Returns the exit code, the result unless it was refused, and standard error.
 fn calibrate(place: &Place, words: &str) -> (Option<i32>, Option<Value>, String) {
     let mut command = place.command("skinbus", &format!("calibrate skin.toml --json --overwrite {words}"));
     let output = command.args(START).output().unwrap();
@@ -28,7 +28,7 @@ fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
     let (code, again, repeated) = calibrate(&place, "--recording run.mcap -o again.toml");
     assert_eq!(found, again, "{said}");
     let exists = |name: &str| place.path(name).exists();
-    // The same cells under the description of others.
+    // The same cells with the description of other ones.
     let skin = place.read("skin.toml");
     place.write("skin.toml", &skin.replace("serial = 100001", "serial = 7"));
     let (refused, nothing, why) = calibrate(&place, "--recording run.mcap -o other.toml");
@@ -37,7 +37,7 @@ fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
     assert!(!exists("other.toml"));
     place.write("skin.toml", &skin);
     let Some(found) = found else {
-        // A machine that is late too often: the refusal names the gaps, and nothing is written.
+        // A machine that is late too often: the refusal names the gaps, and no file is written.
         assert_eq!(code, Some(1));
         assert!(
             said.contains("in the broadcasts") && repeated.contains("in the broadcasts"),
@@ -53,7 +53,7 @@ fn a_calibration_finds_cells_and_its_recording_finds_the_same() {
     for ((old, new), result) in skin.cells.iter().zip(&new.cells).zip(cells) {
         assert_eq!((old.joint, old.node), (new.joint, new.node), "{result}");
         assert!(result["readings"].as_u64().unwrap() > 120, "{result}");
-        // As far as a machine lets it that is late for some broadcasts.
+        // As accurate as a machine allows that is late for some broadcasts.
         assert!(result["moved_mm"].as_f64().unwrap() < 15.0, "{result}");
         assert!(result["turned_deg"].as_f64().unwrap() < 3.0, "{result}");
     }

@@ -1,5 +1,5 @@
-//! Captures that are larger than the memory they are converted in: hundreds of megabytes through a pipe, in a
-//! process that cannot have more than a hundred.
+//! Captures that are larger than the memory of the converter: hundreds of megabytes through a pipe, in a process with a
+//! limit of a hundred.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -12,10 +12,10 @@ use process::program;
 
 /// Lines of the log, 53 bytes each: 212 MB.
 const LINES: u64 = 4_000_000;
-/// Lines that are made and compared at once.
+/// The number of lines that are generated and compared at once.
 const PIECE: u64 = 10_000;
 
-/// The lines from `first` on.
+/// Writes the lines from `first` on.
 fn piece(text: &mut String, first: u64) {
     text.clear();
     for line in first..first + PIECE {
@@ -25,7 +25,8 @@ fn piece(text: &mut String, first: u64) {
     }
 }
 
-/// The gateway with an address space of 100 MB, and without the room that allocators take for each thread.
+/// Returns the gateway's command with an address space of 100 MB, without the memory that allocators reserve for each
+/// thread.
 fn bounded(from: &str, to: &str) -> Command {
     let mut command = Command::new("sh");
     let gateway = program("skinbus");

@@ -1,4 +1,4 @@
-//! Robots with several chains, and with joints that slide: run, recorded, shown, replayed and reported.
+//! Robots with several chains and with prismatic joints: run, recorded, shown, replayed and reported.
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
@@ -38,7 +38,7 @@ fn run(place: &Place, words: &str) -> Ended {
     place.start("skinbus", words).end().well()
 }
 
-/// `skin.toml` of an example robot with these cells, and a scenario that presses all of them.
+/// Writes `skin.toml` of an example robot with these cells, and a scenario that presses all of them.
 fn robot(file: &str, tips: &str, cells: &str) -> Place {
     let place = Place::new();
     fs::copy(example(file), place.path(file)).unwrap();
@@ -72,13 +72,13 @@ fn the_torque_of_a_torso_is_that_of_both_arms() {
     let place = robot("two-arms.urdf", "--tip left_palm --tip right_palm", cells);
     place.bench(3.0, "--record run.mcap").end().well();
 
-    // What the cells sent, by bus and epoch; the arms have moved.
+    // The cells' torques, by bus and epoch; the arms have moved.
     let mut sent = BTreeMap::<(String, u64), Vec<Vec<f64>>>::new();
     for torque in objects(&place, "dump run.mcap --json --kind torque --from 2") {
         let key = (torque["bus"].as_str().unwrap().to_owned(), torque["epoch"].as_u64().unwrap());
         sent.entry(key).or_default().push(numbers(&torque["values"]["torque_nm"]));
     }
-    // One that all of them answered: on a busy machine cells skip some.
+    // An epoch that all of them answered: on a busy machine cells skip some.
     let all_sent = |epoch: &u64| {
         CHAINS.iter().zip([3, 2]).all(|((bus, _), cells)| {
             sent.get(&((*bus).to_owned(), *epoch)).is_some_and(|words| words.len() == cells)
@@ -100,7 +100,7 @@ fn the_torque_of_a_torso_is_that_of_both_arms() {
         assert!((total["central_nm"].as_f64().unwrap() - sum).abs() < 5e-3, "{total}");
     }
     assert!(sums[1].abs() > 0.1, "the torso bears a load: {sums:?}");
-    // The robot's numbers, also where a chain counts otherwise.
+    // The robot's joint numbers, also for a chain that counts differently.
     let last = explained["cells"].as_array().unwrap().last().unwrap();
     let numbered =
         |value: &Value| value.as_array().unwrap().iter().map(|it| it.as_u64().unwrap()).collect::<Vec<_>>();
@@ -120,7 +120,7 @@ fn the_torque_of_a_torso_is_that_of_both_arms() {
     let torques = recorded.on("/two_arms/torques").last().unwrap();
     assert_eq!(numbers(&torques.value["distributed"]).len(), 12, "{}", torques.value);
 
-    // Two arms need two buses, whatever fits on one.
+    // Two arms need two buses, even if one bus has room for all cells.
     let fit: Value =
         serde_json::from_str(&run(&place, "fit skin.toml --nominal 1M --data 5M --json").stdout).unwrap();
     assert!(fit["whole"]["buses_needed"]["buses"].as_u64().unwrap() >= 2, "{}", fit["whole"]);
@@ -151,7 +151,7 @@ fn a_joint_that_slides_has_its_own_units() {
     let heard = |object: &&Value| object["kind"] == "joints" && object["epoch"] == epoch;
     let joints = shown[0].iter().rev().find(heard).unwrap();
     let positions = numbers(&joints["values"]["position_rad"]);
-    // Of 2 N the part along the lift, in words of 2^-10 N.
+    // The component of 2 N along the lift, in words of 2^-10 N.
     assert!(sent[0] != 0.0 && sent[0].abs() <= 2.0 && (sent[0] * 1024.0).fract() == 0.0, "{sent:?}");
     let all = explained(&place, epoch, 1);
     let [rows, bus] = [&all["cells"][0]["rows"], &all["buses"][0]];
@@ -163,14 +163,14 @@ fn a_joint_that_slides_has_its_own_units() {
     let expected = format!("torque 1 epoch {epoch}: {:.4} N {:.4}", sent[0], sent[1]);
     assert!(text.contains(&expected) && text.contains(" m "), "{expected}\n{text}");
 
-    // Without the skin the bits are taken for Q3.12 and rad.
+    // Without the skin the words are decoded as Q3.12 and rad.
     let plain = objects(&place, "dump run.log --json --kind torque --from 1");
     let plain = plain.iter().rev().find(|object| object["epoch"] == epoch).unwrap();
     assert_eq!(numbers(&plain["values"]["torque_nm"])[0] * 4.0, sent[0]);
     let ended = place.start("skinbus", "dump run.log --skin nowhere.toml").end();
     assert!(ended.refusal(2).contains("nowhere.toml"));
 
-    // The skin of another robot is named, and not believed.
+    // The skin of another robot is reported, and not used.
     fs::copy(example("panda.urdf"), place.path("panda.urdf")).unwrap();
     run(&place, "skin import panda.urdf --tip hand -o other.toml");
     let another =

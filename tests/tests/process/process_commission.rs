@@ -16,7 +16,8 @@ use protocol::skin::Skin;
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// The skin as cells have it from the last time: with another gain, another wrist, and other poses.
+/// Returns the skin as the cells have it from an earlier commissioning: with another gain, another wrist, and other
+/// poses.
 fn older(text: &str) -> String {
     let older = text
         .replace("alpha_c = 1.0", "alpha_c = 0.5")
@@ -26,7 +27,7 @@ fn older(text: &str) -> String {
     older
 }
 
-/// A bus with cells that are there already, with the older skin in their flash.
+/// A bus with running cells, which have the older skin in their flash.
 struct Workshop {
     place: Place,
     _cells: Running,
@@ -38,7 +39,7 @@ impl Workshop {
         Self::with(text, &older(text), "")
     }
 
-    /// The cells from 1 on in one process, with the skin `had`.
+    /// Starts the cells from 1 on in one process, with the skin `had`.
     fn with(text: &str, had: &str, more: &str) -> Self {
         let place = Place::new();
         place.write("skin.toml", text);
@@ -63,7 +64,7 @@ impl Workshop {
         self.place.start("skinbus", &format!("commission skin.toml --bus-kind embedded {more}"))
     }
 
-    /// The list of cells as JSON.
+    /// Returns the list of cells as JSON.
     fn list(&self, more: &str) -> Result<Value, Ended> {
         let ended =
             self.place.start("skinbus", &format!("cells vcan0 --bus-kind embedded --json {more}")).end();
@@ -73,7 +74,7 @@ impl Workshop {
         }
     }
 
-    /// The flash of each cell, by node id.
+    /// Returns the parameters in the flash of each cell, by node id.
     fn flashes(&self) -> BTreeMap<u8, Option<Parameters>> {
         let of = |cell: &protocol::skin::Cell| {
             let file = self.place.path(&format!("flash/vcan0-{}.flash", cell.node));
@@ -84,7 +85,8 @@ impl Workshop {
         self.skin().cells.iter().filter_map(of).collect()
     }
 
-    /// Checks that each cell has the older skin's parameters or the new one's; how many have the new.
+    /// Checks that each cell has either the older skin's parameters or the new one's; returns the number with the new
+    /// ones.
     fn none_is_mixed(&self) -> usize {
         let of = |name: &str| {
             let skin = Skin::read(&self.place.path(name)).unwrap();
@@ -139,7 +141,7 @@ fn cells_get_the_skins_parameters_and_a_repeat_is_a_no_op() {
 fn killed_in_the_middle_and_run_again_it_is_complete_and_nothing_is_mixed() {
     let workshop = Workshop::new(&skin(120));
     let mut halfway = false;
-    // A machine may be too quick, or too slow; somewhere between, some cells have it and others not.
+    // A machine may be too quick or too slow; in between, some cells have it and others do not.
     for _ in 0..40 {
         let running = workshop.commission("--quiet");
         let file = workshop.place.path("flash/vcan0-1.flash");
@@ -173,7 +175,7 @@ fn killed_in_the_middle_and_run_again_it_is_complete_and_nothing_is_mixed() {
 fn cells_that_hang_delay_no_others_and_are_named() {
     let text = skin(9);
     let workshop = Workshop::new(&text);
-    // The cells of the second process: the next node ids.
+    // The cells of the second process have the next node ids.
     let more = skin(12);
     workshop.place.write("skin.toml", &more);
     workshop.place.write("had.toml", &older(&more));
@@ -187,7 +189,7 @@ fn cells_that_hang_delay_no_others_and_are_named() {
         (listed["cells"].as_array().unwrap().iter().filter(ready).count() == 12).then_some(())
     });
     let running = workshop.commission("--json");
-    // Its first message is received, and no answer comes.
+    // Its first message is received, but not answered.
     hung.signal(Signal::STOP);
     let ended = running.end();
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
@@ -241,7 +243,7 @@ fn node_ids_on_the_bus_are_written_into_a_copy_of_the_description() {
     assert_eq!(workshop.commission("--json").end().well().stdout.matches("\"already so\"").count(), 6);
     let listed = workshop.list("--skin as-is.toml").unwrap();
     assert!(listed["cells"].as_array().unwrap().iter().all(|cell| cell["skin"] == "yes"), "{listed:#}");
-    // A bench of the copy runs with the cells that are there.
+    // A bench of the copy runs with the existing cells.
     let run = "run as-is.toml --no-spawn --bus-kind embedded --duration 0.5 --quiet";
     workshop.place.start("skinbus", run).end().well();
 }
@@ -273,7 +275,7 @@ fn new_cells_get_node_ids_from_the_network_and_then_their_parameters() {
         let file = fs::read(place.path(&format!("flash/vcan0-s{}.flash", described.serial))).unwrap();
         let kept = flash::decode(Identity { cell: None, serial: described.serial }, &file).unwrap();
         assert_eq!((kept.number, kept.parameters), (Some(there.node), Some(skin.parameters(described))));
-        // The wiring is the same, by other node ids.
+        // The wiring is the same, with other node ids.
         let renamed =
             |node: CellId| skin.cells.iter().position(|cell| cell.node == node).map(|at| copy.cells[at].node);
         assert_eq!(described.neighbors.map(|it| it.and_then(renamed)), there.neighbors);
@@ -327,7 +329,7 @@ fn unknown_nodes_are_named_and_left_alone_and_missing_cells_are_named() {
     let text = skin(6);
     let workshop = Workshop::new(&text);
     let without: String = {
-        // The fourth cell is another one, which is nowhere.
+        // The fourth cell has a serial number that the skin does not list.
         text.replace("serial = 100004", "serial = 7")
     };
     workshop.place.write("skin.toml", &without);
@@ -357,7 +359,7 @@ fn beside_a_gateway_nothing_is_sent() {
     place.write("other.toml", &older(&text));
     let said = place.start("skinbus", "commission other.toml --bus-kind embedded --quiet").end();
     assert_eq!(said.refusal(1), "skinbus: another gateway is on vcan0: stop it first");
-    // Listing disturbs no one.
+    // Listing does not disturb other clients.
     let listed = until("all in the list", || {
         let listed = place.start("skinbus", "cells vcan0 --bus-kind embedded --skin skin.toml").end().well();
         let all = "8 cells on vcan0 (embedded), 8 in contact, and a gateway\n";

@@ -1,5 +1,5 @@
-//! `skinbus conformance` against a cell that is a process: it passes, is put back, and everything that may go wrong is said in
-//! a line.
+//! `skinbus conformance` against a cell that is a process: the cell passes and is restored, and each possible failure
+//! is reported in one line.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -48,7 +48,7 @@ impl Cell {
         self.settles();
     }
 
-    /// Waits until it answers.
+    /// Waits until the cell answers.
     fn settles(&self) {
         until("the cell", || {
             let words = format!("frame configure --cell 5 --read identity {}", self.bus());
@@ -65,13 +65,13 @@ impl Cell {
         format!("--bus vcan0 --bus-kind embedded --format {}", self.format.name())
     }
 
-    /// Waits until its configuration is saved, and a moment more.
+    /// Waits until its configuration is saved, and a moment longer.
     fn is_tested(&self) {
         until("the file", || self.place.path("conformance-vcan0-5.json").exists().then_some(()));
         std::thread::sleep(Duration::from_millis(900));
     }
 
-    /// What it has in use.
+    /// Returns the values in use.
     fn has(&self) -> Vec<String> {
         let read = |parameter: &&str| {
             let words = format!("frame configure --cell 5 --read {parameter} {}", self.bus());
@@ -90,7 +90,7 @@ impl Drop for Cell {
     }
 }
 
-/// A whole test; a machine that is late makes no difference to what is checked here.
+/// Runs a whole test; a late machine does not affect its results here.
 fn passes(format: Format) {
     let cell = Cell::new(format);
     let before = cell.has();
@@ -100,7 +100,8 @@ fn passes(format: Format) {
     let whole: Value = serde_json::from_str(&ended.stdout).unwrap_or_else(|_| panic!("{ended:#?}"));
     let requirements = whole["requirements"].as_array().unwrap();
     let timed = |id: &str| id.starts_with("TIME") || id.starts_with("BEAT-1") || id.starts_with("BEAT-2");
-    // A machine that keeps the process from its processor makes it skip joints, as it should: what failed is met alone.
+    // On a machine that keeps the process waiting the cell skips joints, as it should: requirements that failed are
+    // tested again alone.
     let failed = |whole: &Value| -> Vec<Value> {
         let all = whole["requirements"].as_array().unwrap().iter();
         all.filter(|it| it["verdict"] == "failed" && !timed(it["id"].as_str().unwrap())).cloned().collect()
@@ -217,7 +218,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     };
     assert_eq!(
         of(6).refusal(1),
-        "skinbus: cell 6 sends nothing on vcan0, only 5: switch it on, or give the node id that it has"
+        "skinbus: cell 6 sends nothing on vcan0, only 5: switch it on, or give its actual node id"
     );
     let words = "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml";
     let other = cell.place.start("cell-node", words);
@@ -228,10 +229,10 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     });
     assert_eq!(
         of(5).refusal(1),
-        "skinbus: other cells are on vcan0: 3; joints and halts of the test reach them too: take them away, or say \
+        "skinbus: other cells are on vcan0: 3; joints and halts of the test reach them too: remove them, or say \
          --others-will-stop"
     );
-    // A busy machine may keep the cell from its processor for longer than it has to answer.
+    // A busy machine may keep the cell waiting for longer than its time to answer.
     until("a test beside a cell that is tolerated", || {
         let tolerated = cell.conformance("--others-will-stop --requirement CMD").end();
         (tolerated.code() == Some(0) && tolerated.stdout.contains("4 passed, 0 failed")).then_some(())
@@ -239,7 +240,7 @@ fn what_cannot_be_tested_is_refused_in_a_line() {
     drop(other);
 }
 
-/// A heartbeat under the cell's node id, of another cell.
+/// Returns a heartbeat of another cell with the cell's node id.
 fn twin() -> Message {
     let beat = Heartbeat { serial: 77, state: State::default().with_joint(0), ..Heartbeat::default() };
     let from = Node::from_byte(5);
@@ -258,9 +259,9 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     });
     assert_eq!(
         test.end().refusal(1),
-        "skinbus: 2 cells send as node 5 on vcan0, with the serial numbers 77 and 100005: take away all but one"
+        "skinbus: 2 cells send as node 5 on vcan0, with the serial numbers 77 and 100005: remove all but one"
     );
-    // One that begins to command in the middle.
+    // A gateway that begins to command in the middle of a test.
     let test = cell.conformance("");
     cell.is_tested();
     client.sends(&Message::Resume);
@@ -268,7 +269,7 @@ fn a_second_cell_with_its_node_id_and_a_second_gateway_are_named() {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     assert_eq!(
         ended.stderr,
-        "skinbus: 003##500000000000000000000000000004782 was sent by somebody else: stop the gateway that is on this bus\n"
+        "skinbus: 003##500000000000000000000000000004782 was sent by another program: stop the gateway on this bus\n"
     );
     assert_eq!(cell.has(), before);
     let test = cell.conformance("--requirement CMD");
@@ -287,7 +288,7 @@ fn other_cells_that_send_much_do_not_matter_if_they_are_tolerated() {
     let from = protocol::id::CellId::new(9).unwrap();
     let torque = protocol::packet::Words::zeros(protocol::packet::Length::Six);
     let flood = Message::Torque { from, epoch: Epoch(1), torque };
-    // A busy machine may keep the cell from its processor for longer than it has to answer.
+    // A busy machine may keep the cell waiting for longer than its time to answer.
     until("a test beside a flood that is passed", || {
         let test = cell.conformance("--requirement CMD,STIM,CONF --others-will-stop");
         let file = cell.place.path("conformance-vcan0-5.json");

@@ -1,4 +1,4 @@
-//! However a bench ends, nothing of it remains.
+//! However a bench ends, no process or file of it remains.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 #![allow(clippy::wildcard_enum_match_arm, reason = "a test looks for what it looks for")]
 
@@ -45,7 +45,7 @@ fn a_signal_ends_a_bench_early_and_well() {
         assert!(summary.figure("/duration_s") < 600.0, "{:#}", summary.0);
         let log = Log::read(&place.read("run.log"), Format::Fd);
         assert_eq!(summary.number("/recording/frames"), log.frames.len() as u64);
-        // The cells are halted, and are not resumed.
+        // The cells are halted, and not resumed.
         let last = log.messages.iter().rev().find_map(|(message, _)| match message {
             Message::Halt | Message::Resume | Message::Joints { .. } => Some(*message),
             _ => None,

@@ -1,4 +1,4 @@
-//! The experiments with real processes, in their quick form, and what may go wrong around them.
+//! The experiments with real processes in their quick form, and their failures.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -29,7 +29,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_rated() {
         (single["paper"]["value"].as_f64(), single["verdict"].as_str()),
         (Some(0.0054), Some("Better"))
     );
-    // Sums of all cells, rounded: far above a step of Q3.12, far below what cutting off would give.
+    // Sums of all cells, rounded: far above a step of Q3.12, far below the result of truncation.
     let summed = value(finding(0, "Q7.8"));
     assert!((1e-4..0.0356).contains(&summed), "{summed}");
     assert!((value(finding(1, "active at once")) - 24.0).abs() < 0.5);
@@ -42,7 +42,7 @@ fn the_moving_arm_is_run_recorded_drawn_and_rated() {
     assert_eq!(lines.next(), Some("time (s),central (Nm),distributed (Nm)"));
     let rows: Vec<Vec<&str>> = lines.map(|line| line.split(',').collect()).collect();
     let seconds = |row: &Vec<&str>| row[0].parse::<f64>().unwrap();
-    // 2.4 s at 500 Hz, less what a busy machine skips; central until 1.2 s and not after.
+    // 2.4 s at 500 Hz, less the ticks that a busy machine skips; central until 1.2 s and not after.
     assert!(rows.len() > 100 && rows.windows(2).all(|pair| seconds(&pair[0]) < seconds(&pair[1])));
     assert!(rows.iter().all(|row| row[1].is_empty() == (seconds(row) > 1.1995)), "{torque}");
     assert!(rows.iter().any(|row| row[2].parse::<f64>().unwrap().abs() > 0.1), "somebody pushes");

@@ -1,4 +1,4 @@
-//! Another program closes the loop of a bench of real processes, well and badly.
+//! Another program closes the loop of a bench of real processes, correctly or with faults.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -16,7 +16,7 @@ const MISSING: &str = "the external controller's answer is missing";
 const NOBODY: &str = "no external controller is connected";
 const NONSENSE: &str = "the external controller sent nonsense";
 
-/// The example in Python.
+/// Starts the example in Python.
 fn python(place: &Place) -> Running {
     let mut command = Command::new("python3");
     command.arg(example("external_controller.py")).arg(place.path("controller.sock"));
@@ -25,7 +25,7 @@ fn python(place: &Place) -> Running {
 
 #[test]
 fn the_example_in_python_moves_the_arm() {
-    // A busy machine halts no robot.
+    // A busy machine must not halt the robot.
     let place = place(10_000);
     let python = python(&place);
     python.hears("waiting for a gateway at ");
@@ -39,7 +39,7 @@ fn the_example_in_python_moves_the_arm() {
     let summary = place.summary();
     summary.adds_up();
     assert!(summary.0["halted"].is_null() && summary.0["outcome"] == "interrupted", "{:#}", summary.0);
-    // It is there when the loop begins; then it may be late, as the machine is.
+    // It is there when the loop begins; later it may be late, depending on the machine.
     assert_eq!(summary.count("/loop/bad_cycles", NONSENSE), 0, "{:#}", summary.0);
     assert!(summary.total("/loop/bad_cycles") < summary.number("/loop/ticks"), "{:#}", summary.0);
 }
@@ -49,7 +49,7 @@ fn a_controller_that_begins_later_is_waited_for() {
     let place = place(250);
     place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 600.0"));
     let bench = place.running_bench(600.0, "");
-    // More ticks than it may be missing once it has begun: each broadcast is in one of its own.
+    // More ticks than it may miss after it has begun: each broadcast is in a tick of its own.
     place.test_client().waits_for_joints(260);
     let python = python(&place);
     place.test_client().waits_for_motion();
@@ -132,7 +132,7 @@ fn a_controllers_nonsense_is_counted_and_ignored() {
     assert!(summary.count("/loop/bad_cycles", NONSENSE) > 0, "{:#}", summary.0);
     let reasons = [NONSENSE, NOBODY, MISSING].map(|reason| summary.count("/loop/bad_cycles", reason));
     assert_eq!(summary.total("/loop/bad_cycles"), reasons.iter().sum::<u64>());
-    // Nothing of it was executed: the robot stands where it stood.
+    // Nothing of it was executed: the robot has not moved.
     let log = process::log::Log::read(&place.read("run.log"), protocol::can::Format::Fd);
     let mut positions = log.joints();
     positions.dedup();
@@ -140,7 +140,8 @@ fn a_controllers_nonsense_is_counted_and_ignored() {
     assert!(log.messages.iter().any(|(message, _)| *message == Message::Halt), "the cells are halted");
 }
 
-/// Runs a bench whose controller may take longer to begin than the run lasts; `control` is what there is of one.
+/// Runs a bench whose controller may take longer to begin than the run lasts; `control` creates the part of it that
+/// exists.
 fn ends_without_controller(control: impl FnOnce(&Place), why: &str) {
     let place = place(25);
     place.write("skin.toml", &place.read("skin.toml").replace("start_s = 0.0", "start_s = 600.0"));
@@ -148,7 +149,7 @@ fn ends_without_controller(control: impl FnOnce(&Place), why: &str) {
     let gateway = place.path("controller.sock");
     until("the gateway's socket", || gateway.exists().then_some(()));
     control(&place);
-    // The loop runs, and so many ticks are over.
+    // The loop runs, and this number of ticks is over.
     place.test_client().waits_for_joints(30);
     bench.signal(Signal::TERM);
     let ended = bench.end();
@@ -194,7 +195,7 @@ fn a_controller_that_says_hello_and_does_not_answer_is_none() {
     let control = |place: &Place| {
         let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
         own.send_to(&[b"SKBC".as_slice(), &[1, 0, 3, 0]].concat(), place.path("controller.sock")).unwrap();
-        // It stays there, and reads nothing.
+        // It stays connected, and reads nothing.
         peer = Some(own);
     };
     ends_without_controller(control, " said hello and answered no tick in time (");

@@ -42,7 +42,7 @@ bus = "vcan0"
 cells = [4]
 "#;
 
-/// A torque of a cell.
+/// Returns a predicate for a torque of a cell.
 fn torque_of(cell: u8) -> impl Fn(&Message) -> bool {
     move |message| matches!(message, Message::Torque { from, .. } if from.get() == cell)
 }
@@ -83,7 +83,7 @@ fn a_scenario_kills_restarts_stops_and_continues_cells_and_the_loop_goes_on() {
     let started = log.messages.iter().rposition(|(message, _)| claims(message)).unwrap();
     assert!(log.torques_after(started, 3) > 0, "it answers again");
     assert_eq!(log.torques_after(started, 2), 0, "it was killed at the same time");
-    // A cell that was stopped answers none of the joints that waited for it.
+    // A cell that was stopped answers none of the joints that arrived meanwhile.
     let answers: Vec<_> = log.torques().into_iter().filter(|(_, (cell, ..), _)| *cell == 4).collect();
     let gap = answers.windows(2).map(|pair| pair[1].0 - pair[0].0).max().unwrap();
     assert!(gap > 20, "it was stopped for 4 s, and missed {gap} joints in a row");
@@ -139,8 +139,8 @@ fn several_cells_in_a_killed_process_are_all_named() {
     assert_eq!(place.summary().adds_up().silent(), [1, 2, 3, 4]);
 }
 
-/// Ends the cells of vcan1 by an error of their own: they lose their bus, and its folder is one in which they may not
-/// look for it again. Afterwards it is served again.
+/// Makes the cells of vcan1 end with an error of their own: they lose their bus, and may not search its folder again.
+/// Afterwards the bus is served again.
 fn errors_on_vcan1(place: &Place, bench: &Running, server: Running, processes: usize) -> Running {
     let mode = |mode| std::fs::set_permissions(place.buses(), std::fs::Permissions::from_mode(mode)).unwrap();
     let serve = || {
@@ -185,7 +185,7 @@ fn cells_that_end_by_an_error_of_their_own_are_the_runs_outcome_and_their_reason
         };
         assert_eq!(error["cells"], serde_json::json!([{ "bus": "vcan1", "nodes": [1, 2, 3, 4] }]));
         let why = error["reason"].as_str().unwrap();
-        // The gateway itself may not look there either.
+        // The gateway itself may not search it either.
         let given = ended.stderr.lines().filter(|line| !line.starts_with("vcan1 cannot be opened again yet"));
         assert_eq!(given.filter(|line| line.contains(why)).count(), 1, "{ended:#?}");
         let last = ended.stderr.lines().last().unwrap();
@@ -261,7 +261,7 @@ fn a_newcomer_with_a_taken_node_id_ends_with_one_line() {
     let place = Place::new();
     place.pressed();
     place.write("other.toml", &skin(8).replace("serial = 100003\n", "serial = 777\n"));
-    // An unknown cell, and a duplicate by the same description.
+    // An unknown cell, and a duplicate with the same description.
     for skin in ["other.toml", "skin.toml"] {
         let bench = place.running_bench(600.0, "");
         let newcomer =
@@ -274,7 +274,7 @@ fn a_newcomer_with_a_taken_node_id_ends_with_one_line() {
         let ended = bench.end().well();
         let summary = place.summary();
         assert_eq!(summary.silent().len(), 0);
-        // It may also have received from cell 3 before it sent anything.
+        // The gateway may also have received from cell 3 before the duplicate sent anything.
         let named = ended
             .stderr
             .contains("cell 3 on vcan0 shares its node id with another cell: stop one of the two");
@@ -286,7 +286,7 @@ fn a_newcomer_with_a_taken_node_id_ends_with_one_line() {
     }
 }
 
-/// A frame and the reason by which it is counted.
+/// Returns frames, each with the reason under which it is counted.
 fn odd_frames() -> Vec<(Frame, &'static str)> {
     let cell = |node| CellId::new(node).unwrap();
     let torque = |node| {
@@ -347,13 +347,13 @@ fn frames_that_cannot_be_used_are_counted_by_reason_and_none_is_used() {
         assert_eq!(summary.count("/buses/0/events", reason), sent as u64, "{reason}: {:#}", summary.0);
     }
     assert_eq!(summary.odd(0), 3 * odd.len() as u64, "{:#}", summary.0);
-    // A torque that was used would not be what the cell should have sent.
+    // A used torque would differ from the one that the cell should have sent.
     assert!(summary.figure("/accuracy/single/max_nm") < 0.002, "{:#}", summary.0);
     summary.adds_up();
     log_has_all(&place, &summary);
 }
 
-/// The log has every frame, unusable ones too.
+/// Checks that the log has every frame, including unusable ones.
 fn log_has_all(place: &Place, summary: &Summary) {
     let packets = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
     let frames = packets + summary.count("/buses/0/events", "foreign");
@@ -364,7 +364,7 @@ fn log_has_all(place: &Place, summary: &Summary) {
 #[test]
 fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
     let place = Place::new();
-    // A busy machine halts no robot.
+    // A busy machine must not halt the robot.
     place.write("skin.toml", &(skin(8) + "\n[safety]\nbad_cycles = 10000\n"));
     // The touch moves the arm.
     place.scenario(&PRESSED.replace("hold", "kinesthetic"));
@@ -412,7 +412,7 @@ fn a_halt_from_a_shell_halts_the_robot_and_ack_resumes_it() {
         all.dedup();
         all.len()
     };
-    // From the tick after the halt on the joints stand; one broadcast may have been on its way.
+    // From the tick after the halt on the joints stand still; one broadcast may have been on its way.
     assert!(joints(&log.messages[halt..resume]) <= 2, "a halted robot stands");
     assert!(joints(&log.messages[..halt]) > 2 && joints(&log.messages[resume..]) > 2, "else it moves");
 }
@@ -430,7 +430,7 @@ fn a_cell_that_restarts_while_the_robot_is_halted_is_halted_too() {
     bench.hears("the process of cell 3 on vcan0 ended");
     let _cell = place.start("cell-node", "--bus vcan0 --bus-kind embedded --node 3 --skin skin.toml");
     bench.hears("cell 3 on vcan0 restarted");
-    // One that knows nothing of its predecessor.
+    // A gateway that knows nothing of its predecessor.
     let test_client = place.test_client();
     let state = |message: &Message| match message {
         Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } => {

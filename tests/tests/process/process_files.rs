@@ -1,4 +1,4 @@
-//! Files that commands write: a log can be read while it grows, a summary is there after every end, and nothing is
+//! Files that commands write: a log can be read while it grows, a summary is written at every end, and no file is
 //! overwritten without --overwrite.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -25,7 +25,7 @@ use trace::capture::{Entry, Reader};
 
 const RUN: &str = "run skin.toml --bus-kind embedded --scenario scenario.toml";
 
-/// The times in ns of a log that consists of whole lines, each a frame, as our reader has them too.
+/// Returns the times in ns of a log of whole lines, each a frame, and checks them with our reader.
 fn times(path: &Path) -> Vec<u64> {
     let text = fs::read_to_string(path).unwrap();
     assert!(text.is_empty() || text.ends_with('\n'), "not whole: {:?}", text.lines().last());
@@ -42,8 +42,8 @@ fn times(path: &Path) -> Vec<u64> {
     times
 }
 
-/// Kills a gateway that writes a log so many times, each at a random moment; by how much the last line was older than
-/// the kill, in ms.
+/// Kills a gateway that writes a log several times, each at a random moment. Returns the age of the last line at each
+/// kill, in ms.
 fn kill_again_and_again(seed: u64, times_killed: u32) -> Vec<f64> {
     let place = Place::new();
     place.pressed();
@@ -87,7 +87,7 @@ fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
     let follow = |name: &str| {
         let log = place.path(name);
         let mut seen = 0;
-        // Each time more whole lines, all of them frames.
+        // Each time there are more whole lines, all of them frames.
         for _ in 0..5 {
             seen = until("more lines", || {
                 let text = fs::read_to_string(&log).unwrap();
@@ -118,8 +118,8 @@ fn a_log_can_be_followed_while_it_grows_and_has_one_writer() {
     }
 }
 
-/// Every option of every command that writes a file, with a name in the place of NAME; files that the command reads
-/// are there.
+/// Every option of every command that writes a file, with NAME in the place of its name; the files that the command
+/// reads exist.
 const WRITERS: [(&str, &str, &str); 13] = [
     ("--candump ", "run skin.toml --bus-kind embedded --duration 0.1 --candump NAME", "new.log"),
     ("--summary ", "run skin.toml --bus-kind embedded --duration 0.1 --summary NAME", "new.json"),
@@ -183,7 +183,7 @@ fn no_option_of_any_command_overwrites_a_file_or_follows_a_symlink_to_one() {
             }
         }
     }
-    // Whole folders: one in which there is something.
+    // Whole folders: one that is not empty.
     fs::create_dir(place.path("results")).unwrap();
     place.write("results/notes.txt", "mine\n");
     let said = place.start("skinbus", "experiment fig10 --quick -o results").end();
@@ -204,7 +204,7 @@ fn a_log_into_a_pipe_whose_reader_stops_does_not_keep_a_run_from_ending() {
     for (signal, summary) in [(Signal::INT, "int.json"), (Signal::TERM, "term.json")] {
         let words = format!("{RUN} --duration 600 --quiet --candump log.fifo --summary {summary}");
         let bench = place.start("skinbus", &words);
-        // Nothing has room any more: for a second nothing came.
+        // The pipe is full: no data was added for a second.
         let (mut there, mut same) = (0, 0);
         until("a full pipe", || {
             let now = ioctl_fionread(&reader).unwrap();
@@ -257,7 +257,7 @@ fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
     let ended = place.start("skinbus", &run).end().well();
     let (frames, table): (Vec<_>, Vec<_>) = ended.stdout.lines().partition(|line| line.starts_with('('));
     assert!(frames.len() > 16 && table.len() > 10, "{ended:#?}");
-    // A file that the shell has opened is not truncated, whatever is in it.
+    // A file that the shell has opened is not truncated, whatever its content is.
     let mut command = place.command_of(Path::new("/bin/sh"), "");
     let gateway = process::program("skinbus");
     let script = format!(
@@ -272,7 +272,7 @@ fn a_symlink_to_a_terminal_or_a_pipe_is_written_to() {
     place.is_left_clean();
 }
 
-/// Checks that a run has failed, and that its summary has the reason, as its last line does.
+/// Checks that a run has failed, and that its summary and its last line give the reason.
 fn failed(place: &Place, ended: &process::Ended) -> Summary {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
     let summary = place.summary();
@@ -296,7 +296,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     let test_client = place.test_client();
     test_client.waits_for_epoch(10);
     let positions = [Q1_14::ZERO; WORDS];
-    // One such packet may come from anybody; a gateway goes on.
+    // A single packet of this kind may have any sender; a gateway continues.
     for epoch in 77..81 {
         test_client.sends(&Message::Joints {
             epoch: Epoch(epoch),
@@ -309,7 +309,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     let lines = Log::read(&place.read("run.log"), Format::Fd).frames.len() as u64;
     assert_eq!(summary.number("/recording/frames"), lines);
 
-    // Its log breaks off, and it goes on until it is ended.
+    // Its log breaks off, and the run continues until it is ended.
     let mut command = place.command_of(Path::new("/bin/sh"), "");
     let run = format!("{RUN} --duration 600 --candump run.log --summary run.json --overwrite");
     command.args(["-c", &format!("ulimit -f 64; exec {} {run}", process::program("skinbus").display())]);
@@ -322,7 +322,7 @@ fn a_failed_run_has_a_summary_with_the_reason() {
     assert_eq!(summary.number("/recording/frames"), frames);
     assert!(frames > 100 && summary.number("/recording/lost_write") >= 20, "{:#}", summary.0);
 
-    // Whoever signals twice gets it too.
+    // The summary is also written after several signals.
     let bench = place.running_bench(600.0, "");
     for signal in [Signal::INT, Signal::INT, Signal::TERM] {
         bench.signal(signal);
@@ -366,7 +366,7 @@ fn any_number_of_demonstrations_go_on_side_by_side() {
     }
     let files = place.files();
     assert!(files.iter().all(|name| name.ends_with(".log")), "{files:?}");
-    // One that is killed leaves its log, and nothing else.
+    // A killed run leaves only its log.
     let killed = run("");
     killed.hears_the_loop();
     killed.signal(Signal::KILL);

@@ -1,4 +1,4 @@
-//! Cells that keep their parameters in files: written once, found again, and not trusted when damaged.
+//! Cells that keep their parameters in files: written once, found again, and rejected when damaged.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -12,7 +12,7 @@ use protocol::id::Node;
 use protocol::message::{Message, NetworkPage, State};
 use rustix::process::Signal;
 
-/// A bench whose cells have written their parameters.
+/// Runs a bench whose cells have written their parameters.
 fn written() -> Place {
     let place = Place::new();
     place.pressed();
@@ -136,7 +136,7 @@ fn cells_that_are_configured_for_another_skin_are_refused_by_name() {
     assert_eq!(place.bench(1.0, "--flash flash --quiet").end().refusal(1), said);
     place.is_left_clean();
 
-    // Another cell of the same node id.
+    // Another cell with the same node id.
     place.write("skin.toml", &text.replace("serial = 100006\n", "serial = 6\n"));
     let ended = place.bench(1.0, "--flash flash --quiet").end();
     assert_eq!(ended.code(), Some(1));
@@ -177,7 +177,7 @@ fn two_programs_do_not_use_one_cells_file_at_a_time() {
     let who = running.cell(1).as_raw_nonzero();
     assert!(ended.stderr.contains(&format!("flash of cell 1 ({flash}/vcan0-1.flash)")), "{ended:#?}");
     assert!(ended.stderr.contains(&format!("process {who} (cell-node) uses it")), "{ended:#?}");
-    // A cell alone says so too; one of which nobody has the file starts.
+    // A cell started alone reports it too; a cell without a file starts.
     let words = |node| {
         format!("--bus vcan0 --bus-kind embedded --node {node} --skin skin.toml --flash {flash} --fresh")
     };

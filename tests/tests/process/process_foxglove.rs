@@ -1,4 +1,4 @@
-//! The layout for Foxglove in docs/how-to/ fits a recording: its topics, the paths in them, and its panels.
+//! The layout for Foxglove in docs/how-to/ matches a recording: its topics, the paths in them, and its panels.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -12,7 +12,7 @@ use serde_json::Value;
 
 const LAYOUT: &str = include_str!("../../../docs/how-to/foxglove-layout.json");
 
-/// What stands on a path behind the topic, as `.values[3].name`, in a message.
+/// Returns the value at a path within a message of a topic, such as `.values[3].name`.
 fn at<'a>(message: &'a Value, path: &str) -> Option<&'a Value> {
     let steps = path.split(['.', '[']).filter(|step| !step.is_empty());
     steps.into_iter().try_fold(message, |value, step| match step.strip_suffix(']') {
@@ -21,7 +21,7 @@ fn at<'a>(message: &'a Value, path: &str) -> Option<&'a Value> {
     })
 }
 
-/// The panels of a layout's tree.
+/// Collects the panels of a layout's tree.
 fn placed(layout: &Value, panels: &mut Vec<String>) {
     if let Some(panel) = layout.as_str() {
         return panels.push(panel.to_owned());
@@ -62,7 +62,7 @@ fn every_topic_and_path_of_the_layout_is_in_a_recording() {
             "3D" => {
                 for (topic, options) in config["topics"].as_object().unwrap() {
                     if topic == "/robot_description" {
-                        // It is drawn on the frames of its links.
+                        // The robot is drawn on the frames of its links.
                         let urdf = messages(topic)[0]["data"].as_str().unwrap();
                         let poses = [messages("/tf")[0], messages("/tf_static")[0]];
                         let frames = poses.iter().flat_map(|it| it["transforms"].as_array().unwrap());

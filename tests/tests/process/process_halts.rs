@@ -14,10 +14,10 @@ use serde_json::Value;
 
 const MISSING: &str = "the external controller's answer is missing";
 const NOBODY: &str = "no external controller is connected";
-/// What ends the last line of a run that was halted.
+/// The end of the last line of a run that was halted.
 const HISTORY: &str = "; --summary FILE keeps the ticks before it";
 
-/// Answers so many ticks, then only listens until the robot is halted.
+/// Answers a number of ticks, then only listens until the robot is halted.
 fn control(place: &Place, bench: &Running, answers: u32) {
     let gateway = place.path("controller.sock");
     let own = UnixDatagram::bind(place.path("peer.sock")).unwrap();
@@ -38,7 +38,7 @@ fn control(place: &Place, bench: &Running, answers: u32) {
     }
 }
 
-/// Checks that a run reported a halt that lasted to its end, in the table and on standard error; the halt.
+/// Checks that a run reported a halt that lasted to its end, in the table and on standard error; returns the halt.
 fn ended_halted(ended: &process::Ended, summary: &Summary, reason: &str) -> Value {
     assert_eq!(ended.code(), Some(3), "{ended:#?}");
     let halts = summary.0["halts"].as_array().unwrap();
@@ -61,7 +61,7 @@ fn ended_halted(ended: &process::Ended, summary: &Summary, reason: &str) -> Valu
     halted
 }
 
-/// The ticks up to the last halt; the last one is that of the halt.
+/// Returns the ticks up to the last halt; the last one is that of the halt.
 fn before<'a>(summary: &'a Summary, halted: &Value) -> &'a [Value] {
     let before = summary.0["before_halt"].as_array().unwrap();
     let ticks: Vec<_> = before.iter().map(|tick| tick["tick"].as_u64().unwrap()).collect();
@@ -120,7 +120,7 @@ fn without_any_controller_a_run_that_comes_to_its_end_was_halted() {
 fn a_lost_bus_that_halts_is_named_and_the_exit_code_is_that_of_the_halt() {
     let place = Place::new();
     let skin = process::skin_of(8, 2, model::generate::Format::Fd);
-    // A bus that only this machine is late for is not lost.
+    // A bus for which only this machine is late is not lost.
     let safety = "[safety]\nlost_bus = \"halt\"\nhold_epochs = 100\nbad_cycles = 100\n\n[controller]";
     place.write("skin.toml", &skin.replacen("[controller]", safety, 1));
     place.scenario(PRESSED.replace("hold", "kinesthetic").as_str());

@@ -1,4 +1,4 @@
-//! Robots of one's own: a URDF becomes a skin, covered with cells, drawn, recorded, and computed with.
+//! A user's own robots: a URDF becomes a skin, is covered with cells, drawn, recorded, and computed with.
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
@@ -21,7 +21,7 @@ use protocol::skin::Skin;
 use recorded::{Message, Recorded};
 use serde_json::Value;
 
-/// Two joints, a tube, a box, and a plate that is a mesh of a package.
+/// A robot with two joints, a tube, a box, and a plate that is a mesh of a package.
 const ARM: &str = r#"<robot name="arm">
   <link name="base"><visual><geometry><cylinder radius="0.06" length="0.1"/></geometry></visual></link>
   <link name="upper"><visual><origin xyz="0 0 0.2"/><geometry><cylinder radius="0.05" length="0.3"/></geometry></visual></link>
@@ -44,7 +44,7 @@ const ARM: &str = r#"<robot name="arm">
 const COVER: &str =
     "skin import arm.urdf --tip bare --cover upper,fore --pitch 0.04 --package arm_parts=parts";
 
-/// `arm.urdf`, and its mesh in `parts/meshes`: a square of 0.2 m.
+/// Writes `arm.urdf`, and its mesh in `parts/meshes`: a square of 0.2 m.
 fn arm() -> Place {
     let place = Place::new();
     place.write("arm.urdf", ARM);
@@ -63,7 +63,7 @@ fn run(place: &Place, words: &str) -> Ended {
     place.start("skinbus", words).end()
 }
 
-/// A command that is refused with exit code 2 in one line, and writes nothing.
+/// Checks that a command is refused with exit code 2 in one line, and writes no file.
 fn refused(place: &Place, words: &str, expected: &str) {
     let before = place.files();
     let ended = run(place, words);
@@ -115,7 +115,7 @@ fn links_are_covered_and_the_skin_runs() {
         let wired = skin.cells_of(index).filter(|cell| cell.neighbors.iter().any(Option::is_some));
         assert!(wired.count() > skin.cells_of(index).count() * 9 / 10);
     }
-    // By the first line, the same again; with another seed, other cells.
+    // The command in the first line gives the same again; another seed gives other cells.
     let again = run(&place, &format!("{COVER} --nodes-per-bus 60 -o again.toml")).well();
     assert_eq!((place.read("again.toml"), again.stderr), (place.read("skin.toml"), said.stderr));
     run(&place, &format!("{COVER} --seed 2 -o other.toml")).well();
@@ -140,7 +140,7 @@ fn links_are_covered_and_the_skin_runs() {
         }
         assert!(frames.contains("upper") && frames.contains("vcan0/1"), "{frames:?}");
     }
-    // What is no URDF goes into no recording.
+    // A file that is not a URDF is not added to a recording.
     place.write("arm.urdf", "root:x:0:0:root:/root:/bin/bash\n");
     refused(
         &place,
@@ -253,7 +253,7 @@ fn what_is_no_chain_of_joints_is_said_in_a_line() {
             "cells.csv: line 2: 3 values: one is needed for each of the columns link, ",
         ),
         (head.to_owned(), "there is no cell in it"),
-        // What only the skin's check knows, by the line of the file.
+        // A defect that only the skin's check finds, reported with its line in the file.
         (
             format!("# mine\n{head}\nfore,0,0,0,0,0,1\n\nfore,3,0,0,0,0,1\n"),
             "skinbus: cells.csv: line 5: position px,py,pz = 3,0,0 of link \"fore\" can come 3.",
@@ -344,7 +344,7 @@ fn each_covered_link_has_a_cell() {
     assert!(!plain.is_empty() && plain == blanks, "blanks around names do not count");
 }
 
-/// 10 N on a cell 0.3 m above the shoulder, and 0.2 m in front of it.
+/// Checks the torques of 10 N on a cell 0.3 m above the shoulder, and 0.2 m in front of it.
 #[test]
 fn torques_of_a_force_are_computed_in_both_ways() {
     let place = arm();
@@ -356,7 +356,8 @@ fn torques_of_a_force_are_computed_in_both_ways() {
     let numbers = |row: &Value, key: &str| {
         row[key].as_array().unwrap().iter().map(|it| it.as_f64().unwrap()).collect::<Vec<_>>()
     };
-    // A lever r and a force -F n about y: r_z F_x - r_x F_z. The forearm is turned by 0.5 about y at 0.4 m.
+    // A lever r and a force -F n give the torque r_z F_x - r_x F_z about y. The forearm is turned by 0.5 about y at 0.4
+    // m.
     let (sine, cosine) = 0.5_f64.sin_cos();
     let (x, z) = (0.2 * cosine + 0.1 * sine, 0.1 * cosine - 0.2 * sine);
     let elbow = z * -10.0 * sine + x * 10.0 * cosine;
@@ -429,7 +430,7 @@ fn torques_of_a_force_are_computed_in_both_ways() {
         refused(&place, "explain skin.toml --batch rows.csv", expected);
     }
 
-    // The ends of what is possible.
+    // The limits of the ranges.
     place.write("rows.csv", "# ends\ncell,force_n,q\n1,0,-6.28 0.5\n1,95.9970703125,2 6.28\n");
     run(&place, "explain skin.toml --batch rows.csv").well();
     let endless = ARM.replacen("revolute", "continuous", 1).replacen("revolute", "prismatic", 1);

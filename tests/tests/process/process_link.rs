@@ -1,4 +1,4 @@
-//! `vcan-setup link`, and the program that takes its place; `tests/hosts` has the true one.
+//! `vcan-setup link`, with a substitute for the program that it runs; `tests/hosts` has the real one.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process::{Place, Running, program};
@@ -10,17 +10,17 @@ use std::process::Command;
 
 use rustix::process::Signal;
 
-/// A command with nothing on `PATH` but the folder of the place.
+/// Returns a command with only the folder of the place on `PATH`.
 fn command(place: &Place, program: &Path, words: &str) -> Command {
     let mut command = place.command_of(program, words);
     command.env("PATH", place.path("")).env_remove("SKINBUS_VCAN_LINK");
     command
 }
 
-/// A copy of `vcan-setup`, which has the programs of a place beside it.
+/// Copies `vcan-setup` beside the programs of a place.
 fn copy(place: &Place) -> PathBuf {
     let path = place.path("vcan-setup");
-    // By a process of its own, as a script of the place is written.
+    // A separate process copies it, for the reason given at [`Place::script`].
     assert!(Command::new("cp").arg(program("vcan-setup")).arg(&path).status().unwrap().success());
     path
 }

@@ -34,12 +34,12 @@ use protocol::skin::{Skin, Wires};
 use protocol::time::Micros;
 use rustix::process::Signal;
 
-/// Cells in most skins.
+/// The number of cells in most skins.
 const CELLS: u8 = 12;
-/// A cell that was never configured has this hash.
+/// The hash that a cell without a configuration reports.
 const UNCONFIGURED: u16 = 0;
 
-/// A skin of cells that answer with sums.
+/// Writes a skin of cells that answer with sums.
 fn sums(place: &Place, cells: u8, format: Target) -> Skin {
     let cells = usize::from(cells);
     let expected = model::generate::Target { cells, reply: Reply::Sum, format, ..Default::default() };
@@ -67,7 +67,7 @@ struct Side {
     start: Instant,
     heartbeats: BTreeMap<u8, Heartbeat>,
     trees: BTreeMap<u8, Tree>,
-    /// By epoch and sender, the last sum's count.
+    /// The last sum's count, by epoch and sender.
     sums: BTreeMap<(u8, u8), u8>,
 }
 
@@ -106,7 +106,7 @@ impl Side {
         }
     }
 
-    /// Receives and answers what comes within this time.
+    /// Receives and answers messages for this time.
     fn turn(&mut self, time: Duration) {
         let end = Instant::now() + time;
         let mut inbox = Inbox::new();
@@ -156,7 +156,7 @@ impl Side {
         }
     }
 
-    /// Whether every cell has a unique node id and a parent.
+    /// Returns true if every cell has a unique node id and a parent.
     fn is_tree_ready(&self) -> bool {
         let settled = |heartbeat: &&Heartbeat| !heartbeat.state.has(State::CLAIMING);
         self.heartbeats.values().filter(settled).count() == self.cells
@@ -164,7 +164,7 @@ impl Side {
             && self.trees.values().all(|tree| tree.parent.is_some())
     }
 
-    /// By serial number, the node ids.
+    /// Returns the node ids, by serial number.
     fn numbers(&self) -> BTreeMap<u32, u8> {
         self.heartbeats.iter().map(|(&number, heartbeat)| (heartbeat.serial, number)).collect()
     }
@@ -204,7 +204,7 @@ fn new_cells_get_node_ids_over_their_wires_and_keep_them() {
             let kept = flash::decode(Identity { cell: None, serial }, &bytes).unwrap();
             assert_eq!((kept.number.map(CellId::get), kept.parameters), (Some(number), None));
         }
-        // No node ids are assigned this time, and they have theirs from the start.
+        // This time no node ids are assigned; the cells have theirs from the start.
         let running = start();
         let mut side = Side::new(&place, &skin);
         side.roots.clear();
@@ -223,7 +223,7 @@ fn sums_reach_the_roots_whichever_cells_share_a_process() {
         (Target::Classic, 12, vec!["--nodes 1-12"]),
         (Target::Fd, 12, vec!["--nodes 1-4", "--node 5", "--nodes 6-12"]),
         (Target::Classic, 12, vec!["--nodes 1-7", "--nodes 8-12"]),
-        // More identifiers and wires than a socket takes filters.
+        // More identifiers and wires than a socket can have filters.
         (Target::Fd, 100, vec!["--nodes 1-99", "--node 100"]),
     ] {
         let place = Place::new();
@@ -274,7 +274,7 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
     let away = "no embedded bus vcan0 is served in";
     let refused = cells(&place, "--node 1", "").end();
     assert!(refused.refusal(2).contains(away), "{refused:?}");
-    // At the start it is waited for too.
+    // Cells wait for the bus at the start, too.
     let shared = cells(&place, "--nodes 1-11", "--reconnect");
     shared.hears(away);
     let first = server(&place);
@@ -311,7 +311,7 @@ fn a_bus_that_comes_back_finds_its_cells_as_they_were() {
     assert_eq!(leaves.end().refusal(1), "cell-node: the embedded bus vcan0 was closed: its server ended");
 }
 
-/// A heartbeat of each cell.
+/// Returns a heartbeat of each cell.
 fn heard(side: &mut Side) -> BTreeMap<u8, Heartbeat> {
     side.heartbeats.clear();
     side.until("a heartbeat of each", |side| side.heartbeats.len() == usize::from(CELLS));

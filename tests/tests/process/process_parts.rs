@@ -1,5 +1,5 @@
-//! Split recordings of real processes: every part replays by itself, bit for bit, with presses across the split and late
-//! frames; all parts together are one recording.
+//! Split recordings of real processes: every part can be replayed by itself, bit for bit, with presses across the split
+//! and late frames; all parts together are one recording.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -13,7 +13,7 @@ use process::{Place, skin_of, until};
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// Touches across every split of a second, and on both buses.
+/// Returns a scenario with touches across every split of a second, on both buses.
 fn touched(buses: usize) -> String {
     let more = |bus: usize| {
         format!(
@@ -25,14 +25,14 @@ fn touched(buses: usize) -> String {
     TOUCHED.to_owned() + &(1..buses).map(more).collect::<String>()
 }
 
-/// The parts of `run.mcap`, by their numbers.
+/// Returns the parts of `run.mcap`, by their numbers.
 fn parts(place: &Place) -> Vec<String> {
     let name = |number: u32| if number == 0 { "run.mcap".to_owned() } else { format!("run-{number}.mcap") };
     (0..).map(name).take_while(|name| place.path(name).exists()).collect()
 }
 
-/// Checks that each part answers by itself as it is recorded, and all together: at least so often, which is a tenth of what
-/// comes from a machine that is always in time.
+/// Checks that each part, and all together, are answered as recorded, with at least `min` replies, a tenth of those
+/// from a machine that is always in time.
 fn all_come_back(place: &Place, min: u64) {
     place.is_left_clean();
     let parts = parts(place);
@@ -42,11 +42,11 @@ fn all_come_back(place: &Place, min: u64) {
     for part in &parts {
         let (ended, replayed) = place.replayed(part, route);
         let came_back = replayed.all_came_back(&ended);
-        // In the second part at least something was pressed in the one before.
+        // In the second part at least one cell was pressed in the part before.
         assert!(part != "run-1.mcap" || came_back > min / 10, "{came_back} in {part}: {:#}", replayed.0);
         equal += came_back;
     }
-    // In whatever order.
+    // In any order.
     let backwards = parts.iter().rev().map(String::as_str).collect::<Vec<_>>().join(" ");
     let (ended, replayed) = place.replayed(&backwards, route);
     let together = replayed.all_came_back(&ended);
@@ -109,7 +109,7 @@ fn parts_of_sums_come_back_with_what_rounding_carries() {
     all_come_back(&place, 40);
 }
 
-/// A run of four seconds in parts, with a touch all the time.
+/// Records a run of four seconds in parts, with a touch all the time.
 fn recorded(place: &Place) {
     place.skin(8);
     place.scenario(&touched(1));
@@ -122,7 +122,8 @@ fn explain_dump_and_report_take_a_part_and_all_of_them() {
     recorded(&place);
     let parts = parts(&place);
     let (last, count, parts) = (parts.last().unwrap(), parts.len(), parts.join(" "));
-    // Cell 1 is pressed from the beginning of the run on: more than half of all epochs ago, unless many were skipped.
+    // Cell 1 is pressed from the beginning of the run: more than half of all epoch numbers ago, unless many were
+    // skipped.
     let torques = place.start("skinbus", &format!("dump {last} --json --kind torque --cell 1")).end().well();
     let torque: Value = serde_json::from_str(torques.stdout.lines().last().unwrap()).unwrap();
     let epoch = &torque["epoch"];
@@ -203,7 +204,7 @@ fn files_that_are_not_the_parts_of_one_recording_are_named() {
         line.starts_with("skinbus: other.mcap and run-1.mcap are of different recordings, begun at "),
         "{line}"
     );
-    // The file name does not matter; nor do parts that are missing at an end.
+    // The file name does not matter, and neither do missing parts at an end.
     place.start("skinbus", "dump run-2.mcap run-1.mcap run-recovered.mcap").end().well();
     place.start("skinbus", "dump run-3.mcap run-2.mcap").end().well();
 }
@@ -214,7 +215,7 @@ fn parts_of_a_killed_run_come_back_recovered_or_as_they_are() {
     place.skin(8);
     place.scenario(&touched(1));
     let bench = place.running_bench(600.0, "--record run.mcap --record-split 1s");
-    // A moment ago the file before it was ended.
+    // The file before it has just been finished.
     until("a fourth part", || place.path("run-3.mcap.part").exists().then_some(()));
     place.test_client().waits_for_joints(20);
     bench.signal(Signal::KILL);

@@ -15,12 +15,12 @@ fn every_command_does_what_it_should() {
     let ended = run(&place, &commands).well();
     place.is_left_clean();
 
-    // Each line of the quoted output begins as a line of the demo's output.
+    // Each line of the quoted output begins like a line of the demo's output.
     let quoted = blocks(README).into_iter().find_map(|(_, block)| block.split_once("\nur5-253 ")).unwrap();
     let (verdict, table) = (quoted.0, format!("ur5-253 {}", quoted.1));
     let demo = printed(&ended, "cargo build --release && target/release/skinbus demo");
     let said = demo.lines().nth(1).unwrap();
-    // What is good and what is not depends on the machine.
+    // The verdict depends on the machine.
     let is_verdict = |line: &str| line.starts_with("all well: 253 cells, 575 of 575 epochs complete, ");
     assert!(is_verdict(verdict) && (is_verdict(said) || said.starts_with("look at: ")), "{verdict}\n{said}");
     let mut rest = demo;

@@ -1,4 +1,4 @@
-//! Recordings of benches of real processes: they are complete, or the rest is counted.
+//! Recordings of benches of real processes: they are complete, or the missing part is counted.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -31,7 +31,7 @@ fn frames_are_whole(lines: &[String], place: &Place, summary: &Summary, frames_a
     assert_eq!(summary.0["recording"]["errors"], Value::Array(vec![]));
 }
 
-/// The number of messages on each topic.
+/// Returns the number of messages on each topic.
 fn counts(recorded: &Recorded) -> BTreeMap<&str, u64> {
     let mut counts = BTreeMap::new();
     for message in &recorded.messages {
@@ -67,7 +67,7 @@ fn everything_that_a_run_knows_is_in_its_recording() {
     assert!(recorded.metadata["program"]["command_line"].contains("--record run.mcap"));
     assert!(recorded.metadata["configuration"]["bus/vcan0"].starts_with("embedded, fd, receive buffer "));
 
-    // Own frames are distinguished, and each cell has sent its hash before the first joints.
+    // The gateway's own frames are distinguished, and each cell has sent its hash before the first joints.
     let frames: Vec<_> = recorded.on("/can/vcan0").map(|message| &message.value).collect();
     let id = |frame: &Value| frame["id"].as_u64().unwrap();
     let joints = frames.iter().position(|frame| id(frame) == 0x001 && frame["direction"] == 2).unwrap();
@@ -113,7 +113,7 @@ fn everything_that_a_run_knows_is_in_its_recording() {
     }
     assert_eq!(cells, skin.cells.len());
 
-    // The arm stands, so at the end what has come is what should come.
+    // The arm stands, so at the end the received torque equals the expected one.
     let torques =
         recorded.on(&format!("{robot}/torques")).last().map(|message| message.value.clone()).unwrap();
     let (central, difference) = (numbers(&torques["central"]), numbers(&torques["difference"]));
@@ -135,7 +135,7 @@ fn two_hundred_and_fifty_three_cells_are_recorded_without_a_gap() {
     let (summary, recorded) = (place.summary(), Recorded::read(&place.path("run.mcap")));
     frames_are_whole(&recorded.lines("/can/vcan0"), &place, &summary, 1);
     assert!(recorded.on("/can/notes").next().is_none());
-    // What stands before the first message is small: of little more than that, there are messages.
+    // The part before the first message is small: a recording of little more than that has messages.
     let file = fs::read(place.path("run.mcap")).unwrap();
     fs::write(place.path("cut.mcap"), &file[..300_000]).unwrap();
     place.start("skinbus", "recover cut.mcap").end().well();
@@ -149,7 +149,7 @@ fn two_buses_of_classic_frames_have_a_topic_each() {
     place.scenario(PRESSED);
     place.bench(1.0, "--record run.mcap").end().well();
     let recorded = Recorded::read(&place.path("run.mcap"));
-    // The log has both buses' frames as the recorder took them: each bus in its order.
+    // The log has both buses' frames in the recorder's order, each bus in its own order.
     for bus in ["vcan0", "vcan1"] {
         let lines = recorded.lines(&format!("/can/{bus}"));
         let log = place.read("run.log");
@@ -163,7 +163,7 @@ fn two_buses_of_classic_frames_have_a_topic_each() {
     );
 }
 
-/// The files of a recording in their order.
+/// Returns the files of a recording in their order.
 fn parts(summary: &Summary) -> Vec<String> {
     let files = summary.0["recording"]["files"].as_array().unwrap();
     let mcap = files.iter().filter(|file| file["format"] == "mcap");
@@ -174,7 +174,7 @@ fn parts(summary: &Summary) -> Vec<String> {
 fn a_recording_in_parts_is_one_recording_and_each_part_can_be_read_alone() {
     let place = Place::new();
     place.pressed();
-    // Of an earlier and longer recording.
+    // Files of an earlier and longer recording.
     for name in ["run.mcap", "run-1.mcap", "run-2.mcap", "run-3.mcap", "run-4.mcap"] {
         place.write(name, "old");
     }
@@ -195,8 +195,8 @@ fn a_recording_in_parts_is_one_recording_and_each_part_can_be_read_alone() {
             assert_eq!(force, Vec::<String>::new());
             continue;
         }
-        // Latched are frames of the files before: of each cell its start, its last heartbeat, its contact state and its
-        // stimulus; the joints at which that was latched, the last ones, a resume.
+        // The latched frames come from the files before: of each cell its start, its last heartbeat, its contact state
+        // and its stimulus; the joints at which that was latched, the last ones, and a resume.
         let of = |kind: u32| force.iter().filter(|line| line.contains(&format!(" {kind:X}"))).count();
         let before: Vec<_> = read[..number].iter().flat_map(|part| part.lines("/can/vcan0")).collect();
         assert!(force.iter().all(|line| before.contains(line)), "{force:?}");
@@ -240,7 +240,7 @@ fn a_recording_that_exists_or_cannot_be_is_refused_before_anything_happens() {
         refused("--record same.mcap --summary same.mcap")
             .contains("--summary and --record name the same file")
     );
-    // One that cannot begin for another reason leaves nothing.
+    // A run that cannot begin for another reason leaves no file.
     assert!(refused("--record run.mcap SKINBUS_CELL_NODE=/nowhere").contains("/nowhere"));
     assert_eq!(
         place.files(),
@@ -270,7 +270,7 @@ fn a_file_that_another_program_moves_while_it_is_written_counts_as_lost_and_the_
     assert!(!place.path("run.mcap").exists());
 }
 
-/// A bench in a shell that first runs a command.
+/// Runs a bench in a shell that first runs a command.
 fn in_shell(place: &Place, before: &str, run: &str, after: &str) -> process::Ended {
     let gateway = process::program("skinbus");
     let script = format!("{before} && {{ {} {run}; code=$?; {after}; exit $code; }}", gateway.display());
@@ -283,7 +283,7 @@ fn in_shell(place: &Place, before: &str, run: &str, after: &str) -> process::End
 fn until_it_broke_off(place: &Place, shell: process::Running) -> process::Ended {
     shell.hears("the run goes on without it");
     place.test_client().waits_for_joints(20);
-    // The shell's own line has its name in it as well.
+    // The shell's own command line contains the name as well.
     let is_it = |line: &str| line.split(' ').next().is_some_and(|program| program.ends_with("/skinbus"));
     let gateway = place.processes().into_iter().find(|(_, line)| is_it(line));
     let (gateway, _) = gateway.expect("the gateway goes on");
@@ -307,7 +307,7 @@ fn broke_off(place: &Place, ended: &process::Ended, why: &str) {
     let files = summary.0["recording"]["files"].as_array().unwrap();
     let recordings =
         files.iter().filter_map(|file| file["path"].as_str().filter(|path| path.ends_with(".mcap")));
-    // They are listed as they were ended; one that broke off may be after the next.
+    // They are listed in the order of their ends; one that broke off may be listed after the next.
     let mut recordings: Vec<_> = recordings.collect();
     recordings.sort_by_key(|path| (path.len(), *path));
     let lines = recordings.into_iter().flat_map(|path| Recorded::read(&place.path(path)).lines("/can/vcan0"));
@@ -319,7 +319,7 @@ fn broke_off(place: &Place, ended: &process::Ended, why: &str) {
     assert_eq!((frames, frames + lost, lost), (lines.len() as u64, packets, unwritten), "{:#}", summary.0);
     assert!(frames > 100 && lost > 0, "{:#}", summary.0);
     assert!(summary.number("/recording/messages_lost/unwritten") > 0, "{:#}", summary.0);
-    // The log is on another disk, and has all of it; a part that follows begins behind what was lost.
+    // The log is on another disk and complete; a part that follows begins after the lost frames.
     let log = place.read("run.log");
     let mut logged = log.lines();
     let absent = lines.iter().find(|line| !logged.any(|logged| logged == *line));
@@ -368,7 +368,7 @@ fn a_full_disk_ends_the_recording_and_not_the_run() {
     assert_eq!(place.summary().0["recording"]["files"].as_array().unwrap().len(), 2);
 }
 
-/// What a bus has carried, and when.
+/// The frames of a bus, with their times.
 type Heard = std::sync::Arc<std::sync::Mutex<Vec<(u64, protocol::can::Frame)>>>;
 
 /// Listens on a place's bus until it is gone.
@@ -385,15 +385,15 @@ fn listen(place: &Place) -> (Heard, std::thread::JoinHandle<()>) {
     (heard, std::thread::spawn(listen))
 }
 
-/// The frames of a recording.
+/// Returns the frames of a recording.
 fn frames_of(path: &Path) -> Vec<(u64, String)> {
     let recorded = Recorded::read(path);
     let lines = recorded.on("/can/vcan0").zip(recorded.lines("/can/vcan0"));
     lines.map(|(message, line)| (message.nanos, line.rsplit(' ').next().unwrap().to_owned())).collect()
 }
 
-/// Kills a gateway that records so many times, each at a random moment; what each kill lost, in ms. Every other
-/// `.part` is repaired by the next run, the others by hand.
+/// Kills a gateway that records several times, each at a random moment; returns the time that each kill lost, in ms.
+/// Every other `.part` is repaired by the next run, the others by hand.
 fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
     let place = Place::new();
     place.pressed();
@@ -406,7 +406,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
         );
         let (heard, listener) = listen(&place);
         until("the first frame", || (!heard.lock().unwrap().is_empty()).then_some(()));
-        // The recorder has handed it on long before; the loop runs half a second later.
+        // The recorder has written it long before; the loop begins half a second later.
         std::thread::sleep(Duration::from_millis(random.random_range(300..2_300)));
         let wall = SystemTime::now().duration_since(UNIX_EPOCH).unwrap().as_nanos();
         bench.signal(Signal::KILL);
@@ -425,7 +425,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
             );
             fs::remove_file(part).unwrap();
         } else {
-            // Any run that records beside it.
+            // Any run that records in the same folder.
             let run = "run skin.toml --bus-kind embedded --duration 0.01 --record other.mcap --quiet";
             let ended = place.start("skinbus", run).end().well();
             let says =
@@ -438,7 +438,7 @@ fn kill_again_and_again(seed: u64, times: u32) -> Vec<f64> {
         fs::remove_file(repaired).unwrap();
         let heard = heard.lock().unwrap();
         let heard: Vec<_> = heard.iter().map(|(at, frame)| (*at, frame.to_string())).collect();
-        // Nothing is sent before both listen.
+        // No frame is sent before both listen.
         let same = recorded.iter().zip(&heard).take_while(|((_, ours), (_, theirs))| ours == theirs).count();
         assert_eq!(same, recorded.len(), "the frames are the first ones that the other has received");
         assert!(same > 0, "cells had sent");
@@ -459,7 +459,7 @@ fn a_recording_survives_its_writer_being_killed_at_any_moment() {
     let mut lost: Vec<_> = threads.into_iter().flat_map(|thread| thread.join().unwrap()).collect();
     lost.sort_by(f64::total_cmp);
     assert_eq!(lost.len() as u64, kills);
-    // The recorder hands on every 40 to 50 ms; a machine that keeps it waiting longer loses more.
+    // The recorder writes every 40 to 50 ms; a machine that delays it loses more.
     let (median, most) = (lost[lost.len() / 2], lost[lost.len() - 1]);
     println!("{} kills: {median:.0} ms lost (median), at most {most:.0} ms", lost.len());
 }

@@ -1,5 +1,4 @@
-//! Recordings of earlier builds are replayed to cells of this one: they answer as those did
-//! (tests/recordings/README.md).
+//! Recordings of earlier builds are replayed to cells of this one, and answered as before (tests/recordings/README.md).
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -8,7 +7,7 @@ use std::path::Path;
 
 use process::Place;
 
-/// Replays a recording of an earlier build in lockstep to fresh cells; how many replies were equal.
+/// Replays a recording of an earlier build in lockstep to new cells; returns the number of equal replies.
 fn replayed(name: &str, more: &str) -> u64 {
     let place = Place::new();
     let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("recordings").join(name);

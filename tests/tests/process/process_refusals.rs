@@ -1,5 +1,5 @@
-//! Invalid input is refused before anything begins: one line that names it, what is allowed or what to do;
-//! exit code 2; and nothing is left behind.
+//! Invalid input is refused before anything begins: one line names it and says what is allowed or what to do; the exit
+//! code is 2, and no file is left behind.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -9,7 +9,7 @@ use std::os::unix::net::UnixDatagram;
 use process::{PRESSED, Place, skin};
 use protocol::bus::has_socketcan;
 
-/// The message of a refused command; checks that it leaves nothing.
+/// Returns the message of a refused command, and checks that it leaves no file.
 fn refusal(place: &Place, program: &str, words: &str, code: i32) -> String {
     let before = place.files();
     let ended = place.start(program, words).end();
@@ -19,7 +19,7 @@ fn refusal(place: &Place, program: &str, words: &str, code: i32) -> String {
     said
 }
 
-/// A skin of three cells in which something is replaced, as the gateway and a cell refuse it.
+/// Replaces something in a skin of three cells, and checks that the gateway and a cell refuse it.
 fn skin_refusal(old: &str, new: &str, expected: &str) {
     let place = Place::new();
     let text = skin(3);
@@ -149,7 +149,7 @@ fn a_file_that_is_no_program_is_named() {
         2,
     );
     assert_eq!(said, "skinbus: ./skin.toml does not start: Permission denied (os error 13)");
-    // One that starts and is no cell.
+    // A program that starts and is not a cell.
     let said = refusal(
         &place,
         "skinbus",
@@ -172,7 +172,7 @@ fn files_that_cannot_be_written_are_noticed_before_the_run() {
             ("nowhere/file", "No such file or directory (os error 2)"),
             ("skin.toml/file", "Not a directory (os error 20)"),
             ("folder", "is a directory"),
-            // Not even root may.
+            // Not even root may write there.
             ("/sys/file", "Permission denied (os error 13)"),
         ] {
             let said =

@@ -1,5 +1,5 @@
-//! Runs are recorded, and replayed to cells that were just started, or that have another history: their
-//! replies are those recorded, bit for bit, or the difference is reported.
+//! Runs are recorded, and replayed to cells that were just started or have another history: their replies must equal
+//! those recorded, bit for bit, or the difference must be reported.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -109,7 +109,7 @@ fn two_buses_of_classic_frames_come_back_too() {
     }
 }
 
-/// Returns when such messages came first and last, in s after the first frame of a log.
+/// Returns the times of the first and the last such message, in s after the first frame of a log.
 fn seconds(log: &str, is: impl Fn(&Message) -> bool) -> [f64; 2] {
     let records =
         || log.lines().map(|line| if let Ok(Line::Frame(it)) = parse(line) { it } else { panic!("{line}") });
@@ -122,7 +122,8 @@ fn seconds(log: &str, is: impl Fn(&Message) -> bool) -> [f64; 2] {
     [times[0], times[times.len() - 1]]
 }
 
-/// Returns when the loop of [`Place::records`] began, and when the last request to cell 4 changed its configuration.
+/// Returns the time at which the loop of [`Place::records`] began, and the time of the last request that changed the
+/// configuration of cell 4.
 fn begins_and_changes(log: &str) -> [f64; 2] {
     let fourth = Node::Cell(cell(4));
     let [begins, _] = seconds(log, |message| matches!(message, Message::Joints { .. }));
@@ -177,7 +178,7 @@ fn cells_with_another_history_answer_as_they_did_then() {
             joints: protocol::message::Joints { in_use: 6, ..Default::default() },
         });
         test_client.sends(&Message::Halt);
-        // The configuration was changed in the middle of the run, and a restart from there has it again.
+        // The configuration was changed in the middle of the run, and a replay from there applies it again.
         let (part, at) =
             if round == 0 { ("--to", (begins + changes) / 2.0) } else { ("--from", changes + 0.5) };
         let (ended, replayed) = place.replayed("run.log", &format!("--expect --speed max {part} {at:.6}"));
@@ -194,7 +195,7 @@ fn cells_with_other_parameters_and_cells_that_are_not_there_are_named() {
     let place = Place::new();
     place.records(8);
     let text = place.read("skin.toml");
-    // Cell 3 sits 10 cm elsewhere.
+    // Cell 3 is 10 cm elsewhere.
     let third = text.match_indices("\nposition = [").nth(2).unwrap().0;
     let moved = text[..third].to_owned()
         + &text[third..].replacen("position = [", "position = [0.1, 0.0, 0.1] # [", 1);
@@ -249,7 +250,7 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     assert!(lines[2].starts_with("now       torque 2 epoch "), "{text}");
     assert_eq!(lines[3], "joint 2: 3 steps less (0.0007 Nm)", "{text}");
 
-    // Within a tolerance it is equal, and counted.
+    // Within a tolerance a reply counts as equal.
     for (steps, code, replies) in [("2", 1, [1, 0]), ("3", 0, [0, 1])] {
         let (ended, replayed) =
             place.replayed("wrong.log", &format!("{FRESH} --speed max --tolerance {steps}"));
@@ -264,13 +265,13 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
         assert_eq!(ended.stderr.contains(said), code == 1, "{ended:#?}");
     }
 
-    // One that was not recorded, and one that cannot come.
+    // A reply that was not recorded, and one that cannot come.
     let counted = Counter::new(0);
     let gone = without(&log, |message| {
         let it = is_torque(message, 2) || is_torque(message, 3);
         it && counted.replace(counted.get() + 1) == 5
     });
-    // Nor may the recording have counters that say that it is lacking.
+    // The recording must not have counters that show that it is incomplete.
     let silent = |message: &Message| matches!(message, Message::Network { page: NetworkPage::Heard(_), .. });
     let beats = Counter::new(0);
     let heartbeat = |message: &Message| {
@@ -280,19 +281,19 @@ fn a_torque_that_is_not_the_recorded_one_is_shown_word_by_word() {
     place.write("gone.log", &without(&gone, |message| silent(message) || heartbeat(message)));
     let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --speed max"));
     let [_, different, missing, extra] = replayed.replies();
-    // Without counters a reply that a busy machine kept from the recording is extra, too.
+    // Without counters a reply that a busy machine kept out of the recording is extra, too.
     assert!(ended.code() == Some(1) && (different, missing) == (0, 0) && extra >= 1, "{:#}", replayed.0);
     assert_eq!(replayed.text("/expect/first/how"), "extra");
-    // With them it is known that it is the recording's fault.
+    // The counters show that the recording is the cause.
     place.write("gone.log", &gone);
     let (ended, replayed) = place.replayed("gone.log", &format!("{FRESH} --speed max"));
     replayed.all_came_back(&ended);
-    // A busy machine during the recording is another reason, and the two cannot be distinguished.
+    // A busy machine during the recording is another cause, and the two cannot be distinguished.
     let lacking = ["unrecorded", "untaken"].map(|why| replayed.number(&format!("/expect/lacking/{why}")));
     assert!(lacking.iter().sum::<u64>() >= 1, "{:#}", replayed.0);
 }
 
-/// Whether a message is a sum of a cell, of one cell at least.
+/// Returns true for a sum of a cell, of at least one cell.
 fn is_sum(message: &Message, cell: u8) -> bool {
     matches!(message, Message::Sum { from, count, .. } if from.get() == cell && *count > 0)
 }
@@ -311,12 +312,12 @@ fn sums_without_their_children_come_back_in_any_tree() {
         place.is_left_clean();
         let lacking = |why| replayed.number(&format!("/expect/lacking/{why}"));
         assert_eq!(lacking("tree_unknown"), 0, "{:#}", replayed.0);
-        // On a busy machine cells look for other parents, and some sums are omitted.
+        // On a busy machine cells search for other parents, and some sums are omitted.
         let sums = replayed.number("/expect/sums");
         assert!(sums > 75, "{:#}", replayed.0);
     }
 
-    // The root, which is not in contact, adds something to what it forwards.
+    // The root, which is not in contact, adds something to the sums that it forwards.
     let skin = Skin::read(&place.path("skin.toml")).unwrap();
     let root = skin.cells.iter().find(|cell| cell.root).unwrap().node;
     let wrong = (20..30).fold(place.read("run.log"), |log, nth| {

@@ -1,4 +1,4 @@
-//! Replays that cannot go on, or cannot begin: their messages, and the files they leave.
+//! Replays that cannot continue or begin: their messages, and the files they leave.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -82,7 +82,7 @@ fn a_gateway_and_a_replay_notice_each_other() {
     }
     bench.signal(Signal::TERM);
     bench.end().well();
-    // One that comes while the replay lasts.
+    // A bus that comes while the replay lasts.
     let replay = place.replay("old.log", FRESH);
     place.test_client().waits_for_epoch(10);
     let joints = protocol::message::Joints { in_use: 6, ..Default::default() };

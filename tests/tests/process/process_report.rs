@@ -1,5 +1,5 @@
-//! Reports on recordings of real benches: what figures and tables show is what the recording holds, read by another
-//! program's reader, and what the gateway itself counted.
+//! Reports on recordings of real benches: figures and tables must agree with the recording, as an independent reader
+//! decodes it, and with the gateway's own counts.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(clippy::float_cmp, reason = "a figure shows the very numbers of the recording")]
 
@@ -17,7 +17,7 @@ use serde_json::Value;
 const ERRORS: &str =
     "Absolute errors, joint by joint: single cells where the joint carries them, and the whole skin's sum";
 
-/// A bench of eight cells that push the arm, compared all the time. Late cells halt it only after 20 s.
+/// Runs a bench of eight cells that push the arm, compared all the time. Late cells halt it only after 20 s.
 fn recorded_bench(place: &Place, seconds: f64) -> Recorded {
     place.write("skin.toml", &(skin(8) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(&PRESSED.replace("\"hold\"", "\"kinesthetic\""));
@@ -38,7 +38,7 @@ fn drawings(page: &Page) -> impl Iterator<Item = &Drawing> {
     page.sections.iter().flat_map(|section| &section.drawings)
 }
 
-/// A time as a report has it, in ns.
+/// Parses a time of a report as ns.
 fn nanos(text: &str) -> f64 {
     let (number, unit) = text.split_once('\u{a0}').unwrap();
     let (_, scale) = [("ns", 1.0), ("µs", 1e3), ("ms", 1e6), ("s", 1e9)]
@@ -57,19 +57,19 @@ fn table<'a>(page: &'a Page, title: &str) -> &'a Table {
     tables.find(|table| table.title == title).unwrap_or_else(|| panic!("no table {title}"))
 }
 
-/// A row by its first cell, without it.
+/// Returns a row by its first cell, without that cell.
 fn row<'a>(table: &'a Table, first: &str) -> &'a [String] {
     let row = table.rows.iter().find(|row| row[0] == first);
     &row.unwrap_or_else(|| panic!("no row {first} in {table:?}"))[1..]
 }
 
-/// What was found, by what it begins with.
+/// Returns the number of the finding that begins with `what`.
 fn found(page: &Page, what: &str) -> f64 {
     let mut findings = page.sections.iter().flat_map(|section| &section.findings);
     findings.find(|finding| finding.what.starts_with(what)).unwrap_or_else(|| panic!("no {what}")).ours.value
 }
 
-/// The first, the minimum, the maximum and the last.
+/// Returns the first, the minimum, the maximum and the last value.
 fn span(values: impl Iterator<Item = f64>) -> [f64; 4] {
     let values: Vec<_> = values.filter(|value| value.is_finite()).collect();
     let min = values.iter().copied().fold(f64::INFINITY, f64::min);
@@ -106,7 +106,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
         let torque = figures(&page).find(|it| it.name == format!("torque-joint{}", joint + 1));
         let distributed = on("/UR5/torques", "distributed", Some(joint));
         let Some(torque) = torque else {
-            // No axes for what has nothing to show; the first joints carry the touch.
+            // Joints without a torque have no axes; the first joints carry the touch.
             assert_eq!(distributed, [0.0; 4]);
             assert!(joint > 1, "{joint}");
             continue;
@@ -133,7 +133,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
     let last = figure(&page, "positions").series[0].points.last().unwrap().0;
     assert!((last - seconds).abs() < 1e-6, "{last} {seconds}");
 
-    // The gateway's own accounts, which are not in the recording as numbers.
+    // The gateway's own accounts, which the recording does not contain as numbers.
     let counted = |pointer: &str| summary.number(pointer).to_string();
     let replies = row(table(&page, "Replies by bus"), "vcan0");
     let keys =
@@ -181,7 +181,7 @@ fn figures_show_what_the_recording_holds_and_tables_what_the_gateway_counted() {
         let quantile = |name: &str| quantity(summary.figure(&format!("/loop/{key}/{name}")), "µs");
         let expected = ["p50", "p90", "p99", "max"].map(quantile);
         for (shown, expected) in row(control, name)[..4].iter().zip(&expected) {
-            // Of three digits the last one may be rounded either way: 2.385 is between two.
+            // The last of three digits may be rounded either way: 2.385 lies between two values.
             let [shown, expected] = [shown, expected].map(|text| nanos(text));
             assert!((shown - expected).abs() <= 0.01 * expected, "{key}: {shown} {expected}");
         }
@@ -223,7 +223,7 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
     let after: Vec<_> = place.files().into_iter().filter(|name| !before.contains(name)).collect();
     assert_eq!(after, ["figures", "run.html"]);
 
-    // A command that cannot write leaves nothing.
+    // A command that cannot write leaves no file.
     for (options, said) in [
         (
             "-o run.mcap/run.html",
@@ -263,7 +263,7 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
     assert_eq!(row(table(&link_down, "The control loop"), "tick took")[4], ticks.to_string());
 }
 
-/// What the recorder wrote of the forces on cells, and when, in ns since 1970.
+/// Returns the recorded forces on cells, with their times in ns since 1970.
 fn recorded_forces(recorded: &Recorded) -> Vec<(u64, u64, f64)> {
     let topics = recorded
         .messages
@@ -329,13 +329,13 @@ fn touches_are_shown_when_and_where_the_recorder_saw_them_and_losses_where_cells
     let lost: Vec<_> = losses.panels.iter().flat_map(|panel| &panel.cells).collect();
     let of =
         |node: u8| lost.iter().find(|spot| spot.caption == format!("vcan0 {node}")).unwrap().value.unwrap();
-    // At least what the gateway counted; the killed one has some on any machine.
+    // At least the gateway's count; the killed cell has some on any machine.
     let summary = place.summary();
     for cell in summary.cells() {
         let missing = cell["missing"].as_object().unwrap().values().map(|count| count.as_u64().unwrap());
         let counted = missing.sum::<u64>() + cell["late"].as_u64().unwrap();
         let node = cell["node"].as_u64().unwrap().try_into().unwrap();
-        // What the gateway waits for at its end may stand behind the recording's.
+        // The packets that the gateway awaits at its end may follow the end of the recording.
         let is_near = of(node) + 4.0 >= counted as f64;
         assert!(is_near && (node != 3 || of(node) > 2.0), "{counted}, {lost:?}, {cell:#}");
     }
@@ -343,7 +343,7 @@ fn touches_are_shown_when_and_where_the_recorder_saw_them_and_losses_where_cells
     assert!(moments.rows.iter().any(|row| row[1] == "vcan0: cell 3 is silent"), "{moments:?}");
     let touches = table(&page, "Touches, cells of a link together");
     assert!(touches.rows.iter().all(|row| row[2].contains("run.mcap --at ")), "{touches:?}");
-    // The command counts from the first tick, as the column beside it.
+    // The command counts from the first tick, like the column beside it.
     let first = forces.iter().filter(|(_, _, force)| *force > 0.0).map(|(nanos, ..)| *nanos).min().unwrap();
     let at: f64 = touches.rows[0][2].rsplit(' ').next().unwrap().parse().unwrap();
     assert!((at - (first - ticks[0]) as f64 * 1e-9).abs() < 0.004 + gap, "{at} {first} {}", ticks[0]);

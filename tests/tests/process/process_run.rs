@@ -15,8 +15,8 @@ use protocol::packet::WORDS;
 use protocol::parameters::Parameter;
 use rustix::process::{Pid, Signal};
 
-/// Every frame on the buses is in the log: packets by their kinds, as both sides counted them, and what was
-/// no packet.
+/// Checks that every frame on the buses is in the log: packets by their kinds, as both sides counted them, and other
+/// frames.
 fn log_is_whole(place: &Place, summary: &Summary, frames_a_packet: u64) {
     let buses = summary.0["buses"].as_array().unwrap().len();
     let packets = |bus| {
@@ -81,7 +81,7 @@ fn buses_of_classic_frames_carry_the_same_bench() {
     log_is_whole(&place, &summary, 2);
 }
 
-/// Two runs of this scenario, the second one with more options.
+/// Runs this scenario twice, the second time with more options.
 fn twice(scenario: &str, more: &str) {
     let place = Place::new();
     place.skin(8);
@@ -93,7 +93,7 @@ fn twice(scenario: &str, more: &str) {
     });
     place.is_left_clean();
     let (shared, all) = same_torques(&logs[0], &logs[1]);
-    // Each on a machine that skips four of five broadcasts share a thirtieth.
+    // Two runs on a machine that skips four of five broadcasts share a thirtieth.
     assert!(shared > 20, "the two runs share only {shared} of {all} causes");
 }
 
@@ -199,7 +199,7 @@ fn cells_started_by_hand_serve_one_gateway_after_the_other() {
             assert!(summary.of_bus("/replies/in_time") > 0, "{:#}", summary.0);
         }
     }
-    // They are not the gateway's children, and are still there.
+    // They are not the gateway's children, and still run.
     assert_eq!(place.processes().len(), 4);
 
     server.signal(Signal::TERM);
@@ -257,7 +257,7 @@ fn a_gateway_without_cells_names_the_missing_ones() {
     assert_eq!(ended.refusal(1), said);
     assert_eq!(place.files(), ["buses", "run.json", "scenario.toml", "skin.toml"]);
 
-    // Those that are there are enough.
+    // The running cells are enough.
     let cells = place.start("cell-node", "--bus vcan0 --bus-kind embedded --nodes 1-6 --skin skin.toml");
     let ended = place.bench(1.0, "--no-spawn").end().well();
     assert!(ended.stderr.contains("run goes on without them: 7, 8 on vcan0"), "{}", ended.stderr);
@@ -268,7 +268,7 @@ fn a_gateway_without_cells_names_the_missing_ones() {
     until("the server's end", || place.processes().is_empty().then_some(()));
 }
 
-/// The times that a process waited, so that it was woken.
+/// Returns how many times a process was woken from a wait.
 fn wakes(pid: Pid) -> u64 {
     let status = fs::read_to_string(format!("/proc/{}/status", pid.as_raw_nonzero())).unwrap();
     let line = status.lines().find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"));
@@ -296,7 +296,7 @@ fn joints_wake_the_cells_that_are_touched() {
     let before = [touched, untouched].map(wakes);
     client.waits_for_joints(200);
     let [of_touched, of_untouched] = [wakes(touched) - before[0], wakes(untouched) - before[1]];
-    // It sends heartbeats.
+    // The cell sends heartbeats.
     assert!(of_untouched >= 4 && of_untouched * 3 < of_touched * 2, "{of_untouched} beside {of_touched}");
     bench.signal(Signal::TERM);
     bench.end().well();

@@ -20,7 +20,7 @@ use serde_json::json;
 
 const CELLS: u8 = 8;
 
-/// A place whose skin has these keys of its bus.
+/// Creates a place whose skin has these keys of its bus.
 fn place(sensing: &str, scenario: &str) -> Place {
     let place = Place::new();
     let format = "format = \"fd\"";
@@ -36,7 +36,7 @@ fn ends(bench: Running) {
     bench.end().well();
 }
 
-/// What a command in this place prints, when it does what it should.
+/// Runs a command in this place successfully, and returns its output.
 fn switches(place: &Place, words: &str) -> String {
     place
         .start("skinbus", &format!("frame sensing {words} --bus vcan0 --bus-kind embedded"))
@@ -122,7 +122,7 @@ fn a_cell_that_restarts_is_switched_again_to_what_it_was() {
     place.summary().adds_up();
 }
 
-/// The sizes of a cell's torques in a log, in their order.
+/// Returns the sizes of a cell's torques in a log, in their order.
 fn sizes(log: &Log, cell: u8) -> Vec<i32> {
     let size = |(message, _): &(Message, _)| {
         let Message::Torque { from, torque, .. } = message else { return None };
@@ -132,7 +132,7 @@ fn sizes(log: &Log, cell: u8) -> Vec<i32> {
     log.messages.iter().filter_map(size).collect()
 }
 
-/// Ten degrees in eight seconds; offsets that would all be contacts without a baseline.
+/// Ten degrees in eight seconds, with offsets that would all be contacts without a baseline.
 #[test]
 fn cells_whose_sensors_drift_feel_what_touches_them_and_nothing_else() {
     let place = Place::new();
@@ -147,7 +147,7 @@ fn cells_whose_sensors_drift_feel_what_touches_them_and_nothing_else() {
     let log = Log::read(&place.read("run.log"), Format::Fd);
     let torques = sizes(&log, 2);
     assert!(torques.len() > 30, "{} torques of a touch", torques.len());
-    // The last one is of zeros, those beside it may be of the touch's first and last epochs.
+    // The last one is zeros; its neighbours may be of the touch's first and last epochs.
     let (first, last) = (torques[2], torques[torques.len() - 3]);
     assert!(f64::from(last) > 0.95 * f64::from(first), "{first} {last}");
     assert_eq!(torques.last(), Some(&0), "after the release nothing is there");
@@ -159,7 +159,7 @@ fn cells_whose_sensors_drift_feel_what_touches_them_and_nothing_else() {
     assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
 }
 
-/// Of a robot that stands and of one that a controller moves, and that nothing touches.
+/// A robot that stands, and one that a controller moves, both without a touch.
 #[test]
 fn accelerometers_of_a_robot_at_rest_show_gravity_in_the_frames_of_their_cells() {
     for motion in ["hold", "kinesthetic"] {
@@ -202,7 +202,7 @@ fn an_invalid_request_is_refused_in_one_line() {
     assert!(nowhere.starts_with("skinbus: ") && nowhere.contains("vcan0"), "{nowhere}");
 }
 
-/// Cells that have taken stimuli before a gateway listens: from another sender, and from a gateway that was killed.
+/// Cells that have accepted stimuli before a gateway listens: from another sender, and from a gateway that was killed.
 #[test]
 fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known() {
     let place = Place::new();
@@ -221,7 +221,7 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     let page = SensorPage::Skin(SkinSensors { contact, ..SkinSensors::default() });
     test_client.sends(&Message::Stimulus { to: third, from: From::Next, page });
 
-    // A run that touches nothing leaves the cell as it is, and says that it does not know what touches it.
+    // A run without touches leaves the cell as it is, and reports that its contact is unknown.
     place.scenario(head);
     let ended = place.bench(1.5, "--no-spawn").end().well();
     let said = "the contact of these cells is not known, their torques are not compared: 3 on vcan0;";
@@ -254,7 +254,7 @@ fn cells_that_were_pressed_before_are_compared_only_once_their_contact_is_known(
     drop((cells, server, test_client));
 }
 
-/// Ends threads that pass frames on, also when the test fails.
+/// Ends the forwarding threads, also when the test fails.
 struct Stops<'a>(&'a AtomicBool);
 
 impl Drop for Stops<'_> {
@@ -263,7 +263,7 @@ impl Drop for Stops<'_> {
     }
 }
 
-/// Passes frames on until it is stopped, as `change` makes them.
+/// Forwards frames, changed by `change`, until it is stopped.
 fn pass_on(from: &Bus, to: &Bus, stop: &AtomicBool, mut change: impl FnMut(&Frame) -> Frame) {
     let mut inbox = Inbox::new();
     while !stop.load(Ordering::Relaxed) {
@@ -276,7 +276,7 @@ fn pass_on(from: &Bus, to: &Bus, stop: &AtomicBool, mut change: impl FnMut(&Fram
 
 #[test]
 fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_the_report() {
-    // The cell is on a bus of its own, and what it sends comes to the others changed.
+    // The cell is on a bus of its own, and its packets arrive changed at the others.
     let [place, behind] = [Place::new(), Place::new()];
     let moving = PRESSED
         .replace("hold", "sine")

@@ -1,4 +1,4 @@
-//! `vcan-setup slcan` as a process: lines of all kinds on an embedded bus, and what becomes of their frames.
+//! `vcan-setup slcan` as a process: lines of all kinds on an embedded bus, and the treatment of their frames.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -51,14 +51,14 @@ impl Bench {
         self.place.start("vcan-setup", &format!("slcan vcan0 --bus-kind embedded {words}"))
     }
 
-    /// The same, once all lines are open.
+    /// Starts the same, and waits until all lines are open.
     fn joined(&self, words: &str) -> Running {
         let bridge = self.slcan(&format!("{words} --json"));
         bridge.hears(" on vcan0 (embedded)");
         bridge
     }
 
-    /// Waits for so many frames on the bus.
+    /// Waits for a number of frames on the bus.
     fn receives(&self, count: usize) -> Vec<Frame> {
         let (mut inbox, mut frames) = (Inbox::new(), Vec::new());
         until("frames on the bus", || {
@@ -71,7 +71,7 @@ impl Bench {
     }
 }
 
-/// Ends lines; what became of the frames of each.
+/// Ends the bridge, and returns the account of each line.
 fn ended(bridge: Running) -> Vec<Value> {
     bridge.signal(Signal::TERM);
     let ended = bridge.end().well();
@@ -87,7 +87,7 @@ fn ended(bridge: Running) -> Vec<Value> {
     lines
 }
 
-/// Frames of every kind.
+/// Returns frames of every kind.
 fn frames(count: usize) -> Vec<Frame> {
     let frame = |number: usize| {
         let id = u32::try_from(number % 0x700).unwrap();
@@ -204,7 +204,7 @@ fn a_bit_rate_that_an_adapter_does_not_have_is_reported() {
     let bench = Bench::new();
     let mut pty = Pty::new();
     let bridge = bench.joined(&format!("{} --bit-rates 500k/2M", pty.path.display()));
-    // Closing what is closed is refused as well, and means nothing.
+    // Closing a closed channel is refused as well, and has no effect.
     pty.peer.hears("C\r");
     pty.peer.says(b"\x07");
     pty.peer.hears("S6\r");
@@ -274,7 +274,7 @@ fn a_board_that_opening_its_line_resets_is_left_alone_until_it_has_started() {
     );
 }
 
-/// A line goes and comes back; `connect` makes its other end. How many lines were cut off in the middle.
+/// A line goes away and comes back; `connect` makes its other end. Returns the number of lines that were cut.
 fn goes_and_returns(
     bench: &Bench,
     address: &str,
@@ -321,7 +321,7 @@ fn a_terminal_goes_and_returns() {
         drop(peer);
         slaves.borrow_mut().clear();
     });
-    // What a terminal has not read when it is hung up is gone.
+    // Data that a terminal has not read is lost when it is hung up.
     assert!(short <= 3);
 }
 
@@ -342,7 +342,7 @@ fn a_tcp_socket_goes_and_returns() {
     let bench = Bench::new();
     let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     let connect = || {
-        // Not there once it is connected, as a program that ends.
+        // The other end is gone once it is connected, like a program that ends.
         let listener = TcpListener::bind(("127.0.0.1", port)).unwrap();
         Peer::new(OwnedFd::from(listener.accept().unwrap().0))
     };
@@ -357,7 +357,7 @@ fn what_a_line_is_too_slow_for_is_counted_exactly_and_holds_up_nobody() {
     let mut quick = Pty::new();
     let bridge = bench.joined(&format!("unix:{} {}", path.display(), quick.path.display()));
     let mut slow = Peer::new(OwnedFd::from(listener.accept().unwrap().0));
-    // Nobody reads the one line, and the other one gets everything.
+    // One line is not read, and the other one still gets everything.
     let all: Vec<_> = (0..20_000_u32).map(|n| Frame::fd(1, 1, &n.to_le_bytes()).unwrap()).collect();
     for (done, frames) in (1..).zip(all.chunks(100)) {
         bench.client.send(frames).unwrap();
@@ -365,7 +365,7 @@ fn what_a_line_is_too_slow_for_is_counted_exactly_and_holds_up_nobody() {
     }
     assert_eq!(quick.peer.frames(), all);
     until("a report", || bridge.stderr().contains("line too slow").then_some(()));
-    // While it ends, what is in the socket and what was begun is read.
+    // While it ends, the data in the socket and unfinished lines are read.
     bridge.signal(Signal::TERM);
     while slow.look() {
         std::thread::sleep(Duration::from_millis(1));
@@ -386,7 +386,7 @@ fn what_a_line_is_too_slow_for_is_counted_exactly_and_holds_up_nobody() {
     assert!(slow.bytes.ends_with(b"\rC\r"), "its adapter was closed");
 }
 
-/// The accounts of lines that were signalled.
+/// Returns the accounts of lines after the bridge got a signal.
 fn ended_already(bridge: Running) -> Vec<Value> {
     let mut report: Value = serde_json::from_str(&bridge.end().well().stdout).unwrap();
     serde_json::from_value(report["lines"].take()).unwrap()
@@ -449,7 +449,7 @@ fn what_cannot_be_is_refused_in_one_line() {
         refused(&tty.to_string(), 1),
         format!("vcan-setup: cannot open {tty}: another program uses it; stop that one first")
     );
-    // A name for the same terminal is the same terminal.
+    // A link to the same terminal is the same terminal.
     let link = bench.place.path("link");
     std::os::unix::fs::symlink(&pty.path, &link).unwrap();
     assert!(refused(&link.display().to_string(), 1).contains("another program uses it"));
@@ -463,7 +463,7 @@ fn what_cannot_be_is_refused_in_one_line() {
 
 #[test]
 fn a_cell_behind_a_line_answers_as_one_on_the_bus() {
-    // The cell is on a bus of its own, which stands for what is behind an adapter.
+    // The cell is on a bus of its own, which stands for the bus behind an adapter.
     let [bench, behind] = [Bench::new(), Bench::new()];
     for place in [&bench.place, &behind.place] {
         place.pressed();

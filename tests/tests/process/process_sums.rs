@@ -30,7 +30,7 @@ fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
     let sums = |key: &str| summary.of_bus(&format!("/sums/{key}"));
     let broadcasts = summary.number("/loop/broadcasts");
     assert_eq!((sums("roots"), sums("overheard")), (2, 0), "{:#}", summary.0);
-    // Each root once an epoch, and resent sums are counted.
+    // Each root sends once an epoch, and resent sums are counted.
     assert!(sums("first") > 0 && sums("first") <= 2 * broadcasts, "{:#}", summary.0);
     assert_eq!(summary.count("/buses/0/received", "sum"), sums("received"));
     assert!(summary.of_bus("/uplink/unheard") > 0, "ten cells sent to others: {:#}", summary.0);
@@ -46,7 +46,7 @@ fn the_gateway_receives_its_roots_alone_and_every_cell_is_in_their_sums() {
     assert!((2..=11).contains(&summary.of_bus("/network/deepest")), "{:#}", summary.0);
     assert!(summary.figure("/buses/0/network/tree_ready_s") >= 0.0);
     assert_eq!(summary.0["buses"][0]["network"]["differences"].as_array().unwrap().len(), 0);
-    // Half a step of each cell, and what is carried.
+    // Half a step of each cell, and the carried remainder.
     let errors = ["mean", "max"].map(|which| summary.figure(&format!("/accuracy/sums/{which}_nm")));
     assert!(errors[0] <= 0.0065 && errors[1] <= 12.0 / 256.0, "{:#}", summary.0);
     assert_eq!(summary.number("/accuracy/single/count"), 0);
@@ -106,7 +106,7 @@ fn an_unreachable_cell_is_named_in_classic_frames_too() {
 #[test]
 fn cells_that_are_wired_otherwise_than_described_are_named() {
     let place = Place::new();
-    // What leads from 6 to 10 leads to 11, and what leads from 7 to 11 leads to 10; 8 and 12 are not wired.
+    // The wires from 6 to 10 and from 7 to 11 are swapped: they lead to 11 and 10; 8 and 12 are not wired.
     wired(&place, Format::Fd, |cell| {
         let [left, right, up, down] = neighbors(cell);
         match cell {

@@ -1,4 +1,4 @@
-//! `skinbus view`: a page's WebSocket beside a real bench, and clients that mean no good.
+//! `skinbus view`: a page's WebSocket beside a real bench, and hostile clients.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 mod intruders;
@@ -59,7 +59,7 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
         it.joints.iter().all(|joint| joint[1] == 0.0) && it.cells[4].0 == 1 && it.cells[4].1 == 0
     });
 
-    // A page that goes takes its touch with it.
+    // The touch of a page ends when the page goes.
     let mut other = Page::new(&address);
     other.press(7, 3.0);
     page.sees("a touch of the other page", |it| it.cells[6].2 == 3_000);
@@ -73,7 +73,7 @@ fn a_press_is_a_torque_and_a_release_takes_it_away() {
     run.end();
     place.is_left_clean();
     assert!(TcpStream::connect(&address.host).is_err(), "the page ends with its run");
-    // What the page pressed is on the bus as stimuli.
+    // The page's press is on the bus as stimuli.
     let log = place.read("run.log");
     assert!(log.contains(" 705#") && log.contains(" 707#"), "stimuli of cells 5 and 7");
 }
@@ -114,7 +114,7 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
     let long = http(format!("GET / HTTP/1.1\r\nHost: {host}\r\nX: {}\r\n\r\n", "x".repeat(20_000)));
     assert!(long.starts_with("HTTP/1.1 431"), "{long}");
 
-    // One page reads nothing, one sends what it likes; a third one goes on.
+    // One page reads nothing, one sends arbitrary data; a third one must still work.
     let stalled = Page::new(&address);
     let mut flood = Page::new(&address);
     let flooding = std::thread::spawn(move || {
@@ -170,7 +170,7 @@ fn who_is_no_page_of_this_server_is_refused_and_floods_end_nothing() {
 #[test]
 fn pages_that_may_only_look_press_nothing() {
     let place = Place::new();
-    // A busy machine halts no robot.
+    // A busy machine must not halt the robot.
     place.write("skin.toml", &(skin(4) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(QUIET);
     let run = place.running_bench(600.0, "");
@@ -194,7 +194,10 @@ fn pages_that_may_only_look_press_nothing() {
     run.signal(rustix::process::Signal::INT);
     run.end();
     for (words, expected) in [
-        ("--token-file skin.toml", "--token-file skin.toml: a token has 16 to 256 letters or digits"),
+        (
+            "--token-file skin.toml",
+            "--token-file skin.toml: a token must consist of 16 to 256 letters or digits",
+        ),
         ("--token-file no-such-file", "--token-file no-such-file: No such file or directory"),
         ("--address-file skin.toml", "--address-file skin.toml: it exists, and is no page's address: name"),
         ("--listen nowhere", "--listen"),
@@ -265,7 +268,7 @@ fn a_robot_of_which_the_urdf_is_there_comes_with_its_surface() {
         answer[body..].chunks(4).map(|bytes| f32::from_le_bytes(bytes.try_into().unwrap())).collect();
     let corners: Vec<_> = floats.chunks(6).collect();
     assert_eq!(corners.len(), shells.iter().map(|shell| number(shell, "count")).sum::<usize>());
-    // The base, a box, is as large as the URDF says.
+    // The base, a box, has the size that the URDF gives.
     let base = &corners[number(&shells[0], "first")..][..number(&shells[0], "count")];
     let size = [0, 1, 2].map(|axis| {
         let of = |pick: fn(f32, f32) -> f32| base.iter().map(|corner| corner[axis]).reduce(pick).unwrap();
@@ -285,7 +288,7 @@ fn a_page_that_acts_tells_and_does_nothing_without_its_token() {
     assert_eq!(query.len(), "?token=".len() + 32, "{query}");
     assert_eq!(place.read("address"), format!("{}\n", address.url()));
     assert_eq!(place.path("address").metadata().unwrap().permissions().mode() & 0o777, 0o600);
-    // It is on no command line, which every user of the machine may read.
+    // The token is not on a command line, which every user of the machine can read.
     let token = query.strip_prefix("?token=").unwrap();
     assert!(place.processes().iter().all(|(_, line)| !line.contains(token)));
     let origin = format!("http://{host}");
@@ -335,7 +338,7 @@ fn a_token_is_taken_from_a_file_or_the_environment() {
         served.signal(rustix::process::Signal::INT);
         served.end();
     }
-    // What can only look needs none on this machine, and one elsewhere.
+    // A read-only page needs no token on this machine, but one for other machines.
     for (words, has_token) in [("--read-only", false), ("--read-only --listen 0.0.0.0:0", true)] {
         let served = place.start("skinbus", &format!("{view} {words}"));
         let address = address(&served);
@@ -349,7 +352,7 @@ fn a_token_is_taken_from_a_file_or_the_environment() {
     let refused = Running::start(command).end();
     assert_eq!(
         refused.refusal(2),
-        "skinbus: SKINBUS_TOKEN: a token has 16 to 256 letters or digits, and nothing else"
+        "skinbus: SKINBUS_TOKEN: a token must consist of 16 to 256 letters or digits"
     );
     assert!(!place.path("run.log").exists(), "nothing was done");
 }

@@ -1,4 +1,4 @@
-//! A page commands the run that it belongs to: processes of cells, links, buses; and sees how late the loop is.
+//! A page commands its run (processes of cells, links, buses), and shows the lateness of the loop.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -11,7 +11,7 @@ use recorded::Recorded;
 use rustix::process::{Pid, Signal};
 use serde_json::{Value, json};
 
-/// Ends a run that is watched, and checks what it left; its exit code.
+/// Ends a run with a page, checks the files that it left, and returns its exit code.
 fn end(place: &Place, run: Running) -> Option<i32> {
     run.signal(Signal::INT);
     let ended = run.end();
@@ -20,7 +20,7 @@ fn end(place: &Place, run: Running) -> Option<i32> {
     ended.code()
 }
 
-/// The process that serves a run's page.
+/// Returns the process that serves a run's page.
 fn server(place: &Place) -> Pid {
     until("the server of the page", || {
         place
@@ -150,7 +150,7 @@ fn a_bus_that_a_page_takes_down_stays_down_until_it_takes_it_up() {
     page.sees("a torque", |it| it.joints.iter().any(|joint| joint[1] != 0.0));
     page.say(r#"{"do":"release"}"#);
 
-    // As after any other loss: a bus that is down at the end is one that the run has lost.
+    // As after any other loss: a bus that is down at the end is a bus that the run has lost.
     page.command(r#""on":"bus","down":true,"bus":0"#);
     page.hears("the bus down again", |said| said["buses"][0]["up"] == false);
     assert_eq!(end(&place, run), Some(1));
@@ -257,7 +257,7 @@ fn a_server_that_hangs_or_ends_does_not_hold_the_run_up() {
     goes_on(&run);
     signal(server, Signal::CONT);
     assert!(page.answer("kill cell 2 on vcan0"));
-    // Nobody is left who would take the bus up again.
+    // After the page has gone, no client can bring the bus up again.
     page.command(r#""on":"bus","down":true,"bus":0"#);
     assert!(page.answer("bus vcan0 down"));
     signal(server, Signal::KILL);

@@ -1,4 +1,4 @@
-//! `skinbus view` over recordings of earlier builds: what a page gets at a moment is what `skinbus dump` says up to it.
+//! `skinbus view` of recordings of earlier builds: a page at a moment shows what `skinbus dump` prints up to it.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -33,7 +33,7 @@ impl Recording {
         it
     }
 
-    /// All that `dump` has with these options.
+    /// Returns the output of `dump` with these options.
     fn dumped(&self, more: &str) -> Vec<Value> {
         let words = format!("dump {} --json {more}", self.files.join(" "));
         let dumped = self.place.start("skinbus", &words).end().well();
@@ -53,7 +53,7 @@ impl Recording {
     }
 }
 
-/// Of each cell the words of its last torque, as `dump` has them.
+/// Returns the words of the last torque of each cell, as `dump` prints them.
 fn torques(dumped: &[Value]) -> BTreeMap<(String, u64), (u64, Vec<f64>)> {
     let torques = dumped.iter().filter(|line| line["kind"] == "torque" && line["verdict"] == "ok");
     let one = |line: &Value| {
@@ -68,12 +68,12 @@ fn torques(dumped: &[Value]) -> BTreeMap<(String, u64), (u64, Vec<f64>)> {
 fn agrees_with_dump(names: &[&str], more: &str) {
     let mut recording = Recording::new(names, more);
     let (length, mut compared) = (recording.length(), 0);
-    // Forth and back.
+    // Forwards and backwards.
     for share in [0.9, 0.2, 0.55, 0.3, 0.999, 0.7] {
         let at_s = (length * share * 1e3).round() / 1e3;
         let said = recording.at(at_s);
         assert_eq!(said["playback"]["exact"], true);
-        // Up to and with this moment, to the next ns.
+        // Up to and including this moment, to the next ns.
         let dumped = recording.dumped(&format!("--to {:.9}", at_s + 1e-9));
         let torques = torques(&dumped);
         compared += torques.len();
@@ -92,7 +92,7 @@ fn agrees_with_dump(names: &[&str], more: &str) {
             assert_eq!(shown, words, "{names:?} at {at_s}, {bus}:{node}");
         }
         let last = dumped.iter().rev().find(|line| line["kind"] == "joints");
-        // Two buses have joints at times of their own.
+        // Two buses have joints at different times.
         let Some(last) = last.filter(|_| names[0] != "two.mcap") else { continue };
         let positions = last["values"]["position_rad"].as_array().unwrap().clone();
         let snapshot = recording.page.sees("the position", |it| (it.time - at_s).abs() < 1e-6);

@@ -20,7 +20,7 @@ use rustix::process::{Pid, Signal, kill_process};
 use served::Served;
 use tempfile::TempDir;
 
-/// A server that is ready.
+/// Starts a server, and waits until it is ready.
 fn serve(directory: &Path, arguments: &[&str]) -> Served {
     let mut command = Command::new(program("vcan-setup"));
     command.args(["serve", "vcan0"]).args(arguments).env("SKINBUS_DIR", directory);
@@ -95,7 +95,7 @@ fn a_parent_that_is_killed_takes_it_along_even_while_standard_input_stays_open()
     let input = shell.stdin.take();
     shell.kill().unwrap();
     shell.wait().unwrap();
-    // The server has the other end of the output: when that closes, it has ended.
+    // The server has the other end of the output: when that closes, the server has ended.
     output.read_to_string(&mut line).unwrap();
     assert_eq!(std::fs::read_dir(parent.path()).unwrap().count(), 0);
     drop(input);
@@ -198,7 +198,7 @@ fn wrong_use_is_2_and_failure_is_1_each_in_one_line() {
 
 const DOCUMENT: &str = include_str!("../../../docs/reference/embedded-bus.md");
 
-/// The document's program in a language, as a file.
+/// Writes the document's program in a language to a file.
 fn listing(language: &str, folder: &Path) -> PathBuf {
     let fence = format!("\n```{language}\n");
     let mut blocks = DOCUMENT.split(&fence).skip(1);
@@ -209,7 +209,7 @@ fn listing(language: &str, folder: &Path) -> PathBuf {
     path
 }
 
-/// The document's programs, ready to be run.
+/// Returns the document's programs, ready to be run.
 fn listings(folder: &Path) -> [Vec<PathBuf>; 2] {
     let program = folder.join("attach");
     let mut compiler = Command::new("cc");
@@ -226,7 +226,7 @@ fn attach(listing: &[PathBuf], directory: &Path) -> Child {
     command.spawn().expect("python3 is needed: apt install python3")
 }
 
-/// The frames that the documents' programs send.
+/// Returns the frames that the document's programs send.
 fn sent_by_listings() -> [Frame; 2] {
     let mut data = [0; 12];
     data[..3].copy_from_slice(&[1, 2, 3]);
@@ -283,7 +283,7 @@ fn the_documents_programs_send_receive_and_end_with_the_server() {
     }
 }
 
-/// What a program meets that attaches to this listener: its hello, and the connection.
+/// Plays the server for a program that attaches: answers its hello, and returns the connection.
 fn greeted(listener: &OwnedFd, answer: Answer) -> OwnedFd {
     let socket = rustix::net::accept(listener).unwrap();
     let mut bytes = [0; 64];
@@ -348,7 +348,7 @@ fn what_was_ignored_is_said_at_the_end() {
     assert!(said.contains("vcan0: ignored 1 datagrams") && said.contains("refused 0 clients"), "{said}");
 }
 
-/// A server that may have this many files, by an option of `ulimit`.
+/// Starts a server with a limit of open files, given as an option of `ulimit`.
 fn serve_with_files(directory: &Path, limit: &str) -> Served {
     let mut command = Command::new("sh");
     let line = format!("ulimit {limit} && exec \"$0\" serve vcan0");
@@ -358,7 +358,7 @@ fn serve_with_files(directory: &Path, limit: &str) -> Served {
     child
 }
 
-/// Sends a frame from one client to another, which has nothing else waiting.
+/// Checks that a frame passes from one client to another one, which has no other frames waiting.
 fn passes(from: &Bus, to: &Bus) {
     let frame = Frame::classic(0x123, &[5]).unwrap();
     from.send(&[frame]).unwrap();
@@ -388,7 +388,7 @@ fn clients_for_which_there_is_no_file_are_turned_away_and_the_others_go_on() {
     passes(&a, &b);
     drop(others);
     passes(&b, &a);
-    // There is room again as soon as the server has seen that they are gone.
+    // There is room again as soon as the server has noticed that they are gone.
     let again = std::iter::repeat_with(|| open(&listening)).find_map(Result::ok).unwrap();
     passes(&again, &a);
     signal(&server, Signal::TERM);
@@ -398,7 +398,7 @@ fn clients_for_which_there_is_no_file_are_turned_away_and_the_others_go_on() {
     assert_eq!(ended(server, &parent).code(), Some(0));
 }
 
-/// The processor's time that a process has used, in ticks of 10 ms.
+/// Returns the processor time of a process, in ticks of 10 ms.
 fn processor_ticks(pid: u32) -> u64 {
     let stat = std::fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
     let (_, after_name) = stat.rsplit_once(')').unwrap();

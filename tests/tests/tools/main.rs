@@ -1,4 +1,4 @@
-//! Benches beside other people's tools: `tests/tools/run`.
+//! Benches beside third-party tools: `tests/tools/run`.
 
 mod tools_captures;
 mod tools_chains;

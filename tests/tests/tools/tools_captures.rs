@@ -1,6 +1,6 @@
-//! Captures beside other people's tools: each reads what we write, and we read what it writes.
+//! Captures beside third-party tools: each reads our files, and we read its files.
 //!
-//! `tests/tools/install` makes the tools ready; `tests/run` does that, and then runs these.
+//! `tests/tools/install` installs the tools; `tests/run` does that, and then runs these tests.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -16,7 +16,7 @@ use protocol::candump::{Direction, Record};
 use tempfile::TempDir;
 use trace::capture::{Entry, NoteKind, Reader};
 
-/// Frames of every kind that all tools read, on two buses, in candump's words.
+/// Frames of every kind that all tools read, on two buses, in candump's notation.
 const PORTABLE: &str = "\
 (1700000000.000001) vcan0 123#DEADBEEF
 (1700000000.000002) can1 000#
@@ -33,7 +33,7 @@ const PORTABLE: &str = "\
 (1700000001.000006) can1 7FE##5000102030405060708090A0B0C0D0E0F101112131415161718191A1B1C1D1E1F202122232425262728292A2B2C2D2E2F303132333435363738393A3B3C3D3E3F
 ";
 
-/// What only some tools read: error frames, lengths of remote frames, directions, 9 digits, raw DLCs, notes.
+/// Frames that only some tools read: error frames, lengths of remote frames, directions, 9 digits, raw DLCs, notes.
 const RICH: &str = "\
 # taken in the laboratory
 (1700000000.000001) vcan0 123#DEADBEEF
@@ -46,7 +46,7 @@ DROPCOUNT: dropped 12 CAN frames on 'can1' socket (total drops 40)
 (1700000000.000007) nonsense
 ";
 
-/// A folder, and in it what tools are to read.
+/// A folder with the files for the tools.
 struct Place(TempDir);
 
 impl Place {
@@ -61,7 +61,7 @@ impl Place {
         self.0.path().join(name)
     }
 
-    /// What a tool prints that is content; words with a dot in them are files here.
+    /// Returns the content that a tool prints; words with a dot are files in this folder.
     fn run(&self, tool: &Path, arguments: &str, input: Option<&str>) -> String {
         let mut command = Command::new(tool);
         command.args(arguments.split(' ').filter(|word| !word.is_empty())).current_dir(self.0.path());
@@ -82,7 +82,7 @@ impl Place {
         self.run(Path::new(tool), arguments, None)
     }
 
-    /// A program of the tools' Python.
+    /// Runs a program with the tools' Python.
     fn python(&self, arguments: &str) -> String {
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tools/captures.py");
         self.run(&of_python("python"), &format!("{} {arguments}", script.display()), None)
@@ -123,7 +123,7 @@ fn lines(text: &str) -> Vec<String> {
     text.lines().map(str::to_owned).collect()
 }
 
-/// A frame as the script prints python-can's; what that does not have is left out.
+/// Formats a frame as the script prints python-can's; fields that python-can does not have are left out.
 fn of_can(record: &Record<'_>) -> String {
     let Record { time, interface, frame, .. } = record;
     let fd = frame.format() == Format::Fd;
@@ -182,7 +182,7 @@ fn log2asc_reads_our_log() {
 #[ignore = "needs tests/tools/install"]
 fn tshark_reads_our_log() {
     let place = Place::new();
-    // Error frames are for it too.
+    // The log contains an error frame as well.
     let error = "(1700000002.000000) vcan0 20000004#0001000000000000\n";
     fs::write(place.path("more.log"), format!("{PORTABLE}{error}")).unwrap();
     place.gateway("convert more.log run.mcap");
@@ -250,7 +250,8 @@ fn what_each_tool_reads_beyond_that_is_as_docs_captures_says() {
             ".000004",
         ),
     ];
-    // Two frames of the portable subset's first line, and one thing more; whether each tool reads both at their times.
+    // The first two frames of the portable subset, and one more entry; the flag tells if the tool reads both at their
+    // times.
     let odd = [
         (
             "directions",
@@ -288,7 +289,7 @@ fn what_each_tool_reads_beyond_that_is_as_docs_captures_says() {
     }
 }
 
-/// Everything in a recording as the script prints it, with the digits of its channels.
+/// Returns everything in a recording as the script prints it, with the digits of its channels.
 fn of_ros(path: &Path) -> Vec<String> {
     let stamp = |nanos: u64| format!("{nanos} {}.{:09}", nanos / 1_000_000_000, nanos % 1_000_000_000);
     let mut all = Vec::new();
@@ -320,7 +321,7 @@ fn of_ros(path: &Path) -> Vec<String> {
                 )
             }
             Entry::Note(note) => {
-                // Notes before the first frame are kept under its time.
+                // Notes before the first frame are stored under its time.
                 let nanos = if note.nanos == 0 { first.unwrap() } else { note.nanos };
                 let bus = if note.interface.is_empty() { "-" } else { note.interface };
                 let (kind, frames, text, bytes) = match &note.kind {
@@ -354,7 +355,7 @@ fn the_mcap_library_and_rosbags_read_every_field_of_our_recording() {
             fs::read_to_string(place.path(&format!("{name}.log"))).unwrap().lines().count()
         );
         assert_eq!(lines(&place.python(&format!("mcap-read {name}.mcap"))), ours);
-        // It reads by time, and of one time in an order of its own.
+        // It sorts by time, with an order of its own at equal times.
         assert_eq!(sorted(lines(&place.python(&format!("bag-read {name}.mcap")))), sorted(ours));
     }
 }

@@ -1,6 +1,6 @@
-//! Other people's robots, and Pinocchio: torques of cells on the chains of three URDFs of example-robot-data.
+//! Published robots, and Pinocchio: torques of cells on the chains of three URDFs of example-robot-data.
 //!
-//! `tests/tools/install` makes them ready; `tests/run --all` does that, and then runs this.
+//! `tests/tools/install` installs them; `tests/run --all` does that, and then runs this test.
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
@@ -22,9 +22,9 @@ use protocol::parameters::{Parameter, RowKind};
 use protocol::skin::Skin;
 use serde_json::Value;
 
-/// What the vectors say of each row.
+/// The columns of the vectors.
 const COLUMNS: &str = "robot,urdf,root_link,tip_link,link,px,py,pz,nx,ny,nz,force_n,joints,q,tau";
-/// Mean and maximum of the difference between a cell's torque and the exact one, in Nm or N.
+/// The mean and the maximum of the difference between a cell's torque and the exact one, in Nm or N.
 const BOUNDS: [f64; 2] = [1.4e-4, 2e-3];
 
 fn tools() -> PathBuf {
@@ -34,14 +34,14 @@ fn tools() -> PathBuf {
     folder
 }
 
-/// The folder of the URDFs.
+/// Returns the folder of the URDFs.
 fn robots() -> PathBuf {
     let mut libraries = fs::read_dir(tools().join("lib")).unwrap();
     let python = libraries.next().unwrap().unwrap().path();
     python.join("site-packages/cmeel.prefix/share/example-robot-data/robots")
 }
 
-/// The rows of a chain, each as its columns.
+/// Returns the rows of a chain, each as its columns.
 fn rows(robot: &str) -> Vec<Vec<&'static str>> {
     let mut lines = include_str!("../../data/robots.csv").lines();
     assert_eq!(lines.next(), Some(COLUMNS));
@@ -55,7 +55,7 @@ fn numbers(text: &str) -> Vec<f64> {
     text.split(' ').map(|number| number.parse().unwrap()).collect()
 }
 
-/// `skin.toml`: a cell for each row, by `cells.csv`.
+/// Writes `skin.toml`: a cell for each row, by `cells.csv`.
 fn import(place: &Place, rows: &[Vec<&str>], torque_format: &str) -> PathBuf {
     let mut cells = "link,px,py,pz,nx,ny,nz\n".to_owned();
     for row in rows {
@@ -73,7 +73,7 @@ fn import(place: &Place, rows: &[Vec<&str>], torque_format: &str) -> PathBuf {
     urdf
 }
 
-/// What a force does, by the central computation and by the code of a cell.
+/// Checks the torque of a force, by the central computation and by the code of a cell.
 fn check_calculator(robot: &str) {
     let place = Place::new();
     let rows = rows(robot);
@@ -111,7 +111,7 @@ fn check_calculator(robot: &str) {
     assert!(mean <= BOUNDS[0] && max <= BOUNDS[1], "{robot}: {mean} {max}");
 }
 
-/// Every seventh cell as a process, pressed while the robot gives way.
+/// Runs every seventh cell as a process, pressed while the robot gives way.
 fn check_moving(robot: &str) {
     let place = Place::new();
     let rows: Vec<_> = rows(robot).into_iter().step_by(7).collect();
@@ -130,12 +130,12 @@ fn check_moving(robot: &str) {
     println!(
         "{robot}: {torques} torques, mean {mean:.2e}, max {max:.1e}; moved by {moved:.2}; {saturated} saturated"
     );
-    // A tenth of what a machine has that is always in time.
+    // A tenth of the torques of a machine that is always in time.
     assert!(torques >= 500.0 && moved > 0.02 && saturated < torques, "{said}");
     assert!(mean <= BOUNDS[0] && max <= BOUNDS[1], "{robot}: {said}");
 }
 
-/// The contacts in words, as cells on these robots are configured and receive them.
+/// Writes the contacts in words, as cells on these robots are configured and receive them.
 fn in_words(robot: &str, text: &mut String) {
     let place = Place::new();
     let rows = rows(robot);

@@ -1,6 +1,6 @@
 //! `skinbus skin dbc` beside cantools, which decodes and encodes the golden frames by it.
 //!
-//! `tests/tools/install` makes the tools ready; `tests/run` does that, and then runs this.
+//! `tests/tools/install` installs the tools; `tests/run` does that, and then runs this test.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -10,7 +10,7 @@ use std::process::Command;
 
 use process::program;
 
-/// What a command prints that ends well.
+/// Returns the output of a command that must succeed.
 fn said(command: &mut Command) -> String {
     let output = command.output().unwrap();
     let error = String::from_utf8_lossy(&output.stderr);

@@ -1,7 +1,7 @@
-//! A recording on a disk that loses its power: ext4 in an image, copied while a run writes. What was not synced is not in
-//! the copy.
+//! A recording on a disk that loses its power: ext4 in an image, copied while a run writes. Unsynced data is not in the
+//! copy.
 //!
-//! Needs root, mkfs.ext4 and loop devices; `tests/tools/run` says so where it has to leave this out.
+//! Needs root, mkfs.ext4 and loop devices; `tests/tools/run` reports when it has to skip this test.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -41,7 +41,7 @@ impl Disk {
         Self { image, mounted }
     }
 
-    /// The disk as a loss of power leaves it now. Nobody may write meanwhile.
+    /// Returns the disk as a loss of power would leave it now. No program may write meanwhile.
     fn after_a_power_loss(&self, number: u32) -> Self {
         let copy = self.image.with_file_name(format!("disk-{number}"));
         loop {
@@ -83,7 +83,7 @@ fn a_recordings_file_that_has_its_name_is_whole_after_a_loss_of_power() {
         bench.signal(Signal::CONT);
         for name in after.files().iter().filter(|name| name.ends_with(".mcap")) {
             let recorded = Recorded::read(&after.mounted.join(name));
-            // On a busy machine a part may have few.
+            // On a busy machine a part may have few messages.
             assert!(!recorded.messages.is_empty(), "{name}");
             whole += 1;
         }

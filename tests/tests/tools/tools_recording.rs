@@ -1,6 +1,6 @@
-//! A run's recording, read by other people's libraries: every value on every topic.
+//! A run's recording, read by third-party libraries: every value on every topic.
 //!
-//! `tests/tools/install` makes them ready; `tests/run` does that, and then runs this.
+//! `tests/tools/install` installs them; `tests/run` does that, and then runs this test.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -13,7 +13,7 @@ use process::{PRESSED, Place};
 use recorded::{Message, Recorded};
 use serde_json::Value;
 
-/// The values of a message as the script has them.
+/// Lists the values of a message in the script's format.
 fn leaves(value: &Value, into: &mut Vec<String>) {
     match value {
         Value::Null => into.push("null".to_owned()),
@@ -67,7 +67,7 @@ fn the_mcap_library_and_rosbags_read_every_value_on_every_topic() {
         assert_eq!((differs, ours.len()), (None, theirs.len()));
     };
     first(&ours, &read("mcap"));
-    // It reads by time, and of one time in an order of its own.
+    // It sorts by time, with an order of its own at equal times.
     let mut theirs = read("bag");
     ours.sort();
     theirs.sort();
@@ -90,7 +90,7 @@ fn the_robot_and_its_cells_are_where_forward_kinematics_says() {
         let import = format!("skin import {}/{file} {tips} -o {skin}", examples.display());
         place.start("skinbus", &import).end().well();
     }
-    // The same arms by what is written of their rows.
+    // The same arms, by the description of their rows.
     let two = place.read("two.toml");
     let rows: String =
         two.lines().filter(|line| !line.starts_with("urdf = ")).flat_map(|line| [line, "\n"]).collect();

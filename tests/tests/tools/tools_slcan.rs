@@ -1,6 +1,6 @@
-//! `vcan-setup slcan` beside python-can's slcan: frames both ways over a pseudoterminal, all of them and equal.
+//! `vcan-setup slcan` beside python-can's slcan: frames in both directions over a pseudoterminal, complete and equal.
 //!
-//! `tests/tools/install` makes the tools ready; `tests/run --all` does that, and then runs this.
+//! `tests/tools/install` installs the tools; `tests/run --all` does that, and then runs this test.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -19,12 +19,12 @@ use rustix::process::Signal;
 use serde_json::Value;
 use slcan::{Pty, carry};
 
-/// Each way.
+/// The number of frames in each direction.
 const FRAMES: usize = 10_000;
-/// So many are on their way at most, which any queue holds.
+/// The maximum number of frames on their way, which any queue holds.
 const BURST: usize = 100;
 
-/// It ends with the test.
+/// Ends with the test.
 struct Python(Child);
 
 impl Drop for Python {
@@ -34,7 +34,7 @@ impl Drop for Python {
     }
 }
 
-/// Frames of all kinds of a format, of all lengths, with all kinds of identifiers.
+/// Returns frames of all kinds of a format, of all lengths, with all kinds of identifiers.
 fn frames(format: Format, salt: u32) -> Vec<Frame> {
     let lens = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64];
     let mut state = 0x9E37_79B9 ^ salt;
@@ -59,7 +59,7 @@ fn frames(format: Format, salt: u32) -> Vec<Frame> {
     (0..FRAMES).map(|_| frame().unwrap()).collect()
 }
 
-/// As `tools/slcan.py` reads and writes it.
+/// Formats a frame as `tools/slcan.py` reads and writes it.
 fn line(frame: &Frame) -> String {
     let is_fd = frame.format() == Format::Fd;
     let switches = is_fd && frame.flags() & BIT_RATE_SWITCH != 0;
@@ -107,7 +107,7 @@ fn check(format: Format, options: &str) {
     let mut printed = BufReader::new(child.0.stdout.take().unwrap()).lines().map(Result::unwrap);
     assert_eq!(printed.next().as_deref(), Some("ready"));
 
-    // As many each way at the same time; a sender that nothing holds back fills the queue of a bus that is late.
+    // The same number in both directions at once; an unlimited sender would fill the queue of a slow bus.
     let (mut inbox, mut received) = (Inbox::new(), Vec::new());
     for burst in to_them.chunks(BURST) {
         writeln!(credit, "{}", burst.len()).unwrap();

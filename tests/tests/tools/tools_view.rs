@@ -1,6 +1,6 @@
 //! The page of `skinbus run --view` in a real browser: a click presses a cell, and the arm gives way.
 //!
-//! `tests/tools/install` makes the browser ready; `tests/tools/run` does that, and then runs this.
+//! `tests/tools/install` installs the browser; `tests/tools/run` does that, and then runs this test.
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
@@ -20,10 +20,10 @@ use process::page::{address, watched};
 use protocol::can::Format;
 use protocol::message::{Message, SensorPage};
 
-/// Rules of accessibility, and what looks for faults of a page.
+/// The rules of accessibility and the checker for them.
 const AXE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../target/axe/node_modules/axe-core/axe.min.js");
 
-/// The serious and critical findings of axe-core, which is in the page.
+/// Returns the serious and critical findings of axe-core, which is loaded into the page.
 fn findings(browser: &mut Browser) -> Vec<String> {
     browser.value(
         "window.found = null; axe.run().then((it) => { window.found = [it.passes.length, it.violations.filter((it) =>
@@ -34,7 +34,7 @@ fn findings(browser: &mut Browser) -> Vec<String> {
     serde_json::from_value(found[1].clone()).unwrap()
 }
 
-/// There are no faults of accessibility at two widths, light and dark.
+/// Checks accessibility at two widths, light and dark.
 fn is_accessible(browser: &mut Browser) {
     let axe = std::fs::read_to_string(AXE).expect("tests/tools/install makes axe-core ready");
     browser.value(&format!("{axe};0"));
@@ -46,7 +46,7 @@ fn is_accessible(browser: &mut Browser) {
     }
 }
 
-/// The page asked for nothing elsewhere, and has nothing to complain about.
+/// Checks that the page requested nothing from elsewhere, and reported no error.
 fn is_content(browser: &Browser, url: &str) {
     let host = url.split(['#', '?']).next().unwrap();
     assert!(host.starts_with("http://127.0.0.1:"), "{host}");
@@ -71,13 +71,13 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     browser.until("window.skinbus && window.skinbus.frames > 3");
     browser.until("document.getElementById('facts').textContent.includes('Cells24')");
 
-    // Here the processor draws: it says so, and draws sharp what stands still.
+    // Here the processor draws: the page reports that, and draws a still picture in full resolution.
     assert_eq!(browser.value("document.getElementById('software').hidden"), false);
     browser.until(
         "(() => { const c = document.getElementById('picture'); return c.width === 2 * c.clientWidth; })()",
     );
 
-    // A cell that is seen from its front.
+    // A cell whose front is visible.
     let found = browser.until(
         "(() => { for (let i = 0; i < 24; i++) { const at = window.skinbus.where(i); if (at) return [i, ...at]; } return null; })()",
     );
@@ -111,7 +111,7 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     ));
 
     is_accessible(&mut browser);
-    // It finds what is there.
+    // The checker does find faults.
     browser.value("document.getElementById('halt').textContent = ''");
     assert_eq!(findings(&mut browser).len(), 1);
     is_content(&browser, &url);
@@ -138,7 +138,8 @@ fn a_click_in_a_browser_is_a_torque_on_the_bus_and_the_arm_gives_way() {
     place.is_left_clean();
 }
 
-/// A click as long as a hand's: the row may not move away between press and release, and the explanation comes into view.
+/// A click as long as a hand's: the row must not move away between press and release, and the explanation must come
+/// into view.
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
@@ -164,7 +165,7 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
         browser.mouse(kind, hold);
     }
     browser.until("document.getElementById('facts').textContent.includes('In contact1')");
-    // Pressed and under the pointer, in the dark: both colours are the pressed ones.
+    // Pressed and under the pointer, in the dark scheme: both colours are the pressed ones.
     browser.until(
         "(() => { const it = document.getElementById('hold'), style = getComputedStyle(it); \
          return it.matches(':hover') && it.getAttribute('aria-pressed') === 'true' && \
@@ -196,7 +197,7 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
             "the list stands still while the mouse is down"
         );
         browser.mouse("mouseReleased", pressed);
-        // On a busy machine the frame may be too old by now, which the page says.
+        // On a busy machine the frame may be too old by now, which the page reports.
         let said =
             browser.until("/^Why, epoch|^No answer/.exec(document.getElementById('why').textContent)?.[0]");
         browser.until(
@@ -208,7 +209,7 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
             break;
         }
         assert!(clicks < 60, "{answered} of {clicks} clicks were answered");
-        // The list goes on, and this explanation goes.
+        // The list continues, and this explanation is closed.
         browser.value("document.getElementById('hold-frames').click()");
         browser.value("document.getElementById('why').replaceChildren()");
     }
@@ -233,7 +234,7 @@ fn a_click_on_why_of_a_moving_list_explains_and_a_halt_says_what_to_press() {
         referers.filter_map(|referer| referer.as_str()).filter(|it| !it.is_empty()).collect();
     assert_eq!(referers, Vec::<&str>::new(), "the token leaves by no Referer");
     browser.open(&format!("http://{}/", address.host));
-    browser.until("document.body.textContent.startsWith('403: without the page')");
+    browser.until("document.body.textContent.startsWith('403: the token is missing')");
     drop(browser);
     run.signal(rustix::process::Signal::INT);
     run.end();
@@ -257,27 +258,27 @@ fn a_recording_is_gone_through_in_a_browser() {
     browser.until(&format!("window.skinbus && window.skinbus.frames > 1 && {at} === 0.9"));
     assert_eq!(browser.value("getComputedStyle(document.getElementById('commands')).display"), "none");
 
-    // An epoch forth and back.
-    browser.value(&click("The next epoch"));
+    // An epoch forwards and backwards.
+    browser.value(&click("Next epoch"));
     browser.until(&format!("{at} > 0.9 && {at} < 0.92"));
-    browser.value(&click("The epoch before"));
+    browser.value(&click("Previous epoch"));
     browser.until(&format!("{at} < 0.91"));
-    // It plays to its end, and a touch is gone back to.
+    // It plays to its end, and jumps back to a touch.
     browser.value(&click("Play"));
     browser.until(&format!("{at} > 1.2"));
     browser.until(&format!("{at} > 2.1"));
-    browser.value(&click("The event before"));
+    browser.value(&click("Previous event"));
     browser.until(&format!("{at} < 2"));
     // Its torque comes within an epoch or two.
     browser.until(&format!(
         "!document.getElementById('facts').textContent.includes('In contact0') || ({}, false)",
-        click("The next epoch")
+        click("Next epoch")
     ));
     // The slider.
     browser.value("(() => { const it = document.querySelector('#time input'); it.value = 0; it.oninput(); it.onchange(); })()");
     browser.until(&format!("{at} === 0"));
 
-    // A cell's frames, and why its torque is what it is.
+    // A cell's frames, and the explanation of its torque.
     browser.value("location.hash = '#at=1'");
     browser.until(&format!("{at} === 1"));
     browser.value(
@@ -306,7 +307,7 @@ fn a_skin_is_looked_at_in_a_file_without_a_server() {
     let title = "document.getElementById('cell-title').textContent";
     browser.until(&format!("{title} === 'vcan0:7'"));
     browser.until("window.skinbus.where(6)");
-    // Another one by a click, and none by a click beside them all.
+    // A click selects another cell, and a click beside all cells selects none.
     browser.value("document.getElementById('whole').click()");
     let at = |browser: &mut Browser, expression: &str| {
         let found = browser.until(expression);
@@ -330,7 +331,7 @@ fn a_skin_is_looked_at_in_a_file_without_a_server() {
     );
     click(&mut browser, corner);
     browser.until(&format!("{title} === 'No cell chosen'"));
-    // A search, and a neighbour of what it found.
+    // A search, and a neighbour of the cell that it found.
     let search = |text: &str| {
         format!(
             "document.getElementById('search').value = '{text}'; document.getElementById('find').requestSubmit()"
@@ -348,7 +349,7 @@ fn a_skin_is_looked_at_in_a_file_without_a_server() {
     assert_eq!(browser.complaints(), Vec::<&serde_json::Value>::new());
 }
 
-/// Prints how often the page draws an arm that moves, beside the 253 processes of its cells.
+/// Prints the frame rate of the page with a moving arm, beside the 253 processes of its cells.
 #[test]
 #[ignore = "needs tests/tools/install"]
 fn a_page_in_software_draws_an_arm_that_moves() {

@@ -1,4 +1,4 @@
-//! The table of `CAN_RAW`'s rules, held against a real kernel.
+//! The table of `CAN_RAW`'s rules, checked against a real kernel.
 //!
 //! Needs `vcan0` with MTU 72, up: `vcan-setup up vcan0`.
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
@@ -22,7 +22,7 @@ fn sender() -> Bus {
     open(&Options { filters: vec![], ..Options::default() })
 }
 
-/// Everything up to and without the frame [`LAST`].
+/// Returns all frames before [`LAST`].
 fn read(bus: &Bus, inbox: &mut Inbox) -> Vec<Frame> {
     let mut frames = Vec::new();
     loop {
@@ -126,7 +126,7 @@ fn the_choice_is_socketcan_and_a_missing_interface_is_no_reason_for_another_bus(
     assert!(matches!(error, BusError::NotCan { .. }), "{error}");
 }
 
-/// Uses an interface of its own, so that no other test's goes down.
+/// Uses an interface of its own, so that the interface of another test does not go down.
 #[test]
 #[ignore = "needs vcan"]
 fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
@@ -155,11 +155,11 @@ fn an_interface_that_goes_down_and_up_and_away_is_told_apart() {
     let error = a.receive(&mut inbox).unwrap_err();
     assert!(matches!(error, BusError::Down { .. }) && error.may_pass(), "{error}");
     assert_eq!(a.receive(&mut inbox).unwrap(), 0, "and is told once");
-    // A loop that only offers frames consumes the error; a receiver on the same bus gets it all the same.
+    // A loop that only offers frames consumes the error; a receiver on the same bus still gets it.
     assert!(!c.offer(&[frame]) && c.wait(Some(Duration::ZERO)).unwrap());
     assert!(matches!(c.receive(&mut inbox).unwrap_err(), BusError::Down { .. }));
     assert!(!c.wait(Some(Duration::ZERO)).unwrap(), "once for each time that it was said");
-    // A pending error of the socket comes before the requested operation.
+    // A pending error of the socket is returned before the requested operation.
     let errors = [(); 2].map(|()| b.send(&[frame]).unwrap_err());
     assert!(errors.iter().all(|error| matches!(error.cause, BusError::Down { .. })), "{errors:?}");
     ip("link set vcan9 up");

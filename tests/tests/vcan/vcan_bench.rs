@@ -10,8 +10,7 @@ use process::log::{Log, same_torques};
 use process::vcan::{Candump, frames_of, same_by_sender};
 use protocol::can::Format;
 
-/// The joints stand still, so that torques depend on nothing but the epoch, also when a slow machine skips
-/// ticks.
+/// The joints stand still, so that torques depend only on the epoch, also when a slow machine skips ticks.
 const SCENARIO: &str = r#"version = 1
 duration_s = 6.0
 
@@ -27,7 +26,7 @@ force_n = 1.5
 profile = "half-sine"
 "#;
 
-/// Twelve cells at a rate that an emulated machine keeps up.
+/// Writes a skin of twelve cells with a rate that an emulated machine can follow.
 fn prepare(place: &Place) {
     let expected = Target { cells: 12, broadcast_hz: 20.0, ..Target::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
@@ -49,7 +48,7 @@ fn candump_sees_exactly_what_the_gateway_counts_in_the_same_order_by_sender() {
     assert_eq!(summary.odd(0), 0, "{:#}", summary.0);
     let counted = summary.total("/buses/0/received") + summary.total("/buses/0/sent");
     assert_eq!(ours.len() as u64, counted, "the log has what is counted");
-    // A tenth of what a machine has that is always in time.
+    // A tenth of the number on a machine that is always in time.
     assert!(summary.of_bus("/replies/due") > 144, "{:#}", summary.0);
 
     same_by_sender(&ours, &theirs);
@@ -77,7 +76,7 @@ fn what_candump_logged_is_the_same_run_when_we_decode_it() {
     assert!(shared == all && ours.torques().len() == theirs.torques().len(), "{shared} of {all}");
 }
 
-/// A line of `skinbus dump` from the interface's name on.
+/// Returns a line of `skinbus dump` from the interface's name on.
 fn without_time(line: &str) -> &str {
     line.find("vcan0").map_or(line, |at| &line[at..])
 }
@@ -91,8 +90,8 @@ fn torques_are_the_same_bit_for_bit_on_vcan_and_on_the_embedded_bus() {
         place.summary().adds_up();
         Log::read(&place.read("run.log"), Format::Fd)
     });
-    // A machine that is away for a while skips broadcasts, and its cells skip epochs: what both have is equal, and that is
-    // a tenth at least of the 732 causes of a machine that is always in time.
+    // A machine that pauses skips broadcasts, and its cells skip epochs: the shared causes must be equal, and at least
+    // a tenth of the 732 causes of a machine that is always in time.
     let (shared, all) = same_torques(&on_vcan, &on_embedded);
     assert!(shared > 70, "{shared} of {all} causes are in both runs");
 }

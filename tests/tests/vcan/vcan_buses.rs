@@ -1,5 +1,5 @@
-//! Several buses on a real kernel, of CAN FD and of classic frames, beside one that is no interface at all: one that goes
-//! down, or is removed and made again, is lost alone.
+//! Several buses on a real kernel, with CAN FD and with classic frames, beside one that is not an interface: a bus that
+//! goes down, or is removed and made again, is lost alone.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(clippy::wildcard_enum_match_arm, reason = "a test looks for what it looks for")]
 
@@ -16,7 +16,7 @@ use protocol::can::Format;
 use rustix::process::Signal;
 use serde_json::Value;
 
-/// vcan0 is there already; vcan1 is a classic interface; vcan3 is an embedded bus.
+/// vcan0 exists already; vcan1 is a classic interface; vcan3 is an embedded bus.
 const BUSES: [(&str, Format, BusKind); 4] = [
     ("vcan0", Format::Fd, BusKind::SocketCan),
     ("vcan1", Format::Classic, BusKind::SocketCan),
@@ -25,7 +25,7 @@ const BUSES: [(&str, Format, BusKind); 4] = [
 ];
 const CELLS: usize = 8;
 
-/// Eight cells on four buses, all pressed, and an arm that this moves.
+/// Creates eight cells on four buses, all pressed, and an arm that moves under the touch.
 fn prepare() -> (Place, Vcan, Vcan) {
     let place = Place::on_vcan();
     let expected = Target { cells: CELLS, buses: BUSES.len(), broadcast_hz: 20.0, ..Target::default() };
@@ -52,12 +52,12 @@ fn all_answer(place: &Place) {
     (0..BUSES.len()).for_each(|bus| answers(place, bus));
 }
 
-/// Waits until a bench has printed something so many times.
+/// Waits until a bench has printed a text a number of times.
 fn says(bench: &Running, words: &str, times: usize) {
     until(words, || (bench.stderr().matches(words).count() == times).then_some(()));
 }
 
-/// Ends a bench and sees that all adds up, and how often each bus was lost.
+/// Ends a bench, and checks that all counts add up, and how many times each bus was lost.
 fn ended_well(place: &Place, bench: Running, times: [u64; 4]) {
     bench.signal(Signal::TERM);
     bench.end().well();

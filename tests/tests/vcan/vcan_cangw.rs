@@ -1,5 +1,5 @@
-//! Frames that are damaged on their way, on a real kernel: the cells are on `vcan0`, the gateway is on `vcan1`,
-//! and the kernel's own CAN gateway stands between them and turns bits as its rules define.
+//! Frames that are damaged on their way, on a real kernel: the cells are on `vcan0`, the gateway is on `vcan1`, and the
+//! kernel's own CAN gateway between them flips bits as its rules define.
 
 #![allow(
     clippy::unwrap_used,
@@ -22,7 +22,7 @@ use rustix::process::Signal;
 
 const CELLS: usize = 8;
 
-/// Cells and a gateway's bus; the way between them is yet to be made.
+/// The bus of the cells and that of the gateway, not connected yet.
 struct Parted {
     place: Place,
     _cells: Vec<Running>,
@@ -30,7 +30,7 @@ struct Parted {
     _vcan1: Vcan,
 }
 
-/// What the kernel's gateway does; with the test, it does nothing any more.
+/// The rules of the kernel's gateway, which are removed with the test.
 struct Rules;
 
 impl Drop for Rules {
@@ -57,14 +57,14 @@ impl Parted {
     }
 }
 
-/// Bits that are turned in the data, from the first byte on; what is in the identifier's place is not looked at.
+/// Returns a change of data bits, from the first byte on; the part for the identifier is ignored.
 fn turned(bits: &str) -> String {
     format!("-M XOR:D:0.0.0.{bits:0<128}")
 }
 
-/// How many frames the rule with this filter has passed on, by the kernel's own count.
+/// Returns how many frames the rule with this filter has passed on, by the kernel's own count.
 fn passed(filter: &str) -> usize {
-    // Its exit code is no status: it depends on the length of the kernel's answer.
+    // Its exit code is not a status: it depends on the length of the kernel's answer.
     let rules = command("cangw -L").output().unwrap().stdout;
     let rules = String::from_utf8(rules).unwrap();
     let rule =
@@ -76,7 +76,7 @@ fn passed(filter: &str) -> usize {
     handled.parse().unwrap()
 }
 
-/// Which frames have the wrong CRC, by this library; nothing else may be wrong with any.
+/// Returns the frames with a wrong CRC, and checks that no frame has another defect.
 fn damaged(frames: &[Frame]) -> Vec<&Frame> {
     let is_damaged = |frame: &&Frame| match Packet::from_fd(frame) {
         Ok(_) => false,
@@ -86,12 +86,12 @@ fn damaged(frames: &[Frame]) -> Vec<&Frame> {
     frames.iter().filter(is_damaged).collect()
 }
 
-/// How many frames stand under an identifier.
+/// Returns the number of frames under an identifier.
 fn under(frames: &[Frame], id: u32) -> usize {
     frames.iter().filter(|frame| frame.raw_id() == id).count()
 }
 
-/// Torques that arrived whole.
+/// Returns the number of complete torques.
 fn torques(log: &Log) -> u64 {
     log.messages.iter().filter(|(message, _)| matches!(message, Message::Torque { .. })).count() as u64
 }
@@ -126,7 +126,7 @@ fn damaged_torques_are_counted_by_their_crc_and_none_is_used() {
     assert_eq!((summary.of_bus("/uplink/surplus"), summary.of_bus("/dropped_by_bus")), (0, 0));
     assert_eq!(summary.of_bus("/replies/lost"), wrong, "each was a reply that was due: {:#}", summary.0);
 
-    // Those of the other six are all used, and nothing of the two.
+    // The torques of the other six are all used, and none of the two.
     let log = Log::of(theirs, Format::Fd);
     let used = summary.of_bus("/replies/in_time") + summary.of_bus("/replies/late");
     assert_eq!(used + summary.count("/buses/0/events", "stale torque"), torques(&log));
@@ -146,7 +146,7 @@ fn damaged_torques_are_counted_by_their_crc_and_none_is_used() {
 fn cells_refuse_damaged_joints_count_them_and_are_not_blamed() {
     let bench = Parted::new();
     let (joints, others) = ("001:C00007FF", "001~C00007FF");
-    // A rule with a number of its own can be changed while frames pass.
+    // A rule with a number can be changed while frames pass.
     let with_joints = |change: &str| route("vcan1", "vcan0", joints, &format!("-u 1 {change}"));
     with_joints(&turned(""));
     route("vcan1", "vcan0", others, "");
@@ -201,7 +201,7 @@ fn cells_refuse_damaged_joints_count_them_and_are_not_blamed() {
 #[ignore = "needs vcan"]
 fn a_torque_under_another_cells_number_is_refused_because_the_crc_covers_the_identifier() {
     let bench = Parted::new();
-    // Not a bit of the data changes: cell 3's torques come in cell 5's name.
+    // Only the identifier changes: cell 3's torques arrive under cell 5's node id.
     let (third, others) = ("203:C00007FF", "203~C00007FF");
     route("vcan1", "vcan0", "0:0", "");
     route("vcan0", "vcan1", others, "");
@@ -219,7 +219,7 @@ fn a_torque_under_another_cells_number_is_refused_because_the_crc_covers_the_ide
     summary.all_were_due(CELLS as u64, &ended.stderr);
     let of = |pointer: &str| summary.of_bus(pointer);
     assert_eq!((summary.count("/buses/0/events", "wrong CRC"), summary.odd(0)), (wrong, wrong));
-    // By what the bus shows, so many of cell 3's never came, and cell 5 never sent so many.
+    // According to the bus, this number of cell 3's never came, and cell 5 never sent as many.
     let (rejected, surplus, unknown) = (of("/uplink/rejected"), of("/uplink/surplus"), of("/uplink/unknown"));
     assert_eq!((rejected, surplus, unknown), (wrong, wrong, wrong), "{:#}", summary.0);
     assert_eq!((of("/replies/lost"), of("/replies/unknown")), (wrong, 0), "{:#}", summary.0);

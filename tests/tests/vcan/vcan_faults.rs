@@ -1,4 +1,4 @@
-//! What breaks on a real kernel's bus: the interface, a cell, the gateway, the room in a queue.
+//! Failures on a real kernel's bus: the interface, a cell, the gateway, a full queue.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(clippy::wildcard_enum_match_arm, reason = "a test looks for what it looks for")]
 
@@ -17,7 +17,7 @@ const DOWN: &str = "vcan0 is down: bring it up with `";
 const INVALID: &str = "the torque is not valid";
 const ON_CELLS: &str = "--bus vcan0 --nodes 1-6 --skin skin.toml";
 
-/// Six cells that are all pressed, and an arm that this moves.
+/// Creates six cells that are all pressed, and an arm that moves under the touch.
 fn prepare() -> Place {
     let place = Place::on_vcan();
     place.write("skin.toml", &small_skin(CELLS));
@@ -25,7 +25,7 @@ fn prepare() -> Place {
     place
 }
 
-/// A torque of a cell that is pressed.
+/// Returns a predicate for a torque of a pressed cell.
 fn torque_of(cell: u8) -> impl Fn(&Message) -> bool {
     move |message| {
         matches!(message, Message::Torque { from, torque, .. }
@@ -39,13 +39,14 @@ fn all_answer(place: &Place) {
     }
 }
 
-/// Checks that everything is accounted for, whether cells could send what they tried on a bus that took nothing, or not.
+/// Checks that everything is accounted for, although the cells may have been unable to send on a bus that accepted
+/// nothing.
 fn adds_up_though_the_bus_took_nothing(summary: &Summary) {
     let of = |pointer: &str| summary.of_bus(pointer);
     let reasons = ["in_time", "late", "too_late", "skipped", "not_heard", "lost", "in_doubt", "unknown"];
     let replies: u64 = reasons.map(|reason| of(&format!("/replies/{reason}"))).iter().sum();
     assert_eq!(replies, of("/replies/due"), "{:#}", summary.0);
-    // Those to the joints at which the bus began to take nothing: their cells could not send them.
+    // The replies to the joints at which the bus stopped accepting frames: their cells could not send them.
     assert!(of("/replies/unknown") <= CELLS as u64, "{:#}", summary.0);
     let [dropped, backlog, outage, unknown] =
         ["dropped", "backlog", "outage", "unknown"].map(|why| of(&format!("/uplink/{why}")));
@@ -71,7 +72,7 @@ fn goes_on_when_reported(place: &Place, bench: &Running, cells: &[(Pid, String)]
     assert_eq!(bench.cells(), cells, "no cell was restarted");
 }
 
-/// Ends a bench whose bus took nothing for a while, and sees that this has cost what it must, and no more.
+/// Ends a bench whose bus accepted nothing for a while, and checks that the losses are exactly the expected ones.
 fn ends_well_after_a_pause(place: &Place, bench: Running) {
     bench.signal(Signal::TERM);
     bench.end().well();
@@ -161,7 +162,7 @@ fn cells_alone_outlive_a_bus_that_goes_down() {
     place.test_client().waits_for_settled_cells(CELLS);
     for epoch in 1..=3 {
         vcan0.down();
-        // They have to send a heartbeat now and then, and must be met by an error to outlive it.
+        // The cells must send a heartbeat during this time, get an error, and survive it.
         std::thread::sleep(std::time::Duration::from_millis(400));
         vcan0.up();
         place.test_client().waits_for_settled_cells(CELLS);
@@ -196,7 +197,7 @@ fn an_interface_that_is_removed_ends_the_run_with_one_line_and_the_log_is_kept()
     assert!(!log.torques().is_empty());
     assert!(stderr.contains(&format!("{} frames until then are in run.log", log.frames.len())), "{stderr}");
 
-    // And cells that are started by hand report it themselves.
+    // Cells that were started by hand report it themselves.
     let vcan5 = Vcan::make("vcan5");
     let cells = place.start("cell-node", "--bus vcan5 --nodes 1-6 --skin skin.toml");
     let lists = || {
@@ -333,7 +334,7 @@ fn a_second_gateway_is_refused_and_the_first_is_undisturbed() {
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
     let disturbed = summary.of_bus("/uplink/restarts") + summary.of_bus("/uplink/surplus");
     assert_eq!((disturbed, summary.odd(0)), (0, 0), "{:#}", summary.0);
-    // Nothing is on the bus that the first one does not know of.
+    // The bus has no frame that the first gateway does not know of.
     assert_eq!(summary.count("/buses/0/received", "command"), 0, "{:#}", summary.0);
 }
 
@@ -356,7 +357,7 @@ fn of_two_gateways_that_start_at_the_same_time_at_most_one_goes_on() {
         let both = ["one", "other"].map(run).map(Running::end);
         let good = both.iter().filter(|ended| ended.code() == Some(0)).count();
         assert!(good <= 1, "{both:#?}");
-        // Whoever comes next finds a bus that works.
+        // The next run finds a bus that works.
         place.bench(2.0, more).end().well();
         let summary = place.summary();
         assert_eq!(summary.adds_up().silent().len(), 0);

@@ -1,6 +1,6 @@
-//! Loss that is made on purpose, by receive buffers that are far too small, and counted exactly.
+//! Deliberate losses, by receive buffers that are far too small, which must be counted exactly.
 //!
-//! The same rule on a real kernel's vcan and on the embedded bus; the embedded bus needs nothing.
+//! The same rule is tested on a real kernel's vcan and on the embedded bus; the embedded bus needs no preparation.
 
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -18,23 +18,23 @@ use protocol::candump::{Line, parse};
 use recorded::Recorded;
 use rustix::process::Signal;
 
-/// About 16 frames, of which the kernel makes 32 and more.
+/// A buffer for about 16 frames; the kernel allows at least 32.
 const SMALL: usize = 16 * 1024;
-/// Frames of a round; the buffer has room for a hundredth of them.
+/// The frames of a round; the buffer has room for a hundredth of them.
 const FRAMES: u32 = 5_000;
-/// What the receiver wants; it is sent beside what it does not want.
+/// The identifier that the receiver requests; other frames are sent beside it.
 const EXPECTED: u32 = 0x200;
 const UNWANTED: u32 = 0x300;
 
-/// One receiver that sleeps and one sender.
+/// A receiver that sleeps, and a sender.
 struct Pair {
     kind: BusKind,
     sender: Bus,
     sleeper: Bus,
     inbox: Inbox,
-    /// Frames that passed the sleeper's filter, so far.
+    /// The number of frames so far that passed the receiver's filter.
     sent: u32,
-    /// Frames that it got.
+    /// The number of frames that it received.
     heard: u32,
 }
 
@@ -53,7 +53,7 @@ impl Pair {
         Self { kind, sender, sleeper, inbox: Inbox::new(), sent: 0, heard: 0 }
     }
 
-    /// The next frame that the sleeper wants: its number, in frames of either format and several lengths.
+    /// Returns the next frame for the receiver: its number, in frames of either format and several lengths.
     fn next(&mut self) -> Frame {
         let number = self.sent.to_le_bytes();
         self.sent += 1;
@@ -81,8 +81,8 @@ impl Pair {
         self.sender.send(&burst).unwrap();
     }
 
-    /// Reads what is there. The oldest are kept and the newest are dropped; and who reads a frame knows how
-    /// many are missing before it.
+    /// Reads all available frames. The oldest are kept and the newest are dropped, and with each frame the number of
+    /// frames missing before it is known.
     fn read(&mut self) {
         while self.sleeper.wait(Some(Duration::from_millis(20))).unwrap() {
             self.sleeper.receive(&mut self.inbox).unwrap();
@@ -95,7 +95,7 @@ impl Pair {
                 self.heard += 1;
                 last = Some(number);
             }
-            // The embedded bus may have reported drops after the last one as well.
+            // The embedded bus may have reported drops after the last frame as well.
             let known = self.heard + dropped;
             match (last, self.kind) {
                 (Some(last), BusKind::SocketCan) => assert_eq!(last + 1, known),
@@ -105,7 +105,7 @@ impl Pair {
         }
     }
 
-    /// Lets frames follow until one comes: it brings the whole count.
+    /// Sends further frames until one arrives, with the whole count.
     fn settle(&mut self) {
         self.read();
         until("a frame that is not dropped", || {
@@ -113,16 +113,16 @@ impl Pair {
             let last = self.next();
             self.sender.send(&[last]).unwrap();
             self.read();
-            // Those that wait on the way, on the embedded bus, come in between.
+            // On the embedded bus, frames that wait on the way arrive in between.
             (self.heard > heard && self.heard + self.inbox.dropped() == self.sent).then_some(())
         });
     }
 }
 
-/// What was sent and not received is what the bus reports as dropped, to the last frame.
+/// Checks that the bus reports exactly the frames as dropped that were sent and not received.
 fn what_is_lost_is_counted(kind: BusKind, place: &Place) {
     let exact = Filter { id: EXPECTED, mask: Filter::EXACT_MASK };
-    // What several filters match comes once and is dropped once; what none matches is no loss.
+    // A frame that matches several filters arrives once and is dropped once; a frame that matches none is not a loss.
     let several = [exact, Filter { id: EXPECTED, mask: 0x700 }, Filter { id: EXTENDED, mask: EXTENDED }];
     for filters in [&[exact][..], &several, &[Filter { id: UNWANTED, mask: 0x7FF }.inverted()]] {
         let backlog = || if kind == BusKind::SocketCan { backlog_drops() } else { 0 };
@@ -139,10 +139,10 @@ fn what_is_lost_is_counted(kind: BusKind, place: &Place) {
             assert!(heard > 10 && lost > FRAMES / 3, "round {round}: {heard} heard, {lost} lost");
             dropped = pair.inbox.dropped();
         }
-        // Nothing was lost on the way to the socket, which no socket could know.
+        // No frame was lost on the way to the socket, which a socket could not know.
         assert_eq!(backlog(), before);
 
-        // And when it reads in time again, nothing is missing.
+        // When it reads in time again, nothing is missing.
         for _ in 0..10 {
             let frames: Vec<_> = (0..10).map(|_| pair.next()).collect();
             pair.sender.send(&frames).unwrap();
@@ -170,7 +170,7 @@ fn what_is_lost_is_counted_on_the_embedded_bus() {
     what_is_lost_is_counted(BusKind::Embedded, &place);
 }
 
-/// Frames by identifier.
+/// Returns the number of frames by identifier.
 fn counts(frames: &[Frame]) -> BTreeMap<u32, usize> {
     let mut counts = BTreeMap::new();
     for frame in frames {
@@ -195,16 +195,16 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     // For more than a second; cells keep sending meanwhile.
     tool(&format!("cangen vcan0 -g 2 -n {FOREIGN} -e -I 1234567 -L 8 -D i"));
     bench.signal(Signal::CONT);
-    // What comes next brings the whole count.
+    // The next frame brings the whole count.
     place.test_client().waits_for_joints(20);
     bench.signal(Signal::TERM);
     let ended = bench.end().well();
-    // The log itself records what is missing in it.
+    // The log itself records its missing frames.
     let log = place.read("run.log");
     let (missing, lines): (Vec<_>, Vec<_>) = log.lines().partition(|line| line.starts_with("DROPCOUNT: "));
     place.write("frames.log", &(lines.join("\n") + "\n"));
     let (ours, mut theirs) = (frames_of(&place.path("frames.log")), candump.frames());
-    // What cells sent after the gateway stopped listening is not a loss.
+    // Frames that cells sent after the gateway stopped listening do not count as losses.
     let last = ours.last().unwrap();
     theirs.truncate(1 + theirs.iter().rposition(|frame| frame == last).unwrap());
 
@@ -219,7 +219,7 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     };
     assert_eq!(missing.iter().map(|line| said(line)).sum::<u64>(), dropped, "{missing:?}");
     assert!(missing.iter().all(|line| line.contains("on 'vcan0' socket")), "{missing:?}");
-    // And so does the recording, word for word.
+    // So does the recording, with the same text.
     let recorded = Recorded::read(&place.path("run.mcap"));
     let notes: Vec<_> = recorded.on("/can/notes").map(|note| &note.value).collect();
     assert_eq!(notes.iter().map(|note| note["text"].as_str().unwrap()).collect::<Vec<_>>(), missing);
@@ -229,7 +229,7 @@ fn a_gateway_that_hangs_knows_how_many_frames_it_missed() {
     assert!(ours.iter().all(|(id, count)| theirs[id] >= *count), "{ours:?} {theirs:?}");
     let foreign = FOREIGN as usize - ours[&(0x0123_4567 | EXTENDED)];
     assert!(foreign > 400 && (foreign as u64) < dropped, "{foreign} of {dropped} were foreign");
-    // Of the rest, those of cells are missed in their accounts, and nothing else is.
+    // Of the others, those of cells are missing in the cells' accounts, and nothing else is.
     let by_cells = |counts: &BTreeMap<u32, usize>| -> usize {
         counts.iter().filter(|(id, _)| (0x200..0x500).contains(*id)).map(|(_, count)| count).sum()
     };

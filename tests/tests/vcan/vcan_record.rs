@@ -1,4 +1,4 @@
-//! A recording of a bench on a real kernel's vcan, beside `candump`: it misses nothing.
+//! A recording of a bench on a real kernel's vcan, beside `candump`: it is complete.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;

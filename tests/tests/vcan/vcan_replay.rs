@@ -1,5 +1,4 @@
-//! Replays on a real kernel's vcan: to fresh cells, beside `canplayer`, across an outage, and against a queue that has
-//! no room.
+//! Replays on a real kernel's vcan: to new cells, beside `canplayer`, across an outage, and against a full queue.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;
@@ -14,10 +13,10 @@ use process::vcan::{Candump, Vcan0, refused, tool};
 use process::{Place, until};
 use protocol::candump::{Line, parse};
 
-/// Fresh cells of the skin of the recording.
+/// The options for new cells with the recording's skin.
 const FRESH: &str = "--expect --spawn --skin skin.toml";
 
-/// Cells at a rate that an emulated machine keeps up, and touches on some of them.
+/// Writes a skin with a rate that an emulated machine can follow, and touches on some of its cells.
 fn prepare(place: &Place, cells: usize) {
     let expected = Target { cells, broadcast_hz: 20.0, ..Target::default() };
     place.write("skin.toml", &generate(&expected).unwrap());
@@ -103,7 +102,7 @@ fn a_transmit_queue_without_room_refuses_and_is_waited_for() {
     let vcan0 = Vcan0;
     vcan0.fill();
     let replay = place.replay("some.log", "SKINBUS_SEND_TIMEOUT_MS=50");
-    // A frame is tried every half millisecond: after so many tries the first one at least has timed out.
+    // A frame is retried every half millisecond: after this number of attempts at least the first one has timed out.
     until("a frame that is refused", || (refused("vcan0") > 110).then_some(()));
     vcan0.empty();
     let ended = replay.end();
@@ -113,7 +112,7 @@ fn a_transmit_queue_without_room_refuses_and_is_waited_for() {
     assert_eq!(ended.code(), Some(1), "{ended:#?}");
 }
 
-/// How much later than the first one frames came than they should have, in µs: median, 90 %, maximum.
+/// Returns the lateness of the frames relative to the first one, in µs: median, 90 %, maximum.
 fn lateness(log: &str, period_us: i64) -> [i64; 3] {
     let mut late = Vec::new();
     for line in fs::read_to_string(log).unwrap().lines() {

@@ -1,6 +1,6 @@
-//! `up`, `down`, `status` and `doctor` on a real kernel, looked at with `ip`.
+//! `up`, `down`, `status` and `doctor` on a real kernel, checked with `ip`.
 //!
-//! Needs root, and `vcan0` with MTU 72, up, which is left as it is.
+//! Needs root, and `vcan0` with MTU 72, up, which is left unchanged.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process::program;
@@ -20,7 +20,7 @@ use serde_json::Value;
 use skinbus_tests::process::vcan::own_network;
 use tempfile::TempDir;
 
-/// Its network is this thread's, the process' own may be another.
+/// Returns the id of this thread, whose network may differ from that of the process.
 fn thread_id() -> u32 {
     rustix::thread::gettid().as_raw_nonzero().get().cast_unsigned()
 }
@@ -34,14 +34,14 @@ fn run_as(user: u32, arguments: &str) -> Said {
     Said::by(&mut command)
 }
 
-/// A command that succeeds.
+/// Runs a command that must succeed.
 fn done(arguments: &str) -> String {
     let said = run_as(0, arguments);
     assert_eq!((said.code, said.err.as_str()), (0, ""), "{arguments}: {said:?}");
     said.out
 }
 
-/// A command that fails: its message.
+/// Runs a command that must fail, and returns its message.
 fn fails(arguments: &str, code: i32) -> String {
     let said = run_as(0, arguments);
     assert_eq!((said.code, said.out.as_str()), (code, ""), "{arguments}: {said:?}");
@@ -56,7 +56,7 @@ fn ip(arguments: &str) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
-/// All interfaces by `ip`, of a namespace or, for "", of this one.
+/// Returns all interfaces by `ip`, of a namespace or, for "", of this one.
 fn links(namespace: &str) -> Vec<Value> {
     let within = if namespace.is_empty() { String::new() } else { format!("-n {namespace} ") };
     serde_json::from_str(&ip(&format!("{within}-json -details -statistics link show"))).unwrap()
@@ -74,7 +74,7 @@ fn flag(link: &Value, flag: &str) -> bool {
     link["flags"].as_array().unwrap().iter().any(|it| it == flag)
 }
 
-/// Up, of MTU 72, of this kind, and marked.
+/// Checks that an interface is up, of MTU 72, of this kind, and marked.
 fn assert_ours(link: &Value, kind: &str) {
     assert_eq!(link["linkinfo"]["info_kind"], kind, "{link}");
     assert_eq!((&link["mtu"], &link["ifalias"]), (&72.into(), &"skinbus".into()), "{link}");
@@ -85,7 +85,7 @@ fn open(name: &str) -> Bus {
     Bus::open(name, Choice::Only(BusKind::SocketCan), &Options::default()).unwrap()
 }
 
-/// A frame sent on one bus comes on the other.
+/// Checks that a frame sent on one bus arrives on the other.
 fn passes(from: &Bus, to: &Bus) {
     let frame = Frame::fd(0x123, 1, &[7; 16]).unwrap();
     from.send(&[frame]).unwrap();
@@ -126,7 +126,7 @@ fn the_commands_of_a_plan_do_the_same() {
     own_network();
     done("up vcan20");
     let of = |mut link: Value| {
-        // What went through it, and which number it got.
+        // The index and the statistics differ after an interface is made again.
         for key in ["ifindex", "stats64"] {
             link.as_object_mut().unwrap().remove(key);
         }
@@ -238,7 +238,7 @@ fn who_makes_interfaces_at_the_same_time_as_others_makes_them() {
     own_network();
     const NAMES: [&str; 8] = ["vcan20", "vcan21", "vcan22", "vcan23", "vcan24", "vcan25", "vcan26", "vcan27"];
     for _ in 0..4 {
-        // Each takes the first number that is free, and only the first of them can have it.
+        // Each tries the first free number, and only one of them can get it; the others try again.
         let said = std::thread::scope(|scope| {
             let all = NAMES.map(|name| scope.spawn(move || done(&format!("up {name}"))));
             all.map(|one| one.join().unwrap())
@@ -262,7 +262,7 @@ impl Namespace {
         Self(name)
     }
 
-    /// Opens a bus within.
+    /// Opens a bus in the namespace.
     fn open(&self, name: &str) -> Bus {
         let file = File::open(format!("/run/netns/{}", self.0)).unwrap();
         let inside = || {

@@ -1,4 +1,5 @@
-//! `vcan-setup slcan` on a real kernel's vcan: filters, frames both ways, and an interface that goes down and comes back.
+//! `vcan-setup slcan` on a real kernel's vcan: filters, frames in both directions, and an interface that goes down and
+//! comes back.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;

@@ -1,4 +1,4 @@
-//! Sums along a tree on a real kernel's vcan, whole, broken and repaired.
+//! Sums along a tree on a real kernel's vcan: complete, broken and repaired.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use skinbus_tests::process;

@@ -1,4 +1,4 @@
-//! The stock tools at work on a bench: cansend presses and halts, canplayer replays, cangen babbles, log2asc reads.
+//! The standard tools on a bench: cansend presses and halts, canplayer replays, cangen babbles, log2asc reads.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(clippy::wildcard_enum_match_arm, reason = "a test looks for what it looks for")]
 
@@ -20,7 +20,7 @@ use protocol::packet::{Packet, PacketError, WORDS, data_id};
 use protocol::skin::Skin;
 use rustix::process::Signal;
 
-/// Nobody touches the skin, and the arm stands.
+/// A scenario without touches, in which the arm stands.
 const ALONE: &str = r#"version = 1
 duration_s = 60.0
 
@@ -33,7 +33,7 @@ at_s = 0.0
 kind = "compare"
 "#;
 
-/// The arm swings and the touch comes and goes, so that no two torques are the same.
+/// A scenario in which the arm swings and the touch comes and goes, so that no two torques are equal.
 const MOVING: &str = r#"version = 1
 duration_s = 4.0
 
@@ -58,7 +58,7 @@ force_n = 4.0
 profile = "ramp"
 "#;
 
-/// A torque of a cell, and whether it is more than the end of a contact.
+/// Returns a predicate for a torque of a cell; with `pressed`, for one that is more than the end of a contact.
 fn torque_of(cell: u8, pressed: bool) -> impl Fn(&Message) -> bool {
     move |message| {
         matches!(message, Message::Torque { from, torque, .. }
@@ -66,7 +66,7 @@ fn torque_of(cell: u8, pressed: bool) -> impl Fn(&Message) -> bool {
     }
 }
 
-/// Joints until then, which are the numbers of [`Log::torques`].
+/// Returns the number of joints before an index; these are the numbers of [`Log::torques`].
 fn joints_before(log: &Log, index: usize) -> usize {
     let before = log.messages[..index].iter();
     before.filter(|(message, _)| matches!(message, Message::Joints { .. })).count()
@@ -114,7 +114,7 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
     for (_, (_, _, contact_state), _) in &pressed {
         assert_eq!(*contact_state, [1_024, 1_024, 1_024, 0, 0, 0], "3 N, a newton in each word of Q5.10");
     }
-    // Every one of them was due, and compared in every joint that the contact loads.
+    // Each of them was due, and compared in every joint that the contact loads.
     let answered = summary.of_bus("/replies/in_time") + summary.of_bus("/replies/late");
     let all = answered + summary.of_bus("/replies/unasked") + summary.of_bus("/replies/too_late");
     assert_eq!(all, torques.len() as u64, "{:#}", summary.0);
@@ -128,7 +128,7 @@ fn cansend_presses_a_cell_and_its_torque_is_what_the_central_computation_says() 
     );
     assert!(summary.figure("/accuracy/single/mean_nm") < 3e-4, "{:#}", summary.0);
     assert!(summary.figure("/accuracy/single/max_nm") < 2e-3, "{:#}", summary.0);
-    // And it is not little that is compared.
+    // The compared torques are not small.
     let max = pressed.iter().flat_map(|(_, _, packet)| packet.words.six()).map(i16::unsigned_abs).max();
     assert!(max > Some(1_024), "a quarter of a newton metre: {max:?}");
 }
@@ -166,7 +166,7 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
     assert!(summary.0["halted"].is_null(), "{:#}", summary.0);
     let log = Log::read(&place.read("run.log"), Format::Fd);
     let halt = log.messages.iter().position(|(message, _)| *message == Message::Halt).unwrap();
-    // The gateway has sent one too, before its loop began.
+    // The gateway has sent a resume too, before its loop began.
     let resumes = log.messages.iter().enumerate().skip(halt);
     let resume = resumes.clone().find(|(_, (message, _))| *message == Message::Resume).unwrap().0;
     let rounds = joints_before(&log, halt)..joints_before(&log, resume);
@@ -180,14 +180,14 @@ fn cansend_halts_the_cells_and_ack_lets_them_go_on() {
     }
 }
 
-/// A reply, and which broadcast it is to.
+/// A reply, with the number of its broadcast.
 type Reply = (usize, Cause, [i16; WORDS]);
 
 fn replies(log: &Log) -> BTreeSet<Reply> {
     log.torques().into_iter().map(|(number, cause, packet)| (number, cause, packet.words.six())).collect()
 }
 
-/// The times and frames of a log that cells receive: joints and stimuli.
+/// Returns the times and frames of a log that cells receive: joints and stimuli.
 fn joints_and_stimuli(log: &Path) -> String {
     let heard = |line: &&str| {
         let Ok(Line::Frame(record)) = parse(line) else { panic!("{line}") };
@@ -217,7 +217,7 @@ fn canplayer_brings_back_every_torque_of_a_recording_bit_for_bit() {
 
     let text = joints_and_stimuli(&place.path("candump.log"));
     place.write("replay.log", &text);
-    // Fresh ones: the last contact state, and the last epoch, are those of the recording.
+    // New cells: the last contact state, and the last epoch, are those of the recording.
     let cells = place.start("cell-node", &format!("--bus vcan0 --nodes 1-{CELLS} --skin skin.toml"));
     place.test_client().waits_for_settled_cells(CELLS);
     let candump = Candump::start("vcan0", &place.path("again.log"));
@@ -236,15 +236,15 @@ fn canplayer_brings_back_every_torque_of_a_recording_bit_for_bit() {
     let sent = frames.iter().filter(|frame| text.contains(&frame_text(frame))).count();
     assert!(sent >= text.lines().count(), "{sent} of {} frames were played", text.lines().count());
     let replayed = Log::of(frames, Format::Fd);
-    // No two torques of one cause differ. Cells skip joints when a machine is away for more than a period, and count
-    // them: so many replies may be missing, and as many ends of contacts come with later joints.
+    // Equal causes have equal torques. Cells skip joints when a machine pauses for more than a period, and count them:
+    // the same number of replies may be missing, and as many ends of contacts come with later joints.
     same_torques(&recorded, &replayed);
     let again = replies(&replayed);
     let [missing, extra] = [torques.difference(&again), again.difference(&torques)].map(Iterator::count);
     let shared = torques.len() - missing;
     let away = unanswered + skipped.borrow().values().map(|&count| u64::from(count)).sum::<u64>();
     let said = format!("{shared} equal, {missing} missing and {extra} extra, {away} joints skipped");
-    // A tenth of what a machine has that is always in time.
+    // A tenth of the number on a machine that is always in time.
     assert!(shared > 26 && missing.max(extra) as u64 <= away, "{said}");
 }
 
@@ -254,17 +254,17 @@ fn frame_text(frame: &Frame) -> String {
     text
 }
 
-/// Cells of the bench that `cangen` babbles at.
+/// The number of cells on the bench that `cangen` disturbs.
 const CELLS: u8 = 6;
 
 /// Arguments of `cangen`: babbling identifiers, and everything at random.
 const NOISE: &[&str] = &[
-    // A node that does not exist, as fast as it goes.
+    // A node that does not exist, as fast as possible.
     "-g 0 -I 6A0 -L 8 -n 3000",
     "-g 0 -I 6A0 -L 8 -n 3000",
     // The same in packets of our size.
     "-g 0 -f -b -I 2C8 -L 16 -n 1000",
-    // What every cell has to look at and refuse: joints, a cell's heartbeat, its parameters, its stimuli.
+    // Packets that every cell has to check and refuse: joints, a cell's heartbeat, its parameters, its stimuli.
     "-g 0 -I 001 -n 300",
     "-g 0 -f -I 001 -L 16 -n 100",
     "-g 0 -f -b -I 003 -L 12 -n 300",
@@ -284,17 +284,17 @@ const NOISE: &[&str] = &[
     "-g 0 -I r -R -n 200",
     "-g 0 -I r -R -e -n 200",
     "-g 0 -I r -m -n 500",
-    // Now and then, beside the cells' answers.
+    // Occasionally, beside the cells' answers.
     "-g 5 -I r -m -n 100",
 ];
 
-/// Whether a node of this bench uses an identifier: cells 1 to [`CELLS`], or the gateway.
+/// Returns true if a node of this bench uses an identifier: cells 1 to [`CELLS`], or the gateway.
 fn is_used(id: Id) -> bool {
     let bits = id.to_bits();
     bits <= 0x004 || [0x400, 0x5FF, 0x7FF].contains(&bits) || (bits > 0x0FF && (1..=CELLS).contains(&id.node))
 }
 
-/// Why a frame cannot be used, worked out from what candump saw: the events' names.
+/// Returns the reason why a frame cannot be used, as the name of an event, derived from candump's output.
 fn reason(frame: &Frame) -> Option<&'static str> {
     match Packet::from_fd(frame) {
         _ if frame.is_error() => Some("error frame"),
@@ -307,7 +307,7 @@ fn reason(frame: &Frame) -> Option<&'static str> {
     }
 }
 
-/// What a cell has to refuse of these frames.
+/// Returns the counts of these frames that a cell has to refuse.
 fn refused_by(cell: u8, frames: &[Frame]) -> Refused {
     let cell = u16::from(cell);
     let heard = [0x000, 0x001, 0x002, 0x003, 0x004, 0x400 + cell, 0x500 + cell, 0x5FF, 0x700 + cell, 0x7FF];
@@ -325,7 +325,7 @@ fn refused_by(cell: u8, frames: &[Frame]) -> Refused {
     refused
 }
 
-/// Sees that every frame of a bus is in the gateway's counts, by kind and by reason.
+/// Checks that every frame of a bus is in the gateway's counts, by kind and by reason.
 fn all_are_counted(frames: &[Frame], summary: &Summary) {
     let (mut kinds, mut reasons) = (BTreeMap::<_, u64>::new(), BTreeMap::<_, u64>::new());
     for frame in frames {
@@ -371,7 +371,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     place.test_client().waits_for("a torque", torque_of(1, true));
     for noise in NOISE {
         tool(&format!("cangen vcan0 -i {noise}"));
-        // On one processor, every socket needs room for the next ones.
+        // On one processor, every socket needs room for the next frames.
         candump.catch_up();
     }
     // An error frame, which reports a controller as bus-off.
@@ -405,7 +405,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
         NOISE.iter().map(|noise| noise.rsplit(' ').next().unwrap().parse::<u64>().unwrap()).sum();
     // That error frame, and a frame of candump's each time.
     let expected = expected + 1 + NOISE.len() as u64;
-    // A busy kernel drops frames before any socket has them, and tells the sender nothing.
+    // A busy kernel drops frames before they reach any socket, and reports nothing to the sender.
     let at_least = expected - (backlog_drops() - backlog);
     assert!(
         (at_least..=expected).contains(&summary.odd(0)),
@@ -415,7 +415,7 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     for (cell, refused) in &*reported.borrow() {
         assert_eq!(*refused, refused_by(*cell, &frames), "cell {cell}");
     }
-    // What bears a cell's name and is not its own is in its account.
+    // Frames with a cell's node id from another sender are in the cell's account.
     let of_cells = |frame: &&Frame| {
         data_id(frame).is_ok_and(|Id { kind, node }| {
             kind.is_from_cells() && (1..=CELLS).contains(&node) && reason(frame).is_some()
@@ -424,12 +424,12 @@ fn cangen_at_full_speed_disturbs_nobody_and_each_of_its_frames_is_counted() {
     let forged = frames.iter().filter(of_cells).count() as u64;
     assert!(forged >= 150);
     assert_eq!(summary.of_bus("/uplink/rejected"), forged, "{:#}", summary.0);
-    // The log has all of it too.
+    // The log has all of them too.
     let log = Log::read(&place.read("run.log"), Format::Fd);
     assert_eq!(log.frames.len() as u64, summary.number("/recording/frames"));
     assert_eq!(summary.number("/recording/lost"), 0);
     all_are_counted(&log.frames, &summary);
-    // And the cells' torques are what they are without noise.
+    // The cells' torques are the same as without noise.
     assert!(summary.figure("/accuracy/single/max_nm") < 2e-3, "{:#}", summary.0);
     let mut by_cause = BTreeMap::new();
     for (_, cause, packet) in log.torques() {
@@ -455,7 +455,7 @@ fn the_stock_tools_read_our_log() {
     let ours = frames_of(&path);
     assert_eq!(ours.len() as u64, place.summary().number("/recording/frames"));
     assert!(ours.len() > 260, "{} frames, of which cangen sent 260", ours.len());
-    // Its output is candump's, letter by letter.
+    // Its output equals candump's exactly.
     candump.frames();
     let texts = |file: &str| {
         let text = place.read(file);
@@ -482,7 +482,7 @@ fn the_stock_tools_read_our_log() {
     let asc = place.path("run.asc");
     let read = tool(&format!("log2asc -I {} -O {} vcan0", path.display(), asc.display()));
     assert_eq!((read.stdout, read.stderr), (vec![], vec![]));
-    // And back again by its counterpart, which drops the length of classic remote frames.
+    // The counterpart converts back, and drops the length of classic remote frames.
     let back = place.path("back.log");
     tool(&format!("asc2log -I {} -O {}", asc.display(), back.display()));
     let back = frames_of(&back);

@@ -1,4 +1,4 @@
-//! Whole benches whose force sensors drift, and whose cells subtract the zero that they find and follow.
+//! Complete benches whose force sensors drift, and whose cells subtract a zero that they find and track.
 
 #![allow(
     clippy::unwrap_used,
@@ -21,7 +21,7 @@ use skinbus_tests::accounts;
 use skinbus_tests::bench::{Act, Bench};
 use skinbus_tests::skins;
 
-/// Six cells in a row, wired one to the next.
+/// Returns a skin of six cells in a row, wired one to the next.
 fn skin() -> Skin {
     let mut skin = skins::arm(6, Format::Fd);
     // The loop has nothing to do between joints.
@@ -51,7 +51,7 @@ fn write(to: Node, parameter: Parameter, words: [i16; 6]) -> Act {
     Act::Say(Message::Configure { to, tag: 1, request })
 }
 
-/// A bench with this scenario, whose cells have this baseline before the first joints.
+/// Returns a bench with this scenario, whose cells have this baseline before the first joints.
 fn bench(scenario: &str, baseline: Baseline) -> Bench {
     let skin = skin();
     let text = format!("{scenario}\n[motion]\nkind = \"hold\"\nstart = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n");
@@ -68,7 +68,7 @@ fn messages(bench: &Bench) -> impl Iterator<Item = Message> {
     bench.wire.iter().filter_map(|it| Message::decode(&Packet::from_fd(&it.frame).ok()?).ok())
 }
 
-/// The zeros that a cell reported, by its place in the skin.
+/// Returns the zeros that a cell reported, by its index in the skin.
 fn zeros(bench: &Bench, place: usize) -> Vec<BaselinePage> {
     let node = bench.skin.cells[place].node;
     let page = |message| {
@@ -78,7 +78,7 @@ fn zeros(bench: &Bench, place: usize) -> Vec<BaselinePage> {
     messages(bench).filter_map(page).collect()
 }
 
-/// What is lost of a torque from its first second to its weakest one, as a part of it.
+/// Returns the relative loss of a torque from its first second to its weakest one.
 fn lost(torques: &[(u8, [i16; 6])]) -> f64 {
     let size = |(_, words): &(u8, [i16; 6])| words.iter().map(|word| f64::from(*word).abs()).sum::<f64>();
     let seconds: Vec<f64> = torques.chunks_exact(62).map(|part| part.iter().map(size).sum::<f64>()).collect();
@@ -86,11 +86,11 @@ fn lost(torques: &[(u8, [i16; 6])]) -> f64 {
     1.0 - weakest / seconds[0]
 }
 
-/// Sensors whose zero shifts eight times as much as the data sheet's, and walks.
+/// Sensors whose zero shifts eight times as much as the data sheet's, and drifts.
 const DRIFTING: &str = "[sensors.force]\nkind = \"piezoresistive\"\ntemperature_n_per_c = 0.02\ndrift_n = 0.02\n\
                         hysteresis = 0.02\ncrosstalk = 0.02\n";
 
-/// Five minutes of warming up, and then ten of 1 N on four cells.
+/// Returns a scenario: five minutes of warming up, and then ten of 1 N on four cells.
 fn pressed(seed: u64) -> String {
     format!(
         "seed = {seed}\nduration_s = 910.0\n[[touch]]\nat_s = 300.0\nfor_s = 600.0\ncells = [3, 4, 5, 6]\n\

@@ -1,4 +1,5 @@
-//! Whole skins at the exact timing of a real bus, in virtual time: which fit, which do not, and that the shadow says the same.
+//! Complete skins at the exact timing of a real bus, in virtual time: those that fit, those that do not, and the
+//! agreement with the bus model.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, clippy::panic, reason = "a test may stop")]
 
@@ -12,17 +13,18 @@ use skinbus_tests::bench::Bench;
 use skinbus_tests::gateway::epoch_of;
 use skinbus_tests::skins;
 
-/// Epochs that are looked at, after all cells have been pressed.
+/// The number of epochs that are evaluated, after all cells have been pressed.
 const EPOCHS: u64 = 40;
 
 fn rates(text: &str) -> BitRates {
     text.parse().unwrap()
 }
 
-/// A skin of which every cell is pressed, on a real bus.
+/// Returns a bench on a real bus, with every cell pressed.
 fn pressed(cells: u8, format: Format, rates: BitRates, seed: u64) -> Bench {
     let mut bench = Bench::new(&skins::arm(cells, format), seed).on_a_bus(rates).started();
-    // From the same joints on: stimuli come last on a bus, and on a full one the last of them never.
+    // From the same joints on: stimuli have the lowest priority on a bus, and on a full one the last of them never
+    // pass.
     let from = From::Epoch(epoch_of(bench.gateway.broadcasts() + 4));
     for place in 0..usize::from(cells) {
         bench.press_from(place, 1.0 + 0.005 * place as f64, from);
@@ -35,7 +37,7 @@ fn replies(bench: &Bench) -> Replies {
     Replies::total(bench.gateway.table.cells().iter().map(|cell| cell.replies))
 }
 
-/// What came of the answers to some epochs: due, in time, late.
+/// Returns the numbers of answers due, in time and late, over some epochs.
 fn over_epochs(bench: &mut Bench, epochs: u64) -> (u64, u64, u64) {
     let before = replies(bench);
     bench.run_epochs(epochs);
@@ -43,9 +45,9 @@ fn over_epochs(bench: &mut Bench, epochs: u64) -> (u64, u64, u64) {
     (after.due - before.due, after.in_time - before.in_time, after.late - before.late)
 }
 
-/// The traffic of a bench as a capture would have it, through the shadow.
+/// Runs the traffic of a bench, as a capture, through the bus model.
 fn shadow(bench: &Bench, rates: BitRates) -> (Vec<Shaded>, BusShadow) {
-    // Stimuli were on this bus too.
+    // This bus carried stimuli too.
     let options = Options { each_frame: true, bench_traffic: true, ..Options::new(rates) };
     let mut shadow = Shadow::new(options).unwrap();
     bench.requested().iter().for_each(|(at, frame)| shadow.frame("vcan0", at.0 * 1_000, frame));
@@ -54,14 +56,14 @@ fn shadow(bench: &Bench, rates: BitRates) -> (Vec<Shaded>, BusShadow) {
     (frames, shadow.report().buses.remove(0))
 }
 
-/// The share of the time in which the bus was taken, from some time on.
+/// Returns the share of time in which the bus was busy, from some time on.
 fn taken_since(bench: &Bench, nanos: u64) -> f64 {
     let attempts = bench.attempts().iter().filter(|attempt| attempt.start >= nanos);
     let taken: u64 = attempts.map(|attempt| attempt.end - attempt.start).sum();
     taken as f64 / (bench.now().0 * 1_000 - nanos) as f64
 }
 
-/// Every frame went out when the shadow says that it would have gone out.
+/// Checks that every frame was sent at the time that the bus model computes.
 fn assert_shaded_alike(bench: &Bench, frames: &[Shaded]) {
     assert!(bench.attempts().len() > 1_000);
     for attempt in bench.attempts() {
@@ -70,7 +72,7 @@ fn assert_shaded_alike(bench: &Bench, frames: &[Shaded]) {
     }
 }
 
-/// Every cell answers every epoch in time; returns the share of the bus that is taken.
+/// Checks that every cell answers every epoch in time; returns the share of time in which the bus is busy.
 fn fits(cells: u8, rates: BitRates) -> f64 {
     let mut bench = pressed(cells, Format::Fd, rates, 1);
     let since = bench.now().0 * 1_000;
@@ -114,7 +116,7 @@ fn the_whole_skin_is_too_much_for_one_bus_at_1m_5m_and_the_shadow_says_so() {
     assert!((1.05..1.2).contains(&bus.load.worst_1_s.value), "{:?}", bus.load);
     let replies = bus.replies.unwrap();
     assert!(replies.late > 400, "{replies:?}");
-    // Joints win every arbitration: they wait for one frame at most, and so the robot's side notices nothing.
+    // Joints win every arbitration: they wait for one frame at most, so the robot's side is not affected.
     let joints = Id::command(Command::Joints).to_bits();
     let longest = frames.iter().filter_map(|frame| Some((frame, frame.sent?)));
     let longest = longest.map(|(_, (start, end))| end - start).max().unwrap();

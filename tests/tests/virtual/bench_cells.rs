@@ -1,4 +1,4 @@
-//! Whole benches on which cells fall silent, hang, restart, or share a node id.
+//! Complete benches on which cells fall silent, hang, restart, or share a node id.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -24,7 +24,7 @@ fn bench(seed: u64) -> Bench {
     Bench::new(&skins::arm(4, Format::Fd), seed).started()
 }
 
-/// Longer than a cell needs from its start to its first torque.
+/// A time longer than a cell needs from its start to its first torque.
 const START: Span = Span(2 * CLAIM.0 + 2 * HEARTBEAT.0);
 
 fn status(bench: &Bench, place: usize) -> Status {
@@ -51,7 +51,7 @@ fn a_stale_cells_torque_is_held_and_then_decays_to_zero() {
     bench.run_epochs(3);
     let whole = magnitude(&bench.gateway.table.snapshot().sums.torque);
     assert!(whole > 0.01);
-    // The cell goes on to speak of a contact, but none of its torques arrives.
+    // The cell goes on to report a contact, but none of its torques arrives.
     bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).of(Kind::Torque).from(Party::CellSlot(CELL)));
     let course: Vec<_> = (0..10)
         .map(|_| {
@@ -61,7 +61,7 @@ fn a_stale_cells_torque_is_held_and_then_decays_to_zero() {
             (part, snapshot.age, snapshot.stale, snapshot.contributing)
         })
         .collect();
-    // The newest broadcast may still be answered; then held for 2 epochs, and decaying over 4.
+    // The newest broadcast may still be answered; then the torque is held for 2 epochs, and decays over 4.
     let expected = [
         (1.0, 0, 0, 1),
         (1.0, 1, 1, 1),
@@ -115,7 +115,7 @@ fn a_killed_cell_is_dead_after_the_documented_time_and_back_when_it_returns() {
             panic!("{:?}", bench.gateway.notices)
         };
         assert_eq!(who, node);
-        // It answered every epoch, so its last word is at most an epoch old.
+        // It answered every epoch, so its last packet is at most an epoch old.
         let after = dead.since(killed);
         assert!((DEAD_AFTER.0 - bench.epoch().0..DEAD_AFTER.0 + 5_000).contains(&after.0), "{after:?}");
         assert_eq!((status(&bench, CELL), bench.gateway.table.snapshot().sums.dead), (Status::Dead, 1));
@@ -176,7 +176,7 @@ fn a_restart_without_its_claim_is_detected_by_the_counter() {
         bench.run(Span(600_000 + seed * 7_919));
         bench.act(Act::Kill(CELL));
         bench.act(Act::Start(CELL));
-        // Its claim is lost; the first word that is heard comes when the number is its own.
+        // Its claim is lost; the first received packet comes when the node id is its own.
         let claim = bench.now()..bench.now() + CLAIM;
         bench.fault(Fault::new(Harm::Lose, 1.0).at(Party::Gateway).from(Party::CellSlot(CELL)).during(claim));
         bench.run(START);
@@ -227,7 +227,7 @@ fn joints_older_than_a_period_are_skipped_and_explain_what_is_missing() {
         let (skipped, unheard) = cell.unanswered().unwrap();
         let replies = replies(&bench, CELL);
         assert!(skipped >= 5 && unheard == 0, "{skipped} {unheard}");
-        // The last broadcast of the hang may be young enough to be answered, after its time.
+        // The last broadcast of the hang may be recent enough to be answered late.
         assert_eq!(replies.missing, skipped, "{replies:?}");
         assert!(replies.late <= 1, "{replies:?}");
     }
@@ -252,7 +252,7 @@ fn lost_joints_and_skipped_joints_are_counted_apart() {
 
 #[test]
 fn a_long_run_does_not_confuse_the_count_of_joints() {
-    // One tick a broadcast, and more of them than a counter of 16 bits holds.
+    // One tick per broadcast, and more of them than a counter of 16 bits holds.
     let mut skin = skins::arm(1, Format::Fd);
     (skin.timing.control_hz, skin.timing.ticks_per_broadcast) = (62.5, 1);
     let mut bench = Bench::new(&skin, 5).started();
@@ -324,7 +324,7 @@ fn an_address_claim_for_a_settled_cells_node_id_changes_nothing_and_is_noticed()
         assert_eq!(bench.cell_slots[newcomer].gave_up(), Some(bench.cell_slots[0].identity.serial));
         let now = replies(&bench, 0);
         assert_eq!((now.due, now.in_time), (before.due + 60, before.in_time + 60), "{now:?}");
-        // It may hear a heartbeat before its first word, and then says none.
+        // It may receive a heartbeat before it sends its first packet, and then sends none.
         let claim = bench.wire.iter().find(|it| it.from == Party::CellSlot(newcomer)).map(|it| it.at);
         let claimed = claim.is_some();
         claims[usize::from(claimed)] += 1;

@@ -1,5 +1,5 @@
-//! Whole benches with many faults, for hundreds of seeds: nothing panics, every account adds up,
-//! and every torque that a tick takes is the one that the oracle expects.
+//! Complete benches with many faults, for hundreds of seeds: nothing panics, every account adds up, and every torque
+//! that a tick uses is the one that the oracle expects.
 
 #![allow(
     clippy::unwrap_used,
@@ -21,16 +21,16 @@ use skinbus_tests::bench::{Act, Bench};
 use skinbus_tests::fault::{Fault, Harm, Party};
 use skinbus_tests::skins;
 
-/// Seeds of each kind of fault.
+/// The number of seeds of each kind of fault.
 const SEEDS: u64 = 100;
 const CELLS: u8 = 5;
 
-/// The last of these lines names the run that failed.
+/// Prints a run; the last of these lines names the run that failed.
 fn print_run(harm: Option<Harm>, format: Format, seed: u64) {
     println!("{harm:?} {format:?} seed {seed}");
 }
 
-/// A bench of five cells that are pressed and released for two seconds with the faults of `inject`.
+/// Runs a bench of five cells that are pressed and released for two seconds, with the faults of `inject`.
 fn campaign(skin: &Skin, seed: u64, inject: impl Fn(&mut Bench, &mut Pcg64Mcg)) -> Bench {
     let mut dice = Pcg64Mcg::seed_from_u64(seed);
     let mut bench = Bench::new(skin, seed).started();
@@ -66,7 +66,7 @@ fn some_fault(dice: &mut Pcg64Mcg) -> Fault {
     }
 }
 
-/// Kills, starts and hangs cells at any time.
+/// Kills, starts and hangs cells at random times.
 fn some_trouble(bench: &mut Bench, dice: &mut Pcg64Mcg) {
     for _ in 0..dice.random_range(0..6) {
         let cell_slot = dice.random_range(0..usize::from(CELLS));
@@ -159,12 +159,12 @@ fn no_torque_with_turned_bits_is_ever_used() {
     let skin = skins::arm(CELLS, Format::Fd);
     let mut flipped = 0;
     for seed in 0..SEEDS {
-        // Most torques are damaged, and nothing else is: what is used must be as right as ever.
+        // Only torques are damaged, and most of them: those that are used must still be right.
         let fault = Fault::new(Harm::Flip, 0.7).of(Kind::Torque);
         let bench = campaign(&skin, seed, |bench, _| bench.fault(fault.clone()));
         let table = &bench.gateway.table;
         assert!(table.accuracy().single.max() < 1e-3, "{:?}", table.accuracy());
-        // Turned bits of an identifier may point at another kind, which has no cell's account.
+        // Flipped bits of an identifier may produce another kind, which is in no cell's account.
         assert!(uplink(&bench).rejected <= table.counters().events(Event::Crc));
         flipped += table.counters().events(Event::Crc);
     }

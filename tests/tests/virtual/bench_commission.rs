@@ -1,5 +1,5 @@
-//! Commissioning in virtual time: real cells, seeded loss, kills and restarts at any moment. It always ends, says
-//! who has not what the skin says, and no cell ever has anything but its old parameters or its new ones.
+//! Commissioning in virtual time: real cells, seeded loss, kills and restarts at any moment. It always ends, names the
+//! cells that differ from the skin, and every cell has either its old parameters or its new ones.
 #![allow(clippy::unwrap_used, clippy::panic, clippy::indexing_slicing, reason = "a test may stop")]
 
 use cell_node::flash::Flash;
@@ -20,7 +20,7 @@ const CELLS: u8 = 12;
 const WISH: Wish = Wish { dry_run: false, verify: false };
 const VERIFY: Wish = Wish { dry_run: false, verify: true };
 
-/// The skin, and what its cells have before.
+/// Returns the skin, and the old and the new parameters of its cells.
 fn skin() -> (Skin, impl Fn(usize) -> Parameters, impl Fn(usize) -> Parameters) {
     skin_of(CELLS, Format::Fd)
 }
@@ -48,7 +48,7 @@ fn all(report: &Report, expected: Outcome) {
     assert_eq!(report.trouble, None);
 }
 
-/// Whatever was ever in a cell's flash is its old configuration, or its new one.
+/// Checks that the flash of a cell only ever had its old configuration or its new one.
 fn nothing_is_mixed(workshop: &Workshop, old: impl Fn(usize) -> Flash, new: impl Fn(usize) -> Parameters) {
     for (place, piece) in workshop.pieces.iter().enumerate() {
         for flash in &piece.history {
@@ -70,7 +70,7 @@ fn cells_with_other_parameters_without_any_and_with_damaged_flash_all_get_the_sk
         let report = workshop.commission(&skin, WISH, None);
         all(&report, Outcome::Written);
         assert_eq!(workshop.holding(&new), usize::from(CELLS));
-        // The robot's table, gains and the period were said once, to everyone, and all was read back so.
+        // The robot's table, gains and the period were sent once, to everyone, and all cells read them back.
         let common = 8 + 10;
         assert_eq!((report.requests, report.repeated), (common + u64::from(CELLS) * 3, 0), "{format:?}");
         nothing_is_mixed(&workshop, flash, new);
@@ -86,7 +86,7 @@ fn a_configured_cell_is_left_alone_and_read_back_only_if_requested() {
     let mut expected = vec![Outcome::AlreadySo; CELLS.into()];
     expected[3] = Outcome::Written;
     assert_eq!(outcomes(&report), expected);
-    // Ten parameters, a commit, ten reads: of the one cell.
+    // Ten parameters, a commit and ten reads, all of one cell.
     assert_eq!(report.requests, 21);
     let again = workshop.commission(&skin, WISH, None);
     all(&again, Outcome::AlreadySo);
@@ -114,12 +114,12 @@ fn a_dry_run_writes_nothing_and_reports_what_would_be_written() {
     let expected = |place| if place < 5 { Outcome::AlreadySo } else { Outcome::WouldWrite };
     assert_eq!(outcomes(&report), (0..CELLS.into()).map(expected).collect::<Vec<_>>());
     assert_eq!(report.requests, 0);
-    // Two heartbeats of each cell, and not a word of ours.
+    // Two heartbeats of each cell, and no packet of the commissioning.
     assert!(workshop.said - said <= 3 * u64::from(CELLS), "{}", workshop.said - said);
     assert!(workshop.pieces.iter().all(|piece| piece.history.len() == 1));
 }
 
-/// Seeds of the runs in which much goes wrong.
+/// The number of runs with many faults.
 const SEEDS: u64 = 100;
 
 #[test]
@@ -131,7 +131,7 @@ fn loss_and_repetition_and_damage_cost_time_and_nothing_else() {
         (workshop.loss, workshop.twice, workshop.damage) = (0.05, 0.05, 0.05);
         let mut report = workshop.commission(&skin, WISH, None);
         nothing_is_mixed(&workshop, flash, &new);
-        // A cell that was unlucky six times in a row is named, and has its turn in the next run.
+        // A cell with six failures in a row is named, and commissioned in the next run.
         for _ in 0..5 {
             for cell in &report.cells {
                 let silent = matches!(cell.outcome, Outcome::Failed(Reason::Silent { .. } | Reason::Gone));
@@ -147,14 +147,14 @@ fn loss_and_repetition_and_damage_cost_time_and_nothing_else() {
 
 #[test]
 fn killed_at_any_moment_and_run_again_it_is_complete_and_nothing_is_mixed() {
-    // More than are asked at the same time.
+    // More cells than are asked at the same time.
     const MANY: u8 = 50;
     let mut halfway = 0;
     for seed in 0..SEEDS / 4 {
         let (skin, old, new) = skin_of(MANY, if seed % 2 == 0 { Format::Fd } else { Format::Classic });
         let flash = |place| if place % 4 == 3 { Flash::Empty } else { Flash::Sound(old(place)) };
         let mut workshop = Workshop::of(&skin, seed, flash);
-        // Where a frame is lost, most of the time goes by with waiting for it.
+        // With lost frames, most of the time is spent waiting for them.
         workshop.loss = if seed % 4 == 0 { 0.02 } else { 0.0 };
         workshop.rest(Span::from_millis(700));
         for _ in 0..3 {
@@ -219,7 +219,7 @@ fn cells_that_are_switched_off_and_on_in_the_middle_are_rewritten_or_named() {
     assert!(restarted > 0);
 }
 
-/// The first words of cells that were switched on are lost.
+/// Drops the first packets of cells that were switched on.
 fn nobody_claims(packet: Packet) -> Packet {
     match Message::decode(&packet) {
         Ok(Message::Network { page: NetworkPage::Heartbeat(beat), .. })
@@ -255,7 +255,7 @@ fn cells_are_identified_by_serial_number_with_any_node_id() {
     let (skin, old, new) = skin();
     let mut workshop = Workshop::new(Format::Fd, 4);
     for (place, described) in skin.cells.iter().enumerate() {
-        // Numbers the other way round.
+        // Numbers in the reverse order.
         let number = cell(CELLS + 1 - described.node.get());
         workshop.add(Identity { cell: Some(number), serial: described.serial }, Flash::Sound(old(place)));
     }
@@ -281,7 +281,7 @@ fn missing_cells_are_named_and_unknown_ones_left_alone() {
         report.unknown_nodes.iter().map(|it| (it.number.get(), it.serial)).collect::<Vec<_>>(),
         [(77, 9)]
     );
-    // Nothing is even staged: it may commit what it has.
+    // Nothing is even staged: the cell may commit its present parameters.
     let mut words = [0; WORDS];
     words[0] = old(0).hash().cast_signed();
     let request = Request::Write { number: Parameter::Commit.number(), words };
@@ -351,7 +351,7 @@ fn flash_that_cannot_be_written_is_named_and_the_old_remains() {
     );
 }
 
-/// A pose on its way, x a step greater: what a turned bit would be that no CRC notices.
+/// Changes a pose on its way, x by one step: a flipped bit that no CRC detects.
 fn other_pose(packet: Packet) -> Packet {
     let is_pose = packet.id.kind == Kind::Configure && packet.count & 0x7F == Parameter::Pose.number();
     let mut packet = packet;
@@ -359,7 +359,7 @@ fn other_pose(packet: Packet) -> Packet {
     packet
 }
 
-/// The same on its way back, so that the answer to the write looks right.
+/// Changes it back on the return, so that the answer to the write looks right.
 fn pose_back(packet: Packet) -> Packet {
     let is_pose = packet.id.kind == Kind::Configured && packet.count == Parameter::Pose.number() | 0x80;
     let mut packet = packet;
@@ -402,7 +402,7 @@ fn a_pose_whose_crc_is_wrong_is_not_taken_and_the_old_one_stays() {
     workshop.rest(Span::from_millis(5));
     assert_eq!(refused(&workshop), '1');
     workshop.damage = 0.0;
-    // Had it been staged, the hash of the old with the new pose would be committed.
+    // Had it been staged, the hash of the old parameters with the new pose would be committed.
     let mixed = Parameters { pose: skin.parameters(&skin.cells[0]).pose, ..old(0) };
     let words = [mixed.hash().cast_signed(), 0, 0, 0, 0, 0];
     let commit = Request::Write { number: Parameter::Commit.number(), words };
@@ -411,7 +411,7 @@ fn a_pose_whose_crc_is_wrong_is_not_taken_and_the_old_one_stays() {
     assert_eq!(workshop.pieces[0].history, [Flash::Sound(old(0))]);
 }
 
-/// A cell that reads another period than it was told.
+/// Makes a cell report another period than the one that was written.
 fn liar(packet: Packet) -> Packet {
     let is_period = packet.id.kind == Kind::Configured && packet.count == Parameter::Timing.number();
     let mut packet = packet;

@@ -1,5 +1,5 @@
-//! The conformance test in virtual time: this project's cell passes, and cells that do one thing wrong are found out, each
-//! by the requirement that says so.
+//! The conformance test in virtual time: this project's cell passes, and each faulty cell is detected by the
+//! requirement that it breaks.
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
@@ -22,7 +22,7 @@ use protocol::id::CellId;
 use protocol::packet::Packet;
 use protocol::time::Span;
 
-/// What came of a cell, and why the test ended early.
+/// Returns the findings on a cell and the failed requirements.
 fn test(bus: &mut Virtual, format: Format, number: u8, only: &Only) -> (Vec<Finding>, Vec<&'static str>) {
     let cell = CellId::new(number.into()).unwrap();
     let survey = Survey::take(bus, "vcan0").unwrap();
@@ -76,7 +76,8 @@ fn without_a_restart_what_shows_only_at_a_start_is_not_tested() {
     assert_eq!(untested, ["ID-3", "CLAIM-1", "CLAIM-2", "CLAIM-3", "CLAIM-4", "CLAIM-5", "CONF-8"]);
 }
 
-/// A restart may end the former life of a cell anywhere, also between the segments of an answer; nothing of it counts.
+/// A restart may end the former life of a cell anywhere, also between the segments of an answer; none of its packets
+/// count.
 #[test]
 fn a_right_cell_that_is_cut_off_anywhere_passes() {
     let longest = Span(3_000);
@@ -85,7 +86,7 @@ fn a_right_cell_that_is_cut_off_anywhere_passes() {
         std::env::var("SKINBUS_RESTARTS").map_or(8, |restarts| restarts.parse::<u64>().unwrap().div_ceil(13));
     let (mut restarts, mut torn) = (0, 0);
     for run in 0..runs {
-        // The last of the restarts of a run comes while a commit is answered: it is another place in each run.
+        // The last restart of a run comes while a commit is answered, at another place in each run.
         let first = Span(run * longest.0 / runs);
         let mut bus = Virtual::new(Format::Classic, 12, Box::new(Right)).cut(first, Span(233), longest);
         let (findings, failed) = test(&mut bus, Format::Classic, 12, &only);
@@ -100,7 +101,7 @@ fn a_right_cell_that_is_cut_off_anywhere_passes() {
     );
 }
 
-/// A cell that waits for a processor skips joints and is late, as it may: nothing but times is held against it.
+/// A cell that waits for a processor skips joints and is late, which is allowed: only requirements on times may fail.
 #[test]
 fn a_cell_that_waits_for_a_processor_is_not_blamed() {
     let timed = |id: &&str| {
@@ -118,14 +119,14 @@ fn a_cell_that_waits_for_a_processor_is_not_blamed() {
     }
 }
 
-/// Cells that are right and have less: no option, few abilities; or take their time.
+/// Correct cells with less: no options, few abilities, or slow.
 #[test]
 fn cells_with_less_pass() {
     for (name, lessen) in lesser::ALL {
         for format in [Format::Fd, Format::Classic] {
             let mut lesser = wrong::Wrong::new(format, mutants::NODE);
             lessen(&mut lesser);
-            // Of two segments the first has the first words, and they are not changed on the way.
+            // The first of two segments has the first words, which are not changed on the way.
             let measures = lesser.memory.measures;
             if measures && format == Format::Classic {
                 continue;
@@ -140,7 +141,7 @@ fn cells_with_less_pass() {
     }
 }
 
-/// A cell none of whose frames is a packet is there all the same, and what is wrong with it is named.
+/// A cell without a single valid packet is detected as present, and its mistake is named.
 #[test]
 fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
     type Put = fn(&mut wrong::Memory, &Packet, Format) -> Vec<Frame>;
@@ -171,11 +172,12 @@ fn a_cell_without_a_single_packet_is_named_with_its_mistake() {
         let cell = CellId::new(mutants::NODE.into()).unwrap();
         let why = survey.check(cell, "vcan0", None, false).unwrap_err();
         assert!(why.starts_with("cell 12 on vcan0 fails SEND-1: of "), "{why}");
-        assert!(why.contains("none is a packet, as in 40C#") && why.contains(mistake), "{mistake}: {why}");
+        assert!(why.contains("is a valid packet, for example 40C#") && why.contains(mistake), "{mistake}: {why}");
     }
 }
 
-/// The frames of a packet with another CRC: of the identifier and the bytes before it, and of the right one.
+/// Returns the frames of a packet with another CRC, computed from the identifier, the bytes before it and the right
+/// CRC.
 fn spoilt(packet: &Packet, format: Format, crc: fn(&[u8], u16) -> u16) -> Vec<Frame> {
     let frames: Vec<_> = packet.frames(format).collect();
     let mut bytes: Vec<u8> = frames.iter().flat_map(Frame::data).copied().collect();
@@ -193,7 +195,7 @@ fn spoilt(packet: &Packet, format: Format, crc: fn(&[u8], u16) -> u16) -> Vec<Fr
     made.map(Result::unwrap).collect()
 }
 
-/// Each wrong cell fails the requirement that it breaks.
+/// Checks that each faulty cell fails the requirement that it breaks.
 fn are_found(spoilt: &[mutants::Spoilt], format: Format) {
     let mut found_out = Vec::new();
     for (name, id, spoil) in spoilt {
@@ -209,7 +211,7 @@ fn are_found(spoilt: &[mutants::Spoilt], format: Format) {
         }
         for it in &findings {
             if let Verdict::Failed { frames, .. } = &it.verdict {
-                // Of a cell that sends nothing there are none, nor of its timing as a whole.
+                // A cell that sends nothing has no frames to show; neither has its timing as a whole.
                 let has_none = ["TIME-1", "TIME-2", "BEAT-1"].contains(&it.requirement.id)
                     || *name == "it is silent after a reset";
                 assert!(!frames.is_empty() || has_none, "{name}: {}", it.requirement.id);
@@ -289,7 +291,7 @@ fn commits_that_take_something_along_are_found() {
     are_found(mutants::flash::LEAVES, Format::Fd);
 }
 
-/// What passes for the right cell is failed by a wrong one; but for what follows from other requirements.
+/// Each requirement that the right cell passes is failed by a faulty one, except those that follow from others.
 #[test]
 fn each_requirement_is_broken_by_a_wrong_cell() {
     let mut passed = std::collections::BTreeSet::new();
@@ -303,7 +305,7 @@ fn each_requirement_is_broken_by_a_wrong_cell() {
         mutants::ALL.iter().flat_map(|(all, _)| all.iter().map(|(_, id, _)| *id)).collect();
     let unbroken: Vec<_> = passed.difference(&broken).copied().collect();
     assert!(passed.len() > 70, "{passed:?}");
-    // A cell without its node id after a reset sends nothing, which is CLAIM-1.
+    // A cell without its node id after a reset sends nothing, which breaks CLAIM-1.
     assert_eq!(unbroken, ["ID-3"]);
     let count: usize = mutants::ALL.iter().map(|(all, _)| all.len()).sum();
     assert!(count >= 24, "{count} wrong cells");

@@ -1,4 +1,4 @@
-//! Whole benches in virtual time, explained from what stood on the wire: the cells' own code against the central
+//! Complete benches in virtual time, explained from the frames on the wire: the cells' own code against the central
 //! computation, word by word.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
@@ -15,10 +15,10 @@ use skinbus_tests::bench::{Act, Bench, OnTheWire};
 use skinbus_tests::fault::{Fault, Harm};
 use skinbus_tests::skins;
 
-/// Epochs of a bench.
+/// The number of epochs of a bench.
 const EPOCHS: u64 = 60;
 
-/// What a capture of these frames explains.
+/// Explains an epoch from a capture of these frames.
 fn explained(bench: &Bench, wire: &[OnTheWire], epoch: u8) -> Explanation {
     let requested = Requested { epoch: Epoch(epoch), from_ns: 0, occurrence: 1 };
     let bus = &bench.skin.buses[0].name;
@@ -33,7 +33,7 @@ fn explained(bench: &Bench, wire: &[OnTheWire], epoch: u8) -> Explanation {
     explain(&bench.skin, &watch.moments().unwrap())
 }
 
-/// A bench whose cells are pressed and released all the time, some so hard that they saturate.
+/// Returns a bench whose cells are pressed and released all the time, some so hard that they saturate.
 fn pressed(seed: u64, format: Format) -> Bench {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut bench = Bench::new(&skins::arm(8, format), seed).started();
@@ -63,7 +63,7 @@ fn every_word_of_every_cell_is_explained() {
                 let torques = bench.torques(place);
                 let said = torques.iter().find(|(of, _)| *of == epoch).map(|(_, words)| *words);
                 let found = explanation.cells.iter().find(|it| it.node == cell.node.get());
-                // Whoever answers is explained, and whoever should have answered has.
+                // Every cell that answers is explained, and every cell that should have answered has.
                 assert_eq!(found.is_some(), said.is_some(), "epoch {epoch}, cell {}", cell.node);
                 let (Some(found), Some(said)) = (found, said) else { continue };
                 let words: Vec<_> = found.rows.iter().map(|row| row.word.unwrap()).collect();
@@ -100,7 +100,7 @@ fn the_sum_is_the_one_that_the_gateway_has() {
     let mut bench = Bench::new(&skins::arm(8, Format::Fd), 5).started();
     (0..8).for_each(|place| bench.press(place, 1.0 + f64::from(u8::try_from(place).unwrap())));
     bench.run_epochs(10);
-    // All of them have answered the last joints by now, and the arm goes on only with the next.
+    // All of them have answered the last joints by now, and the arm moves on only with the next.
     let sums = bench.gateway.table.snapshot().sums;
     assert_eq!((sums.contributing, bench.skin.cells.len()), (8, 8));
     let last = bench.torques(0).last().unwrap().0;
@@ -121,7 +121,7 @@ fn unknown_causes_are_named_and_not_guessed() {
     let epoch = bench.torques(0).last().unwrap().0;
     let [zero, one] = [0, 1].map(|place| bench.skin.cells[place].node.get());
 
-    // Without what was before, the first cell's stimulus is not known, and so is its torque's reason.
+    // Without the frames before, the first cell's stimulus is unknown, and so is the reason of its torque.
     let late: Vec<_> = bench.wire.iter().filter(|sent| sent.at >= began).copied().collect();
     bench.run_epochs(1);
     let explanation = explained(&bench, &late, epoch);
@@ -138,7 +138,7 @@ fn unknown_causes_are_named_and_not_guessed() {
         "{said}"
     );
 
-    // Without the torque, the sum is without it.
+    // Without the torque, the sum does not include it.
     let node = u32::from(one);
     let torque =
         |sent: &OnTheWire| sent.frame.id() >> 8 == Kind::Torque as u32 && sent.frame.id() & 0xFF == node;
@@ -157,7 +157,7 @@ fn a_cell_that_has_just_started_sends_nothing_and_one_that_releases_sends_zeros(
     (0..4).for_each(|place| bench.press(place, 2.0));
     bench.run_epochs(5);
     bench.act(Act::Start(2));
-    // Its first word comes within 64 ms.
+    // Its first packet comes within 64 ms.
     bench.run_epochs(5);
     bench.press(3, 0.0);
     bench.run_epochs(2);
@@ -180,7 +180,7 @@ fn a_cell_that_has_just_started_sends_nothing_and_one_that_releases_sends_zeros(
 #[test]
 fn a_lossy_bus_loses_no_explanation_of_what_came() {
     let mut bench = Bench::new(&skins::arm(8, Format::Fd), 11);
-    // Before the wire: what is lost there stands in no capture either.
+    // Before the wire: frames lost there are in no capture either.
     bench.fault(Fault::new(Harm::Lose, 0.02).on_the_wire());
     let mut bench = bench.started();
     for round in 0..10 {

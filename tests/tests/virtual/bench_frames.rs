@@ -1,4 +1,4 @@
-//! Whole benches on which frames come twice, late, in the wrong order, in segments, or from other senders.
+//! Complete benches on which frames come twice, late, in the wrong order, in segments, or from other senders.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -19,7 +19,7 @@ use skinbus_tests::skins;
 
 const CELLS: usize = 4;
 
-/// All cells pressed, for some epochs.
+/// Returns a bench with all cells pressed, after some epochs.
 fn pressed(format: Format, seed: u64) -> Bench {
     let mut bench = Bench::new(&skins::arm(4, format), seed).started();
     (0..CELLS).for_each(|place| bench.press(place, 1.0 + 0.2 * place as f64));
@@ -77,7 +77,7 @@ fn joints_that_come_twice_are_answered_once() {
 #[test]
 fn a_torque_that_was_overtaken_by_a_later_one_is_dropped_as_stale() {
     let mut bench = pressed(Format::Fd, 3);
-    // Each of them comes between one and three epochs late, and some overtake others.
+    // Each of them comes one to three epochs late, and some overtake others.
     let delay = Harm::Delay(Span(3 * bench.epoch().0));
     bench.fault(Fault::new(delay, 0.5).at(Party::Gateway).of(Kind::Torque));
     bench.run_epochs(200);
@@ -97,7 +97,7 @@ fn a_torque_may_be_three_epochs_late_and_not_four() {
     for (late, used) in [(1, true), (2, true), (3, true), (4, false)] {
         let mut bench = pressed(Format::Fd, 4);
         let epoch = bench.epoch();
-        // Cell 1's next torque is repeated by somebody so many epochs later, and it says nothing itself.
+        // Another client sends cell 1's next torque some epochs late, while the cell's own torques are lost.
         bench.fault(Fault::new(Harm::Lose, 1.0).on_the_wire().of(Kind::Torque).from(Party::CellSlot(0)));
         bench.run_epochs(1);
         let answers = epoch_of(bench.gateway.broadcasts() - 1);
@@ -137,7 +137,7 @@ fn broadcasts_that_change_places_on_the_wire_are_answered_forward_and_back() {
     finish(&mut bench);
     let Replies { due, in_time, late, missing, .. } = replies(&bench);
     assert!(in_time + late > due * 9 / 10, "{:?}", replies(&bench));
-    // A cell answers what the wire carried in its order, so it misses nothing.
+    // A cell answers the frames in the wire's order, so it misses nothing.
     assert_eq!(missing, 0);
     assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
 }
@@ -149,7 +149,7 @@ fn epochs_may_jump_forward_and_back() {
     let before = replies(&bench);
     for _ in 0..300 {
         bench.run(Span(bench.epoch().0 / 2));
-        // As if it had restarted, or a recording was repeated. Not the epoch of the last or next one.
+        // Like a restarted gateway, or a replayed recording; not the epoch of the last or next broadcast.
         let ours = bench.gateway.broadcasts();
         let epoch = Epoch(epoch_of(ours).0.wrapping_add(dice.random_range(10..240)));
         let joints = Joints { in_use: 6, ..Joints::default() };
@@ -245,7 +245,7 @@ fn a_second_gateway_is_noticed_by_its_joints_and_by_its_heartbeat() {
         assert_eq!(bench.gateway.table.snapshot().sums.other_gateways, u32::from(goes_on));
         assert_eq!(events(&bench, Event::OtherGateway), 4);
         finish(&mut bench);
-        // What cells answered to the other one is nothing that this one uses.
+        // This gateway uses none of the cells' answers to the other one.
         assert!(bench.gateway.table.accuracy().single.max() < 1e-3);
     }
 }
@@ -293,7 +293,7 @@ fn neither_the_order_of_starts_nor_that_of_replies_changes_a_single_torque() {
         let idle = model::scenario::Scenario::idle(Span(0));
         let mut bench = Bench::with(&skin, &idle, seed, |place| Micros(starts[place]));
         for cell_slot in &mut bench.cell_slots {
-            // Within a tick, or the arm, which gives way to the sum, would move differently.
+            // Within a tick; otherwise the arm, which gives way to the sum, would move differently.
             cell_slot.thinks = Span(dice.random_range(0..1_500));
         }
         bench.settle();

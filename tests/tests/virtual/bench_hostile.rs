@@ -1,5 +1,5 @@
-//! Whole benches on which somebody sends frames that a bench does not expect: the accounts stay exact, and no cell's
-//! torque changes.
+//! Complete benches on which another sender sends unexpected frames: the accounts stay exact, and no cell's torque
+//! changes.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -22,15 +22,15 @@ use skinbus_tests::skins;
 const CELLS: u8 = 4;
 const FRAMES: u32 = 400;
 
-/// What somebody sends.
+/// The kinds of unexpected frames.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum What {
-    /// Of other protocols.
+    /// Frames of other protocols.
     Foreign,
     Extended,
     Remote,
     ErrorFrame,
-    /// Under a cell's identifier, and no packet.
+    /// Under a cell's identifier, but not a packet.
     WrongChecksum,
     WrongLength,
     HalfPacket,
@@ -47,9 +47,9 @@ enum What {
     Place,
     Answer,
     Sum,
-    /// Of nodes that the skin does not have.
+    /// From nodes that the skin does not have.
     UnknownNode,
-    /// Of a gateway or a command line.
+    /// From a gateway or a command line.
     Requests,
     GatewaysHeartbeat,
 }
@@ -80,14 +80,14 @@ const ALL: [What; 22] = [
 ];
 
 impl What {
-    /// Whether the gateway counts it as a packet of the cell whose node id it has.
+    /// Returns true if the gateway counts it as a packet of the cell whose node id it has.
     fn is_of_a_cell(self) -> bool {
         use What::*;
         let none = [Foreign, Extended, Remote, ErrorFrame, UnknownNode, Requests, GatewaysHeartbeat];
         !none.contains(&self)
     }
 
-    /// Whether it is a heartbeat that is not the cell's own.
+    /// Returns true for a heartbeat that is not the cell's own.
     fn is_an_outsider(self) -> bool {
         use What::*;
         [OldHeartbeat, HeartbeatAhead, HeartbeatOfAnother, Claim, ClaimOfAnother].contains(&self)
@@ -200,7 +200,7 @@ fn no_frame_that_somebody_sends_changes_an_account_or_a_torque() {
             assert_eq!(uplink.outsiders, outsiders, "{what:?}: {uplink:?}");
             let Replies { due, in_time, missing, in_doubt, .. } = cell.replies;
             assert_eq!(missing, in_doubt, "{what:?}: {:?}", cell.replies);
-            // Few are due of a cell whose contact a second holder of its node id made unknown.
+            // Few replies are due of a cell whose contact became unknown by a second owner of its node id.
             assert!(due - in_time <= (due / 100).max(1), "{what:?}: {:?}", cell.replies);
         }
         assert!(table.accuracy().single.max() < 1e-3, "{what:?}: {:?}", table.accuracy());

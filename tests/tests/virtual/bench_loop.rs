@@ -1,4 +1,4 @@
-//! Whole benches on which the loop halts, resumes, and is late.
+//! Complete benches on which the loop halts, resumes, and is late.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
@@ -134,7 +134,7 @@ fn skipped_ticks_skip_whole_broadcasts_and_are_counted() {
     assert!(bench.gateway.records.iter().any(|record| record.skipped == 5 * ticks));
     let broadcasts = bench.gateway.broadcasts() - before;
     assert!((5..=6).contains(&broadcasts), "{broadcasts}");
-    // The phase is what it was: but for the one after the gap they are one period apart.
+    // The phase is unchanged: all broadcasts but the one after the gap are one period apart.
     let times = on_the_wire(&bench, Command::Joints, Party::Gateway);
     let phases: Vec<_> = times.iter().rev().take(4).map(|at| at.0 % bench.epoch().0).collect();
     let first = times[1].0 % bench.epoch().0;

@@ -12,7 +12,7 @@ use skinbus_tests::network::{End, PERIOD, Wiring};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// Cells are started in any order within a third of a second, and have until then to be a tree.
+/// The time limit for the tree; the cells are started in any order within a third of a second.
 const TREE_READY: Span = Span::from_millis(2_000);
 
 /// Starts all cells at random times, and waits for the tree.
@@ -28,7 +28,7 @@ fn wait_for_tree(wiring: &mut Wiring, dice: &mut Pcg64Mcg) {
     wiring.run(TREE_READY);
 }
 
-/// The tree spans all reachable cells, node ids are dense and unique, and neighbours agree on their wires.
+/// Checks that the tree spans all reachable cells, node ids are dense and unique, and neighbours agree on their wires.
 fn check_tree_ready(wiring: &Wiring, seed: u64) {
     let reachable = wiring.reachable();
     let mut node_ids = BTreeSet::new();
@@ -78,7 +78,8 @@ fn press_all(wiring: &mut Wiring) {
     wiring.run(Span(4 * PERIOD.0));
 }
 
-/// How many epochs in a row were not complete after a fault; the last one must be.
+/// Runs for some epochs after a fault, and returns the number of epochs up to the last incomplete one; `None` if the
+/// last epoch is incomplete.
 fn incomplete(wiring: &mut Wiring, epochs: u64) -> Option<usize> {
     let from = wiring.took.len();
     for _ in 0..epochs {
@@ -102,7 +103,7 @@ fn incomplete(wiring: &mut Wiring, epochs: u64) -> Option<usize> {
     }
 }
 
-/// A random fault, or its end.
+/// Injects a random fault, or ends one.
 fn inject_fault(wiring: &mut Wiring, dice: &mut Pcg64Mcg) -> String {
     let cell = dice.random_range(0..wiring.cells.len());
     let port = dice.random_range(0..4);
@@ -147,12 +148,12 @@ fn restart(wiring: &mut Wiring, cell: usize) -> String {
     format!("restart {cell}")
 }
 
-/// Wirings that are tried, of each kind; `SKINBUS_WIRINGS=10000` tries more.
+/// Returns the number of wirings of each kind; `SKINBUS_WIRINGS=10000` runs more.
 fn wirings() -> u64 {
     std::env::var("SKINBUS_WIRINGS").map_or(600, |wirings| wirings.parse().unwrap())
 }
 
-/// Waits for the tree, presses every cell, injects four faults, and prints how many epochs were not complete after each.
+/// Waits for the tree, presses every cell, injects four faults, and prints the number of incomplete epochs after each.
 fn campaign(seeds: impl Iterator<Item = u64>) {
     let mut repairs = BTreeMap::<(String, usize), usize>::new();
     for seed in seeds {
@@ -187,7 +188,7 @@ fn campaign(seeds: impl Iterator<Item = u64>) {
             .map(|(_, times)| times)
             .sum::<usize>()
     };
-    // Slower ones lose their root, or find a route only through cells that were below them.
+    // Slower cases lose their root, or find a route only through cells that were below them.
     assert!(
         of(&|epochs| epochs > 3) * 10 < of(&|epochs| epochs > 0) * 3,
         "most are complete again in 3 epochs"
@@ -195,8 +196,8 @@ fn campaign(seeds: impl Iterator<Item = u64>) {
     assert_eq!(of(&|epochs| epochs > 12), 0, "all are, soon");
 }
 
-// All of these together: SUM-1, SUM-7, LEASE-1, LEASE-3, NACK-1, NACK-3, NACK-4, NACK-5, HELLO-2, HELLO-3, JOIN-1, JOIN-2,
-// JOIN-3, JOIN-4, JOIN-5, LOSS-1, LOSS-2, LOSS-3, LOSS-4, REPAIR-1, REPAIR-2, REPAIR-3, REPAIR-4, LINK-1.
+// This covers SUM-1, SUM-7, LEASE-1, LEASE-3, NACK-1, NACK-3, NACK-4, NACK-5, HELLO-2, HELLO-3, JOIN-1, JOIN-2, JOIN-3,
+// JOIN-4, JOIN-5, LOSS-1, LOSS-2, LOSS-3, LOSS-4, REPAIR-1, REPAIR-2, REPAIR-3, REPAIR-4, LINK-1.
 #[test]
 fn random_wirings_become_trees_and_never_count_a_cell_twice() {
     campaign((0..wirings()).step_by(2));

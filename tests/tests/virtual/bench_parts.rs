@@ -1,6 +1,6 @@
-//! A recording split anywhere: whole benches in virtual time, with cells that hang and answer too late, and packets that
-//! are lost on their way to the recording. The frames latched at a split, and the frames from there up to another split,
-//! are replayed to cells that were just started: they answer as recorded.
+//! A recording split anywhere: complete benches in virtual time, with cells that hang and answer too late, and packets
+//! that are lost on their way to the recording. The frames latched at a split, and the frames from there up to another
+//! split, are replayed to cells that were just started: they must answer as recorded.
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 
 use analysis::explain::{Requested, Watch};
@@ -31,10 +31,10 @@ use trace::capture;
 const CELLS: u8 = 8;
 const SEEDS: u64 = 40;
 const BUS: &str = "vcan0";
-/// More epochs than half of all numbers.
+/// More epochs than half of all epoch numbers.
 const EPOCHS: u64 = 190;
 
-/// What goes wrong while it is recorded.
+/// The faults during the recording.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Trouble {
     None,
@@ -42,7 +42,7 @@ enum Trouble {
     Late,
 }
 
-/// What a recorder has of a bench in which cells are pressed and released all the time.
+/// Records a bench in which cells are pressed and released all the time.
 fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
     let mut rng = Pcg64Mcg::seed_from_u64(seed);
     let mut bench = Bench::new(&skins::arm(CELLS, format), seed);
@@ -56,7 +56,7 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
         let newtons = [0.0, 0.0, 0.05, 1.5, 4.0, 90.0][rng.random_range(0..6)];
         let ahead = Epoch(u8::try_from((epoch + rng.random_range(0..6)) % 256).unwrap());
         let from = if rng.random_ratio(1, 3) { From::Next } else { From::Epoch(ahead) };
-        // Of the last cells some are pressed once and for all.
+        // Some of the last cells are pressed permanently.
         if place < 5 || epoch % 60 == 7 {
             bench.press_from(place, newtons, from);
         }
@@ -112,7 +112,7 @@ fn recorded(seed: u64, format: Format, trouble: Trouble) -> (Skin, Vec<Seen>) {
     (bench.skin, seen)
 }
 
-/// The first place from `at` on at which the recorder may begin another file, and the frames latched there.
+/// Returns the first index from `at` on at which the recorder may begin another file, and the frames latched there.
 fn split(seen: &[Seen], at: usize) -> (usize, Vec<capture::Latched>) {
     let mut latched_frames = Latched::default();
     for (place, frame) in seen.iter().enumerate() {
@@ -141,7 +141,7 @@ fn record(seen: &Seen) -> Record<'static> {
     Record { time, interface: BUS, frame: seen.frame, direction }
 }
 
-/// Cells that were just started, and what they say.
+/// Cells that were just started.
 struct Cells(Vec<Node>);
 
 impl Cells {
@@ -159,7 +159,7 @@ impl Cells {
         Self(skin.cells.iter().map(started).collect())
     }
 
-    /// All take a frame in time, and answer.
+    /// Gives a frame to all cells in time, and their answers to the comparator.
     fn take(&mut self, frame: &Frame, comparator: &mut Comparator) {
         for node in &mut self.0 {
             node.handle_frame(Micros(300_000), Span(0), frame);
@@ -177,7 +177,7 @@ impl Cells {
     }
 }
 
-/// What a replay of a part comes to, in lockstep.
+/// Replays a part in lockstep, and returns the comparator.
 fn replayed(skin: &Skin, before: &[capture::Latched], part: &[Seen]) -> Comparator {
     let format = skin.buses[0].format;
     let mut survey = Survey::new(Part::default());
@@ -218,7 +218,7 @@ fn replayed(skin: &Skin, before: &[capture::Latched], part: &[Seen]) -> Comparat
     comparator
 }
 
-/// Torques in a part.
+/// Returns the number of torques in a part.
 fn torques(part: &[Seen]) -> u64 {
     let mut decoder = Decoder::new(None);
     let is_torque = |seen: &&Seen| {
@@ -250,7 +250,7 @@ fn a_recording_that_is_split_anywhere_replays_from_there() {
                 comparator.tally(),
                 comparator.first()
             );
-            // Each recorded torque is compared, or has a reason why not.
+            // Each recorded torque is compared, or has a reason for not being compared.
             let apart = lacking.joints_earlier + lacking.joints_unrecorded + lacking.said_later;
             assert!(comparator.tally().equal + apart >= torques(part), "{:#?}", comparator.tally());
             equal += comparator.tally().equal;
@@ -270,7 +270,7 @@ fn where_nothing_was_lost_or_late_nothing_is_explained() {
         let (skin, seen) = recorded(seed, format, Trouble::None);
         for at in (0..seen.len() - 200).step_by(seen.len() / 15) {
             let (from, before) = split(&seen, at);
-            // Up to the next joints: all that was asked is answered.
+            // Up to the next joints: all requests before are answered.
             let is_joints = |seen: &&Seen| seen.frame.raw_id() == 1;
             let last = seen.iter().rposition(|seen| is_joints(&seen)).unwrap();
             let to = if at % 2 == 0 { seen.len() } else { (from + 400).min(last) };

@@ -1,5 +1,5 @@
-//! A cell that is brought into the state of the middle of a recording answers the rest as the recorded one did: real
-//! cells, in virtual time, hundreds of scripts, each cut somewhere.
+//! A cell that is brought into the state of the middle of a recording must answer the rest as the recorded cell did:
+//! real cells, in virtual time, hundreds of scripts, each cut somewhere.
 #![allow(
     clippy::unwrap_used,
     clippy::panic,
@@ -33,7 +33,7 @@ fn parameters() -> Parameters {
     skin.parameters(&skin.cells[0])
 }
 
-/// A cell that has claimed its number.
+/// Returns a cell that has claimed its node id.
 fn started() -> Node {
     let identity = Identity { cell: CellId::new(CELL).ok(), serial: 1 };
     let mut node = Node::new(identity, Format::Fd, &Flash::Sound(parameters()), true, Micros(0));
@@ -44,7 +44,7 @@ fn started() -> Node {
     node
 }
 
-/// What a cell answers to a message, without its heartbeats and counters.
+/// Returns a cell's answers to a message, without its heartbeats and counters.
 fn tell(node: &mut Node, message: &Message) -> Vec<Message> {
     let mut answers = Vec::new();
     for frame in message.encode().frames(Format::Fd) {
@@ -60,7 +60,8 @@ fn tell(node: &mut Node, message: &Message) -> Vec<Message> {
     answers
 }
 
-/// Anything that a gateway may say, with many joints between; `tame` cells keep their parameters and go on obeying.
+/// Returns random messages of a gateway, with many joints between them; `tame` scripts keep the cell's parameters and
+/// leave it operating.
 fn script(random: &mut Pcg64, tame: bool) -> Vec<Message> {
     let mut epoch = Epoch(random.random());
     let mut script = Vec::new();
@@ -162,7 +163,7 @@ fn a_cell_with_another_past_answers_the_rest_as_the_recorded_one_did() {
         for (at, message) in after.iter().enumerate() {
             let (then, now) = (tell(&mut recorded, message), tell(&mut other, message));
             has_epoch |= matches!(message, Message::Joints { .. });
-            // A report before the first joints tells the epoch of whoever spoke before.
+            // A report before the first joints has the epoch of an earlier sender.
             if matches!(message, Message::Report) && !has_epoch {
                 continue;
             }

@@ -1,4 +1,4 @@
-//! Whole benches on which cells tell what they feel: continuously, on events, or not at all.
+//! Complete benches on which cells send their sensor values: continuously, on events, or not at all.
 
 #![allow(
     clippy::unwrap_used,
@@ -25,12 +25,12 @@ use skinbus_tests::fault::{Fault, Harm, Party};
 use skinbus_tests::skins;
 
 const AT_62_5_HZ: Sensing = Sensing::Continuous { period_ms: 16 };
-/// How long a bench is looked at.
+/// The time for which a bench is observed.
 const LOOK: Span = Span::from_millis(8_000);
 const TOUCHED: usize = 100;
 
-/// Touches of half a second to two, one after another, each of some of the first 100 cells, of 0.5 to 6 N times
-/// `harder`, and at phases that have nothing to do with epochs.
+/// Returns touches of half a second to two, one after another, each of some of the first 100 cells, of 0.5 to 6 N times
+/// `harder`, and at phases that are independent of epochs.
 fn moving(skin: &Skin, harder: f64) -> Scenario {
     let mut text = String::from(
         "version = 1\nduration_s = 10.0\n[motion]\nkind = \"sine\"\nstart_rad = [0.0, -1.2, 1.0, -1.4, -1.57, 0.0]\n\
@@ -49,7 +49,7 @@ fn moving(skin: &Skin, harder: f64) -> Scenario {
                  profile = \"half-sine\"\n",
                 nodes.join(", ")
             );
-            // The next one comes at once: the cell is in contact all the time, but for an epoch or two.
+            // The next one follows at once: the cell is in contact all the time, except for an epoch or two.
             at += length + 0.03;
             n += 1;
         }
@@ -66,7 +66,7 @@ fn to(to: Node, mode: Sensing) -> Message {
     Message::Configure { to, tag: 1, request }
 }
 
-/// The sensors frames that stood on the wire since, by time, with their senders.
+/// Returns the sensors frames on the wire since a time, with their times and senders.
 fn sensors_frames(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPage)> {
     let format = bench.skin.buses[0].format;
     let mut segments = BTreeMap::new();
@@ -96,7 +96,8 @@ fn sensors_frames(bench: &Bench, since: Micros) -> Vec<(Micros, CellId, SensorPa
     frames
 }
 
-/// A bench whose cells are in this mode, and since when; nothing of the switch is in the count.
+/// Returns a bench whose cells are in this mode, and the start of the observation, which excludes the frames of the
+/// switch.
 fn looked_at(skin: &Skin, scenario: &Scenario, mode: Sensing) -> (Bench, Micros) {
     let mut bench = Bench::with(skin, scenario, 7, |_| Micros(0));
     bench.settle();
@@ -108,8 +109,8 @@ fn looked_at(skin: &Skin, scenario: &Scenario, mode: Sensing) -> (Bench, Micros)
     (bench, since)
 }
 
-/// The sensors of every touched cell at each joints that it took, of stimuli on the wire: each turn of its
-/// contact is a touch or a release, and has its frame before the next joints.
+/// Checks the sensors of every touched cell at each joints message, derived from the stimuli on the wire: each change
+/// of its contact is a touch or a release, and has its frame before the next joints. Returns the numbers of both.
 fn every_turn_was_reported(bench: &Bench, since: Micros) -> (usize, usize) {
     let events = bench.skin.events;
     let frames = sensors_frames(bench, since);
@@ -202,7 +203,7 @@ fn events_of_a_whole_skin_are_few_and_miss_no_touch_and_no_release() {
     assert!(touches > 5 * TOUCHED && releases > 4 * TOUCHED, "{touches} {releases}");
     let active: usize = bench.wire.iter().filter(|it| it.frame.id() >> 8 == Kind::Torque as u32).count();
     assert!(active as f64 > 0.85 * 100.0 * 62.5 * 7.0, "{active} torques: 100 cells are in contact");
-    // The gateway counts the same turns from what it hears.
+    // The gateway counts the same changes from the frames that it receives.
     bench.finish();
     accounts::check(&bench);
     let sensed = || bench.gateway.table.cells().iter().map(|cell| cell.sensed);

@@ -1,4 +1,4 @@
-//! Whole benches on which nothing goes wrong.
+//! Complete benches without faults.
 
 #![allow(clippy::unwrap_used, reason = "a test may stop")]
 
@@ -15,7 +15,7 @@ use skinbus_tests::bench::Bench;
 use skinbus_tests::gateway::epoch_of;
 use skinbus_tests::skins;
 
-/// The mean error of a single torque that is promised, in Nm.
+/// The documented mean error of a single torque, in Nm.
 const PROMISED_NM: f64 = 1.2e-4;
 
 fn totals(bench: &Bench) -> (Uplink, Replies) {
@@ -23,7 +23,7 @@ fn totals(bench: &Bench) -> (Uplink, Replies) {
     (cells().map(|cell| cell.uplink()).sum(), Replies::total(cells().map(|cell| cell.replies)))
 }
 
-/// Nothing is lost, late, unknown, repeated, or odd in any way.
+/// Checks that nothing is lost, late, unknown, repeated, or irregular in any way.
 fn assert_flawless(bench: &Bench) {
     accounts::check(bench);
     let (uplink, replies) = totals(bench);
@@ -89,7 +89,7 @@ fn a_contact_ends_with_one_zero_torque_and_nothing_is_held() {
 #[test]
 fn epochs_wrap_around_without_notices() {
     let mut bench = Bench::new(&skins::arm(2, Format::Fd), 3).started();
-    // Pressed from an epoch on that lies beyond the corner.
+    // Pressed from an epoch on that lies beyond the wrap-around.
     bench.run_epochs(200);
     let from = epoch_of(bench.gateway.broadcasts() + 100);
     bench.press_from(0, 2.0, From::Epoch(from));

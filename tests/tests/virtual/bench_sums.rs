@@ -1,4 +1,5 @@
-//! How far sums along a tree are from the central computation: rounding, carrying, and what the paper did.
+//! The error of sums along a tree against the central computation: with rounding, with carrying, and by the paper's
+//! method.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 #![allow(clippy::print_stdout, reason = "the figures are worth a look")]
@@ -14,12 +15,12 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// Cells that are touched.
+/// The number of cells that are touched.
 const ACTIVE: usize = 20;
-/// Epochs over which a constant touch is averaged.
+/// The number of epochs over which a constant touch is averaged.
 const AVERAGED: usize = 32;
 
-/// The paper's arm, whose cells add up along the shortest ways to the root.
+/// Returns the paper's arm, whose cells add up along the shortest ways to the root.
 fn tree(carry: bool) -> Tree {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../gateway/examples/ur5-253.toml");
     let skin = Skin::read(&path).unwrap();
@@ -28,7 +29,7 @@ fn tree(carry: bool) -> Tree {
     tree
 }
 
-/// One epoch, in whose sum everybody is who is touched.
+/// Runs one epoch, whose sum contains every touched cell.
 fn turn(tree: &mut Tree, q: &[f64; MAX_JOINTS], touch: &[(usize, SkinSensors)]) -> Came {
     let came = tree.turn(q, touch);
     assert_eq!(came.count, touch.len());
@@ -66,7 +67,7 @@ fn difference(a: &[f64; MAX_JOINTS], b: &[f64; MAX_JOINTS]) -> [f64; MAX_JOINTS]
     core::array::from_fn(|joint| a[joint] - b[joint])
 }
 
-/// Mean absolute errors of single epochs while the arm moves: of sums, and of truncation.
+/// Returns the mean absolute errors of single epochs while the arm moves: of sums, and of truncation.
 fn moving(carry: bool) -> (f64, f64) {
     let mut dice = Pcg64Mcg::seed_from_u64(1);
     let (mut sums, mut truncated) = (Mean::default(), Mean::default());
@@ -84,7 +85,7 @@ fn moving(carry: bool) -> (f64, f64) {
     (sums.mean(), truncated.mean())
 }
 
-/// Mean absolute error of the average over some epochs of a constant touch on an arm that stands.
+/// Returns the mean absolute error of the average over some epochs of a constant touch on an arm that stands.
 fn constant(carry: bool) -> f64 {
     let mut dice = Pcg64Mcg::seed_from_u64(2);
     let mut errors = Mean::default();

@@ -1,4 +1,4 @@
-//! Whole benches whose scenarios press cells with forces of their own.
+//! Complete benches whose scenarios press cells with forces of their own.
 
 #![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may stop")]
 

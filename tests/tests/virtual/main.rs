@@ -1,4 +1,4 @@
-//! Whole benches in virtual time: a queue of events, a clock that the test moves, faults from a seed.
+//! Complete benches in virtual time: a queue of events, a clock that the test moves, faults from a seed.
 
 mod bench_baseline;
 mod bench_bus;

@@ -1,6 +1,8 @@
-//! Calibrations in virtual time, over seeds: how good estimates are, how well they know that, and which cells they name.
+//! Calibrations in virtual time, over several seeds: the accuracy of estimates and of their stated uncertainty, and the
+//! cells that are marked.
 //!
-//! `SKINBUS_SEEDS=20` takes so many seeds instead of one. Recordings of loops that skip ticks are in `bars/campaign.rs`.
+//! `SKINBUS_SEEDS=20` sets the number of seeds, 1 by default. Recordings of loops that skip ticks are in
+//! `bars/campaign.rs`.
 
 #![allow(
     clippy::unwrap_used,
@@ -52,18 +54,18 @@ fn moved(skin: &Skin, bounds: &Bounds, seed: u64, defects: &[Defect]) -> Observa
     observe(skin, &motion, &Accelerometers::new(skin, &sheet, seed, GRAVITY), defects)
 }
 
-/// What of a calibration can be compared with the truth.
+/// The differences between a calibration and the truth.
 #[derive(Default)]
 struct Errors {
     position_mm: Vec<f64>,
     orientation_deg: Vec<f64>,
-    /// Cells whose truth is within what is stated.
+    /// The number of cells whose truth is within the stated uncertainty.
     covered: [usize; 2],
     wrong_joint: usize,
 }
 
 impl Errors {
-    /// Of the cells that `count` takes; the skin says where cells really are.
+    /// Adds the cells that `count` accepts; the skin has their true places.
     fn add(&mut self, skin: &Skin, calibration: &Calibration, count: impl Fn(usize, &CellResult) -> bool) {
         for (index, (cell, result)) in skin.cells.iter().zip(&calibration.cells).enumerate() {
             if !count(index, result) {
@@ -110,7 +112,7 @@ impl Errors {
     }
 }
 
-/// The mean error of torques as a part of their mean size, for forces on every cell in a few poses.
+/// Returns the mean error of torques relative to their mean size, for forces on every cell in a few poses.
 fn torque_error(truth: &Skin, found: &Skin) -> f64 {
     let [truth_central, found_central] = [truth, found].map(Central::unquantised);
     let (mut off, mut size) = (0.0, 0.0);
@@ -136,7 +138,7 @@ fn cells_on_a_ur5_are_found() {
     for seed in 0..seeds() {
         let settings = settings(&skin);
         let seen = moved(&skin, &settings.bounds, seed, &[]);
-        // Nobody knows where the cells are: all of them are described at one place.
+        // The places of the cells are unknown: all of them are described at the same place.
         let mut unknown = skin.clone();
         for cell in &mut unknown.cells {
             (cell.joint, cell.row) = (2, 2);
@@ -165,7 +167,8 @@ fn cells_on_an_arm_of_seven_joints_are_found() {
         let settings = settings(&skin);
         let seen = moved(&skin, &settings.bounds, seed, &[]);
         let calibration = calibrate(&skin, &seen, &settings).unwrap();
-        // The first joint turns about gravity: where around it a cell is, and how high, nothing tells.
+        // The first joint turns about gravity: nothing determines the angle around it, or the height, of a cell on its
+        // link.
         let determined = |result: &CellResult| {
             !result.troubles.iter().any(|it| matches!(it, Trouble::NotObservable { .. }))
         };
@@ -180,7 +183,7 @@ fn cells_on_an_arm_of_seven_joints_are_found() {
             );
         }
         let advice = calibration.cells[0].troubles[0].to_string();
-        assert!(advice.ends_with("no motion of this robot tells more; its description is kept"), "{advice}");
+        assert!(advice.ends_with("no motion of this robot would help; its description is kept"), "{advice}");
         errors.add(&skin, &calibration, |_, result| determined(result));
     }
     errors.check("panda", 3.0);
@@ -194,7 +197,7 @@ fn dead_swapped_and_loose_cells_are_named_and_spoil_no_other() {
         let mut settings = settings(&skin);
         settings.spacing = Some(Spacing::of(0.028));
         let mut defects = vec![Defect::None; skin.cells.len()];
-        // 13 cells of 253 are 5 %, 5 are 2 %, in two pairs and a half.
+        // 13 cells of 253 are 5 %; 5 are 2 %, in two pairs and a half.
         for dead in (0..13).map(|index| (index * 19 + 7) % 253) {
             defects[dead] = if dead % 3 == 0 { Defect::Stuck } else { Defect::Dead };
         }
@@ -208,7 +211,8 @@ fn dead_swapped_and_loose_cells_are_named_and_spoil_no_other() {
             described.cells[one].node = described.cells[other].node;
             described.cells[other].node = node;
         }
-        // Frames come under node ids: what cell 1 of the description has, the robot has where cell 11 is described.
+        // Frames carry node ids: the node id of cell 1 in the description is on the robot at the described place of
+        // cell 11.
         let mut heard = Observations::new(&described);
         heard.buses = seen.buses;
         for (index, cell) in described.cells.iter().enumerate() {
@@ -258,7 +262,7 @@ fn a_joint_that_does_not_move_is_named_as_what_would_help() {
     settings.bounds.length_s = 60.0;
     let sheet = DataSheet::default();
     let mut motion = plan(&skin, &settings.bounds, &sheet, GRAVITY).unwrap();
-    // The last joints are held.
+    // The last joints stand still.
     for timed in &mut motion.steps {
         use crate::motion::Step;
         match &mut timed.step {
@@ -281,7 +285,7 @@ fn zero_offsets_of_joints_are_found_or_called_not_observable() {
     let skin = testing::panda();
     let settings = Settings { zero_offsets: true, ..settings(&skin) };
     let seen = moved(&skin, &settings.bounds, 11, &[]);
-    // The robot that is described has other zeros than the one that moved.
+    // The described robot has other zeros than the one that moved.
     let mut described = skin;
     let offsets = [0.0, 0.01, -0.008, 0.012, -0.01, 0.006, 0.0];
     for (row, offset) in described.robot.chains[0].rows.iter_mut().zip(offsets) {

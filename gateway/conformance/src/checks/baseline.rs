@@ -1,4 +1,4 @@
-//! The zero of the force sensor: how it is found, followed, held and reported.
+//! The zero of the force sensor: how the cell finds, tracks, holds and reports it.
 
 use protocol::fixed::Q9_6;
 use protocol::message::{BaselinePage, SensorPage, SkinSensors};
@@ -12,14 +12,14 @@ use crate::session::{Heard, Reply, Session, Step};
 
 const BASELINE: u8 = 11;
 const TARE: u8 = 12;
-/// Touched from 0.1 N on, released at half of it; the zero holds, within 0.5 N.
+/// A touch begins at 0.1 N and ends at half of it; the zero is held, within 0.5 N.
 pub(super) const HOLD: [i16; WORDS] = [1, 102, 8_192, 0, LIMIT, 0];
 const LIMIT: i16 = 512;
-/// The highest rate: 1.07 steps of a contact word at each joints.
+/// The highest rate: the zero moves by 1.07 steps of a contact word at each joints message.
 const FOLLOW: [i16; WORDS] = [2, 102, 8_192, -1, LIMIT, 0];
 /// 0.02 N/°C.
 const SLOPE: i16 = 328;
-/// Joints before the first tare, and a few.
+/// The number of joints messages before the first tare, with some margin.
 const START: usize = 40;
 /// 25 °C.
 const WARM: i16 = 25 << 6;
@@ -49,7 +49,7 @@ fn reading(sum: i32, temperature: i16) -> SkinSensors {
     SkinSensors { temperature: [Q9_6::from_bits(temperature); 2], ..arm::press(sum) }
 }
 
-/// So many joints with this reading; what came of the last ones.
+/// Sends a number of joints messages with this reading, and returns the last step.
 fn reads(session: &mut Session<'_>, sum: i32, temperature: i16, joints: usize) -> Result<Step, Stop> {
     session.press(reading(sum, temperature))?;
     let mut step = session.step(&[0x0321; MAX_JOINTS])?;
@@ -59,7 +59,7 @@ fn reads(session: &mut Session<'_>, sum: i32, temperature: i16, joints: usize) -
     Ok(step)
 }
 
-/// Sensors pages 0 and 3 of a report: the sum of the contact words, and the zero.
+/// Requests a report, and returns the sum of the contact words, the zero (page 3) and page 0.
 fn report(session: &mut Session<'_>) -> Result<Option<(i32, BaselinePage, SkinSensors)>, Stop> {
     session.quiet(Span::from_millis(30))?;
     let pages = session.report()?;
@@ -76,7 +76,7 @@ const fn zero_of(page: &SensorPage) -> Option<BaselinePage> {
     if let SensorPage::Baseline(page) = page { Some(*page) } else { None }
 }
 
-/// Another rule, with which the zero is found again.
+/// Writes another rule, which makes the cell find its zero again.
 fn set(session: &mut Session<'_>, rule: [i16; WORDS]) -> Result<(), Stop> {
     let reply = session.write(BASELINE, rule)?;
     session.check("BASE-1", reply == Reply::Value(rule), || {
@@ -85,7 +85,7 @@ fn set(session: &mut Session<'_>, rule: [i16; WORDS]) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Another rule, and a first tare at this reading.
+/// Writes another rule, and waits for a first tare at this reading.
 fn tared(session: &mut Session<'_>, rule: [i16; WORDS], sum: i32) -> Result<(), Stop> {
     set(session, rule)?;
     reads(session, sum, WARM, START)?;
@@ -158,7 +158,7 @@ fn start(session: &mut Session<'_>) -> Result<(), Stop> {
             format!("contact words {got:?} of page 0 with a zero of {zero}, not {expected:?}")
         });
     }
-    // Beyond the limit it is a touch from the start.
+    // A reading beyond the limit is a touch from the start.
     set(session, HOLD)?;
     let step = reads(session, 700, WARM, START)?;
     session.check("BASE-2", step.torque.is_some(), || {
@@ -203,7 +203,7 @@ fn follows(session: &mut Session<'_>) -> Result<(), Stop> {
         let is_so = (min..=max).contains(&steps) || skips != session.skips;
         session.check("BASE-4", is_so, || {
             format!(
-                "{JOINTS} joints with 80 steps at {} uN/s: the zero is {steps} steps, {min} to {max} are right",
+                "{JOINTS} joints with 80 steps at {} uN/s: the zero is {steps} steps, not {min} to {max}",
                 rate.cast_unsigned()
             )
         });
@@ -215,7 +215,7 @@ fn temperature(session: &mut Session<'_>) -> Result<(), Stop> {
     let mut rule = HOLD;
     rule.iter_mut().skip(5).take(1).for_each(|word| *word = SLOPE);
     tared(session, rule, 0)?;
-    // 5 °C more, in contact: 0.1 N. Then less.
+    // 5 °C more, in contact, shift the zero by 0.1 N; 5 °C less shift it back.
     for (degrees, expected) in [(5, 102), (-5, -102)] {
         reads(session, TOUCH, WARM + (degrees << 6), 1)?;
         if let Some((sum, zero, _)) = report(session)? {
@@ -278,7 +278,7 @@ fn pages(session: &mut Session<'_>) -> Result<(), Stop> {
         let came = pages.find_map(|(_, page)| zero_of(page));
         session.check("BASE-7", came.is_some_and(|page| page.touched == touched), || {
             let came = came.map_or_else(|| "none".to_owned(), text);
-            format!("a touch or its end has to bring page 3: {came} came")
+            format!("a touch or its end must send page 3; {came} came")
         });
     }
     session.quiet(Span::from_millis(60))?;
@@ -290,7 +290,7 @@ fn pages(session: &mut Session<'_>) -> Result<(), Stop> {
     let count = pages.filter(|(_, page)| zero_of(page).is_some()).count();
     session.consume();
     session.check("BASE-7", count >= beats / 4 && count <= beats / 4 + 1, || {
-        format!("page 3 came {count} times with {beats} heartbeats; with each fourth is right")
+        format!("page 3 came {count} times with {beats} heartbeats, not with each fourth one")
     });
     Ok(())
 }

@@ -1,4 +1,4 @@
-//! When heartbeats come.
+//! The times of heartbeats.
 
 use protocol::message::{Message, State};
 use protocol::packet::Epoch;
@@ -11,9 +11,9 @@ use crate::bus::Stop;
 use crate::session::{Heard, Session};
 
 const BEAT: u64 = 250_000;
-/// How late a heartbeat may be.
+/// The allowed lateness of a heartbeat, in us.
 const LATE: u64 = 20_000;
-/// How far a clock may be off in one of these tests, and time stamps with it.
+/// The allowed error of a clock and of time stamps in one of these checks, in us.
 const SLACK: u64 = 3_000;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
@@ -33,26 +33,26 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Regular heartbeats that were seen.
+/// The regular heartbeats of an interval.
 #[derive(Clone, Copy, Debug)]
 struct Grid {
-    /// When the first of them was due at the latest, in us.
+    /// The time at which the first one was due at the latest, in us.
     due: u64,
-    /// The mean time from one to the next.
+    /// The mean interval, in us.
     each: u64,
 }
 
-/// Times in us, as ms.
+/// Formats times in us as ms.
 pub(super) fn in_ms(times: impl Iterator<Item = u64>) -> String {
     times.map(|us| (us / 1_000).to_string()).collect::<Vec<_>>().join(", ")
 }
 
-/// Times of heartbeats since the exchange began.
+/// Returns the times of the heartbeats since the exchange began.
 fn times(session: &Session<'_>) -> Vec<u64> {
     session.answers().iter().filter(|it| it.beat().is_some()).map(|it| it.at.0).collect()
 }
 
-/// A halt, and what is latched, hold for longer than 2 s, and heartbeats come meanwhile.
+/// Checks that a halt and a latched stimulus last longer than 2 s, and that heartbeats continue meanwhile.
 fn held(session: &mut Session<'_>) -> Result<Option<Grid>, Stop> {
     let presses = session.about.test_mode && session.about.committed;
     if presses {
@@ -77,7 +77,7 @@ fn held(session: &mut Session<'_>) -> Result<Option<Grid>, Stop> {
     Ok(grid)
 }
 
-/// Nothing is asked for so long: a heartbeat every 250 ms, at most 20 ms late.
+/// Checks that without any request a heartbeat comes every 250 ms, at most 20 ms late.
 fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, Stop> {
     let due = usize::try_from(ms * 1_000 / BEAT).unwrap_or_default();
     for attempt in 0..3 {
@@ -103,7 +103,7 @@ fn regular(session: &mut Session<'_>, ms: u64) -> Result<Option<Grid>, Stop> {
     Ok(None)
 }
 
-/// Heartbeats to a sync and to a claimant between regular ones.
+/// Checks that heartbeats that answer a sync or a claimant do not shift the regular ones.
 fn shifted(session: &mut Session<'_>) -> Result<(), Stop> {
     let claim = twin(session, 1, true);
     for (what, message, offset) in
@@ -118,7 +118,7 @@ fn shifted(session: &mut Session<'_>) -> Result<(), Stop> {
             let late = session.lateness();
             let times = times(session);
             session.consume();
-            // The answer, and two regular ones.
+            // The answer, and two regular heartbeats.
             let is_so = match times.as_slice() {
                 [answer, first, second] => {
                     answer - at.0 < LATE + SLACK
@@ -142,7 +142,7 @@ fn shifted(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// The next heartbeat that nothing asked for.
+/// Waits for the next regular heartbeat.
 fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, Stop> {
     session.settle()?;
     let until = session.now() + Span(BEAT + LATE + 50_000);
@@ -153,7 +153,8 @@ fn next_beat(session: &mut Session<'_>) -> Result<Option<Micros>, Stop> {
     Ok(at)
 }
 
-/// While joints come a heartbeat may be early: right after the answer to the last ones before it.
+/// Checks that while joints come, a heartbeat is early only as far as allowed: right after the answer to the last
+/// joints before it.
 fn early(session: &mut Session<'_>) -> Result<(), Stop> {
     const PERIOD: u64 = 16_000;
     for press in [4_096, 0] {
@@ -179,7 +180,7 @@ fn early(session: &mut Session<'_>) -> Result<(), Stop> {
             session.known.pending = None;
             session.known.skin = Some(arm::press(press));
             session.known.active = Some(press > 0);
-            // 1 024 ms: at most a period and a bit too early, each 250 ms once.
+            // 1024 ms: each heartbeat is at most a period and a bit early, and each 250 ms have one.
             let slots: Vec<_> = times
                 .iter()
                 .map(|at| {
@@ -207,8 +208,8 @@ fn early(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// A heartbeat that is early, or due at that moment, follows the torque of its epoch. A cell may come to a single one between
-/// taking joints and answering them.
+/// Checks that a heartbeat that is early, or due at that moment, follows the torque of its epoch. One exception is
+/// allowed: the cell may send a heartbeat between receiving joints and answering them.
 fn look_at_order(session: &mut Session<'_>) {
     let before = |place: usize, of: Epoch| {
         let later = session.answers().get(place..).unwrap_or_default();
@@ -222,18 +223,18 @@ fn look_at_order(session: &mut Session<'_>) {
     });
 }
 
-/// The cell's clock by its heartbeats, over some seconds.
+/// Checks the cell's clock by its heartbeats, over several seconds.
 fn clock(session: &mut Session<'_>, first: Grid, last: Grid) {
     let span = last.due.saturating_sub(first.due);
     let each = ((first.each + last.each) / 2).max(1);
     let beats = (span + each / 2) / each;
-    // 1 %, and how late the earliest of five heartbeats may be.
+    // 1 %, plus the lateness that the earliest of five heartbeats may have.
     let allowed = span / 100 + LATE / 4 + SLACK;
     let off = span.abs_diff(beats * BEAT);
     session.start();
     session.check("TIME-1", off <= allowed, || {
         format!(
-            "{beats} heartbeats in {} ms: its clock is off by {} us, and {allowed} are allowed",
+            "{beats} heartbeats in {} ms: its clock is off by {} us; {allowed} us are allowed",
             span / 1_000,
             off
         )

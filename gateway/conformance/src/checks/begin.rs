@@ -1,4 +1,4 @@
-//! What the cell is and which options it has.
+//! The first group: the identity of the cell and its options.
 
 use protocol::message::{Message, VERSION};
 use protocol::parameters::Parameter;
@@ -12,7 +12,7 @@ use crate::session::{Reply, Session};
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     session.mark();
     session.say(&[Message::Resume])?;
-    // Whoever sends sensor values is silenced.
+    // Stops sensor values without a request.
     session.known.senses = true;
     session.set(Parameter::Sensing.number(), [0])?;
     session.set(Parameter::Reply.number(), [0])?;
@@ -32,7 +32,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     let document = arm::document(2);
     session.about.committed = session.commit(&document)?;
     session.known.halted = Some(false);
-    // Before it the hash may have been 0.
+    // Before the commit the hash may have been 0.
     if session.about.committed { identity(session) } else { Ok(()) }
 }
 
@@ -76,7 +76,7 @@ fn options(session: &mut Session<'_>) -> Result<(), Stop> {
     session.set(Parameter::Sensing.number(), [0])?;
     let reply = session.write(Parameter::Baseline.number(), baseline::HOLD)?;
     session.about.baseline = reply.words().is_some();
-    // A cell that knows the protocol without it refuses with 18.
+    // A cell that implements the protocol without baselines refuses with 18.
     let is_known = session.about.baseline || matches!(reply, Reply::Refused(18 | 19));
     session.check("OPT-1", is_known, || format!("a write of parameter 11 was answered with {reply}"));
     session.set(Parameter::Baseline.number(), [0])?;

@@ -1,4 +1,4 @@
-//! A settled cell that receives its own `4nn`.
+//! Claims of the node id of a settled cell: it receives its own `4nn`.
 
 use protocol::id::Node;
 use protocol::message::{Heard as HeardPage, Heartbeat, Message, NetworkPage, Ports, Refused, State, Tree};
@@ -10,17 +10,17 @@ use crate::arm;
 use crate::bus::Stop;
 use crate::session::Session;
 
-/// No claim is answered again before this.
+/// The minimum time between two answered claims.
 const DEFEND: Span = Span::from_millis(10);
 
-/// A heartbeat of another cell with this node id.
+/// Returns a heartbeat of another cell with this node id.
 pub(super) fn twin(session: &Session<'_>, serial: u32, claiming: bool) -> Message {
     let state = State::default().with(State::CLAIMING, claiming).with_joint(0);
     let beat = Heartbeat { serial, state, ..Heartbeat::default() };
     Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page: NetworkPage::Heartbeat(beat) }
 }
 
-/// A page of another cell with this node id that is no heartbeat.
+/// Returns a page, other than a heartbeat, of another cell with this node id.
 pub(super) fn page(session: &Session<'_>, page: NetworkPage) -> Message {
     Message::Network { from: Node::Cell(session.cell), epoch: Epoch(0), page }
 }
@@ -32,7 +32,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
         defended(session, serial)?;
     }
     twice(session, own)?;
-    // What are serial number and CLAIMING of a heartbeat means other things there.
+    // The words of a heartbeat's serial number and CLAIMING have other meanings in these pages.
     let state = State::CLAIMING.0 | 1 << 12;
     let pages = [
         NetworkPage::Heard(HeardPage::default()),
@@ -48,7 +48,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     for other in others {
         not_answered(session, &other)?;
     }
-    // A claim is answered whatever came before it.
+    // A claim is answered regardless of the packets before it.
     session.quiet(Span::from_millis(120))?;
     let other = page(session, NetworkPage::Heard(HeardPage::default()));
     session.say(&[other])?;
@@ -57,14 +57,14 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// How often each state bit came in heartbeats since the exchange began.
+/// Returns the time and the state of each heartbeat since the exchange began.
 fn beats(session: &Session<'_>) -> Vec<(Micros, State)> {
     session.answers().iter().filter_map(|it| Some((it.at, it.beat()?.0.state))).collect()
 }
 
-/// A claim is answered at once, with DUPLICATE, which is clear then.
+/// Checks that a claim is answered at once with DUPLICATE, and that DUPLICATE is clear in the next heartbeat.
 fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), Stop> {
-    // How late the answer may be is a matter of TIME-2.
+    // The time of the answer is a matter of TIME-2.
     session.quiet(Span::from_millis(160))?;
     session.mark();
     let claim = twin(session, serial, true);
@@ -83,15 +83,15 @@ fn defended(session: &mut Session<'_>, serial: u32) -> Result<(), Stop> {
     let count = beats(session).len();
     session.check("CLAIM-6", count <= 1, || format!("a claim was answered with {count} heartbeats"));
     session.consume();
-    // The sync's heartbeat is looked at as any other.
+    // The heartbeat that answers the sync is checked as usual.
     session.exchange_all(&[])?;
     session.idle(DEFEND)
 }
 
-/// Of two claims within 10 ms one is answered; the next after that again.
+/// Checks that of two claims within 10 ms one is answered, and so is the next one after that time.
 fn twice(session: &mut Session<'_>, own: u32) -> Result<(), Stop> {
     if session.is_slow() {
-        session.findings.not_tested("CLAIM-6", "claims within 10 ms: the way to the cell takes too long");
+        session.findings.not_tested("CLAIM-6", "claims within 10 ms: the connection to the cell is too slow");
         return Ok(());
     }
     for _ in 0..3 {
@@ -111,7 +111,7 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), Stop> {
         session.check("CLAIM-6", count == 1, || {
             format!("three claims within {} us were answered with {count} heartbeats", apart.0)
         });
-        // The later ones are in the next heartbeat.
+        // The next heartbeat shows the later claims.
         session.mark();
         let at = session.say(&[Message::Sync])?;
         session.wait(at + Span::from_millis(50), |heard| heard.iter().any(|it| it.beat().is_some()))?;
@@ -127,16 +127,16 @@ fn twice(session: &mut Session<'_>, own: u32) -> Result<(), Stop> {
     Ok(())
 }
 
-/// What is no claim is not answered, and sets DUPLICATE in one heartbeat.
+/// Checks that a `4nn` that is not a claim gets no answer, and sets DUPLICATE in one heartbeat.
 fn not_answered(session: &mut Session<'_>, other: &Message) -> Result<(), Stop> {
     session.quiet(Span::from_millis(80))?;
     session.mark();
     session.say(&[*other])?;
     session.idle(Span::from_millis(25))?;
     let count = beats(session).len();
-    session.check("CLAIM-6", count == 0, || "a 4nn that is no claim was answered".to_owned());
+    session.check("CLAIM-6", count == 0, || "a 4nn that is not a claim was answered".to_owned());
     session.consume();
-    // A read of the identity shows it, and clears nothing.
+    // A read of the identity shows DUPLICATE, and does not clear it.
     let reply = session.read(Parameter::Identity.number())?;
     let shown = reply.words().map(|[.., state, _]| State(state.cast_unsigned())).unwrap_or_default();
     let is_set = shown.has(State::DUPLICATE);

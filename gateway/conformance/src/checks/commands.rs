@@ -1,4 +1,4 @@
-//! Halt, resume, sync and report.
+//! The commands halt, resume, sync and report.
 
 use model::central::Central;
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, Q9_6};
@@ -39,7 +39,8 @@ fn command(session: &mut Session<'_>, command: Message, id: &'static str) -> Res
     Ok(exchange)
 }
 
-/// Nothing comes to a halt or a resume by itself, and a heartbeat to a sync of a halted cell, while no regular one is due.
+/// Checks that a halt or a resume is not answered, and that a halted cell answers a sync with one heartbeat. No regular
+/// heartbeat is due meanwhile.
 fn alone(session: &mut Session<'_>) -> Result<(), Stop> {
     const ATTEMPTS: usize = 3;
     let cases = [
@@ -84,7 +85,7 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
         if round == 1 {
             command(session, Message::Halt, "CMD-1")?;
         } else {
-            // Nothing but a resume ends it.
+            // Only a resume ends a halt: neither a commit nor an exchange does.
             session.commit(&protocol::parameters::Parameters { period_us: 46_500, ..arm::document(6) })?;
             session.commit(&arm::document(6))?;
             session.exchange_all(&[])?;
@@ -110,14 +111,14 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
         session.check("CMD-2", off <= 8, || {
             format!("the first torque after a resume is not of the new joints: {}", arm::list(&step.words()))
         });
-        // Released while it was halted: ACTIVE was cleared, so no zeros are due.
+        // A release while halted clears ACTIVE, so no torque of zeros is due.
         command(session, Message::Halt, "CMD-1")?;
         session.pressed(&HERE, arm::press(0))?;
         command(session, Message::Resume, "CMD-2")?;
         let step = session.step(&THERE)?;
         session.check("CMD-1", step.torque.is_none(), || "released while halted: a torque came".to_owned());
     }
-    // A resume changes nothing in a cell that is not halted.
+    // A resume does not change a cell that is not halted.
     session.pressed(&HERE, unit)?;
     command(session, Message::Resume, "CMD-2")?;
     session.pressed(&HERE, arm::press(0))?;
@@ -125,7 +126,7 @@ fn halt(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// A heartbeat for each, and no more.
+/// Checks that each sync is answered with one heartbeat.
 fn syncs(session: &mut Session<'_>) -> Result<(), Stop> {
     const SYNCS: usize = 8;
     session.mark();
@@ -139,7 +140,7 @@ fn syncs(session: &mut Session<'_>) -> Result<(), Stop> {
         session.idle(Span::from_millis(4))?;
         beats = count(session.answers());
     }
-    // Regular ones may come between.
+    // Regular heartbeats may come between.
     let regular = 1 + usize::try_from(session.now().since(began).0 / 250_000).unwrap_or(0);
     session.check("CMD-3", (SYNCS..=SYNCS + regular).contains(&beats), || {
         format!("{SYNCS} syncs were answered with {beats} heartbeats")

@@ -1,4 +1,4 @@
-//! What cannot be used: dropped, counted by its reason, without any other effect.
+//! Unusable packets: the cell drops them, counts them by reason, and does nothing else.
 
 use protocol::can::{BIT_RATE_SWITCH, EXTENDED, Format, Frame};
 use protocol::id::{Command, Id, Kind, Node};
@@ -10,12 +10,12 @@ use crate::arm;
 use crate::bus::Stop;
 use crate::session::Session;
 
-/// A reason of page 2.
+/// The reason under which page 2 counts a packet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Reason {
     Length,
     Crc,
-    /// As far as the cell's controller delivers it.
+    /// Counted only if the cell's controller delivers the frame.
     MaybeForeign,
     Meaning,
     Incomplete,
@@ -35,7 +35,7 @@ impl Reason {
     }
 }
 
-/// Whether something comes each time.
+/// The number of attempts, to tell an answer from a regular heartbeat.
 const ATTEMPTS: usize = 3;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
@@ -56,10 +56,10 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
             let after = session.counters()?;
             let is_so = is_counted(before.refused, after.refused, reason) && before.heard == after.heard;
             session.check("COUNT-1", is_so, || {
-                format!("{what} has to be counted {} alone: {after}; before: {before}", reason.text())
+                format!("{what} must be counted only {}: {after}; before: {before}", reason.text())
             });
             before = after;
-            // A regular heartbeat may have come beside that to the sync, but not each time.
+            // A regular heartbeat may have come beside the one to the sync, but not in each attempt.
             beats = beats.min(exchange.beats);
             if beats <= 1 {
                 break;
@@ -84,7 +84,7 @@ fn is_counted(before: Refused, after: Refused, reason: Reason) -> bool {
     after == expected || reason == Reason::MaybeForeign && after == before
 }
 
-/// Packets that would have an effect if they were taken.
+/// Returns packets that would have an effect if the cell accepted them.
 fn packets(session: &Session<'_>) -> Vec<(&'static str, Packet)> {
     let own = Node::Cell(session.cell);
     let packet =
@@ -164,7 +164,7 @@ fn cases(session: &Session<'_>) -> Vec<(String, Vec<Frame>, Reason)> {
     cases
 }
 
-/// Bytes in the format of a bus.
+/// Returns frames with these bytes in the format of a bus.
 fn frames(format: Format, id: u32, bytes: &[u8]) -> Vec<Frame> {
     match format {
         Format::Fd => Frame::fd(id, BIT_RATE_SWITCH, bytes).into_iter().collect(),
@@ -172,7 +172,7 @@ fn frames(format: Format, id: u32, bytes: &[u8]) -> Vec<Frame> {
     }
 }
 
-/// Lengths that no packet of this kind has, with a right CRC where there is room for one.
+/// Adds lengths that this kind of packet cannot have, with a correct CRC if there is room for one.
 fn fd_lengths(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, packet: &Packet) {
     let id = u32::from(packet.id.to_bits());
     let has_long = packet.id == Id::command(Command::Joints);
@@ -201,12 +201,12 @@ fn fd_lengths(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, packet:
     cases.push((format!("{name} in a classic frame"), classic.into_iter().collect(), Reason::Length));
 }
 
-/// Frames that only look like packets.
+/// Adds frames that only resemble packets.
 fn foreign(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, format: Format, id: u32, bytes: &[u8]) {
-    // Of classic segments only the first would be there.
+    // On a classic bus, only the first segment.
     let whole = frames(format, id | EXTENDED, bytes).into_iter().take(1).collect();
     cases.push((format!("{name} under an identifier of 29 bits"), whole, Reason::MaybeForeign));
-    // The upper 11 of 29 bits; that of a wire's frames has the uppermost bit set.
+    // The upper 11 of 29 bits; the frames of a wire have the uppermost bit set.
     if id < 0x400 {
         let upper = frames(format, id << 18 | EXTENDED, bytes).into_iter().take(1).collect();
         cases.push((format!("{name} in the upper bits of 29"), upper, Reason::MaybeForeign));
@@ -215,7 +215,7 @@ fn foreign(cases: &mut Vec<(String, Vec<Frame>, Reason)>, name: &str, format: Fo
     cases.push((format!("a remote frame of {name}"), remote, Reason::MaybeForeign));
 }
 
-/// Pages and counts that do not exist, and identifiers that are for nobody or for others.
+/// Adds pages and counts that do not exist, and identifiers that are undefined or belong to other nodes.
 fn pages(session: &Session<'_>, cases: &mut Vec<(String, Vec<Frame>, Reason)>) {
     let own = Node::Cell(session.cell);
     let packet =

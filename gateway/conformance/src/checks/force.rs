@@ -1,4 +1,4 @@
-//! Algorithm 1 and the words of torques, to the bit: J is measured first, with a force under which words are J.
+//! Algorithm 1 and torque words, bit for bit. J is measured first, with a force for which the torque words equal J.
 
 use protocol::fixed::{Q1_14, Q3_12, Q5_10, TorqueFormat};
 use protocol::message::SkinSensors;
@@ -9,15 +9,15 @@ use crate::arm::{self, Dice};
 use crate::bus::Stop;
 use crate::session::Session;
 
-/// Forces of any size for each of several rules.
+/// The number of random forces for each of several rules.
 const RANDOM: usize = 40;
-/// Forces at which an error of rounding shows.
+/// The number of forces that reveal a rounding error.
 const SHOWN: usize = 12;
 
-/// Contact words and the proximity.
+/// The three contact words, and the proximity.
 type Sensed = ([i16; 3], i16);
 
-/// Joint positions at which J is known.
+/// Joint positions with a known J.
 struct Known {
     positions: [i16; MAX_JOINTS],
     j: [i16; MAX_JOINTS],
@@ -51,7 +51,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// One press at joints of which J is known.
+/// Checks one press at joint positions with a known J.
 fn press(
     session: &mut Session<'_>,
     parameters: &Parameters,
@@ -79,7 +79,7 @@ fn press(
     Ok(())
 }
 
-/// Products that end in just one half of a step, and words at the end of their range.
+/// Checks products that end in exactly half a step, and words at the limits of their range.
 fn ties(session: &mut Session<'_>, parameters: &Parameters, known: &[Known]) -> Result<(), Stop> {
     let format = parameters.torque_format;
     let bits = 30 - i64::from(format.fraction());
@@ -105,7 +105,7 @@ fn ties(session: &mut Session<'_>, parameters: &Parameters, known: &[Known]) -> 
     Ok(())
 }
 
-/// Gains and thresholds, each with sensor words at its corners: the three contact words and the proximity.
+/// Returns gains and thresholds, each with sensor words at their corner cases.
 fn rules() -> Vec<(Contact, Vec<Sensed>)> {
     let rule = |words: [i16; 5]| {
         let [alpha_c, alpha_p, contact, proximity, force] = words;
@@ -120,7 +120,7 @@ fn rules() -> Vec<(Contact, Vec<Sensed>)> {
     let big = i16::MAX;
     let max = i16::MAX;
     vec![
-        // Thresholds: what equals one counts.
+        // Thresholds: a value equal to the threshold counts.
         (
             arm::document_contact(),
             vec![
@@ -135,7 +135,7 @@ fn rules() -> Vec<(Contact, Vec<Sensed>)> {
                 ([max, i16::MIN, 200], 0),
             ],
         ),
-        // F_c is wider than a word; nothing pulls.
+        // F_c is wider than a word; forces are never negative.
         (
             rule([4096, 1024, 0, 0x0334, 0]),
             vec![
@@ -149,7 +149,7 @@ fn rules() -> Vec<(Contact, Vec<Sensed>)> {
                 ([big, 1, 0], 0),
             ],
         ),
-        // Steps below 2^-16 N: 127 of 2^-24 are none, 128 are one.
+        // Steps below 2^-16 N: 127 of 2^-24 round down to none, 128 round up to one.
         (
             rule([1, 1, 0, 0, 0]),
             vec![
@@ -167,7 +167,7 @@ fn rules() -> Vec<(Contact, Vec<Sensed>)> {
             rule([5, 3, 0, 0, 1]),
             vec![([818, 0, 0], 8), ([818, 0, 0], 7), ([819, 0, 0], 1), ([0, 0, 0], 5461), ([0, 0, 0], 5462)],
         ),
-        // F_c and F_p each have their own threshold, and F_z has another.
+        // F_c and F_p each have their own threshold, and F_z has another one.
         (
             rule([0x0CCD, 0x0666, 200, 4000, 300]),
             vec![
@@ -210,7 +210,7 @@ fn rule(
         let (Some(known), Some(shift)) = (known.get(place % 4), shift.get(place / 2 % 4)) else { continue };
         press(session, parameters, known, skin(random(*shift)), "FORCE-1")?;
     }
-    // Where F_z that is cut off instead of rounded gives another word.
+    // Forces for which truncating F_z instead of rounding it gives another word.
     let mut shown = 0;
     for attempt in 0..4_000 {
         let (Some(known), skin) = (known.get(attempt % 4), skin(random(3))) else { continue };
@@ -230,7 +230,7 @@ fn rule(
     Ok(())
 }
 
-/// Whether the last step of F_z is from rounding.
+/// Returns true if the last step of F_z comes from rounding.
 fn is_rounded_up(contact: &Contact, skin: &SkinSensors) -> bool {
     let bits = |word: i16| i64::from(word);
     let sum: i64 = skin.contact.iter().map(|word| bits(word.to_bits())).sum();

@@ -1,4 +1,4 @@
-//! Which joints are taken, and how they are counted and answered.
+//! Joints: which ones the cell accepts, and how it counts and answers them.
 
 use protocol::can::Frame;
 use protocol::packet::{Epoch, Length, Packet, Words};
@@ -23,7 +23,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     contacts(session)
 }
 
-/// Every epoch but the last is accepted, whatever its distance; more than 256 in a row.
+/// Checks that each epoch other than the last one is accepted, at any distance; more than 256 in a row.
 fn epochs(session: &mut Session<'_>) -> Result<(), Stop> {
     let before = session.counters()?.heard;
     let mut torque: Option<Words> = None;
@@ -44,16 +44,16 @@ fn epochs(session: &mut Session<'_>) -> Result<(), Stop> {
         torque = came.or(torque);
     }
     let after = session.counters()?.heard;
-    // All of them add up, and few can have come too late.
+    // The counters add up, and only few joints may have come too late.
     let skipped = after.joints_late.wrapping_sub(before.joints_late);
     let late = session.skips;
     session.check("JOINTS-5", skipped <= late, || {
-        format!("{skipped} joints were counted as skipped, and {late} were answered too late for that")
+        format!("{skipped} joints were counted as skipped; only {late} were answered late enough for that")
     });
     Ok(())
 }
 
-/// The epoch of the last joints again; 0 is one as any other.
+/// Checks that the epoch of the last joints is dropped when it is repeated; epoch 0 is not special.
 fn repeats(session: &mut Session<'_>) -> Result<(), Stop> {
     for is_zero in [false, true] {
         session.pressed(&POSITIONS, arm::press(4_096))?;
@@ -65,7 +65,7 @@ fn repeats(session: &mut Session<'_>) -> Result<(), Stop> {
             let exchange = session.exchange_all(&[joints])?;
             session.check("JOINTS-1", exchange.is_silent(), || format!("joints {first} were answered again"));
         }
-        // What waits for the next joints does not take these for them.
+        // A pending stimulus must not be latched by repeated joints.
         session.press(arm::press(2_000))?;
         let joints = session.joints(first, &POSITIONS);
         session.exchange_all(&[joints])?;
@@ -75,7 +75,7 @@ fn repeats(session: &mut Session<'_>) -> Result<(), Stop> {
         });
         let second = session.next_epoch();
         session.step_at(second, &POSITIONS)?;
-        // Between others the same epoch is another one.
+        // After other joints, the same epoch counts as a new one.
         session.step_at(first, &POSITIONS)?;
         session.step_at(second, &POSITIONS)?;
         let after = session.counters()?.heard;
@@ -85,13 +85,13 @@ fn repeats(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// A count that is not that of the chain, or cannot be at all.
+/// Checks joints whose count is not that of the chain, or is impossible.
 fn counts(session: &mut Session<'_>) -> Result<(), Stop> {
     session.pressed(&POSITIONS, arm::press(4_096))?;
     let mut before = session.counters()?;
     for count in [5, 1, 4, 0, 7, 15, 255] {
         let epoch = session.next_epoch();
-        // Held from the joints that follow on, whatever their epoch.
+        // The stimulus is latched by the next valid joints, whatever their epoch.
         let sum = 4_096 + i32::from(count) * 8;
         let before_press = session.latched()?;
         session.press(arm::press(sum))?;
@@ -112,14 +112,14 @@ fn counts(session: &mut Session<'_>) -> Result<(), Stop> {
         session.check(id, is_so, || {
             format!("joints with count {count} were not counted as meaning alone: {after}; before: {before}")
         });
-        // Their epoch is not the last one.
+        // The epoch of the dropped joints does not become the last one.
         let step = session.step_at(epoch, &POSITIONS)?;
         session.check("JOINTS-2", step.torque.is_some(), || {
             format!("after joints {epoch} with a wrong count those with the right one were not answered")
         });
         before = session.counters()?;
     }
-    // The order: what cannot be, then a repetition, then the chain.
+    // The order of a cell's checks: impossible counts, then repetitions, then the count of the chain.
     let last = session.known.last_epoch;
     for (count, is_repeated) in [(5, true), (0, false)] {
         let frames = raw(session, last, count, Length::Six);
@@ -144,20 +144,20 @@ fn counts(session: &mut Session<'_>) -> Result<(), Stop> {
         let is_so = after.refused.meaning == before.refused.meaning.wrapping_add(1)
             && after.refused.length == before.refused.length;
         session.check("JOINTS-2", is_so, || {
-            format!("joints of 7 in 20 bytes have to be counted as meaning: {after}; before: {before}")
+            format!("joints of 7 in 20 bytes must be counted as meaning: {after}; before: {before}")
         });
     }
     Ok(())
 }
 
-/// Joints with any count.
+/// Returns frames of joints with any count.
 fn raw(session: &Session<'_>, epoch: u8, count: u8, length: Length) -> Vec<Frame> {
     let id = session.joints(epoch, &POSITIONS).id();
     let packet = Packet { id, words: Words::new(length, POSITIONS), epoch: Epoch(epoch), count };
     packet.frames(session.format).collect()
 }
 
-/// Touches and releases: a torque each time, zeros once, then nothing.
+/// Checks touches and releases: a torque for each joints message, zeros once, then nothing.
 fn contacts(session: &mut Session<'_>) -> Result<(), Stop> {
     for round in 0..4 {
         for sum in [3_000, 3_000, 0, 0, 0, 9_000, 0, 0] {
@@ -174,7 +174,7 @@ fn contacts(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Joints that are older than a period of 1 us when the cell comes to them.
+/// Checks joints that are older than a period of 1 us when the cell processes them.
 pub(super) fn old(session: &mut Session<'_>) -> Result<(), Stop> {
     if !session.ready(&arm::document(6))? {
         return Ok(());
@@ -184,7 +184,7 @@ pub(super) fn old(session: &mut Session<'_>) -> Result<(), Stop> {
         burst(session, press, &mut shown)?;
     }
     if !shown.any {
-        session.findings.not_tested("JOINTS-4", "the cell came to all joints at once, and skipped none");
+        session.findings.not_tested("JOINTS-4", "the cell processed all joints at once, and skipped none");
     }
     session.known.active = None;
     none_is_lost(session)?;
@@ -192,20 +192,20 @@ pub(super) fn old(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// What bursts of joints have shown.
+/// The results of the bursts of joints.
 #[derive(Debug, Default)]
 struct Old {
-    /// Bursts in which old ones were answered.
+    /// The number of bursts in which old joints were answered.
     answered: usize,
     any: bool,
 }
 
-/// Bursts of joints.
+/// The number of bursts of joints.
 const BURSTS: usize = 4;
 
 fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), Stop> {
     const BURST: u8 = 24;
-    // In contact: what is skipped changes that as little as the commit does.
+    // In contact: skipped joints change the contact as little as the commit does.
     session.commit(&arm::document(6))?;
     session.pressed(&POSITIONS, arm::press(press + 1))?;
     session.commit(&Parameters { period_us: 1, ..arm::document(6) })?;
@@ -230,11 +230,11 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
     let answers: Vec<_> = session.answers().iter().filter_map(|it| Some((it.at, it.torque()?.0.0))).collect();
     if let Some(text) = look_at_old(&sent, &answers) {
         (shown.any, shown.answered) = (true, shown.answered + 1);
-        // The stamps of the bus are not those of the cell: one burst shows nothing.
+        // The time stamps of the bus differ from those of the cell: a single burst proves nothing.
         session.check("JOINTS-4", shown.answered < BURSTS, || text);
     }
     session.known.epoch = None;
-    // Of a burst a cell may lose some.
+    // A cell may lose some joints of a burst.
     session.forget_counters();
     let after = session.counters()?;
     let [joints, skipped, torques] = [
@@ -252,7 +252,7 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
     });
     shown.any |= skipped > 0;
     if skipped > 0 && taken == u16::from(BURST) {
-        // They are the last ones taken, latch stimuli and leave ACTIVE alone, all the same.
+        // Skipped joints still count as the last ones, latch stimuli and leave ACTIVE unchanged.
         let page = session.latched()?;
         session.check("STIM-8", page == Some(arm::press(press)), || {
             format!("skipped joints did not latch a stimulus: {}", arm::skin(page))
@@ -270,8 +270,8 @@ fn burst(session: &mut Session<'_>, press: i32, shown: &mut Old) -> Result<(), S
     Ok(())
 }
 
-/// Whoever sends the answer to one joint after another has come, and answers that one too, was late for it; which one shows
-/// that.
+/// Describes joints that were answered although they were too old. A cell that sends the answer to one joints message
+/// after the next one has come, and answers that one too, was late for it.
 fn look_at_old(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String> {
     const MARGIN: Span = Span(100);
     let late = answers.windows(2).find(|pair| match pair {
@@ -285,7 +285,7 @@ fn look_at_old(sent: &[(u8, Micros)], answers: &[(Micros, u8)]) -> Option<String
     ))
 }
 
-/// Joints that wait for others are taken too: the counters add up to what was sent.
+/// Checks that joints that wait behind others are accepted too: the counters add up to the number sent.
 fn none_is_lost(session: &mut Session<'_>) -> Result<(), Stop> {
     const WAIT: usize = 3;
     session.commit(&arm::document(6))?;

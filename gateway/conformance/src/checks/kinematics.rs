@@ -1,4 +1,4 @@
-//! J of arms of many shapes, and torque words to the bit.
+//! J of arms of many shapes, and torque words bit for bit.
 
 use model::central::Central;
 use protocol::fixed::{Q1_14, TorqueFormat};
@@ -8,9 +8,9 @@ use crate::arm::{self, Dice, Shape};
 use crate::bus::Stop;
 use crate::session::Session;
 
-/// Joint positions of one arm.
+/// The number of joint positions per arm.
 const POSES: usize = 20;
-/// Of one that is like others but for its number of joints.
+/// The same for arms that differ only in their number of joints.
 const FEW: usize = 4;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
@@ -24,7 +24,8 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     out_of_reach(session)
 }
 
-/// Arms that the cell can compute: a UR5, six revolute joints of any shape, and what else its identity says.
+/// Returns arms that the cell can compute: a UR5, six revolute joints of any shape, and the further shapes that its
+/// identity allows.
 fn arms(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
     let mut arms: Vec<_> = [2, 6, 1].map(arm::document).into();
     arms.extend(half_turns());
@@ -57,7 +58,7 @@ fn arms(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
     arms
 }
 
-/// A UR5 with half turns, whose word is the lowest one: of two twists, and of two joints.
+/// Returns a UR5 with half turns, whose word is the lowest one: in two twists, and in two joints.
 fn half_turns() -> [Parameters; 2] {
     let half = |places: [usize; 2], turn: fn(&mut Row)| {
         let mut parameters = arm::document(6);
@@ -69,7 +70,7 @@ fn half_turns() -> [Parameters; 2] {
     [half([1, 4], |row| row.alpha = Q1_14::MIN), half([0, 3], |row| row.theta_offset = Q1_14::MIN)]
 }
 
-/// Arms of each number of joints above six, with a row for each and the cell at their end.
+/// Returns arms of each number of joints above six, with a row for each joint and the cell at the tip.
 fn lengths(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
     let most = abilities.joints().min(abilities.rows());
     let of = |joints| {
@@ -79,7 +80,7 @@ fn lengths(dice: &mut Dice, abilities: Abilities) -> Vec<Parameters> {
     (7..=most).map(of).collect()
 }
 
-/// One arm at many joint positions.
+/// Checks one arm at many joint positions.
 fn one(
     session: &mut Session<'_>,
     dice: &mut Dice,
@@ -94,7 +95,7 @@ fn one(
     let mut positions = [0; MAX_JOINTS];
     for pose in 0..session.attempts(poses) {
         let next = arm::positions(dice, parameters);
-        // Every third time only joints beyond the sixth have moved.
+        // Every third time only joints beyond the sixth move.
         let stays = if pose % 3 == 2 && parameters.joints > 6 { 6 } else { 0 };
         positions.iter_mut().zip(next).skip(stays).for_each(|(position, next)| *position = next);
         let j = session.pressed(&positions, arm::press(arm::unit_press(format)))?.words();
@@ -128,7 +129,7 @@ fn look_at_j(
     });
 }
 
-/// Words of a torque of which J and the force are known.
+/// Checks the words of a torque with known J and force.
 pub(super) fn look_at_words(
     session: &mut Session<'_>,
     parameters: &Parameters,
@@ -149,7 +150,7 @@ pub(super) fn look_at_words(
     });
 }
 
-/// Levers of 3.8 m: of a link, and of a joint that slides beyond the range of a word.
+/// Checks levers of 3.8 m: one of a link, and one of a prismatic joint that slides beyond the range of a word.
 fn out_of_reach(session: &mut Session<'_>) -> Result<(), Stop> {
     let far = Q1_14::from_bits(31_000);
     let mut long = Parameters { joint: 1, joints: 1, ..arm::document(1) };
@@ -172,7 +173,8 @@ fn out_of_reach(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// With this normal J of the first joint is held at its lowest word, and with the other one at its highest.
+/// Checks that J of the first joint saturates at its lowest word with this normal, and at its highest word with the
+/// opposite one.
 fn held(
     session: &mut Session<'_>,
     arm: &Parameters,
@@ -191,7 +193,7 @@ fn held(
         session.check("J-2", is_held, || {
             let word = if sign > 0 { "8000" } else { "7FFF" };
             format!(
-                "a lever of {:.1} m: J is {first:04X}, and has to be held at {word}",
+                "a lever of {:.1} m: J is {first:04X}, and must saturate at {word}",
                 -3.78 * f64::from(sign)
             )
         });

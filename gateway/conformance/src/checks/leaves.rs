@@ -1,4 +1,4 @@
-//! What a commit, a resume and a write of the mode leave as it is.
+//! The state that a commit, a resume and a write of the mode leave unchanged.
 
 use protocol::id::Node;
 use protocol::message::{From, Message, SensorPage};
@@ -25,7 +25,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// In contact, and with a stimulus that is pending: the joints that it waits for.
+/// Puts the cell in contact with a pending stimulus, and returns the epoch of that stimulus.
 fn touched(session: &mut Session<'_>) -> Result<u8, Stop> {
     session.pressed(&POSITIONS, arm::press(HELD))?;
     let later = session.known.last_epoch.wrapping_add(20);
@@ -35,7 +35,7 @@ fn touched(session: &mut Session<'_>) -> Result<u8, Stop> {
     Ok(later)
 }
 
-/// What was latched and what was pending are there, one after the other.
+/// Checks that the latched and the pending stimulus are still there.
 fn is_touched(session: &mut Session<'_>, later: u8, id: &'static str, what: &str) -> Result<(), Stop> {
     let is_there = session.step(&POSITIONS)?.torque.is_some();
     session.check(id, is_there, || format!("{what} forgot the stimulus that was latched"));
@@ -55,13 +55,13 @@ fn commit(session: &mut Session<'_>) -> Result<(), Stop> {
     if session.about.sensing {
         session.known.senses = true;
         session.write(thresholds, events)?;
-        // None but the two of the switch comes meanwhile.
+        // Only the two pages of the switch come meanwhile.
         session.set(sensing, [1, i16::MAX])?;
         session.settle()?;
     }
     let before = session.counters()?;
     session.commit(&Parameters { period_us: 47_250, ..arm::document(6) })?;
-    // It is in contact until the next joints.
+    // The cell stays in contact until the next joints.
     session.exchange_all(&[])?;
     let after = session.counters()?;
     session
@@ -78,14 +78,14 @@ fn commit(session: &mut Session<'_>) -> Result<(), Stop> {
         session.settle()?;
         session.known.senses = false;
     }
-    // Nor does the epoch begin again.
+    // The epoch does not begin again either.
     let joints = session.joints(session.known.last_epoch, &POSITIONS);
     let again = session.exchange_all(&[joints])?;
     session.check("CONF-7", again.is_silent(), || {
         "after a commit the last joints are answered again".to_owned()
     });
     is_touched(session, later, "CONF-7", "a commit")?;
-    // Halted it stays so.
+    // A halted cell stays halted.
     session.say(&[Message::Halt])?;
     (session.known.halted, session.known.active) = (Some(true), Some(false));
     session.commit(&arm::document(6))?;
@@ -109,7 +109,7 @@ fn resume(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// A write of parameter 5 forgets stimuli, and nothing else; also one to everyone.
+/// Checks that a write of parameter 5 forgets stimuli and changes nothing else, also when it is sent to everyone.
 fn mode(session: &mut Session<'_>) -> Result<(), Stop> {
     for to in [Node::Cell(session.cell), Node::Everyone] {
         touched(session)?;

@@ -1,4 +1,4 @@
-//! A cell that measures: its sensors are not known, and its answers have to agree with its ACTIVE all the same.
+//! A cell that measures: the bench does not know its sensor values, but its answers must agree with ACTIVE.
 
 use protocol::message::State;
 use protocol::parameters::MAX_JOINTS;
@@ -7,7 +7,7 @@ use crate::arm;
 use crate::bus::Stop;
 use crate::session::Session;
 
-/// Joints that are sent.
+/// The number of joints messages.
 const JOINTS: i16 = 12;
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {

@@ -30,17 +30,17 @@ use crate::bus::Stop;
 use crate::findings::Only;
 use crate::session::Session;
 
-/// What a group of checks needs.
+/// The precondition of a group of checks.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Needs {
     Nothing,
     /// Test mode, and a configuration that can be committed.
     Press,
-    /// The command of a restart.
+    /// The restart command.
     Restart,
     /// Sensor values without a request.
     Sensing,
-    /// A zero that is subtracted.
+    /// A baseline, which the cell subtracts.
     Baseline,
     /// Classic frames.
     Classic,
@@ -48,7 +48,7 @@ enum Needs {
 
 /// A group of checks.
 struct Group {
-    /// The requirements that it is about.
+    /// The requirements that the group covers.
     about: &'static [&'static str],
     needs: Needs,
     run: fn(&mut Session<'_>) -> Result<(), Stop>,
@@ -108,24 +108,24 @@ const GROUPS: &[Group] = &[
     ),
 ];
 
-/// What the groups after one that is repeated take.
+/// The time that the groups after a repeated one need.
 const RESERVE: Span = Span::from_millis(20_000);
 
-/// What no cell can be tested for from its bus, and why.
+/// The parts of requirements that cannot be tested from the bus of any cell, with the reason.
 const BEYOND: &[(&str, &str)] = &[
     ("CLAIM-8", "wires cannot be reached from the bus"),
-    ("TIME-3", "only of torques, answers and pages, not of the tree's"),
-    ("CONF-7", "flash that cannot be written: nothing on the bus makes it fail"),
-    ("CONF-8", "damaged flash: nothing on the bus damages it"),
-    ("BEAT-1", "after a hang: nothing on the bus makes a cell hang"),
-    ("ID-1", "that no other cell has it"),
-    ("CLAIM-1", "(serial mod 64) ms after the start: when it started is not on the bus"),
+    ("TIME-3", "the order of packets of the tree"),
+    ("CONF-7", "a failing flash: the bus cannot cause it"),
+    ("CONF-8", "damaged flash: the bus cannot cause it"),
+    ("BEAT-1", "after a hang: the bus cannot cause it"),
+    ("ID-1", "uniqueness among all cells"),
+    ("CLAIM-1", "(serial mod 64) ms after the start: the bus does not show the start"),
 ];
 
-/// Tests what is asked for; [`Session::save`] comes before it, [`Session::restore`] after it.
+/// Runs the requested checks. Call [`Session::save`] before it and [`Session::restore`] after it.
 ///
 /// # Errors
-/// Why the test could not go on.
+/// Returns the reason why the test could not continue.
 pub fn run(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
     let done = groups(session, only);
     if done.is_ok() {
@@ -161,8 +161,8 @@ fn groups(session: &mut Session<'_>, only: &Only) -> Result<(), Stop> {
     if only.has("TIME-2") && session.about.committed { session.measure_times() } else { Ok(()) }
 }
 
-/// Runs a group; again, if something failed while this computer was late, for a cell that is a process may have waited for a
-/// processor as well. It has to meet each requirement in one of a few attempts then.
+/// Runs a group, and repeats it if something failed while this computer was late: a cell that is a process may have
+/// waited for a processor as well. The cell then has to meet each requirement in one of a few attempts.
 fn run_group(session: &mut Session<'_>, group: &Group) -> Result<(), Stop> {
     const ATTEMPTS: usize = 4;
     const LATE: Span = Span::from_millis(4);
@@ -195,7 +195,8 @@ fn run_group(session: &mut Session<'_>, group: &Group) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Whether the cell has what a group needs; else whether it might, and why not.
+/// Checks that the cell has the group's precondition. The error gives the reason, and true if the cell might have it
+/// (not tested) or false if it does not (not applicable).
 fn met(session: &Session<'_>, needs: Needs) -> Result<(), (bool, &'static str)> {
     let about = &session.about;
     match needs {
@@ -224,7 +225,7 @@ fn met(session: &Session<'_>, needs: Needs) -> Result<(), (bool, &'static str)> 
     }
 }
 
-/// What wires are needed for.
+/// Marks the requirements that need wires.
 fn tree(session: &mut Session<'_>) {
     use crate::requirements::{Document, REQUIREMENTS};
     let ids = REQUIREMENTS.iter().filter(|it| it.document == Document::Tree && it.id != "LINK-1");

@@ -1,4 +1,4 @@
-//! What is switched at run time; options that a cell may lack; and what it has to ignore.
+//! Volatile parameters, options that a cell may lack, and contents that it must ignore.
 
 use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id, Kind, Node};
@@ -32,7 +32,7 @@ pub(super) fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// A write, and what has to come of it.
+/// Writes a parameter, and checks the reply.
 fn expect(
     session: &mut Session<'_>,
     id: &'static str,
@@ -47,7 +47,7 @@ fn expect(
     Ok(())
 }
 
-/// A write that cannot be, which changes nothing.
+/// Writes an impossible value, and checks that it is refused and changes nothing.
 fn refuse(
     session: &mut Session<'_>,
     id: &'static str,
@@ -63,7 +63,7 @@ fn refuse(
     Ok(())
 }
 
-/// Test mode is on after 1 and off after everything else, at once.
+/// Checks that test mode is on after 1 and off after every other value, at once.
 fn mode(session: &mut Session<'_>) -> Result<(), Stop> {
     if !session.about.test_mode {
         expect(session, "OPT-1", 5, [0; WORDS], Reply::Value([0; WORDS]))?;
@@ -146,7 +146,7 @@ fn sensing(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// To a cell without a baseline its parameters can only be zeros.
+/// Checks that a cell without a baseline accepts only zeros in its parameters.
 fn no_baseline(session: &mut Session<'_>) -> Result<(), Stop> {
     let reply = session.read(BASELINE)?;
     if session.about.baseline || reply == Reply::Refused(18) {
@@ -179,7 +179,7 @@ fn links(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Rows that the cell cannot have.
+/// Checks rows that the cell cannot have.
 fn rows(session: &mut Session<'_>) -> Result<(), Stop> {
     let most = session.about.abilities.rows();
     let Some(number) = u8::try_from(most).ok().filter(|most| *most < 32).map(|most| 16 + most) else {
@@ -193,7 +193,7 @@ fn rows(session: &mut Session<'_>) -> Result<(), Stop> {
     refuse(session, "OPT-1", number, words([1, 2, 3, 4]))
 }
 
-/// Words, bytes and bits that mean nothing.
+/// Checks that unused words, bytes and bits are ignored.
 pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), Stop> {
     session.ready(&arm::document(2))?;
     let junk = |command| Packet {
@@ -227,7 +227,7 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), Stop> {
     session.check("OPT-2", is_there, || "a sync with words that mean nothing was ignored".to_owned());
     read_with_words(session)?;
     if session.format == Format::Fd {
-        // Without bit-rate switch.
+        // A frame without the bit-rate switch.
         let sync = Message::Sync.encode();
         let frame = Frame::fd(sync.id.to_bits().into(), 0, &sync.encode());
         session.mark();
@@ -243,7 +243,7 @@ pub(super) fn ignored(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// The words of a read mean nothing.
+/// Checks that the words of a read are ignored.
 fn read_with_words(session: &mut Session<'_>) -> Result<(), Stop> {
     let id = Id::new(Kind::Configure, Node::Cell(session.cell));
     let packet = Packet { id, words: [9, 8, 7, 6, 5, 4].into(), epoch: Epoch(3), count: 2 };
@@ -257,7 +257,7 @@ fn read_with_words(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Joints of a shorter chain with words behind it, and a stimulus with words that its page does not have.
+/// Checks joints of a shorter chain with further words, and a stimulus with words that its page does not have.
 fn words_beyond(session: &mut Session<'_>) -> Result<(), Stop> {
     let short = protocol::parameters::Parameters { joints: 3, ..arm::document(2) };
     if !session.ready(&short)? {

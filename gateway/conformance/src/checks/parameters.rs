@@ -1,4 +1,4 @@
-//! Parameters: reading, staging, the hash, the commit, and whom a request is for.
+//! Parameters: reading, staging, the hash, the commit, and the addressing of requests.
 
 use protocol::fixed::{Q1_14, Q3_12};
 use protocol::id::{CellId, Node};
@@ -10,7 +10,7 @@ use crate::arm;
 use crate::bus::Stop;
 use crate::session::{Reply, Session};
 
-/// Another configuration, which differs in each parameter.
+/// Returns a configuration that differs in each parameter.
 fn other() -> Parameters {
     let mut other = Parameters { joint: 6, period_us: 50_000, ..arm::document(6) };
     other.contact.alpha_c = Q3_12::from_bits(5_000);
@@ -28,12 +28,12 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     }
     reads(session, &one, "CONF-1")?;
     session.stage(&other)?;
-    // What is staged is not read, not hashed and not computed with.
+    // Staged values are neither read, hashed nor used for computing.
     reads(session, &one, "CONF-2")?;
     session.exchange_all(&[])?;
     computes(session, &one, &other, "CONF-2")?;
     if session.about.test_mode {
-        // The joints of the chain are those in use too.
+        // The joints of the chain are those in use, too.
         session.stage(&Parameters { joints: 3, joint: 3, ..other })?;
         let step = session.pressed(&[0x0222; MAX_JOINTS], arm::press(4_096))?;
         session.check("JOINTS-2", step.torque.is_some(), || {
@@ -61,7 +61,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     tags(session)
 }
 
-/// Each stored parameter is read as it is in use.
+/// Checks that each stored parameter reads as the value in use.
 fn reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> Result<(), Stop> {
     for parameter in Parameter::stored(6) {
         let reply = session.read(parameter.number())?;
@@ -73,7 +73,7 @@ fn reads(session: &mut Session<'_>, expected: &Parameters, id: &'static str) -> 
     Ok(())
 }
 
-/// The torque is that of these parameters, and not of the others.
+/// Checks that the torque follows from one set of parameters, and not from the other.
 fn computes(
     session: &mut Session<'_>,
     expected: &Parameters,
@@ -97,13 +97,13 @@ fn computes(
     };
     debug_assert!(!near(expected) || !near(not), "they are apart");
     session.check(id, near(expected), || {
-        format!("the torque {} is not of what is in use", arm::list(&step.words()))
+        format!("the torque {} does not follow from the parameters in use", arm::list(&step.words()))
     });
     session.pressed(&positions, arm::press(0))?;
     Ok(())
 }
 
-/// Words that a parameter does not use.
+/// Checks words that a parameter does not use.
 fn unused(session: &mut Session<'_>) -> Result<(), Stop> {
     let expected = Parameters { period_us: 57_001, ..arm::document(3) };
     session.stage(&expected)?;
@@ -129,7 +129,7 @@ fn unused(session: &mut Session<'_>) -> Result<(), Stop> {
     let reply = session.write(Parameter::Commit.number(), [hash.cast_signed(), 1, 2, 3, 4, 5])?;
     let is_so = reply == Reply::Value(words([hash.cast_signed()]));
     session.check("CONF-3", is_so, || {
-        format!("unused words were written and have to be hashed as 0: commit {hash:04X} was answered with {reply}")
+        format!("unused words must be hashed as 0: commit {hash:04X} was answered with {reply}")
     });
     if is_so {
         session.known.parameters = Some(expected);
@@ -152,7 +152,7 @@ fn tags(session: &mut Session<'_>) -> Result<(), Stop> {
         session.request_with(own, tag, Request::Write { number, words: words([on]) })?;
         session.request_with(own, tag, Request::Read { number: 99 })?;
     }
-    // The very same request is answered each time.
+    // An identical request is answered each time.
     let pose = arm::document(3).words(Parameter::Pose);
     let hash = session.known.hash.unwrap_or_default().cast_signed();
     session.write(Parameter::Pose.number(), pose)?;
@@ -177,7 +177,7 @@ fn tags(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Requests to everyone and to other cells, and parameters that do not exist.
+/// Checks requests to everyone and to other cells, and parameters that do not exist.
 pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
     session.ready(&arm::document(2))?;
     let reply = session.request(Node::Everyone, Request::Read { number: 2 })?;
@@ -199,7 +199,7 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
     });
     let staged = Parameters { pose: other().pose, ..arm::document(2) };
     session.known.staged = Some(staged);
-    // A commit of everyone is one of this cell.
+    // A commit to everyone is a commit of this cell.
     let hash = words([staged.hash().cast_signed()]);
     let commit = Request::Write { number: Parameter::Commit.number(), words: hash };
     let reply = session.request(Node::Everyone, commit)?;
@@ -218,7 +218,7 @@ pub(super) fn others(session: &mut Session<'_>) -> Result<(), Stop> {
 
 fn unknown(session: &mut Session<'_>) -> Result<(), Stop> {
     for number in (10..=10).chain(13..16).chain(48..127) {
-        // Each kind of request every other time.
+        // Reads and writes alternate.
         let reply = if number % 2 == 0 { session.read(number)? } else { session.set(number, [1, 2, 3])? };
         session.check("CONF-13", reply == Reply::Refused(18), || {
             format!("parameter {number} does not exist, and was answered with {reply}")
@@ -234,7 +234,7 @@ fn unknown(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// What is for another cell is not answered and has no effect.
+/// Checks that a packet for another cell gets no answer and has no effect.
 fn not_its_own(session: &mut Session<'_>) -> Result<(), Stop> {
     let before = session.counters()?;
     let own = session.cell.get();

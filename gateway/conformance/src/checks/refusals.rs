@@ -1,4 +1,4 @@
-//! Writes and commits that cannot be: the reason, and that nothing changes.
+//! Refused writes and commits: the reason, and that nothing changes.
 
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 
@@ -16,7 +16,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     let staged = Parameters { period_us: 45_000, ..arm::document(5) };
     session.stage(&staged)?;
     writes(session, &staged)?;
-    // What was refused is not staged.
+    // A refused write does not change the staged copy.
     let hash = staged.hash().cast_signed();
     let reply = session.set(Parameter::Commit.number(), [hash])?;
     let is_so = reply.words().is_some_and(|words| words.first() == Some(&hash));
@@ -31,7 +31,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
         (session.known.parameters, session.known.hash, session.known.staged) = (None, None, None);
     }
     commits(session)?;
-    // In use is still what was, and so is the rest of the staged copy.
+    // The values in use are unchanged, and so is the rest of the staged copy.
     session.stage(&staged)?;
     let reply = session.read(Parameter::Timing.number())?;
     session.check("CONF-5", reply == Reply::Value(staged.words(Parameter::Timing)), || {
@@ -45,7 +45,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Refused when they are written: several bad words at once, from the lowest reason.
+/// Checks writes that are refused at once. Of several bad words, the lowest reason is reported.
 fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), Stop> {
     let mount = |words: [i16; 5], reason| (Parameter::Mount, words, reason);
     let row = |kind: i16| (Parameter::Row(1), [1, 2, 3, 4, kind], 9);
@@ -80,20 +80,20 @@ fn writes(session: &mut Session<'_>, good: &Parameters) -> Result<(), Stop> {
         let reply = session.set(parameter.number(), words)?;
         session.check("CONF-6", reply == Reply::Refused(reason), || {
             format!(
-                "parameter {} with {} has to be refused with {reason}: {reply}",
+                "parameter {} with {} must be refused with {reason}: {reply}",
                 parameter.number(),
                 arm::list(&words)
             )
         });
         if reply.words().is_some() {
-            // Staged after all: put that back.
+            // The cell staged it after all: restore the staged copy.
             session.write(parameter.number(), good.words(parameter))?;
         }
     }
     Ok(())
 }
 
-/// What is wrong with a configuration, and the reason that a commit gives.
+/// A defect of a configuration: the reason that a commit gives, and the change that causes it.
 type Flaw = (i16, fn(&mut Parameters));
 
 const FLAWS: &[Flaw] = &[
@@ -117,14 +117,14 @@ const MORE: &[Flaw] = &[
     (5, |it| it.contact.contact_threshold = Q5_10::MIN),
     (5, |it| it.contact.proximity_threshold = Q1_14::from_bits(-1)),
     (5, |it| it.contact.force_threshold = Q5_10::from_bits(-1)),
-    // Right but for the hash.
+    // Valid except for the hash.
     (16, |it| it.pose.normal = [Q1_14::ZERO, Q1_14::ZERO, Q1_14::from_bits(16_511)]),
     (16, |it| it.pose.normal = [Q1_14::from_bits(-16_256), Q1_14::ZERO, Q1_14::ZERO]),
     (16, |it| it.period_us = 0xFFFF),
     (16, |it| it.joint = 6),
 ];
 
-/// Flaws of tables of rows.
+/// Defects of tables of rows.
 const ROWS: &[Flaw] = &[
     (7, |it| (it.table_rows, it.row) = (5, 2)),
     (7, |it| it.table_rows = 255),
@@ -139,7 +139,7 @@ const ROWS: &[Flaw] = &[
     (16, |it| (it.table_rows, it.row) = (6, 2)),
 ];
 
-/// Refused at the commit. The hash is wrong too, so that nothing is committed whatever the cell thinks.
+/// Checks defects that are refused at the commit. The hash is wrong too, so that a faulty cell commits nothing.
 fn commits(session: &mut Session<'_>) -> Result<(), Stop> {
     let can_rows = session.about.abilities.word() != 0;
     let is_apt = |flaw: &&Flaw| can_rows || !matches!(flaw.0, 7 | 8);
@@ -167,7 +167,7 @@ fn commits(session: &mut Session<'_>) -> Result<(), Stop> {
     refused(session, &all, 2)
 }
 
-/// 33 rows, whatever the joints are.
+/// Checks 33 rows with any joints.
 fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), Stop> {
     let mut full = Parameters { table_rows: 32, row: 6, joint: 6, ..*base };
     for (place, row) in full.rows.iter_mut().enumerate().skip(6) {
@@ -180,7 +180,7 @@ fn one_row_more(session: &mut Session<'_>, base: &Parameters) -> Result<(), Stop
         session.write(Parameter::Mount.number(), over.words(Parameter::Mount))?;
         let reply = session.set(Parameter::Commit.number(), [1])?;
         session.check("CONF-6", reply == Reply::Refused(7), || {
-            format!("a commit of 33 rows with {joints} joints has to be refused with 7: {reply}")
+            format!("a commit of 33 rows with {joints} joints must be refused with 7: {reply}")
         });
     }
     session.known.staged = None;
@@ -194,7 +194,7 @@ fn refused(session: &mut Session<'_>, parameters: &Parameters, reason: i16) -> R
     session.check("CONF-6", reply == Reply::Refused(reason), || {
         let words = |parameter| Reply::Value(parameters.words(parameter));
         format!(
-            "a commit with a wrong hash has to be refused with {reason}: {reply}; staged are mount {}, pose {}, \
+            "a commit with a wrong hash must be refused with {reason}: {reply}; staged are mount {}, pose {}, \
              contact {}, timing {}",
             words(Parameter::Mount),
             words(Parameter::Pose),

@@ -1,4 +1,4 @@
-//! What shows only at a start: the address claim, and what survives.
+//! Requirements that show only at a start: the address claim, and the state that survives.
 
 mod claiming;
 #[cfg(test)]
@@ -16,7 +16,7 @@ use crate::bus::Stop;
 use crate::session::{Heard, Known, PATIENT, Reply, Session};
 use claiming::{gives_way, invalid, stays, while_claiming};
 
-/// How long a cell may take from being switched off to its first packet.
+/// The time limit from switching the cell off to its first packet.
 const BOOT: Span = Span::from_millis(8_000);
 
 pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
@@ -26,7 +26,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     stays(session)?;
     invalid(session)?;
     let own = session.about.serial.unwrap_or_default();
-    // CLAIMING and a higher serial number stand there in a heartbeat only.
+    // CLAIMING and a higher serial number have these meanings in a heartbeat only.
     let state = State::CLAIMING.0 | 1 << 12;
     let other =
         protocol::message::Refused { length: 0xFFFF, crc: 0xFFFF, stimuli: state, ..Default::default() };
@@ -49,12 +49,12 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     in_the_middle(session)
 }
 
-/// When claiming ends after the first heartbeat.
+/// Returns the time from the first heartbeat to the end of claiming.
 fn claim(session: &Session<'_>) -> Span {
     Span(250_000 + u64::from(session.cell.get()) * 250_000 / 255)
 }
 
-/// Switches the cell off and on: when its first packet came.
+/// Switches the cell off and on, and returns the time of its first packet.
 fn restart(session: &mut Session<'_>) -> Result<Micros, Stop> {
     let came = restart_with(session, BOOT, |_| Ok(()))?;
     came.ok_or_else(|| {
@@ -64,7 +64,7 @@ fn restart(session: &mut Session<'_>) -> Result<Micros, Stop> {
     })
 }
 
-/// The same for so long; `meanwhile` is called again and again until that packet.
+/// The same with a time limit; `meanwhile` is called repeatedly until that packet.
 fn restart_with(
     session: &mut Session<'_>,
     longest: Span,
@@ -81,21 +81,21 @@ fn restart_with(
     session.end_restart();
     done?;
     let Some(came) = session.claimed() else { return Ok(None) };
-    // Packets before it were sent before the cell was switched off: it was settled, and may have been asked something.
+    // Packets from before the cell was switched off: it was settled, and may have received requests.
     let is_old = |it: &Heard| {
         let is_answer = matches!(it.message, Message::Configured { .. });
         is_answer || it.beat().is_some() || senses && it.sensors().is_some()
     };
     let stray = session.answers().iter().take_while(|it| it.at < came).any(|it| !is_old(it));
     session.check("CLAIM-1", !stray, || {
-        "its first packet after a restart is no heartbeat with CLAIMING".to_owned()
+        "its first packet after a restart is not a heartbeat with CLAIMING".to_owned()
     });
     session.known.parameters = parameters;
     session.known.staged = None;
     Ok(Some(came))
 }
 
-/// Waits for so long at most until the restart is done and a new life of the cell has begun.
+/// Waits until the restart is done and the cell has started again, up to a time limit.
 fn await_claim(
     session: &mut Session<'_>,
     longest: Span,
@@ -123,12 +123,12 @@ fn await_claim(
     }
 }
 
-/// Waits until its node id is settled: when the first heartbeat without CLAIMING came.
+/// Waits until the node id is settled, and returns the time of the first heartbeat without CLAIMING.
 fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>, Stop> {
     let is_settled =
         |it: &Heard| it.at > claimed && it.beat().is_some_and(|(beat, _)| !beat.state.has(State::CLAIMING));
     let until = claimed + claim(session) + Span::from_millis(300);
-    // It may have come in an exchange before, when the bench was late.
+    // It may have come in an earlier exchange, if the bench was late.
     let first = |session: &Session<'_>| {
         let since = session.heard.iter().rev().take_while(|it| it.at > claimed);
         since.filter(|it| is_settled(it)).last().map(|it| it.at)
@@ -147,7 +147,7 @@ fn settled(session: &mut Session<'_>, claimed: Micros) -> Result<Option<Micros>,
     Ok(at)
 }
 
-/// A plain restart: what is kept, what is lost, what is counted.
+/// Checks a plain restart: the values that are kept, lost and counted.
 fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
     let kept = arm::distinct(session.about.abilities);
     session.ready(&kept)?;
@@ -158,14 +158,14 @@ fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
     session.stage(&staged)?;
     if session.about.sensing {
         session.known.senses = true;
-        // None comes before it is switched off.
+        // Sensor pages are set to come only after the cell is switched off.
         session.set(7, [1, i16::MAX])?;
         session.set(8, [1, 2, 3, 4, 5])?;
     }
     session.mark();
     session.say(&[Message::Halt])?;
     let claimed = restart(session)?;
-    // What came before is of its former life.
+    // Earlier packets belong to the time before the restart.
     let mut new = session.answers().iter().filter(|it| it.at >= claimed);
     let first = new.find_map(|it| Some((*it.beat()?.0, it.beat()?.1))).unwrap_or_default();
     let is_new = (first.0.sent, first.0.rejected, first.1.0) == (0, 0, 0);
@@ -208,7 +208,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
             format!("after a restart parameter {} is {reply}", parameter.number())
         });
     }
-    // What was only staged is gone.
+    // Values that were only staged are gone.
     let hash = staged.hash().cast_signed();
     let reply = session.set(Parameter::Commit.number(), [hash])?;
     session.check("CONF-2", reply == Reply::Refused(16), || {
@@ -216,7 +216,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
     });
     volatile(session)?;
     (session.known.parameters, session.known.staged) = (Some(kept), Some(kept));
-    // The staged copy is one of what is in use.
+    // The staged copy equals the values in use.
     let next = Parameters { period_us: 45_250, ..kept };
     session.known.active = None;
     let done = session.commit(&next)?;
@@ -238,7 +238,7 @@ fn survives(session: &mut Session<'_>) -> Result<bool, Stop> {
     Ok(first.0.state.has(State::TEST_MODE))
 }
 
-/// Volatile parameters are as at a start.
+/// Checks that volatile parameters have their initial values.
 fn volatile(session: &mut Session<'_>) -> Result<(), Stop> {
     let events = if session.about.sensing { Events::default().words() } else { [0; WORDS] };
     for (number, expected) in [(6, [0; WORDS]), (7, [0; WORDS]), (8, events), (9, [0; WORDS])] {
@@ -253,7 +253,7 @@ fn volatile(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// The torque of a press at some joints.
+/// Returns the torque of a press at some joints.
 fn touched(session: &mut Session<'_>) -> Result<Option<Words>, Stop> {
     if !session.about.test_mode {
         return Ok(None);
@@ -264,7 +264,8 @@ fn touched(session: &mut Session<'_>) -> Result<Option<Words>, Stop> {
     Ok(session.pressed(&positions, arm::press(9_000))?.torque)
 }
 
-/// A reset just after a commit was requested: flash has the old or the new, or says that it is damaged.
+/// Checks a reset just after a commit was requested: flash has the old or the new configuration, or the cell reports
+/// that it is damaged.
 fn in_the_middle(session: &mut Session<'_>) -> Result<(), Stop> {
     let claimed = restart(session)?;
     settled(session, claimed)?;

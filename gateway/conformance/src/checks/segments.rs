@@ -13,7 +13,7 @@ use crate::session::Session;
 /// Both segments of a packet.
 type Two = [Frame; 2];
 
-/// What is sent: a segment, or a pause of so many ms.
+/// A step of a series: a segment, or a pause in ms.
 #[derive(Clone, Copy, Debug)]
 enum Act {
     Send(Frame),
@@ -22,11 +22,11 @@ enum Act {
 
 use Act::{Send, Wait};
 
-/// A series of segments, and what has to come of it.
+/// A series of segments, and the expected result.
 struct Series {
     what: &'static str,
     acts: Vec<Act>,
-    /// Answers.
+    /// The number of answers.
     packets: usize,
     incomplete: u16,
 }
@@ -56,7 +56,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Of three segments the first is too old for the last, though each comes in time after the one before.
+/// Checks three segments. The first is too old for the last one, though each comes in time after the one before.
 fn three(session: &mut Session<'_>) -> Result<(), Stop> {
     let mut dice = arm::Dice::new(7);
     let parameters = arm::random(&mut dice, arm::Shape { joints: 8, rows: 8, prismatic: false });
@@ -144,7 +144,7 @@ fn flipped(frame: &Frame) -> Frame {
     Frame::classic(frame.raw_id(), &bytes).unwrap_or(*frame)
 }
 
-/// A series; again, up to three times, if the bench was late in it.
+/// Checks a series, and repeats it up to three times if the bench was late.
 fn one(session: &mut Session<'_>, series: &Series) -> Result<(), Stop> {
     for _ in 0..3 {
         let before = session.counters()?.refused;
@@ -171,7 +171,7 @@ fn one(session: &mut Session<'_>, series: &Series) -> Result<(), Stop> {
         session.idle(Span::from_millis(30))?;
         let answers = session.answers().iter().filter(|heard| heard.beat().is_none()).count();
         session.consume();
-        // The next packet under this identifier counts what is left.
+        // The next packet under this identifier counts the remaining segments.
         session.read(1)?;
         let after = session.counters()?.refused;
         if !in_time {
@@ -193,7 +193,7 @@ fn one(session: &mut Session<'_>, series: &Series) -> Result<(), Stop> {
     Ok(())
 }
 
-/// The document's example: seven segments, no two of which are a packet, and a packet.
+/// Checks the document's example: seven segments, no two of which form a packet, and a packet.
 fn seven(session: &mut Session<'_>) -> Result<(), Stop> {
     let firsts: Vec<_> = (0..7)
         .map(|index| {
@@ -208,13 +208,13 @@ fn seven(session: &mut Session<'_>) -> Result<(), Stop> {
     one(
         session,
         &Series {
-            what: "seven segments of which no two are a packet, and a packet",
+            what: "seven segments of which no two form a packet, and a packet",
             acts,
             packets: 1,
             incomplete: 4,
         },
     )?;
-    // A frame of a wrong length or format between two segments leaves them alone.
+    // A frame of a wrong length or format between two segments does not affect them.
     let [b1, b2] = read(session, 2, 0x55);
     let short = Frame::classic(a1.raw_id(), &[1, 2, 3, 4, 5, 6, 7]);
     between(session, "a frame of 7 bytes", [b1, b2], short)?;
@@ -224,7 +224,7 @@ fn seven(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// A frame between two segments of a packet.
+/// Checks a frame between two segments of a packet.
 fn between(
     session: &mut Session<'_>,
     what: &str,
@@ -235,7 +235,7 @@ fn between(
     let before = session.counters()?;
     let exchange = session.exchange(&[first, other, last])?;
     let after = session.counters()?;
-    // The cell's controller need not deliver the other format.
+    // The cell's controller may drop the other format.
     let counted = after.refused.length.wrapping_sub(before.refused.length);
     let is_counted = counted == 1 || counted == 0 && other.format() == Format::Fd;
     let is_so =
@@ -249,7 +249,7 @@ fn between(
     Ok(())
 }
 
-/// Segments of joints wait for 15 ms.
+/// Checks that segments of joints wait for 15 ms.
 fn joints(session: &mut Session<'_>) -> Result<(), Stop> {
     let positions = [0x0111; MAX_JOINTS];
     session.pressed(&positions, arm::press(4_096))?;
@@ -269,11 +269,11 @@ fn joints(session: &mut Session<'_>) -> Result<(), Stop> {
             if arrives {
                 session.known.epoch = Some(epoch);
             }
-            // What waits is counted with the next ones.
+            // A waiting segment is counted with the next ones.
             let next = session.next_epoch();
             let step = session.step_at(next, &positions)?;
             let after = session.counters()?;
-            // In time for 15 ms, which a computer that is late may pass.
+            // In time for 15 ms; a late computer may exceed that.
             if arrives && apart > Span(14_700) {
                 continue;
             }

@@ -1,4 +1,4 @@
-//! Sensor values without a request: switches, events, continuous mode.
+//! Sensor values without a request: switches, event mode, continuous mode.
 
 use protocol::fixed::{Q, Q1_14, Q3_12};
 use protocol::id::Node;
@@ -38,7 +38,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Every change is an event, and a release is at the threshold itself.
+/// Returns thresholds for which every change is an event, and a release happens at the threshold itself.
 fn fine() -> Events {
     let [contact, proximity, temperature, acceleration, hysteresis] = [0, 700, 0, 0, 0];
     Events {
@@ -50,7 +50,7 @@ fn fine() -> Events {
     }
 }
 
-/// Pages since the exchange began, by number.
+/// Returns the page numbers since the exchange began.
 fn pages(heard: &[Heard]) -> Vec<u8> {
     let number = |page: &SensorPage| u8::from(matches!(page, SensorPage::Acceleration(_)));
     heard.iter().filter_map(|it| Some(number(it.sensors()?.1))).collect()
@@ -63,7 +63,7 @@ fn list(pages: &[u8]) -> String {
     pages.iter().map(ToString::to_string).collect::<Vec<_>>().join(" and ")
 }
 
-/// Writes parameter 7, and sees which pages come at once.
+/// Writes parameter 7, and checks the pages that follow at once.
 fn switched(session: &mut Session<'_>, mode: [i16; 2], expected: &[u8], what: &str) -> Result<(), Stop> {
     session.quiet(Span::from_millis(60))?;
     session.mark();
@@ -71,7 +71,7 @@ fn switched(session: &mut Session<'_>, mode: [i16; 2], expected: &[u8], what: &s
     session.idle(Span::from_millis(8))?;
     let pages = pages(session.answers());
     session.check("SENSE-4", pages == expected, || {
-        format!("{what}: sensors pages {} came after it, and {} are right", list(&pages), list(expected))
+        format!("{what}: sensors pages {} came after it, not {}", list(&pages), list(expected))
     });
     session.consume();
     Ok(())
@@ -89,7 +89,7 @@ fn switches(session: &mut Session<'_>) -> Result<(), Stop> {
     switched(session, [2, 0], &[0, 1], "a switch to event mode")
 }
 
-/// A touch: the torque leaves before the page.
+/// Checks that the torque of a touch is sent before the page.
 fn order(session: &mut Session<'_>) -> Result<(), Stop> {
     for sum in [4_096, 0] {
         session.quiet(Span::from_millis(60))?;
@@ -98,13 +98,13 @@ fn order(session: &mut Session<'_>) -> Result<(), Stop> {
         let kinds: Vec<_> = step.exchange.answers.iter().map(|it| it.message.id().kind.name()).collect();
         session.check("TIME-3", kinds == ["torque", "sensors"], || {
             let kinds = kinds.join(", ");
-            format!("a touch or its end in event mode: {kinds} came; a torque and then a page are right")
+            format!("a touch or its end in event mode: {kinds} came, not a torque and then a page")
         });
     }
     Ok(())
 }
 
-/// Random values around the thresholds: a page when the model says so, and only then.
+/// Checks random values around the thresholds: a page comes exactly when the model requires it.
 fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), Stop> {
     let mut dice = Dice::new(seed);
     session.set(SENSING, [0])?;
@@ -123,7 +123,7 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
             None => values(&mut dice, &events, &model, step),
         };
         if step == CRAFTED - 1 {
-            // The same thresholds again change nothing.
+            // Writing the same thresholds again changes nothing.
             session.write(EVENTS, events.words())?;
         }
         session.press(skin)?;
@@ -132,7 +132,7 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
             let page = SensorPage::Acceleration(acceleration);
             session.say(&[Message::Stimulus { to, from: From::Next, page }])?;
         }
-        // What a regular heartbeat brings is the cell's last word too.
+        // Pages that came with a regular heartbeat count as sent, too.
         for heard in session.unmarked() {
             if let Some((_, page)) = heard.sensors() {
                 model.sends(page);
@@ -149,13 +149,14 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
         let numbers = pages(&came.exchange.answers);
         let all = session.heard.get(from..).unwrap_or_default().iter().filter_map(Heard::sensors);
         all.for_each(|(_, page)| model.sends(page));
-        // Skipped joints make no event, and what a heartbeat brought meanwhile may be what the next ones had to bring.
+        // Skipped joints make no event, and a page with a heartbeat may replace the one that the next joints would have
+        // sent.
         if beats == 1 && skips == session.skips {
             session.check(ids, numbers == expected, || {
                 let moved =
                     acceleration.map_or_else(String::new, |it| arm::page(SensorPage::Acceleration(it)));
                 format!(
-                    "{} {moved} is latched, at step {}, {turned}: pages {} came, and {} are right",
+                    "{} {moved} is latched, at step {}, {turned}: pages {} came, not {}",
                     arm::skin(Some(skin)),
                     step + 1,
                     list(&numbers),
@@ -163,16 +164,16 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
                 )
             });
         }
-        // Those of a regular heartbeat may have come before the joints, or have crossed them on the bus.
+        // Pages with a regular heartbeat may have come before the joints, or have crossed them on the bus.
         let after = came.exchange.answers.iter().filter(|it| it.at > came.exchange.at);
         let mut pages = after.filter_map(Heard::sensors).filter(|(epoch, _)| *epoch != before);
         let is_latched = pages.all(|(_, page)| model.has(page));
         session.check("SENSE-7", is_latched, || {
             let sent: Vec<_> = sent.iter().map(|page| arm::page(*page)).collect();
-            format!("{} was sent, and is not what is latched", sent.join("; "))
+            format!("{} was sent, but is not latched", sent.join("; "))
         });
         if step % 40 == 39 {
-            // What answers a report was sent last, too.
+            // The pages of a report count as sent, too.
             for page in session.report()?.iter().filter_map(Heard::sensors) {
                 model.sends(page.1);
             }
@@ -183,10 +184,11 @@ fn events(session: &mut Session<'_>, events: Events, seed: u64) -> Result<(), St
     Ok(())
 }
 
-/// Values that the random ones may miss.
+/// The number of values that random ones may miss.
 const CRAFTED: usize = 6;
 
-/// A touch whose sum is no word any more, and one that fades; each ends so softly that only its end is a turn.
+/// Returns a touch whose sum exceeds a word, and one that fades. Each ends so softly that only the end of the contact
+/// is an event.
 fn crafted(events: &Events) -> [SkinSensors; CRAFTED] {
     let touch = events.contact.to_bits().max(1);
     let soft = (touch / 8).max(1);
@@ -194,7 +196,7 @@ fn crafted(events: &Events) -> [SkinSensors; CRAFTED] {
         .map(|contact| SkinSensors { contact: contact.map(Q::from_bits), ..SkinSensors::default() })
 }
 
-/// Sensor values near what was sent last, and near the thresholds.
+/// Returns sensor values near the last sent ones, and near the thresholds.
 fn values(dice: &mut Dice, events: &Events, model: &Model, step: usize) -> (SkinSensors, Option<[Q3_12; 3]>) {
     let sent = model.sent_skin();
     let mut skin = sent;
@@ -232,7 +234,7 @@ fn values(dice: &mut Dice, events: &Events, model: &Model, step: usize) -> (Skin
     (skin, acceleration)
 }
 
-/// In event mode page 0 follows each regular heartbeat, and page 1 every fourth since the switch.
+/// Checks that in event mode page 0 follows each regular heartbeat, and page 1 every fourth one since the switch.
 fn after_beats(session: &mut Session<'_>) -> Result<(), Stop> {
     session.set(SENSING, [0])?;
     session.quiet(Span::from_millis(60))?;
@@ -260,9 +262,9 @@ fn after_beats(session: &mut Session<'_>) -> Result<(), Stop> {
     session.check("SENSE-10", is_so, || {
         let all: Vec<_> = beats.iter().map(|pages| list(pages)).collect();
         let count = beats.len();
-        format!("pages after each of {count} heartbeats in event mode: {}; page 0, and page 1 after each fourth, are right", all.join(", "))
+        format!("pages after each of {count} heartbeats in event mode: {}; expected are page 0, and page 1 after each fourth", all.join(", "))
     });
-    // Others bring none.
+    // Other heartbeats are not followed by pages.
     session.quiet(Span::from_millis(60))?;
     let sync = session.exchange_all(&[])?;
     session.check("SENSE-10", sync.is_silent(), || "a page came with the heartbeat to a sync".to_owned());
@@ -280,7 +282,7 @@ fn halted(session: &mut Session<'_>) -> Result<(), Stop> {
         let pages = pages(&step.exchange.answers);
         session.check("SENSE-11", pages == [0], || {
             let pages = list(&pages);
-            format!("halted, in event mode: pages {pages} came to a touch or its end, and 0 is right")
+            format!("halted, in event mode: pages {pages} came at a touch or its end, not 0")
         });
     }
     session.say(&[Message::Resume])?;
@@ -293,7 +295,7 @@ fn continuous(session: &mut Session<'_>) -> Result<(), Stop> {
     for period in [50, 120] {
         grid(session, period, false)?;
     }
-    // As short as the period of the joints: none is early.
+    // As short as the period of the joints: no page is early.
     grid(session, 16, true)?;
     if session.about.committed {
         grid(session, 40, true)?;
@@ -301,7 +303,8 @@ fn continuous(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Page 0 at `t + P + P n / 255 + i P`; with joints up to their period earlier, where P is longer.
+/// Checks the times of page 0: `t + P + P n / 255 + i P`. With joints and a longer P, a page may be earlier by up to
+/// the joints' period.
 fn grid(session: &mut Session<'_>, period: u64, with_joints: bool) -> Result<(), Stop> {
     const JOINTS: u64 = 16_000;
     const LATE: u64 = 20_000;

@@ -1,4 +1,4 @@
-//! What event mode has to send, by the document: SENSE-7, SENSE-8 and SENSE-9.
+//! A model of event mode by the document: SENSE-7, SENSE-8 and SENSE-9.
 
 use protocol::fixed::{Q, Q3_12};
 use protocol::message::{SensorPage, SkinSensors};
@@ -14,7 +14,7 @@ enum Touch {
 }
 
 impl Touch {
-    /// The table of SENSE-9.
+    /// Returns the next state, by the table of SENSE-9.
     const fn next(self, v: i64, threshold: i64, hysteresis: i64) -> Self {
         // A threshold of 0 counts as one step.
         let threshold = if threshold < 1 { 1 } else { threshold };
@@ -34,7 +34,7 @@ impl Touch {
     }
 }
 
-/// What is latched, what was sent last, and the states.
+/// The latched values, the last sent values, and the states.
 #[derive(Clone, Debug)]
 pub(super) struct Model {
     events: Events,
@@ -45,7 +45,7 @@ pub(super) struct Model {
 }
 
 impl Model {
-    /// At a switch to event mode with nothing latched.
+    /// Creates the state at a switch to event mode with nothing latched.
     pub(super) fn new(events: Events) -> Self {
         let nothing = (SkinSensors::default(), [Q3_12::ZERO; 3]);
         let mut model =
@@ -62,7 +62,7 @@ impl Model {
         self.sent.1
     }
 
-    /// The states before a latch, for a message.
+    /// Describes the states before a latch, for a message.
     pub(super) fn turned(&self) -> String {
         let name = |touch| match touch {
             Touch::Free => "free",
@@ -72,7 +72,7 @@ impl Model {
         format!("contact {}, proximity {}", name(self.contact), name(self.proximity))
     }
 
-    /// A page was sent.
+    /// Notes that a page was sent.
     pub(super) const fn sends(&mut self, page: &SensorPage) {
         match *page {
             SensorPage::Skin(skin) => self.sent.0 = skin,
@@ -81,17 +81,17 @@ impl Model {
         }
     }
 
-    /// Whether a page is what is latched.
+    /// Returns true if a page equals the latched values.
     pub(super) fn has(&self, page: &SensorPage) -> bool {
         match *page {
             SensorPage::Skin(skin) => self.latched.0 == skin,
             SensorPage::Acceleration(acceleration) => self.latched.1 == acceleration,
-            // There is none without a baseline.
+            // The model has no baseline.
             SensorPage::Baseline(_) => false,
         }
     }
 
-    /// Whether contact or proximity has turned.
+    /// Returns true if the state of contact or proximity has changed.
     fn follow(&mut self) -> bool {
         let before = (self.contact, self.proximity);
         let hysteresis = i64::from(self.events.hysteresis.to_bits());
@@ -103,7 +103,7 @@ impl Model {
         before != (self.contact, self.proximity)
     }
 
-    /// The pages that have to come when this is latched, and the requirement that says so.
+    /// Latches values, and returns the pages that must follow, with the requirement behind them.
     pub(super) fn latch(
         &mut self,
         skin: SkinSensors,
@@ -127,7 +127,7 @@ impl Model {
             pages.push(1);
         }
         let far = |from: &[Q3_12; 3]| is_far(&self.latched.1, from, events.acceleration);
-        // What was latched last is not what was sent last.
+        // The difference to the last latched values is not the difference to the last sent ones.
         let by_sent = moved != has_moved(&before.0) || far(&before.1) != far(&self.sent.1);
         let id = match (by_sent, turned && !moved) {
             (true, _) => "SENSE-8",
@@ -138,7 +138,7 @@ impl Model {
     }
 }
 
-/// Whether one of them has moved by a threshold or more; 0 counts as one step.
+/// Returns true if a value has moved by the threshold or more; 0 counts as one step.
 fn is_far<const F: u32>(now: &[Q<F>], sent: &[Q<F>], threshold: Q<F>) -> bool {
     let threshold = i32::from(threshold.to_bits()).max(1);
     now.iter()

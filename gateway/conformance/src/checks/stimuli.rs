@@ -1,4 +1,4 @@
-//! Stimuli: from when they hold, how many wait, and what forgets them.
+//! Stimuli: the joints that latch them, the number that can be pending, and the events that clear them.
 
 use protocol::id::Node;
 use protocol::message::{From, Message, SensorPage};
@@ -13,7 +13,7 @@ use crate::session::Session;
 const POSITIONS: [i16; MAX_JOINTS] =
     [0x0400, -0x2100, 0x1700, -0x0300, 0x2900, 0x0100, 0, 0, 0, 0, 0, 0, 0, 0];
 
-/// A cell of which J is known at [`POSITIONS`].
+/// A cell with a known J at [`POSITIONS`].
 struct Pressed {
     parameters: Parameters,
     j: [i16; MAX_JOINTS],
@@ -45,7 +45,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     halted(session, &cell)
 }
 
-/// Joints of this epoch, at which this force has to be latched.
+/// Sends joints of an epoch, and checks that this force is latched.
 fn latched(
     session: &mut Session<'_>,
     cell: &Pressed,
@@ -72,7 +72,7 @@ fn latched(
     Ok(())
 }
 
-/// From the next joints on; how many stimuli that took.
+/// Checks stimuli for the next joints, and returns the number of stimuli sent.
 fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     let mut count = 0;
     let start = session.known.last_epoch;
@@ -83,7 +83,7 @@ fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
         latched(session, cell, epoch.wrapping_add(1), sum, "STIM-7")?;
         count += 1;
     }
-    // The epoch byte means nothing then, and everyone is meant too.
+    // The epoch byte is then ignored, and a stimulus to everyone counts too.
     let ahead = session.known.last_epoch.wrapping_add(60);
     for (epoch, to) in
         [(start, Node::Cell(session.cell)), (ahead, Node::Everyone), (ahead, Node::Cell(session.cell))]
@@ -101,7 +101,7 @@ fn next(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     Ok(count)
 }
 
-/// The first epoch, near and far, and around the corner.
+/// Checks first epochs that are near, far, or past the wrap-around.
 fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     let mut held = 4_000;
     let mut count = 1;
@@ -119,12 +119,12 @@ fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
                 latched(session, cell, epoch, held, "STIM-3")?;
             }
         }
-        // The epoch itself, or one behind it.
+        // The first epoch itself, or one or two after it.
         let epoch = first.wrapping_add(ahead % 3);
         latched(session, cell, epoch, sum, "STIM-3")?;
         held = sum;
     }
-    // Two at once, each for its own epoch; and joints that go back do not latch what is ahead.
+    // Two stimuli at once, each for its own epoch; joints with an earlier epoch do not latch later stimuli.
     let last = session.known.last_epoch;
     session.press_at(last.wrapping_add(2), arm::press(held + 300))?;
     session.press_at(last.wrapping_add(3), arm::press(held + 600))?;
@@ -133,7 +133,7 @@ fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     latched(session, cell, last.wrapping_sub(20), held, "STIM-3")?;
     latched(session, cell, last.wrapping_add(2), held + 300, "STIM-3")?;
     latched(session, cell, last.wrapping_add(3), held + 600, "STIM-3")?;
-    // The first epoch just 128 ahead of the joints.
+    // The first epoch is exactly 128 ahead of the joints.
     let first = session.known.last_epoch.wrapping_add(100);
     session.press_at(first, arm::press(held + 900))?;
     latched(session, cell, first.wrapping_sub(128), held + 600, "STIM-3")?;
@@ -141,7 +141,7 @@ fn first_epoch(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     Ok(count + 1)
 }
 
-/// For joints that have been; how many stimuli that took.
+/// Checks stimuli for epochs that are over, and returns the number of stimuli sent.
 fn too_late(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     let mut count = 0;
     for (behind, jump) in [(0, 1), (5, 1), (2, 250), (127, 1)] {
@@ -158,7 +158,7 @@ fn too_late(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     Ok(count + 1)
 }
 
-/// Several for the same joints; how many stimuli that took.
+/// Checks several stimuli for the same joints, and returns the number of stimuli sent.
 fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     let mut count = 0;
     for (first, second, jump) in [(1, 1, 1), (2, 1, 2), (1, 2, 2), (3, 0, 3)] {
@@ -177,7 +177,7 @@ fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
         session.say(&[Message::Stimulus { to, from: From::Next, page }])?;
         count += 1;
         latched(session, cell, last.wrapping_add(jump), 7_000, "STIM-7")?;
-        // It holds, whatever else comes.
+        // A stimulus stays latched, whatever else comes.
         session.counters()?;
         session.read(1)?;
         for _ in 0..2 {
@@ -188,7 +188,7 @@ fn order(session: &mut Session<'_>, cell: &Pressed) -> Result<u16, Stop> {
     Ok(count)
 }
 
-/// Eight wait, and the ninth is refused.
+/// Checks that eight stimuli can be pending, and the ninth is refused.
 fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
     let before = session.counters()?;
     let last = session.known.last_epoch;
@@ -208,7 +208,7 @@ fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
         after.refused.stimuli.wrapping_sub(before.refused.stimuli),
     );
     session.check("STIM-6", counted == (8, 2), || {
-        format!("of 10 stimuli {} were taken and {} refused; 8 can be pending", counted.0, counted.1)
+        format!("of 10 stimuli {} were accepted and {} refused; 8 can be pending", counted.0, counted.1)
     });
     for ahead in [1, 2, 3, 5, 6, 7, 8, 9, 10, 11] {
         let expected = if ahead < 8 { 1_000 * i32::from(ahead) } else { 7_000 };
@@ -220,7 +220,7 @@ fn pending(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
     latched(session, cell, epoch, 1_234, "STIM-6")
 }
 
-/// A write of parameter 5 forgets what is latched and what waits.
+/// Checks that a write of parameter 5 clears the latched and the pending stimuli.
 fn forgotten(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
     for on_between in [true, false] {
         session.press(arm::press(3_333))?;
@@ -237,7 +237,7 @@ fn forgotten(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
     Ok(())
 }
 
-/// A cell that measures obeys none.
+/// Checks that a cell that measures accepts no stimuli.
 fn measuring(session: &mut Session<'_>) -> Result<(), Stop> {
     session.test_mode(false)?;
     let before = session.counters()?;
@@ -254,12 +254,13 @@ fn measuring(session: &mut Session<'_>) -> Result<(), Stop> {
     session.known.active = None;
     session.step(&POSITIONS)?;
     let step = session.step(&POSITIONS)?;
-    session
-        .check("STIM-1", step.torque.is_none(), || "a stimulus from outside test mode is latched".to_owned());
+    session.check("STIM-1", step.torque.is_none(), || {
+        "a stimulus sent outside test mode was latched".to_owned()
+    });
     Ok(())
 }
 
-/// A halted cell takes and latches them.
+/// Checks that a halted cell accepts and latches stimuli.
 fn halted(session: &mut Session<'_>, cell: &Pressed) -> Result<(), Stop> {
     let epoch = session.next_epoch();
     session.mark();

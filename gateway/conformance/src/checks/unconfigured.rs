@@ -1,4 +1,4 @@
-//! A cell without a configuration, as it is from the factory. It cannot be made to have none again.
+//! A cell without a configuration, as it leaves the factory. A configured cell cannot return to this state.
 
 use protocol::message::Message;
 use protocol::packet::{Epoch, Length, Packet, WORDS, Words};
@@ -35,7 +35,7 @@ pub(super) fn run(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// What is staged is read where nothing is in use.
+/// Checks that a read returns the staged value while no configuration is in use.
 fn staged(session: &mut Session<'_>) -> Result<(), Stop> {
     let pose = arm::document(2).words(Parameter::Pose);
     let number = Parameter::Pose.number();
@@ -51,14 +51,16 @@ fn staged(session: &mut Session<'_>) -> Result<(), Stop> {
     session.write(number, before.words().unwrap_or([0; WORDS]))?;
     let reply = session.set(Parameter::Commit.number(), [0])?;
     let is_refused = matches!(reply, Reply::Refused(_));
-    session.check("CONF-7", is_refused, || format!("a commit of nothing was answered with {reply}"));
+    session.check("CONF-7", is_refused, || {
+        format!("a commit without a configuration was answered with {reply}")
+    });
     Ok(())
 }
 
-/// It takes joints of any chain, whose count suits their length, and answers none.
+/// Checks that the cell accepts joints of any chain, if their count matches their length, and does not answer them.
 fn joints(session: &mut Session<'_>) -> Result<(), Stop> {
     let before = session.counters()?;
-    // More than it can compute it need not take.
+    // The cell need not accept more joints than it can compute.
     let most = u8::try_from(session.about.abilities.joints()).unwrap_or(u8::MAX);
     for count in 1..=most {
         let epoch = session.next_epoch();
@@ -101,7 +103,7 @@ fn joints(session: &mut Session<'_>) -> Result<(), Stop> {
     let expected = can.count();
     session.check("COUNT-1", usize::from(counted) == expected, || {
         format!(
-            "{expected} joints whose count does not suit their length were counted {counted} times as meaning"
+            "{expected} joints whose count does not match their length were counted {counted} times as meaning"
         )
     });
     session.exchange_all(&[Message::Resume])?;

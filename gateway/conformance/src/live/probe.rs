@@ -1,5 +1,5 @@
-//! How late this computer is: a thread that sleeps and looks when it is woken. A cell that is a process here waits for a
-//! processor as that does.
+//! The lateness of this computer, measured by a thread that sleeps and checks when it is woken. A cell that is a
+//! process on this computer waits for a processor in the same way.
 
 use std::io;
 use std::sync::Arc;
@@ -10,19 +10,19 @@ use std::time::Duration;
 use bench::bus::listen::now;
 use protocol::time::Span;
 
-/// How long it sleeps.
+/// The sleep time.
 const SLEEP: Duration = Duration::from_millis(1);
 
 #[derive(Debug, Default)]
 struct Shared {
-    /// When it has to be woken, in us.
+    /// The time at which it should be woken, in us.
     due: AtomicU64,
-    /// By how much it was late at most.
+    /// The maximum lateness, in us.
     late: AtomicU64,
     over: AtomicBool,
 }
 
-/// The thread, which ends with this.
+/// The thread; it ends when this value is dropped.
 #[derive(Debug)]
 pub(super) struct Probe(Arc<Shared>);
 
@@ -32,7 +32,7 @@ impl Probe {
         shared.due.store(u64::MAX, Ordering::Relaxed);
         let own = Arc::clone(&shared);
         thread::Builder::new().spawn(move || {
-            // As a cell does.
+            // Cells do the same.
             protocol::bus::never_interrupt();
             while !own.over.load(Ordering::Relaxed) {
                 let due = now().0 + 1_000;
@@ -44,7 +44,7 @@ impl Probe {
         Ok(Self(shared))
     }
 
-    /// By how much it was late at most since this was called last, or is now.
+    /// Returns the maximum lateness since the last call, including the present one.
     pub(super) fn lateness(&self) -> Span {
         let waits = now().0.saturating_sub(self.0.due.load(Ordering::Relaxed));
         Span(self.0.late.swap(0, Ordering::Relaxed).max(waits))

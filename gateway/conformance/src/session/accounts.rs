@@ -1,4 +1,4 @@
-//! What was on the bus, counted: the cell's own counts have to add up to it, and so do its heartbeats.
+//! The accounts of the bus: counts of packets, which the cell's own counters and its heartbeats must match.
 
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Id};
@@ -8,56 +8,56 @@ use protocol::time::{Micros, Span};
 
 use crate::bus::Seen;
 
-/// From one regular heartbeat to the next.
+/// The interval of regular heartbeats.
 pub(crate) const BEAT: Span = Span::from_millis(250);
-/// A claim that comes sooner after one that was answered may be answered or not.
+/// A claim within this time after an answered one may be answered or not.
 const DEFENDED: Span = Span::from_millis(40);
 
-/// Packets that a cell counts, modulo 2^16.
+/// The packets that a cell counts, modulo 2^16.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct Counts {
-    /// Joints that it has to take.
+    /// Joints that it must accept.
     taken: u16,
-    /// Joints of the epoch of the last ones.
+    /// Joints with the epoch of the last ones.
     repeated: u16,
     stimuli: u16,
     /// Torques that it sent.
     torques: u16,
 }
 
-/// Heartbeats until some time.
+/// The heartbeats up to some time.
 #[derive(Clone, Copy, Debug, Default)]
 struct Beats {
     came: u64,
-    /// Those that something asked for: at least, and at most.
+    /// The heartbeats that were requested: minimum and maximum.
     asked: (u64, u64),
 }
 
-/// All of that.
+/// The accounts of one life of the cell.
 #[derive(Debug, Default)]
 pub(super) struct Accounts {
-    /// Of the test's own packets.
+    /// Segments of the test's own packets.
     segments: Vec<(Id, Segment)>,
-    /// The last joints taken.
+    /// The epoch of the last accepted joints.
     last: Option<Epoch>,
     counts: Counts,
-    /// Counters of the cell, and what was counted when they came.
+    /// The last counters of the cell, with the accounts at that time.
     compared: Option<(HeardPage, Refused, Counts)>,
     beats: Beats,
     defended: Option<Micros>,
-    /// When a regular heartbeat came, and all heartbeats until then.
+    /// The time of a regular heartbeat, and the heartbeats until then.
     anchor: Option<(Micros, Beats)>,
-    /// Heartbeats that came too many, over all such times: at least, and at most.
+    /// The minimum and the maximum number of surplus heartbeats, over all such intervals.
     surplus: (i64, i64),
-    /// Heartbeats since then that are not waited for any more.
+    /// The number of missing heartbeats since then that are not awaited any more.
     given_up: u64,
 }
 
-/// Something that does not add up: the requirement, and what is wrong.
+/// A discrepancy: the requirement, and a description.
 pub(super) type Difference = (&'static str, String);
 
 impl Accounts {
-    /// A frame of the test was on the bus; the joints of the chain, if the cell has one.
+    /// Accounts for a frame of the test; `joints` is the number of joints of the chain, if the cell has one.
     pub(super) fn own(&mut self, seen: &Seen, cell: CellId, format: Format, joints: Option<u8>) {
         let Some(message) = self.message(seen, format) else { return };
         if let Message::Joints { epoch, joints: came } = message {
@@ -83,7 +83,7 @@ impl Accounts {
         }
     }
 
-    /// The message that ends with a frame of the test, as a cell takes it.
+    /// Returns the message that a frame of the test completes, as the cell decodes it.
     fn message(&mut self, seen: &Seen, format: Format) -> Option<Message> {
         let Seen { at, frame, .. } = seen;
         let id = data_id(frame).ok().filter(|_| frame.format() == format)?;
@@ -106,7 +106,7 @@ impl Accounts {
         }
     }
 
-    /// A packet of the cell came.
+    /// Accounts for a packet of the cell.
     pub(super) fn heard(&mut self, message: &Message) {
         if matches!(message, Message::Network { page: NetworkPage::Heartbeat(_), .. }) {
             self.beats.came += 1;
@@ -115,17 +115,17 @@ impl Accounts {
         }
     }
 
-    /// Returns the accounts of a cell that has been switched off and on: all its counts begin again.
+    /// Returns the accounts after a restart of the cell, with all its counts at 0.
     pub(super) fn restarted(self) -> Self {
         Self { segments: self.segments, ..Self::default() }
     }
 
-    /// The cell may have lost what came, and counts from here on.
+    /// Restarts the comparison: the cell may have lost packets.
     pub(super) const fn forget_counters(&mut self) {
         self.compared = None;
     }
 
-    /// Counters of the cell: what does not add up since the last ones.
+    /// Compares the cell's counters with the accounts, and returns the discrepancies since the last comparison.
     pub(super) fn compare(&mut self, heard: HeardPage, refused: Refused) -> Vec<Difference> {
         let now = self.counts;
         let Some((heard_before, refused_before, before)) = self.compared.replace((heard, refused, now))
@@ -171,7 +171,7 @@ impl Accounts {
         all.into_iter().filter_map(differs).collect()
     }
 
-    /// Whether more heartbeats were due by then than came, by those that were asked for and the regular ones.
+    /// Returns true if fewer heartbeats came than were requested or regularly due.
     pub(super) fn is_one_missing(&self, now: Micros) -> bool {
         self.missing(now) > self.given_up
     }
@@ -183,12 +183,13 @@ impl Accounts {
         (regular + asked).saturating_sub(self.beats.came - before.came)
     }
 
-    /// What is missing is not waited for any more.
+    /// Stops waiting for the missing heartbeats.
     pub(super) fn give_up(&mut self, now: Micros) {
         self.given_up = self.missing(now);
     }
 
-    /// A regular heartbeat came then: how many came since the last such one, and how many at least and at most had to.
+    /// Notes a regular heartbeat. Returns the number of heartbeats since the last one, and the minimum and the maximum
+    /// that were due.
     pub(super) fn regular(&mut self, at: Micros) -> Option<(u64, u64, u64)> {
         self.given_up = 0;
         let (before_at, before) = self.anchor.replace((at, self.beats))?;
@@ -201,7 +202,8 @@ impl Accounts {
         Some((came, min, max))
     }
 
-    /// How many heartbeats came too many over all such times, if it is certain; too few are below 0.
+    /// Returns the number of surplus heartbeats over all intervals, as far as it is certain; negative if heartbeats are
+    /// missing.
     pub(super) const fn surplus(&self) -> i64 {
         let (min, max) = self.surplus;
         if min > 0 {

@@ -1,4 +1,4 @@
-//! Regular heartbeats: none is left out, and none is too many.
+//! Regular heartbeats: their number must match exactly.
 
 use protocol::time::Span;
 
@@ -6,14 +6,14 @@ use super::Session;
 use super::accounts::BEAT;
 use crate::bus::Stop;
 
-/// Around a regular heartbeat nothing is asked for so long.
+/// No request is sent within this time of a regular heartbeat.
 const EDGE: Span = Span::from_millis(25);
 
 impl Session<'_> {
-    /// Waits for a heartbeat that nothing asked for. Since the last such one every 250 ms one had to come, and one to each sync
-    /// and claim.
+    /// Waits for a regular heartbeat, and checks the number of heartbeats since the last one: one every 250 ms, and one
+    /// for each sync and claim.
     pub(crate) fn regular_beat(&mut self) -> Result<(), Stop> {
-        // Answers to what was asked before have come.
+        // Lets the answers to earlier requests arrive.
         self.settle()?;
         let until = self.now() + BEAT + EDGE + EDGE;
         let came = self.wait(until, |heard| heard.iter().any(|it| it.beat().is_some()))?;
@@ -31,7 +31,8 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// All heartbeats of the test together: a cell that is late leaves none out, unless it was for a whole 250 ms.
+    /// Checks the total number of heartbeats in the test: a late cell omits none, unless it was late for a whole 250
+    /// ms.
     pub(crate) fn check_all_beats(&mut self) {
         let surplus = self.life.accounts.surplus();
         if self.clock.longest < BEAT {
@@ -43,7 +44,7 @@ impl Session<'_> {
         }
     }
 
-    /// No regular heartbeat comes for so long, less than 200 ms.
+    /// Waits until no regular heartbeat is due within a time, which must be less than 200 ms.
     pub(crate) fn quiet(&mut self, span: Span) -> Result<(), Stop> {
         let now = self.now();
         let is_free = self.life.regular.is_some_and(|at| {

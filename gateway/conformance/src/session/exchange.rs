@@ -1,4 +1,4 @@
-//! Packets with a sync after them: what came until the sync is answered.
+//! An exchange: packets followed by a sync, and the cell's packets until it answers the sync.
 
 use protocol::can::Frame;
 use protocol::message::{Heartbeat, Message, State};
@@ -8,21 +8,21 @@ use protocol::time::{Micros, Span};
 use super::{Heard, LINGER, PATIENT, Session};
 use crate::bus::Stop;
 
-/// What came of some packets with a sync after them.
+/// The result of an exchange.
 #[derive(Clone, Debug)]
 pub(crate) struct Exchange {
-    /// When the first of our packets was on the bus as a whole.
+    /// The time at which the bench's first packet was completely on the bus.
     pub(crate) at: Micros,
-    /// What the cell sent, but for heartbeats.
+    /// The cell's packets, without heartbeats.
     pub(crate) answers: Vec<Heard>,
-    /// How many heartbeats came.
+    /// The number of heartbeats.
     pub(crate) beats: usize,
-    /// The heartbeat to the sync, and its epoch byte.
+    /// The heartbeat that answers the sync, and its epoch byte.
     pub(crate) beat: Option<(Heartbeat, Epoch)>,
 }
 
 impl Exchange {
-    /// Whether the cell answered nothing but the sync.
+    /// Returns true if the cell answered only the sync.
     pub(crate) fn is_silent(&self) -> bool {
         self.answers.is_empty()
     }
@@ -33,21 +33,21 @@ impl Exchange {
 }
 
 impl Session<'_> {
-    /// Sends frames and then a sync, and collects what comes until the sync is answered.
+    /// Sends frames and then a sync, and collects packets until the sync is answered.
     pub(crate) fn exchange(&mut self, frames: &[Frame]) -> Result<Exchange, Stop> {
         self.mark();
         let at = self.send(frames)?;
         self.finish(at)
     }
 
-    /// The same with packets.
+    /// Sends packets and then a sync, and collects packets until the sync is answered.
     pub(crate) fn exchange_all(&mut self, messages: &[Message]) -> Result<Exchange, Stop> {
         self.mark();
         let at = self.say(messages)?;
         self.finish(at)
     }
 
-    /// A sync, and what came since the exchange began.
+    /// Sends a sync, and returns the result of the exchange.
     fn finish(&mut self, at: Micros) -> Result<Exchange, Stop> {
         let sync = self.say(&[Message::Sync])?;
         let is_answer = |heard: &Heard| heard.beat().is_some() && heard.at >= sync;
@@ -55,7 +55,7 @@ impl Session<'_> {
         self.check("CMD-3", answered, || "no heartbeat after a sync".to_owned());
         let beats = |it: &Self| it.answers().iter().filter(|heard| heard.beat().is_some()).count();
         if self.answers().len() == beats(self) || self.known.senses {
-            // A regular heartbeat may have come between, and a cell that is wrong may answer later.
+            // A regular heartbeat may have come between, and a faulty cell may answer later.
             self.idle(LINGER)?;
         }
         let first = self.answers().iter().find(|heard| is_answer(heard)).copied();
@@ -81,7 +81,7 @@ impl Session<'_> {
         Ok(exchange)
     }
 
-    /// Whether a heartbeat comes after a sync; if a regular one may have come instead, waits for another.
+    /// Returns true if a heartbeat comes after a sync; waits for another one if a regular one may have come instead.
     fn wait_for_answer(&mut self, sync: Micros) -> Result<bool, Stop> {
         let until = sync + PATIENT;
         loop {
@@ -89,14 +89,14 @@ impl Session<'_> {
             let beats = self.answers().iter().filter(|heard| heard.at >= sync).filter_map(Heard::beat);
             let (mut any, mut right) = (false, false);
             for (_, of) in beats {
-                // One that was due before the cell came to the joints has the epoch before.
+                // A heartbeat that was due before the cell processed the joints has the previous epoch.
                 (any, right) = (true, right || epoch.is_none_or(|epoch| of.0 == epoch));
             }
             if right && !self.life.accounts.is_one_missing(self.bus.now()) {
                 return Ok(true);
             }
             if self.bus.now() >= until {
-                // Others are not waited for again.
+                // Missing heartbeats are not awaited again.
                 self.life.accounts.give_up(self.bus.now());
                 self.clock.other_epochs |= any && !right;
                 return Ok(any);

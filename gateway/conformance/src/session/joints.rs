@@ -1,4 +1,4 @@
-//! Joints, and what a cell has to answer them with.
+//! Joints, and the answers that a cell owes to them.
 
 use protocol::id::Node;
 use protocol::message::{From, Message, Request, SensorPage, SkinSensors, State};
@@ -9,7 +9,7 @@ use super::{Exchange, Heard, Session};
 use crate::arm;
 use crate::bus::Stop;
 
-/// What came of joints.
+/// The result of joints.
 #[derive(Clone, Debug)]
 pub(crate) struct Step {
     pub(crate) exchange: Exchange,
@@ -18,13 +18,13 @@ pub(crate) struct Step {
 }
 
 impl Step {
-    /// The torque's words; zeros if none came.
+    /// Returns the torque's words; zeros if none came.
     pub(crate) fn words(&self) -> [i16; MAX_JOINTS] {
         self.torque.map_or([0; MAX_JOINTS], |torque| torque.padded())
     }
 }
 
-/// What has to come.
+/// The expected answer.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Due {
     Torque,
@@ -33,13 +33,13 @@ enum Due {
 }
 
 impl Session<'_> {
-    /// The epoch after the last one.
+    /// Returns the epoch after the last one.
     pub(crate) fn next_epoch(&mut self) -> u8 {
         self.known.last_epoch = self.known.last_epoch.wrapping_add(1);
         self.known.last_epoch
     }
 
-    /// A stimulus that holds from the next joints on.
+    /// Sends a stimulus for the next joints.
     pub(crate) fn press(&mut self, skin: SkinSensors) -> Result<(), Stop> {
         self.known.pending = Some(skin);
         let to = Node::Cell(self.cell);
@@ -47,14 +47,14 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// A stimulus that holds from these joints on.
+    /// Sends a stimulus for the joints of an epoch.
     pub(crate) fn press_at(&mut self, first: u8, skin: SkinSensors) -> Result<(), Stop> {
         let to = Node::Cell(self.cell);
         self.say(&[Message::Stimulus { to, from: From::Epoch(Epoch(first)), page: SensorPage::Skin(skin) }])?;
         Ok(())
     }
 
-    /// Joints of the next epoch; again, if the cell came to them too late.
+    /// Sends joints of the next epoch, and repeats them if the cell processed them too late.
     pub(crate) fn step(&mut self, positions: &[i16; MAX_JOINTS]) -> Result<Step, Stop> {
         const ATTEMPTS: usize = 6;
         let mut attempt = 1;
@@ -68,13 +68,13 @@ impl Session<'_> {
         }
     }
 
-    /// A press from the next joints on, and these.
+    /// Sends a press for the next joints, and those joints.
     pub(crate) fn pressed(&mut self, positions: &[i16; MAX_JOINTS], skin: SkinSensors) -> Result<Step, Stop> {
         self.press(skin)?;
         self.step(positions)
     }
 
-    /// Joints of this epoch, which is not that of the last ones.
+    /// Sends joints of an epoch other than the last one.
     pub(crate) fn step_at(&mut self, epoch: u8, positions: &[i16; MAX_JOINTS]) -> Result<Step, Stop> {
         let joints = self.joints(epoch, positions);
         if let Some(skin) = self.known.pending.take() {
@@ -82,7 +82,7 @@ impl Session<'_> {
         }
         let due = self.due();
         (self.known.epoch, self.known.last_epoch) = (Some(epoch), epoch);
-        // After joints without a force it is not active, whatever it was.
+        // After joints without a force the cell is not active, whatever it was before.
         self.known.active = match due {
             Some(due) => Some(due == Due::Torque),
             None => self.force().map(|force| force > 0),
@@ -93,13 +93,13 @@ impl Session<'_> {
         self.known.active = active;
         self.look_at_state(&step.exchange);
         if self.clock.skipped {
-            // It stays as it was before them.
+            // The cell is as it was before the skipped joints.
             self.known.active = None;
         }
         Ok(step)
     }
 
-    /// What has to come after the next joints, as far as it is known.
+    /// Returns the expected answer to the next joints, if it is known.
     fn due(&self) -> Option<Due> {
         let known = &self.known;
         if known.halted == Some(true) {
@@ -113,13 +113,13 @@ impl Session<'_> {
         }
     }
 
-    /// F_z of what is latched, as far as it is known.
+    /// Returns F_z of the latched values, if they are known.
     fn force(&self) -> Option<i64> {
         let skin = self.known.skin.filter(|_| !self.known.adapts)?;
         Some(arm::force(&self.known.parameters?.contact, &skin))
     }
 
-    /// Looks at what came to joints.
+    /// Checks the answers to joints.
     fn look_at_torques(&mut self, epoch: u8, due: Option<Due>, exchange: Exchange) -> Result<Step, Stop> {
         let torques: Vec<_> =
             exchange.answers.iter().filter(|heard| heard.torque().is_some()).copied().collect();
@@ -154,7 +154,7 @@ impl Session<'_> {
             });
         }
         if let Some((at, of, words)) = first {
-            // A quarter of the period, and that of the test is long but for what measures times.
+            // The limit is a quarter of the period, and the test's period is long except where times are measured.
             if self.known.parameters.is_some_and(|it| it.period_us == arm::in_time(1).period_us) {
                 self.note_time("torque", exchange.at, at);
             }
@@ -170,8 +170,8 @@ impl Session<'_> {
         Ok(Step { torque: first.map(|(.., words)| words), exchange })
     }
 
-    /// Whether the cell came to the joints, as the answer to the sync shows, when they were older than a period: then it
-    /// skipped them, and nothing that follows from them can be expected.
+    /// Returns true if the cell processed the joints when they were older than a period, as the answer to the sync
+    /// shows. It then skipped them, and their consequences cannot be expected.
     fn came_late(&self, exchange: &Exchange) -> bool {
         let period = self.known.parameters.map_or(u64::MAX, |it| it.period_us.into());
         let beat = self.answers().iter().rev().find(|heard| heard.beat().is_some());
@@ -190,7 +190,7 @@ impl Session<'_> {
         });
     }
 
-    /// SATURATED is in the next heartbeat and in no other.
+    /// Checks that SATURATED is set in the next heartbeat and in no other.
     fn look_at_saturation(&mut self, words: &Words) {
         let expected = words.is_saturated();
         let after = |heard: &[Heard]| {
@@ -200,7 +200,7 @@ impl Session<'_> {
         };
         let beats = after(self.answers());
         if let [first, rest @ ..] = beats.as_slice() {
-            // What was in the heartbeat before and stays is no matter of this torque.
+            // A flag that stays set from the heartbeat before does not concern this torque.
             let stays = *first && !expected && self.life.saturated;
             self.check(if stays { "STATE-2" } else { "TORQUE-2" }, *first == expected, || {
                 let (set, words) = (if *first { "" } else { "not " }, arm::list(words.as_slice()));
@@ -212,7 +212,7 @@ impl Session<'_> {
         }
     }
 
-    /// The skin page of a report.
+    /// Returns the skin page of a report.
     pub(crate) fn latched(&mut self) -> Result<Option<SkinSensors>, Stop> {
         let pages = self.report()?;
         Ok(pages.iter().find_map(|heard| match heard.sensors() {
@@ -221,12 +221,12 @@ impl Session<'_> {
         }))
     }
 
-    /// Test mode on or off, which forgets all stimuli.
+    /// Switches test mode on or off, which clears all stimuli.
     pub(crate) fn test_mode(&mut self, on: bool) -> Result<(), Stop> {
         self.switch(Node::Cell(self.cell), on)
     }
 
-    /// The same of one cell or of everyone.
+    /// The same for one cell or for everyone.
     pub(crate) fn switch(&mut self, to: Node, on: bool) -> Result<(), Stop> {
         let (number, words) = (Parameter::Mode.number(), words([on.into()]));
         let reply = self.request(to, Request::Write { number, words })?;
@@ -235,7 +235,7 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Has the cell compute with parameters, in test mode, not in contact and not halted; whether it does.
+    /// Makes the cell compute with parameters, in test mode, not in contact and not halted. Returns true if it does.
     pub(crate) fn ready(&mut self, parameters: &protocol::parameters::Parameters) -> Result<bool, Stop> {
         self.mark();
         self.say(&[Message::Resume])?;

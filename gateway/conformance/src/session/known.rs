@@ -1,57 +1,57 @@
-//! What the bench knows of the cell, and what a heartbeat has to say then.
+//! The bench's knowledge of the cell, and the state that a heartbeat must therefore report.
 
 use protocol::message::{Message, NetworkPage, SkinSensors, State};
 use protocol::parameters::{Abilities, Parameters};
 
 use super::{Exchange, Session};
 
-/// What the cell is.
+/// The abilities of the cell.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct About {
     pub(crate) serial: Option<u32>,
     pub(crate) abilities: Abilities,
-    /// It sends the pages of a cell with ports.
+    /// True if it sends the pages of a cell with ports.
     pub(crate) ports: bool,
-    /// It can be in test mode.
+    /// True if it can be in test mode.
     pub(crate) test_mode: bool,
-    /// It sends sensor values without a request.
+    /// True if it sends sensor values without a request.
     pub(crate) sensing: bool,
-    /// It can subtract a zero from its force sensor's readings.
+    /// True if it can subtract a zero from its force sensor's readings.
     pub(crate) baseline: bool,
-    /// Its flash takes parameters.
+    /// True if its flash accepts parameters.
     pub(crate) committed: bool,
 }
 
-/// How the cell is now. What is `None` is not known.
+/// The present state of the cell; `None` means unknown.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Known {
     pub(crate) hash: Option<u16>,
-    /// What is in use, if it was committed by this bench.
+    /// The parameters in use, if this bench committed them.
     pub(crate) parameters: Option<Parameters>,
-    /// Joints of the chain.
+    /// The number of joints of the chain.
     pub(crate) joints: u8,
     pub(crate) test_mode: Option<bool>,
     pub(crate) halted: Option<bool>,
     pub(crate) active: Option<bool>,
     pub(crate) epoch: Option<u8>,
-    /// Sensors pages come without a request.
+    /// True if sensors pages come without a request.
     pub(crate) senses: bool,
-    /// It gave way or is off.
+    /// True if the cell gave way or is off.
     pub(crate) may_be_silent: bool,
     /// The last epoch that was sent.
     pub(crate) last_epoch: u8,
-    /// What is staged.
+    /// The staged parameters.
     pub(crate) staged: Option<Parameters>,
-    /// What is latched.
+    /// The latched values.
     pub(crate) skin: Option<SkinSensors>,
-    /// It subtracts a zero: what it computes with is not what is latched.
+    /// True if the cell subtracts a zero, and so does not compute with the latched values.
     pub(crate) adapts: bool,
-    /// What the next joints latch.
+    /// The values that the next joints latch.
     pub(crate) pending: Option<SkinSensors>,
 }
 
 impl Known {
-    /// The requirement that says that a cell does not send this by itself.
+    /// Returns the requirement that forbids the cell to send this packet unrequested.
     pub(crate) fn unexpected(&self, message: &Message) -> Option<&'static str> {
         match message {
             Message::Network { page: NetworkPage::Heard(_) | NetworkPage::Refused(_), .. } => Some("CMD-4"),
@@ -73,7 +73,7 @@ impl Known {
 }
 
 impl Session<'_> {
-    /// A heartbeat to a sync says how the cell is.
+    /// Checks the state that the heartbeat to a sync reports.
     pub(super) fn look_at_state(&mut self, exchange: &Exchange) {
         let Some((beat, epoch)) = exchange.beat else { return };
         let (state, known) = (beat.state, self.known);

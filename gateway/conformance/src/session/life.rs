@@ -1,8 +1,8 @@
-//! The state of the test that belongs to one life of the cell, from a start to the next.
+//! The state of the test that belongs to one life of the cell, from one start to the next.
 //!
-//! A restart replaces it as a whole. Between the command of a restart and the first heartbeat with CLAIMING nothing shows
-//! to which life a frame belongs, so frames are held until that heartbeat is complete: all frames before it are of the
-//! former life, which may have been cut off in the middle of a packet.
+//! A restart replaces it as a whole. Between the command of a restart and the first heartbeat with CLAIMING, a frame
+//! does not show to which life it belongs. Frames are therefore held until that heartbeat is complete. All frames
+//! before it belong to the former life, which may have been cut off in the middle of a packet.
 
 use protocol::can::{Format, Frame};
 use protocol::id::{Id, Kind};
@@ -14,40 +14,41 @@ use super::Session;
 use super::accounts::Accounts;
 use crate::bus::{Seen, Stop};
 
-/// State of the test about one life of the cell.
+/// The state of the test for one life of the cell.
 #[derive(Debug, Default)]
 pub(super) struct Life {
-    /// Time of its first heartbeat with CLAIMING, after a restart.
+    /// The time of its first heartbeat with CLAIMING, after a restart.
     pub(super) claimed: Option<Micros>,
-    /// Segments that wait for the others, by kind, and the last one that came.
+    /// Segments that wait for others, by kind, with the last one received.
     pub(super) segments: [(Segment, Option<Seen>); 8],
-    /// Kinds of which a packet came as a whole; the test may have begun in the middle of the first one.
+    /// The kinds of which a whole packet has come; the test may have begun in the middle of the first one.
     pub(super) joined: [bool; 8],
-    /// Accounts of the bus.
+    /// The accounts of the bus.
     pub(super) accounts: Accounts,
-    /// *sent* of the last heartbeat, and packets since.
+    /// *sent* of the last heartbeat, and the number of packets since.
     pub(super) sent: Option<(u16, u16)>,
-    /// Flag of the last heartbeat: CLAIMING.
+    /// True if CLAIMING is set in the last heartbeat.
     pub(super) claiming: bool,
-    /// The last torque was saturated.
+    /// True if the last torque was saturated.
     pub(super) saturated: bool,
-    /// Time of the last heartbeat that nothing asked for.
+    /// The time of the last regular heartbeat.
     pub(super) regular: Option<Micros>,
 }
 
 impl Life {
-    /// Returns the life that begins with a heartbeat of that time. The test's own packets continue: they were on the bus.
+    /// Returns the life that begins with a heartbeat of that time. The segments of the test's own packets are kept:
+    /// they were on the bus.
     fn after(former: Self, claimed: Micros) -> Self {
         let accounts = former.accounts.restarted();
         Self { claimed: Some(claimed), joined: [true; 8], accounts, ..Self::default() }
     }
 
-    /// Notes that packets of a kind are received from their beginnings on; returns whether that was so before.
+    /// Notes that packets of a kind are received from their beginnings on; returns true if that was so before.
     pub(super) fn joins(&mut self, place: usize) -> bool {
         self.joined.get_mut(place).is_none_or(|joined| core::mem::replace(joined, true))
     }
 
-    /// Returns whether a segment waits for others.
+    /// Returns true if a segment waits for others.
     pub(super) fn is_waiting(&self) -> bool {
         self.segments.iter().any(|(segments, _)| segments.is_waiting())
     }
@@ -62,7 +63,7 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Returns whether the command of the restart is still running.
+    /// Returns true while the command of the restart is running.
     pub(crate) fn is_restarting(&mut self) -> Result<bool, Stop> {
         self.bus.is_restarting()
     }
@@ -74,7 +75,7 @@ impl Session<'_> {
         }
     }
 
-    /// Returns when the first heartbeat with CLAIMING of the present life came, after a restart.
+    /// Returns the time of the first heartbeat with CLAIMING in the present life, after a restart.
     pub(crate) const fn claimed(&self) -> Option<Micros> {
         self.life.claimed
     }
@@ -84,7 +85,7 @@ impl Session<'_> {
         let Some(held) = &mut self.held else { return self.take(seen, id) };
         held.push((seen, id));
         let Some((beat, places)) = claim(held, self.format) else { return };
-        // A contact that bounces starts the cell more than once; an answer to another claim is no start.
+        // A contact that bounces starts the cell more than once; an answer to another claim is not a start.
         if self.life.claimed.is_some() && beat.sent != 0 {
             return;
         }
@@ -102,7 +103,7 @@ impl Session<'_> {
     }
 }
 
-/// Returns the heartbeat with CLAIMING that ends with the last frame, if one does, and the places of its frames.
+/// Returns the heartbeat with CLAIMING that the last frame completes, if there is one, and the indices of its frames.
 fn claim(held: &[(Seen, Id)], format: Format) -> Option<(Heartbeat, Vec<usize>)> {
     let (last, id) = held.last()?;
     if id.kind != Kind::Network || last.frame.format() != format {
@@ -113,7 +114,7 @@ fn claim(held: &[(Seen, Id)], format: Format) -> Option<(Heartbeat, Vec<usize>)>
         Format::Classic => {
             let is_of_it = |(_, (seen, of)): &(usize, &(Seen, Id))| of == id && seen.frame.format() == format;
             let of_it: Vec<_> = held.iter().enumerate().filter(is_of_it).collect();
-            // Pages are of six words.
+            // Pages have six words.
             let of_it = of_it.get(of_it.len().checked_sub(Length::Six.segments())?..)?;
             let frames = of_it.iter().map(|(_, (seen, _))| &seen.frame);
             (whole(*id, frames)?, of_it.iter().map(|(place, _)| *place).collect())
@@ -125,7 +126,7 @@ fn claim(held: &[(Seen, Id)], format: Format) -> Option<(Heartbeat, Vec<usize>)>
     beat.state.has(State::CLAIMING).then_some((beat, places))
 }
 
-/// Returns the packet that these segments are.
+/// Returns the packet that these segments form.
 fn whole<'a>(id: Id, frames: impl Iterator<Item = &'a Frame>) -> Option<Packet> {
     let mut segments = Segment::NONE;
     let last = frames.map(|frame| segments.push(Micros(0), id, Lengths::of(id), frame.data())).last()?;

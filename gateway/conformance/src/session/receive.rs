@@ -1,4 +1,4 @@
-//! Frames of the bus become packets of the cell, and are looked at as far as each holds for itself.
+//! Reassembly of the cell's frames into packets, and the checks that apply to each packet by itself.
 
 use protocol::can::{BIT_RATE_SWITCH, Format};
 use protocol::id::Id;
@@ -10,7 +10,7 @@ use super::{Heard, PATIENT, SILENT, Session};
 use crate::bus::{Seen, Stop};
 
 impl Session<'_> {
-    /// Takes the next frame, if one comes until then.
+    /// Processes the next frame, if one arrives by then.
     pub(super) fn pump(&mut self, until: Micros) -> Result<Option<Seen>, Stop> {
         let Some(seen) = self.bus.receive(until)? else {
             self.look_at_segments(self.bus.now());
@@ -49,7 +49,7 @@ impl Session<'_> {
     /// Checks that no segment has waited longer for the others of its packet than any answer takes.
     fn look_at_segments(&mut self, now: Micros) {
         if self.held.is_some() {
-            // Of a life that was cut off.
+            // It may be a part of the life that was cut off.
             return;
         }
         for place in 0..self.life.segments.len() {
@@ -61,13 +61,13 @@ impl Session<'_> {
                     continue;
                 }
                 self.check("SEND-1", false, || {
-                    format!("{frame} is no packet: no other segment within {} ms", PATIENT.0 / 1_000)
+                    format!("{frame} is not a packet: no other segment within {} ms", PATIENT.0 / 1_000)
                 });
             }
         }
     }
 
-    /// Takes a frame under an identifier of the cell.
+    /// Processes a frame under an identifier of the cell.
     pub(super) fn take(&mut self, seen: Seen, id: Id) {
         let frame = &seen.frame;
         if frame.format() != self.format {
@@ -84,14 +84,14 @@ impl Session<'_> {
                 let Some((segments, last)) = self.life.segments.get_mut(id.kind as usize) else { return };
                 let apart = last.replace(seen).map_or(Span(0), |last| seen.at.since(last.at));
                 self.clock.torn += usize::from(segments.is_waiting() && apart > Segment::within(id));
-                // Those that come late are counted, and belong together all the same.
+                // Late segments are counted, but still belong together.
                 match segments.push(Micros(0), id, Lengths::of(id), frame.data()) {
                     Ok(Reassembly::Waiting) => return,
                     Ok(Reassembly::Complete(packet)) => {
                         self.life.joins(id.kind as usize);
                         Ok(packet)
                     }
-                    // The segment before it is the end of a packet that began before the test.
+                    // The previous segment is the end of a packet that began before the test.
                     Ok(Reassembly::Incomplete) if !self.life.joins(id.kind as usize) => return,
                     Ok(Reassembly::Incomplete) => Err(PacketError::Incomplete),
                     Ok(Reassembly::Ambiguous) => Err(PacketError::Ambiguous),
@@ -102,7 +102,7 @@ impl Session<'_> {
         let message = packet.map_err(|error| error.to_string()).and_then(|packet| {
             let message = Message::decode(&packet).map_err(|error| error.to_string())?;
             let is_clean = message.encode() == packet;
-            if is_clean { Ok(message) } else { Err("something unused is not 0".to_owned()) }
+            if is_clean { Ok(message) } else { Err("an unused word or bit is not 0".to_owned()) }
         });
         match message {
             Ok(message) => {
@@ -112,16 +112,16 @@ impl Session<'_> {
                 self.look_at(&heard);
             }
             Err(error) => {
-                self.check("SEND-1", false, || format!("{frame} is no packet: {error}"));
+                self.check("SEND-1", false, || format!("{frame} is not a packet: {error}"));
             }
         }
     }
 
-    /// What holds of every packet: heartbeats know how many there were.
+    /// Checks the rules for every packet; heartbeats count the packets sent.
     fn look_at(&mut self, heard: &Heard) {
         self.life.accounts.heard(&heard.message);
         if let Some((&Heartbeat { serial, sent, state, .. }, _)) = heard.beat() {
-            // It has been switched off and on.
+            // The cell has been switched off and on.
             let begins = state.has(State::CLAIMING) && !self.life.claiming;
             self.life.claiming = state.has(State::CLAIMING);
             if begins {

@@ -1,4 +1,4 @@
-//! Parameters over the bus: every answer is looked at as the documents have it.
+//! Requests for parameters over the bus, with all answers checked by the documents.
 
 use model::decode::Decoded;
 use protocol::id::Node;
@@ -10,14 +10,14 @@ use protocol::time::{Micros, Span};
 use super::{Heard, PATIENT, Session};
 use crate::bus::Stop;
 
-/// All pages of a report have come by then.
+/// The time by which all pages of a report have come.
 const REPORT: Span = Span::from_millis(150);
-/// After an answer with another tag the right one may come.
+/// The time in which the right answer may follow one with another tag.
 const LATER: Span = Span::from_millis(30);
-/// A commit writes flash.
+/// The time limit of a commit, which writes flash.
 const COMMIT: Span = Span::from_millis(900);
 
-/// What a cell answered a request with.
+/// The reply of a cell to a request.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(crate) enum Reply {
     Value([i16; WORDS]),
@@ -31,7 +31,7 @@ impl Reply {
     }
 }
 
-/// What a cell has counted.
+/// The counters of a cell.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(crate) struct Counters {
     pub(crate) heard: HeardPage,
@@ -49,7 +49,7 @@ impl core::fmt::Display for Counters {
     }
 }
 
-/// The pages that a report is answered with, by their names.
+/// The names of the pages that answer a report.
 const REPORT_OF: [&str; 6] = ["network 1", "network 2", "sensors 0", "sensors 1", "network 3", "network 4"];
 
 fn page_name(message: &Message) -> &'static str {
@@ -87,7 +87,7 @@ impl core::fmt::Display for Reply {
     }
 }
 
-/// When an answer to a request came, its tag, and what it is.
+/// Returns the time, the tag and the content of an answer to a request.
 const fn configured(heard: &Heard) -> Option<(Micros, u8, Answer)> {
     if let Message::Configured { tag, answer, .. } = heard.message {
         Some((heard.at, tag, answer))
@@ -111,7 +111,7 @@ impl Session<'_> {
         self.request(self.own(), Request::Write { number, words })
     }
 
-    /// Writes the first words of a parameter, and zeros.
+    /// Writes the first words of a parameter, and zeros for the others.
     pub(crate) fn set<const N: usize>(&mut self, number: u8, first: [i16; N]) -> Result<Reply, Stop> {
         self.write(number, words(first))
     }
@@ -122,7 +122,7 @@ impl Session<'_> {
         self.request_with(to, self.tag, request)
     }
 
-    /// The same with this tag.
+    /// Sends a request with this tag and waits for the answer.
     pub(crate) fn request_with(&mut self, to: Node, tag: u8, request: Request) -> Result<Reply, Stop> {
         let (number, is_write) = match request {
             Request::Read { number } => (number, false),
@@ -136,7 +136,7 @@ impl Session<'_> {
         self.wait(at + longest, |heard| {
             heard.iter().any(|it| matches!(it.message, Message::Configured { .. }))
         })?;
-        // That of an earlier request may come first, where that was interrupted.
+        // The answer to an earlier, interrupted request may come first.
         let is_its = |heard: &Heard| heard.message.tag() == Some(tag) && configured(heard).is_some();
         self.wait(self.now() + LATER, |heard| {
             heard.iter().any(is_its) || !heard.iter().any(|it| configured(it).is_some())
@@ -173,7 +173,7 @@ impl Session<'_> {
         Ok(reply)
     }
 
-    /// Writes all stored parameters that differ from what is staged.
+    /// Writes all stored parameters that differ from the staged ones.
     pub(crate) fn stage(&mut self, parameters: &Parameters) -> Result<(), Stop> {
         let before = self.known.staged.take();
         for parameter in Parameter::stored(parameters.table().len()) {
@@ -187,7 +187,7 @@ impl Session<'_> {
         }
         let mut staged = *parameters;
         if let Some(before) = before {
-            // Rows behind the table stay.
+            // Rows beyond the table stay unchanged.
             let rows = staged.rows.iter_mut().zip(before.rows).skip(parameters.table().len().max(6));
             rows.for_each(|(row, before)| *row = before);
         }
@@ -195,7 +195,7 @@ impl Session<'_> {
         Ok(())
     }
 
-    /// Has the cell use parameters; whether it does.
+    /// Commits parameters. Returns true if the cell uses them.
     pub(crate) fn commit(&mut self, parameters: &Parameters) -> Result<bool, Stop> {
         let is_so = |known: Option<Parameters>| known.is_some_and(|it| it.hash() == parameters.hash());
         if self.known.parameters == Some(*parameters) && is_so(self.known.staged) {
@@ -215,14 +215,14 @@ impl Session<'_> {
         Ok(done)
     }
 
-    /// What comes to a report, but for heartbeats.
+    /// Requests a report, and returns its packets, without heartbeats.
     pub(crate) fn report(&mut self) -> Result<Vec<Heard>, Stop> {
         self.mark();
         let asked = self.say(&[Message::Report])?;
         self.pages(asked)
     }
 
-    /// Whether it sends the pages of a cell with ports.
+    /// Returns true if the cell sends the pages of a cell with ports.
     pub(crate) fn has_ports(&mut self) -> Result<bool, Stop> {
         self.mark();
         let asked = self.say(&[Message::Report])?;
@@ -231,7 +231,7 @@ impl Session<'_> {
         Ok(pages.iter().any(|it| matches!(&it.message, Message::Network { page, .. } if is_of_ports(page))))
     }
 
-    /// So many pages, or as many as come.
+    /// Collects a number of pages, or fewer if no more come.
     fn collect(&mut self, asked: Micros, expected: usize) -> Result<Vec<Heard>, Stop> {
         let pages = |heard: &[Heard]| heard.iter().filter(|it| it.beat().is_none()).count();
         self.wait(asked + REPORT, |heard| pages(heard) >= expected)?;
@@ -240,7 +240,7 @@ impl Session<'_> {
         Ok(pages)
     }
 
-    /// The pages that come to a report of then.
+    /// Returns the pages of a report that was requested at a time.
     pub(crate) fn pages(&mut self, asked: Micros) -> Result<Vec<Heard>, Stop> {
         let expected = if self.about.ports { 6 } else { 4 };
         let pages = self.collect(asked, expected + usize::from(self.known.adapts))?;
@@ -254,7 +254,7 @@ impl Session<'_> {
         Ok(pages)
     }
 
-    /// Asks for the counters, which have to add up to what was sent and what came.
+    /// Requests the counters, and checks that they match the packets sent and received.
     pub(crate) fn counters(&mut self) -> Result<Counters, Stop> {
         let report = self.report()?;
         let (mut heard, mut refused) = (None, None);
@@ -287,7 +287,7 @@ impl Session<'_> {
         Ok(Counters { heard, refused })
     }
 
-    /// The cell may have lost some of a burst, which its counters show.
+    /// Notes that the cell may have lost packets of a burst, which its counters show.
     pub(crate) const fn forget_counters(&mut self) {
         self.life.accounts.forget_counters();
     }

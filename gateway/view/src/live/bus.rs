@@ -1,4 +1,4 @@
-//! One bus: the table of its cells, and what an epoch came to.
+//! The state of one bus: the table of its cells, and the torques of the last epoch.
 
 use analysis::fit::rates::Requested;
 use bench::view::CellView;
@@ -18,22 +18,22 @@ use protocol::wire_time::{BitRates, Bits};
 
 use super::flag;
 
-/// The load is that of the last so many µs.
+/// The window over which the bus load is measured, in µs.
 const WINDOW_US: u64 = 1_000_000;
 
-/// Joints as they stood on the bus.
+/// The joints of an epoch, as seen on the bus.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Heard {
     pub(super) epoch: Epoch,
     pub(super) positions: [Q1_14; MAX_JOINTS],
 }
 
-/// What the real bus would carry.
+/// The load of the real bus.
 #[derive(Clone, Copy, Debug, Default)]
 struct Load {
     since: Option<Micros>,
     busy_s: f64,
-    /// Of the last window.
+    /// The load in the last complete window.
     share: Option<f64>,
 }
 
@@ -44,15 +44,15 @@ pub(super) struct LiveBus {
     pub(super) central: Central,
     pub(super) torque_format: TorqueFormat,
     pub(super) sums: bool,
-    /// The joints that cells answer, and those before them.
+    /// The joints of the current epoch, and those of the previous one.
     pub(super) heard: Option<Heard>,
     before: Option<Heard>,
-    /// Of the last epoch that is over, distributed and central, by joint of the chain.
+    /// Distributed and central torque in the last completed epoch, by joint of the chain.
     torques: [(f64, f64); MAX_JOINTS],
     joints: usize,
-    /// The last torque of each cell, by its place.
+    /// The last torque of each cell, by its index.
     pub(super) last: Vec<Option<(Epoch, Words)>>,
-    /// Since when each cell is dead.
+    /// The time since which each cell is dead.
     pub(super) dead_since: Vec<Option<Micros>>,
     rates: Option<BitRates>,
     load: Load,
@@ -87,13 +87,13 @@ impl LiveBus {
         }
     }
 
-    /// A frame; whether it is joints, which begin an epoch.
+    /// Applies a frame. Returns true if it carries joints, which begin an epoch.
     pub(super) fn frame(&mut self, at: Micros, frame: &Frame) -> bool {
         let received = self.table.read(at, frame);
         let message = received.message().copied();
         let is_wire = received.content == Content::NotData && wired(frame).is_some();
         if !is_wire && !matches!(message, Some(Message::Stimulus { .. })) {
-            // Wires and stimuli are the bench's.
+            // Wire states and stimuli come from the bench, and do not load the real bus.
             let busy = self.rates.zip(Bits::of(frame)).map_or(0.0, |(rates, bits)| bits.seconds(rates));
             self.load.busy_s += busy;
         }
@@ -115,23 +115,23 @@ impl LiveBus {
             Some(Message::Resume) => self.halted = false,
             Some(_) | None => {}
         }
-        // Whoever sent them, joints open an epoch.
+        // Joints open an epoch, whoever sent them.
         self.table.receive(at, joints, &received, &mut |_| None);
         joints
     }
 
-    /// What came so far does not count.
+    /// Restarts all counters.
     pub(super) fn begin_accounts(&mut self) {
         self.table.begin_accounts();
     }
 
-    /// All that was lost so far, for any reason.
+    /// Returns the total of all losses so far, for any reason.
     pub(super) fn losses(&self) -> u64 {
         let (replies, uplink) = (self.table.replies(), self.table.uplink());
         replies.late + replies.missing + uplink.lost + uplink.rejected + self.dropped
     }
 
-    /// Before the next joints: what has come for the last ones, and what the central computation says of them.
+    /// Closes the epoch before the next joints: stores the sum of the received torques and the centrally computed one.
     fn close(&mut self) {
         let Some(heard) = self.heard else { return };
         let frames = self.central.frames(&heard.positions);
@@ -178,23 +178,23 @@ impl LiveBus {
         self.table.sensors(now).nth(self.table.place(node)?)?.0
     }
 
-    /// Distributed and central, by joint of the chain.
+    /// Returns distributed and central torque, by joint of the chain.
     pub(super) fn torques(&self) -> impl Iterator<Item = (f64, f64)> {
         self.torques.into_iter().take(self.joints)
     }
 
-    /// The position of a joint of the chain in rad or m, once joints came.
+    /// Returns the position of a joint of the chain in rad or m, once joints have been received.
     pub(super) fn position(&self, joint: usize) -> Option<f64> {
         self.central.positions(&self.heard?.positions).get(joint).copied()
     }
 
-    /// The positions that were broadcast in an epoch, of the last two.
+    /// Returns the positions that were broadcast in an epoch, for the last two epochs.
     pub(super) fn positions_of(&self, epoch: Epoch) -> Option<[Q1_14; MAX_JOINTS]> {
         let both = [self.heard, self.before];
         both.into_iter().flatten().find(|heard| heard.epoch == epoch).map(|heard| heard.positions)
     }
 
-    /// Each cell's bytes in a snapshot.
+    /// Encodes each cell for a snapshot.
     pub(super) fn shown(&self, now: Micros) -> Vec<[u8; 8]> {
         let cells = self.table.cells().iter().zip(self.table.sensors(now)).enumerate();
         let bytes = cells.map(|(place, (cell, (sensors, status)))| {
@@ -221,7 +221,7 @@ impl LiveBus {
     }
 }
 
-/// The nearest whole number within these bounds.
+/// Rounds to the nearest integer and clamps to the bounds.
 #[expect(clippy::cast_possible_truncation, reason = "within 17 bits")]
 fn whole(value: f64, min: f64, max: f64) -> i32 {
     value.round().clamp(min, max) as i32

@@ -1,4 +1,4 @@
-//! The frames of the last seconds, in words, and why a torque among them is what it is.
+//! The decoded frames of the last seconds, and the explanation of a torque among them.
 
 use std::collections::VecDeque;
 
@@ -15,22 +15,22 @@ use protocol::skin::Skin;
 use protocol::time::Micros;
 use serde::Serialize;
 
-/// How long frames are kept, in µs.
+/// The time that frames are kept, in µs.
 const KEPT_US: u64 = 3_000_000;
-/// Frames that are kept.
+/// The maximum number of frames that are kept.
 const FRAMES: usize = 65_536;
-/// Frames of a cell that are named.
+/// The number of frames that are listed for a cell.
 const NAMED: usize = 8;
-/// The joints that a torque answers came no longer before it, in ns.
+/// The joints that a torque replies to are searched this long before the torque, in ns.
 const BEFORE_NS: u64 = 500_000_000;
 
-/// The frames of the last seconds of all buses.
+/// The frames of the last seconds on all buses.
 #[derive(Clone, Debug)]
 pub struct Recent {
     frames: VecDeque<Kept>,
-    /// Frames so far.
+    /// The number of frames so far.
     count: u64,
-    /// What was latched on each bus before the oldest frame that is kept.
+    /// The state that was latched on each bus before the oldest kept frame.
     latched: Vec<Latched>,
 }
 
@@ -41,31 +41,31 @@ struct Kept {
     frame: Frame,
 }
 
-/// A frame in words.
+/// A decoded frame.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FrameSaid {
-    /// Its number, by which the page asks for more.
+    /// The frame's number, by which the page requests more.
     pub number: u64,
     /// Seconds of the run, or since the first frame.
     pub at_s: f64,
-    /// The frame as candump writes it.
+    /// The frame in candump's notation.
     pub frame: String,
-    /// Verdict and meaning, as `skinbus dump` has them.
+    /// Verdict and meaning, as `skinbus dump` prints them.
     pub said: String,
-    /// Whether it is a torque, which can be explained.
+    /// True for a torque, which can be explained.
     pub is_torque: bool,
 }
 
-/// Why a torque is what it is.
+/// The explanation of a torque.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Why {
     /// The frame's number.
     pub number: u64,
-    /// The epoch of its joints.
+    /// The epoch of the joints.
     pub epoch: u8,
-    /// The cell's steps.
+    /// The steps of the cell's computation.
     pub cell: Option<CellExplained>,
-    /// What is not known, a line each.
+    /// The inputs that are unknown, one line each.
     pub missing: Vec<String>,
 }
 
@@ -85,7 +85,7 @@ impl Recent {
         }
     }
 
-    /// What they say stays.
+    /// Drops all frames, and keeps the latched state.
     pub(super) fn forget(&mut self) {
         while !self.frames.is_empty() {
             self.drop_first();
@@ -100,7 +100,8 @@ impl Recent {
         }
     }
 
-    /// The newest frames from and to a cell, the newest first; `seconds` gives a time in the run, or since the first frame.
+    /// Returns the newest frames from and to a cell, newest first; `seconds` converts a time to seconds of the run, or
+    /// since the first frame.
     pub(super) fn of_cell(
         &self,
         skin: &Skin,
@@ -111,7 +112,7 @@ impl Recent {
         let mut settler = Settler::new(format);
         for (number, kept) in (self.first_number()..).zip(&self.frames).filter(|(_, kept)| kept.bus == bus) {
             let Ok(id) = data_id(&kept.frame) else { continue };
-            // Commands say how long torques are.
+            // The lengths of torques depend on the commands before them.
             let is_command = id.kind == Kind::Command;
             if is_command || Node::from_byte(id.node) == Node::Cell(node) {
                 settler.push(kept.at, "", &kept.frame, (number, *kept, is_command));
@@ -138,7 +139,7 @@ impl Recent {
         all.into()
     }
 
-    /// Why the torque in a frame is what it is, while the frame is kept.
+    /// Explains the torque in a frame while the frame is kept.
     pub(super) fn why(&self, skin: &Skin, number: u64) -> Option<Why> {
         let place = usize::try_from(number.checked_sub(self.first_number())?).ok()?;
         let asked = self.frames.get(place)?;

@@ -1,4 +1,4 @@
-//! What changes more slowly, as JSON for the page.
+//! The status message: values that change slowly, as JSON for the page.
 
 use bench::remote::State;
 use model::table::{Event, Status};
@@ -13,101 +13,102 @@ use super::{FrameSaid, Live, Why};
 use crate::command::Chosen;
 use crate::player::Playback;
 
-/// Dead cells that are named.
+/// The maximum number of dead cells that are listed.
 const NAMED: usize = 20;
 
-/// What the page shows in words.
+/// The status that the page shows as text.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Said {
-    /// What this message is: `said`.
+    /// The type of this message: `said`.
     pub is: &'static str,
-    /// Cells in contact.
+    /// The number of cells in contact.
     pub contacts: usize,
-    /// Cells that fell silent.
+    /// The number of dead cells.
     pub dead: usize,
-    /// The first of them.
+    /// The first dead cells.
     pub dead_cells: Vec<Dead>,
-    /// Whether a halt stands.
+    /// True while any bus is halted.
     pub halted: bool,
-    /// Each bus.
+    /// The state of each bus.
     pub buses: Vec<BusSaid>,
-    /// The cell that the page has chosen.
+    /// The details of the cell that the page has chosen.
     pub detail: Option<Detail>,
-    /// Where in a recording this is.
+    /// The position in a recording.
     pub playback: Option<Playback>,
-    /// What the run that the page belongs to says of itself; of its processes only that of the chosen cell.
+    /// The state that the run reports; it lists only the process of the chosen cell.
     pub bench: Option<State>,
 }
 
-/// A cell that fell silent.
+/// A dead cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Dead {
-    /// Its bus.
+    /// The name of its bus.
     pub bus: String,
     /// Its node id.
     pub node: u8,
-    /// For so many seconds.
+    /// The time since it was found dead, in s.
     pub for_s: f64,
 }
 
-/// One bus.
+/// The status of a bus.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusSaid {
-    /// Its name.
+    /// The bus's name.
     pub name: String,
-    /// Whether it works.
+    /// True if the bus works.
     pub up: bool,
-    /// The share of its time that a real bus would be busy, 0 to 1 and above.
+    /// The share of time that the real bus would be busy: 1 is the bus's capacity.
     pub load: Option<f64>,
-    /// Epochs that somebody had to answer.
+    /// Epochs in which at least one reply was due.
     pub epochs_due: u64,
-    /// Of these, those that all answered in time.
+    /// Epochs in which all replies due came in time.
     pub epochs_complete: u64,
-    /// Replies.
+    /// Replies due.
     pub due: u64,
-    /// In time.
+    /// Replies in time.
     pub in_time: u64,
-    /// Late.
+    /// Late replies.
     pub late: u64,
-    /// Missing.
+    /// Missing replies.
     pub missing: u64,
-    /// Packets of cells that never came, by the cells' own counts.
+    /// Packets lost on the way from the cells, by the cells' own counts.
     pub lost: u64,
-    /// Packets that came damaged or without a meaning.
+    /// Packets that arrived damaged or could not be decoded.
     pub rejected: u64,
     /// Torques with a saturated word.
     pub saturated: u64,
     /// Frames that this program did not receive.
     pub dropped: u64,
-    /// Mean absolute error of single torques against the central computation, in Nm.
+    /// The mean absolute error of single torques against the central computation, in Nm.
     pub error_nm: Option<f64>,
-    /// Of a bus with sums, the place in the tree of each cell, in the skin's order; none of a cell that is silent or has not reported it.
+    /// On a bus with sums, the place of each cell in the tree, in the skin's order; null for a cell that is silent or
+    /// has not reported it.
     pub tree: Option<Vec<Option<Wires>>>,
 }
 
-/// A cell's place in the tree, as it reports.
+/// A cell's place in the tree, as the cell reports it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub struct Wires(
-    /// Where its sums go: the node id of a cell, 0 for the gateway's side; none where it is unreachable.
+    /// The parent: the node id of a cell, or 0 for the gateway's side; null if the cell is unreachable.
     pub Option<u8>,
-    /// Bit p: port p works in both directions.
+    /// Bit p is set if port p works in both directions.
     pub u8,
 );
 
-/// A cell in detail.
+/// The details of a cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Detail {
-    /// Its bus, as an index into the skin's.
+    /// The cell's bus, as an index into the skin's buses.
     pub bus: usize,
-    /// Its node id.
+    /// The cell's node id.
     pub node: u8,
-    /// Its serial number.
+    /// The cell's serial number.
     pub serial: u32,
-    /// Its status in a word.
+    /// The name of its status.
     pub status: &'static str,
-    /// The hash of its configuration, and the one it must have.
+    /// The hash of its configuration, and the hash that the skin requires.
     pub configuration: [Option<String>; 2],
-    /// Its gains and thresholds, as the skin has them.
+    /// Its gains and thresholds, from the skin.
     pub gains: Gains,
     /// Its three contact forces in N.
     pub contact_n: [f64; 3],
@@ -115,28 +116,28 @@ pub struct Detail {
     pub proximity: f64,
     /// Its temperatures in °C.
     pub temperature_c: [f64; 2],
-    /// The force by Algorithm 1, in N.
+    /// Its force by Algorithm 1, in N.
     pub force_n: f64,
     /// Its last torque.
     pub torque: Option<Answer>,
-    /// Replies due and in time.
+    /// Replies due, and replies in time.
     pub replies: [u64; 2],
-    /// Packets lost by its own count, and restarts.
+    /// Packets lost, by the cell's own count.
     pub lost: u64,
-    /// Restarts.
+    /// The number of restarts.
     pub restarts: u32,
-    /// The newest frames from it and to it, the newest first.
+    /// The newest frames from and to the cell, newest first.
     pub frames: Vec<FrameSaid>,
-    /// Why the torque in the chosen frame is what it is, while that is kept.
+    /// The explanation of the torque in the chosen frame, while that frame is kept.
     pub why: Option<Why>,
 }
 
 /// The gains and thresholds of Algorithm 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Gains {
-    /// alpha_c, and alpha_p in N.
+    /// alpha_c (a number) and alpha_p in N.
     pub alpha: [f64; 2],
-    /// F_c,th in N, F_p,th from 0 to 1, F_z,th in N.
+    /// F_c,th in N, F_p,th (0 to 1), F_z,th in N.
     pub thresholds: [f64; 3],
 }
 
@@ -150,25 +151,25 @@ impl Gains {
     }
 }
 
-/// A torque of a cell.
+/// A torque reply of a cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Answer {
-    /// Its epoch.
+    /// The epoch.
     pub epoch: u8,
-    /// Its words.
+    /// The words of the reply.
     pub words: Vec<i16>,
-    /// The same in Nm or N.
+    /// The same values in Nm or N.
     pub distributed: Vec<f64>,
     /// The central computation at the positions of that epoch, while they are known.
     pub central: Option<Vec<f64>>,
-    /// J at these positions, in m, of prismatic joints a number, while they are known.
+    /// J at these positions, while they are known: in m for revolute joints, a number for prismatic ones.
     pub jacobian: Option<Vec<f64>>,
-    /// Whether a word is saturated.
+    /// True if a word is saturated.
     pub saturated: bool,
 }
 
 impl Live {
-    /// What is to be said now to all pages: the details of a cell are none.
+    /// Returns the status for all pages, without the details of a cell.
     #[must_use]
     pub fn said(&self, now: Micros) -> Said {
         let (mut contacts, mut dead, mut dead_cells) = (0, 0, Vec::new());
@@ -195,7 +196,7 @@ impl Live {
         }
     }
 
-    /// A cell in detail; none if the skin has no such cell.
+    /// Returns the details of a cell, or `None` if the skin does not have the cell.
     #[must_use]
     pub fn detail(&self, chosen: Chosen, now: Micros) -> Option<Detail> {
         let Chosen { bus: index, node, frame } = chosen;

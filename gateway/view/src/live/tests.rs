@@ -1,4 +1,4 @@
-//! Frames made here, and what is known after them.
+//! Synthetic frames, and the state after them.
 
 use super::*;
 use crate::command::Chosen;
@@ -12,11 +12,11 @@ fn skin() -> Skin {
     Skin::parse("ur5", include_str!("../../../examples/ur5-253.toml")).unwrap()
 }
 
-/// A bus of the example at 62.5 Hz.
+/// The example skin at 62.5 Hz.
 struct Bench {
     live: Live,
     now: Micros,
-    /// The bus on which is said what is said.
+    /// The bus that messages go to.
     bus: usize,
 }
 
@@ -98,7 +98,7 @@ fn a_snapshot_holds_the_last_epoch_that_is_over() {
     assert_eq!(cell(7)[0], 0, "never heard");
 
     let said = bench.live.said(bench.now);
-    // The cell's start was not seen, so that no reply is due.
+    // The table has not seen the cell's start, so that no reply is due.
     assert_eq!((said.contacts, said.dead, said.halted, said.buses[0].due), (1, 0, false, 0));
     let detail = bench.live.detail(Chosen { bus: 0, node: 5, frame: None }, bench.now).unwrap();
     let answer = detail.torque.unwrap();

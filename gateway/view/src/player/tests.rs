@@ -1,4 +1,5 @@
-//! A recording made here: at every moment, reached on whatever way, a player knows what all frames up to it say.
+//! A synthetic recording: at every moment, on whatever way the player got there, its state equals that of a straight
+//! read.
 
 use std::io::Write;
 
@@ -14,10 +15,10 @@ use protocol::id::{CellId, Node};
 use protocol::message::{From, Heartbeat, Joints, Message, NetworkPage, SensorPage, SkinSensors, State};
 use protocol::packet::Epoch;
 
-/// When its first frame came, in ns since 1970.
+/// The time of the first frame, in ns since 1970.
 const BEGAN: u64 = 1_700_000_000_000_000_000;
 const MS: u64 = 1_000_000;
-/// Its length in ms, and the time of an epoch.
+/// The length of the log in ms, and the period of an epoch.
 const LENGTH_MS: u64 = 40_000;
 const EPOCH_MS: u64 = 16;
 const CELLS: u8 = 24;
@@ -26,8 +27,8 @@ fn skin() -> Skin {
     Skin::parse("ur5", include_str!("../../../examples/ur5-253.toml")).unwrap()
 }
 
-/// A log of 24 cells: cell 5 is touched from 6 s to 9 s and from 30 s on, cell 7 falls silent at 20 s, replies are missing
-/// at 12 s, and the robot is halted from 25 s to 26 s.
+/// A log of 24 cells: cell 5 is touched from 6 s to 9 s and from 30 s on, cell 7 falls silent at 20 s, replies are
+/// missing at 12 s, and the robot is halted from 25 s to 26 s.
 fn log(skin: &Skin) -> Vec<u8> {
     let mut out = Vec::new();
     let mut say = |ms: u64, micros: u64, message: &Message| {
@@ -80,14 +81,14 @@ fn log(skin: &Skin) -> Vec<u8> {
     out
 }
 
-/// What a page would show, without what counts the snapshots.
+/// Returns what a page would show, without the snapshot's number.
 fn shown(tape: &mut Live, now: Micros) -> (Vec<u8>, String) {
     let detail = tape.detail(Chosen { bus: 0, node: 5, frame: None }, now);
     let said = Said { detail, ..tape.said(now) };
     (tape.snapshot(now, &Pressed::default()).split_off(4), serde_json::to_string(&said).unwrap())
 }
 
-/// The same by reading all from the beginning.
+/// Returns the same after reading everything from the beginning.
 fn straight(bytes: &[u8], skin: &Skin, until: u64) -> (Vec<u8>, String) {
     let mut reader = Reader::from_read("log", std::io::Cursor::new(bytes.to_vec())).unwrap();
     let mut tape = Tape::new(skin.clone(), BEGAN + 10_000);
@@ -219,7 +220,7 @@ fn a_recording_without_frames_is_refused() {
     assert!(error.ends_with("empty.log: there is no frame in it"), "{error}");
 }
 
-/// Times of frames: anything, near the ends of what 64 bits of ns can say, and near each other.
+/// Times of frames: arbitrary ones, ones near the limits of 64 bits of ns, and ones near each other.
 fn times() -> impl Strategy<Value = Vec<u64>> {
     let near = |at: u64| (0..3_000_000_000_u64).prop_map(move |off| at.saturating_sub(off));
     let any = prop_oneof![any::<u64>(), near(u64::MAX), near(3_000_000_000), near(BEGAN), Just(u64::MAX)];

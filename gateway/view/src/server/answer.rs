@@ -1,4 +1,4 @@
-//! Answers to requests: files of the page, and the reasons why somebody is turned away.
+//! The answers to requests: files of the page, and refusals.
 
 use std::sync::atomic::Ordering;
 
@@ -6,74 +6,73 @@ use super::Shared;
 use super::request::Request;
 use crate::web;
 
-/// Nothing from elsewhere, and no other page around it.
+/// The content security policy: no resources from elsewhere, and no embedding in other pages.
 const POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; img-src 'self' data:; \
                       base-uri 'none'; form-action 'none'; frame-ancestors 'none'";
 
-/// A whole answer.
+/// A complete answer.
 #[derive(Debug)]
 pub(super) struct Answer {
     pub(super) bytes: Vec<u8>,
-    /// Its client has shown the token, or needs none.
+    /// True if the client has shown the token, or does not need one.
     pub(super) is_known: bool,
 }
 
-/// The reasons why a client gets nothing.
+/// The reasons for a refusal.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Turned {
-    /// The head is no GET of HTTP/1.1.
+    /// The head is not a GET of HTTP/1.1.
     Malformed,
-    /// It asks for another host, or comes from a page of another site.
+    /// The request asks for another host, or comes from a page of another site.
     Elsewhere,
-    /// Its token is missing or wrong.
+    /// The token is missing or wrong.
     Unknown,
-    /// There is no such file.
+    /// The file does not exist.
     NoFile,
-    /// It asks for the WebSocket as for a file.
+    /// The request asks for the WebSocket as for a file.
     NoPage,
-    /// Its head took too long.
+    /// The head took too long.
     Late,
-    /// Its head is too long.
+    /// The head is too long.
     Long,
-    /// Too many others wait that have not sent a request.
+    /// Too many other clients are connected without having sent a request.
     Crowded,
-    /// There are as many pages as there may be.
+    /// The maximum number of pages is reached.
     Full,
 }
 
 impl Turned {
-    /// Returns the status and a line that says what to do.
+    /// Returns the status line, and a text that says what to do.
     const fn words(self) -> (&'static str, &'static str) {
         match self {
-            Self::Malformed => ("400 Bad Request", "only GET of HTTP/1.1 is answered"),
+            Self::Malformed => ("400 Bad Request", "only GET requests of HTTP/1.1 are answered"),
             Self::Elsewhere => (
                 "403 Forbidden",
-                "not for this host or this origin: open the address that was printed behind `view:`, with its host and port",
+                "wrong host or origin: open the address printed after `view:`, with its host and port",
             ),
             Self::Unknown => (
                 "403 Forbidden",
-                "without the page's token, or with an old one: open the whole address that was printed behind `view:`, \
+                "the token is missing or outdated: open the whole address printed after `view:`, \
                  with ?token=...",
             ),
-            Self::NoFile => {
-                ("404 Not Found", "no such file: open the address that was printed behind `view:`")
+            Self::NoFile => ("404 Not Found", "no such file: open the address printed after `view:`"),
+            Self::NoPage => {
+                ("426 Upgrade Required", "this address is the page's WebSocket, and is available")
             }
-            Self::NoPage => ("426 Upgrade Required", "this is the page's WebSocket, and it is served"),
             Self::Late => ("408 Request Timeout", "the request took longer than 5 s"),
             Self::Long => ("431 Request Header Fields Too Large", "the request is longer than 8 KiB"),
             Self::Crowded => {
-                ("503 Service Unavailable", "too many clients wait that have sent no request: try again")
+                ("503 Service Unavailable", "too many clients are connected without a request: try again")
             }
-            Self::Full => (
-                "503 Service Unavailable",
-                "16 pages are open, and there may be no more: close one, try again",
-            ),
+            Self::Full => {
+                ("503 Service Unavailable", "16 pages are open, the maximum: close one and try again")
+            }
         }
     }
 }
 
 impl Answer {
-    /// Makes the answer for somebody who is turned away.
+    /// Creates the answer for a refused client.
     pub(super) fn of(why: Turned) -> Self {
         let (status, words) = why.words();
         let number = status.split(' ').next().unwrap_or_default();
@@ -94,10 +93,10 @@ impl Answer {
     }
 }
 
-/// Answers a request with this head; `None` for one that becomes a page.
+/// Answers a request with this head; returns `None` if the client becomes a page.
 ///
-/// Scripts and styles are the same for everybody and tell nothing of the bench, so they need no token: the page's links to them
-/// carry none.
+/// Scripts and styles are the same for every client and reveal nothing about the bench, so they need no token: the
+/// page's links to them carry none.
 pub(super) fn answer(head: &[u8], shared: &Shared) -> Option<Answer> {
     let turned = |why| {
         shared.refused.fetch_add(1, Ordering::Relaxed);
@@ -120,7 +119,7 @@ pub(super) fn answer(head: &[u8], shared: &Shared) -> Option<Answer> {
         "/live" => turned(Turned::NoPage),
         "/surface" => Some(Answer::new("200 OK", "application/octet-stream", &shared.surface, is_known)),
         path => match web::file(path) {
-            // Whoever asks for a script may be anybody.
+            // A request for a script does not show that the client knows the token.
             Some((kind, bytes)) => Some(Answer::new("200 OK", kind, bytes, is_known && !is_code)),
             None => turned(Turned::NoFile),
         },

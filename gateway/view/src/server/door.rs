@@ -1,8 +1,9 @@
-//! The door: one thread that reads the requests of all clients, answers them, and hands on those that become pages.
+//! The door: one thread that reads the requests of all clients, answers them, and passes on the clients that become
+//! pages.
 //!
-//! A client has [`HEAD_TIME`] for its whole head. If more clients wait than there is room for, the one that has waited longest
-//! is turned away. Whoever has the token sends its head at once and is through the door by then, so that clients without one,
-//! however many, cannot keep it out; pages have places of their own.
+//! A client has [`HEAD_TIME`] for its whole head. If too many clients wait, the one that has waited longest is refused.
+//! A client with the token sends its head at once and is answered by then, so that any number of clients without a
+//! token cannot keep it out. Pages have a limit of their own.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpListener, TcpStream};
@@ -20,48 +21,48 @@ use super::page::{self, Begun};
 use super::request::LONGEST;
 use super::{PAGES, Shared};
 
-/// The time for a whole head, and for an answer to be taken.
+/// The time limit for a whole head, and for sending an answer.
 const HEAD_TIME: Duration = Duration::from_secs(5);
-/// The time for an answer to somebody who has the token, from one piece to the next.
+/// The time limit per piece of an answer to a client with the token.
 const PIECE_TIME: Duration = Duration::from_secs(5);
-/// The most clients that are neither answered nor pages.
+/// The maximum number of clients that are neither answered nor pages.
 const VISITORS: usize = 256;
-/// Open files that are kept free for buses and pages.
+/// The number of file descriptors that are kept free for buses and pages.
 const OTHER_FILES: u64 = 64;
-/// The most connections that are accepted before the others have their turn.
+/// The maximum number of connections that are accepted before the other clients are served.
 const ACCEPTED_AT_ONCE: usize = 32;
-/// The time between two looks at whether the server ends.
+/// The interval at which the server checks whether it has to stop.
 const POLL_INTERVAL: Timespec = Timespec { tv_sec: 0, tv_nsec: 100_000_000 };
-/// The time without accepting after that has failed.
+/// The pause after accepting has failed.
 const REST: Duration = Duration::from_millis(50);
-/// The priority of the door's thread: a storm of connections takes no time that the bench needs.
+/// The niceness of the door's thread, so that a storm of connections does not take the bench's processor time.
 const NICE: i32 = 10;
-/// Bytes that are read at once.
+/// The read size in bytes.
 const PIECE: usize = 4 * 1024;
 
-/// A client on its way to an answer.
+/// A client that has not got its answer yet.
 #[derive(Debug)]
 struct Visitor {
     stream: TcpStream,
     head: Vec<u8>,
-    /// The answer, once it is known, and the bytes of it that were sent.
+    /// The answer, once it is known, and the number of its bytes that were sent.
     answer: Option<(Answer, usize)>,
     until: Instant,
 }
 
 /// The next step with a visitor.
 enum Next {
-    /// It has to wait.
+    /// The visitor waits.
     Stays(Visitor),
-    /// It is a page.
+    /// The visitor becomes a page.
     Page(Begun),
-    /// It has its answer, or has gone.
+    /// The visitor has its answer, or has gone.
     Done,
 }
 
-/// Serves until the server stops, and hands on those that become pages.
+/// Serves until the server stops, and passes on the clients that become pages.
 pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begun>) {
-    // On Linux this is the thread's own; without it the door works as well.
+    // On Linux the priority is the thread's own. The door also works without it.
     let _ = setpriority_process(None, NICE);
     let room = room();
     let mut visitors = Vec::<Visitor>::new();
@@ -71,11 +72,11 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begu
         let ready = wait(listener, resting.is_none(), &visitors);
         let [listener_is_ready, rest @ ..] = ready.as_slice() else { continue };
         let now = Instant::now();
-        // Clients whose data has come are served before room is made for new ones.
+        // Clients whose data has arrived are served before new ones can displace them.
         for (visitor, is_ready) in std::mem::take(&mut visitors).into_iter().zip(rest) {
             if now >= visitor.until {
                 shared.refused.fetch_add(1, Ordering::Relaxed);
-                // Browsers connect ahead of a request, and would show it these words.
+                // Browsers connect ahead of a request, and would show this text as its answer.
                 if !visitor.head.is_empty() {
                     visitor.turn_away(Turned::Late);
                 }
@@ -104,7 +105,7 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begu
                 Err(error)
                     if matches!(error.kind(), ErrorKind::Interrupted | ErrorKind::ConnectionAborted) => {}
                 Err(_) => {
-                    // Out of files: that lasts until some are closed, so one place is made free.
+                    // Out of file descriptors: this lasts until some are closed, so close one connection.
                     turn_oldest_away(&mut visitors, shared);
                     resting = Some(Instant::now() + REST);
                     break;
@@ -114,15 +115,15 @@ pub(super) fn serve(listener: &TcpListener, shared: &Shared, pages: &Sender<Begu
     }
 }
 
-/// Returns how many visitors may wait: no more than leaves files for buses and pages.
+/// Returns the number of visitors that may wait: it leaves file descriptors for buses and pages.
 fn room() -> usize {
     let files = getrlimit(Resource::Nofile).current.unwrap_or(u64::MAX);
     usize::try_from(files.saturating_sub(OTHER_FILES) / 2).unwrap_or(VISITORS).clamp(4, VISITORS)
 }
 
-/// Waits for the listener and the visitors, and returns which of them are ready.
+/// Waits for the listener and the visitors, and returns a flag for each: true if it is ready.
 fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool> {
-    // A listener that cannot be accepted from stays ready: it is left out meanwhile.
+    // A listener whose accept fails stays ready: it is left out during the pause.
     let listened = if accepts { PollFlags::IN } else { PollFlags::empty() };
     let mut files = vec![PollFd::new(listener, listened)];
     files.extend(visitors.iter().map(|visitor| {
@@ -136,17 +137,17 @@ fn wait(listener: &TcpListener, accepts: bool, visitors: &[Visitor]) -> Vec<bool
     files.iter().map(|file| !file.revents().is_empty()).collect()
 }
 
-/// Takes a visitor where it goes next.
+/// Handles the next step of a visitor.
 fn enter(next: Next, visitors: &mut Vec<Visitor>, pages: &Sender<Begun>) {
     match next {
         Next::Stays(visitor) => visitors.push(visitor),
         Next::Done => {}
-        // The other end ends with this one.
+        // The receiving end stops together with this one.
         Next::Page(begun) => _ = pages.send(begun),
     }
 }
 
-/// Starts a thread for each page, if there is a place; these threads have the ordinary priority of this one.
+/// Starts a thread for each page, up to the limit. These threads have the normal priority of this one.
 pub(super) fn open(pages: Receiver<Begun>, shared: &Arc<Shared>) {
     for (page, begun) in (1..).zip(pages) {
         if shared.pages.fetch_add(1, Ordering::Relaxed) >= PAGES {
@@ -167,7 +168,7 @@ pub(super) fn open(pages: Receiver<Begun>, shared: &Arc<Shared>) {
     }
 }
 
-/// Turns the visitor away that has waited longest, if possible one that has not shown the token.
+/// Refuses the visitor that has waited longest, if possible one that has not shown the token.
 fn turn_oldest_away(visitors: &mut Vec<Visitor>, shared: &Shared) {
     let is_known = |visitor: &Visitor| visitor.answer.as_ref().is_some_and(|(answer, _)| answer.is_known);
     let at = visitors.iter().position(|visitor| !is_known(visitor)).unwrap_or(0);
@@ -186,11 +187,11 @@ impl Visitor {
         Self { stream, head: Vec::new(), answer: None, until: Instant::now() + HEAD_TIME }
     }
 
-    /// Reads what has come, and writes what there is room for.
+    /// Reads the data that has arrived, and writes as much as the socket accepts.
     fn advance(mut self, shared: &Shared) -> Next {
         while self.answer.is_none() {
             let mut piece = [0; PIECE];
-            // The end of a head is not before the last bytes of what was there.
+            // The end of the head may begin in the last three bytes of the data before.
             let seen = self.head.len().saturating_sub(3);
             match self.stream.read(&mut piece) {
                 Ok(0) => return Next::Done,
@@ -237,7 +238,7 @@ impl Visitor {
         Next::Stays(self)
     }
 
-    /// Says why it is not served, as far as that goes without waiting.
+    /// Sends the reason of the refusal, as far as that is possible without waiting.
     fn turn_away(mut self, why: Turned) {
         if self.answer.is_none() {
             let _ = self.stream.write(&Answer::of(why).bytes);

@@ -1,4 +1,4 @@
-//! A page that stays: it gets the newest of everything, and sends commands.
+//! A connected page: it receives the newest messages, and sends commands.
 
 use std::io::{self, Cursor, ErrorKind, Read, Write};
 use std::net::{Shutdown, TcpStream};
@@ -12,14 +12,14 @@ use super::Shared;
 use crate::command::{self, Command};
 use crate::locked;
 
-/// The time for a page to take in a piece of what it is sent.
+/// The time limit for a page to receive a piece of a message.
 const TIMEOUT: Duration = Duration::from_secs(5);
-/// How long a page's message is waited for, before the next snapshot is looked for.
+/// The time that the thread waits for a page's message before it checks for a new snapshot.
 const LOOK: Duration = Duration::from_millis(15);
-/// Messages that are read at once.
+/// The maximum number of messages that are read in a row.
 const AT_ONCE: usize = 64;
 
-/// A stream of which the beginning has been read.
+/// A stream whose first bytes were already read.
 #[derive(Debug)]
 pub(super) struct Begun {
     head: Cursor<Vec<u8>>,
@@ -55,7 +55,7 @@ impl Write for Begun {
     }
 }
 
-/// Serves a page until it goes, or takes too long.
+/// Serves a page until it disconnects, or takes too long.
 pub(super) fn serve(begun: Begun, page: u64, shared: &Shared) {
     let _ = live(begun, page, shared);
 }
@@ -113,7 +113,7 @@ fn talk(socket: &mut WebSocket<Begun>, page: u64, shared: &Shared) -> Result<(),
                 Ok(Message::Close(_)) => return Ok(()),
                 Ok(Message::Binary(_)) => _ = shared.ignored.fetch_add(1, Ordering::Relaxed),
                 Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_)) => {}
-                // A program that was stopped goes on with an interrupted call.
+                // SIGCONT interrupts the read; retry.
                 Err(Error::Io(error))
                     if matches!(
                         error.kind(),
@@ -129,7 +129,7 @@ fn talk(socket: &mut WebSocket<Begun>, page: u64, shared: &Shared) -> Result<(),
     Ok(())
 }
 
-/// A page's message.
+/// Handles a message of a page.
 fn take(text: &str, page: u64, shared: &Shared) {
     let ignore = || _ = shared.ignored.fetch_add(1, Ordering::Relaxed);
     match Command::parse(text) {

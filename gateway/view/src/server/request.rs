@@ -4,12 +4,12 @@ use std::net::{IpAddr, SocketAddr};
 
 use crate::token::Token;
 
-/// The longest head, in bytes.
+/// The maximum length of a head, in bytes.
 pub(super) const LONGEST: usize = 8 * 1024;
-/// The port of an address that names none.
+/// The port of an address without a port.
 const HTTP: u16 = 80;
 
-/// The parts of a request that count.
+/// The relevant parts of a request.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub(super) struct Request {
     pub(super) path: String,
@@ -20,7 +20,7 @@ pub(super) struct Request {
 }
 
 impl Request {
-    /// Reads a head, which ends with an empty line; `None` of anything else than GET.
+    /// Parses a head, which ends with an empty line; returns `None` unless it is a GET request.
     pub(super) fn parse(head: &str) -> Option<Self> {
         let mut lines = head.split("\r\n");
         let mut first = lines.next()?.split(' ');
@@ -33,7 +33,7 @@ impl Request {
             let Some((name, value)) = line.split_once(':') else { continue };
             let value = value.trim();
             match name.to_ascii_lowercase().as_str() {
-                // Twice may be an attempt to be read in two ways.
+                // A second Host header may be an attempt to be parsed in two ways.
                 "host" if request.host.is_some() => return None,
                 "host" => request.host = Some(value.to_ascii_lowercase()),
                 "origin" => request.origin = Some(value.to_ascii_lowercase()),
@@ -44,17 +44,18 @@ impl Request {
         Some(request)
     }
 
-    /// Checks that it asks for this server by an address of its own, and comes from no page of another site.
+    /// Checks that the request asks for this server by one of its own addresses, and does not come from a page of
+    /// another site.
     pub(super) fn is_for(&self, address: SocketAddr) -> bool {
         let Some(host) = self.host.as_deref().and_then(Authority::parse) else { return false };
-        // Browsers name the origin of every WebSocket, other programs may leave it away.
+        // Browsers send an origin with every WebSocket; other programs may omit it.
         let is_origin = self.origin.as_ref().is_none_or(|origin| {
             origin.strip_prefix("http://").and_then(Authority::parse).is_some_and(|origin| origin == host)
         });
         host.is_of(address) && is_origin
     }
 
-    /// Checks that it carries the token, if there is one.
+    /// Checks that the request carries the token, if there is one.
     pub(super) fn has(&self, token: Option<&Token>) -> bool {
         let Some(token) = token else { return true };
         let given = self.query.split('&').find_map(|part| part.strip_prefix("token="));
@@ -70,7 +71,7 @@ struct Authority<'a> {
 }
 
 impl<'a> Authority<'a> {
-    /// Reads `HOST` or `HOST:PORT`; an address of IPv6 is in brackets.
+    /// Parses `HOST` or `HOST:PORT`; an IPv6 address is in brackets.
     fn parse(text: &'a str) -> Option<Self> {
         let end = text.rfind(']').map_or(0, |bracket| bracket + 1);
         let colon = text.get(end..)?.find(':').map(|at| end + at);
@@ -85,8 +86,9 @@ impl<'a> Authority<'a> {
         Some(Self { host, port })
     }
 
-    /// Compares it with the address that the server listens on. Names that other sites have made lead here too, so a name
-    /// other than localhost is refused: a page of such a site cannot read this one.
+    /// Compares the authority with the address that the server listens on. Other sites can make their names resolve to
+    /// this machine. Names other than localhost are therefore refused, so that a page of such a site cannot read this
+    /// one.
     fn is_of(self, listen: SocketAddr) -> bool {
         let is_anywhere = listen.ip().is_unspecified();
         let inner = self.host.strip_prefix('[').and_then(|host| host.strip_suffix(']'));

@@ -8,7 +8,7 @@ use tungstenite::{WebSocket, client};
 use super::*;
 
 const TOKEN: &str = "abcdef0123456789";
-/// The time that anything may take that should happen at once.
+/// The time limit for operations that should finish at once.
 const TIMEOUT: Duration = Duration::from_secs(40);
 
 fn served(token: Option<&str>) -> Server {
@@ -24,7 +24,7 @@ fn connect(server: &Server) -> TcpStream {
     stream
 }
 
-/// Everything that comes until the server closes.
+/// Reads until the server closes the connection.
 fn rest(mut stream: TcpStream) -> String {
     let mut answer = String::new();
     match stream.read_to_string(&mut answer) {
@@ -63,10 +63,7 @@ fn without_the_token_only_the_code_of_the_page_is_served() {
         for path in ["/", "/surface", "/live", "/no-such-file"] {
             let answer = get(&server, &format!("{path}{query}"));
             assert_eq!(status(&answer), "403", "{path}{query}: {answer}");
-            assert!(
-                answer.contains("\r\n\r\n403: without the page's token, or with an old one: open"),
-                "{answer}"
-            );
+            assert!(answer.contains("\r\n\r\n403: the token is missing or outdated: open"), "{answer}");
         }
         assert_eq!(page(&server, query).err(), Some(403), "{query}");
     }
@@ -91,7 +88,7 @@ fn bytes_behind_a_head_do_not_change_its_answer() {
     let server = served(Some(TOKEN));
     let mut stream = connect(&server);
     let head = format!("GET /live HTTP/1.1\r\nHost: {}\r\nUpgrade: websocket\r\n\r\n", server.address());
-    // A message of a page, masked with zeros, is no UTF-8.
+    // A page's message, masked with zeros, is not UTF-8.
     stream
         .write_all(&[head.as_bytes(), &[0x81, 0x80 | 13, 0, 0, 0, 0], br#"{"do":"halt"}"#].concat())
         .unwrap();
@@ -114,14 +111,14 @@ fn a_head_has_one_deadline_however_it_drips() {
     write!(slow, "GET / HTTP/1.1\r\nX: ").unwrap();
     let give_up = Instant::now() + TIMEOUT;
     while slow.write_all(b"a").is_ok() {
-        assert!(Instant::now() < give_up, "a head that drips is waited for");
+        assert!(Instant::now() < give_up, "the server waits for a slow head");
         thread::sleep(Duration::from_millis(200));
     }
     assert!(server.counts().refused >= 1);
 
     let answer = rest(silent);
     assert!(answer.ends_with("408: the request took longer than 5 s\n"), "{answer}");
-    assert_eq!(rest(empty), "", "who has said nothing is told nothing");
+    assert_eq!(rest(empty), "", "a client that sent nothing gets no answer");
 }
 
 #[test]
@@ -129,7 +126,7 @@ fn clients_that_send_no_request_keep_nobody_out_who_has_the_token() {
     let server = served(Some(TOKEN));
     let beginning = |_| {
         let mut stream = connect(&server);
-        // It may have been turned away already.
+        // The client may have been refused already.
         let _ = write!(stream, "GET /?token=wrong HTTP/1.1\r\nX: ");
         stream
     };
@@ -140,7 +137,7 @@ fn clients_that_send_no_request_keep_nobody_out_who_has_the_token() {
     let first = slow.into_iter().next().unwrap();
     let answer = rest(first);
     assert!(
-        answer.ends_with("503: too many clients wait that have sent no request: try again\n"),
+        answer.ends_with("503: too many clients are connected without a request: try again\n"),
         "{answer}"
     );
 }
@@ -153,7 +150,7 @@ fn a_page_too_many_is_refused_in_words() {
     let pages: Vec<_> = (0..PAGES).map(|_| page(&server, &query).unwrap()).collect();
     assert_eq!(page(&server, &query).err(), Some(503));
     let answer = get(&server, &format!("/live{query}"));
-    assert!(answer.contains("503: 16 pages are open, and there may be no more"), "{answer}");
+    assert!(answer.contains("503: 16 pages are open, the maximum"), "{answer}");
     drop(pages);
     let give_up = Instant::now() + TIMEOUT;
     while page(&server, &query).is_err() {

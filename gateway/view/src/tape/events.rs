@@ -1,4 +1,4 @@
-//! What happens in a recording, to be gone to.
+//! The events of a recording, which a page can jump to.
 
 use std::collections::BTreeMap;
 
@@ -8,50 +8,50 @@ use serde::{Deserialize, Serialize};
 
 use crate::live::Live;
 
-/// Losses on a bus that follow each other within so many ns are one event.
+/// Losses on a bus within this time of each other count as one event, in ns.
 const TOGETHER_NS: u64 = 200_000_000;
-/// Events that are kept.
+/// The maximum number of events that are kept.
 const EVENTS: usize = 1 << 18;
 
-/// Something that somebody may look for.
+/// The kind of an event.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, Hash, Ord, PartialEq, PartialOrd, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum EventKind {
     /// A cell comes into contact.
     Touch,
-    /// Replies or packets were lost, late or damaged, or frames not recorded.
+    /// Replies or packets were lost, late or damaged, or frames were not recorded.
     Loss,
-    /// A cell has fallen silent.
+    /// A cell falls silent.
     Silence,
     /// The robot is halted.
     Halt,
 }
 
-/// When something happened.
+/// An event.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Event {
-    /// When it was seen, in ns since 1970: at a look at the time, every 20 ms.
+    /// The time at which it was detected, in ns since 1970, in steps of 20 ms.
     pub at: u64,
-    /// What.
+    /// The kind of event.
     pub kind: EventKind,
-    /// On which bus.
+    /// The bus on which it happened.
     pub bus: usize,
-    /// Of which cell.
+    /// The cell that it concerns.
     pub node: Option<u8>,
 }
 
-/// Looks at what is known, and notes what has changed since the last look.
+/// Compares the state with the previous one, and reports the changes as events.
 #[derive(Clone, Debug, Default)]
 pub struct Watcher {
-    /// By bus: losses, whether it is halted, and when the last loss was.
+    /// For each bus: its losses, true if it is halted, and the time of the last loss.
     buses: Vec<(u64, bool, Option<u64>)>,
-    /// By cell: whether it is touched, and whether it is dead.
+    /// For each cell: true if it is touched, and true if it is dead.
     cells: BTreeMap<(usize, CellId), [bool; 2]>,
     events: usize,
 }
 
 impl Watcher {
-    /// What has happened since the last look.
+    /// Returns the events since the last call.
     pub fn look(&mut self, at: u64, live: &Live) -> Vec<Event> {
         let mut events = Vec::new();
         for (bus, (losses, halted)) in live.losses().enumerate() {
@@ -80,7 +80,7 @@ impl Watcher {
                 }
             }
         }
-        // The first ones, where there are too many.
+        // Only the first events are kept.
         events.truncate(EVENTS - self.events.min(EVENTS));
         self.events += events.len();
         events

@@ -79,14 +79,14 @@ test("a snapshot is read as the server writes it", () => {
 
 test("a cell's shape says the worst about it, and each shape is another", () => {
   const of = (status, flags) => shapeOf({ status, flags }).name;
-  assert.equal(of(2, 0), "in order");
+  assert.equal(of(2, 0), "normal");
   assert.equal(of(4, 3), "silent");
   assert.equal(of(0, 0), "never heard");
   assert.equal(of(1, 1 | 2), "no parameters");
-  assert.equal(of(1, 2 | 8), "other parameters");
-  assert.equal(of(3, 8), "stale: no answer");
+  assert.equal(of(1, 2 | 8), "different parameters");
+  assert.equal(of(3, 8), "stale: no reply");
   assert.equal(of(1, 8 | 16), "halted");
-  assert.equal(of(2, 16 | 32), "stuck: one value");
+  assert.equal(of(2, 16 | 32), "stuck: constant value");
   assert.equal(new Set(SHAPES.map((it) => it.shape)).size, SHAPES.length);
 });
 
@@ -213,7 +213,7 @@ test("a process offers what makes sense, and says which cells it runs", () => {
   const state = { processes: [{ bus: 1, nodes: [1, 63], phase: "running" }], links_down: [{ bus: 1, nodes: [4, 9] }] };
   const process = processOf(state, { bus: 1, node: 63 });
   assert.deepEqual(allowed(process), ["kill", "stop", "restart"]);
-  assert.match(about(process), /cells 1 to 63: .* is running\.$/);
+  assert.match(about(process), /cells 1 to 63; .* is running\.$/);
   assert.deepEqual(allowed({ phase: "stopped" }), ["kill", "continue", "restart"]);
   assert.deepEqual(allowed({ phase: "ended" }), ["restart"]);
   for (const other of [{ bus: 0, node: 5 }, { bus: 1, node: 64 }, undefined]) assert.deepEqual(allowed(processOf(state, other)), []);
@@ -269,7 +269,7 @@ test("a halt is told with its reason and the next step", () => {
   assert.equal(haltedWords({ halted: false, bench: bench(null) }, true), "");
   const said = (bench, mayPress = true) => haltedWords({ halted: true, bench }, mayPress);
   assert.equal(said(bench("too many bad cycles")), "The robot is halted: too many bad cycles. Press Resume to continue.");
-  assert.equal(said(bench("no torque", true)), "The robot is halted: no torque. Take the bus up, then press Resume.");
+  assert.equal(said(bench("no torque", true)), "The robot is halted: no torque. Bring the bus up, then press Resume.");
   assert.equal(said(null), "The robot is halted by a Halt on the bus. Press Resume to continue.");
   assert.equal(said(null, false), "The robot is halted by a Halt on the bus.");
   // A run with its bus down knows of the halt before any frame tells it.

@@ -1,4 +1,4 @@
-//! Where a bus lies: who may serve it there, and who may not.
+//! The directory of a bus, and the permissions to serve a bus in it.
 
 use super::*;
 
@@ -53,7 +53,7 @@ fn a_directory_of_the_user_stays_and_one_of_ours_goes_with_its_last_bus() {
     assert!(!ours.exists());
 }
 
-/// What a server that was killed leaves behind.
+/// Leaves the socket that a killed server leaves behind.
 fn leave_stale_socket(directory: &Path) {
     drop(protocol::bus::embedded::make_directory(directory).unwrap());
     let socket = rustix::net::socket(AddressFamily::UNIX, SocketType::SEQPACKET, None).unwrap();

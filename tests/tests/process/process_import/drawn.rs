@@ -6,13 +6,13 @@ use serde_json::Value;
 
 use super::{COVER, arm, example, read, refused, run};
 
-/// What a page's script reads.
+/// Returns the data for a page's script.
 fn data(page: &str) -> Value {
     let (_, data) = page.split_once(r#"id="skin">"#).unwrap();
     serde_json::from_str(data.split_once("</script>").unwrap().0).unwrap()
 }
 
-/// The numbers of base64 in which there are little-endian f32.
+/// Decodes little-endian f32 from base64.
 fn floats(base64: &str) -> Vec<f32> {
     let value = |letter: u8| match letter {
         b'A'..=b'Z' => letter - b'A',
@@ -61,7 +61,7 @@ fn a_skin_is_drawn_on_one_page() {
         }
     }
 
-    // Without the mesh, the rest; without the URDF, tubes.
+    // Without the mesh, the other parts; without the URDF, tubes.
     let said = run(&place, "skin show skin.toml -o less.html").well().stderr;
     assert!(said.starts_with("1 link not drawn: arm.urdf: link plate: mesh package://arm_parts/"), "{said}");
     fs::remove_file(place.path("arm.urdf")).unwrap();

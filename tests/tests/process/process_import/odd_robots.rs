@@ -1,4 +1,4 @@
-//! Robots as others publish them: files that lack something, or are not quite what they should be.
+//! Published robots with defects: files that lack something or deviate from the specification.
 
 use std::fs;
 

@@ -1,7 +1,8 @@
-//! The page of a run among users of the machine that mean no good: of another user id, without the token.
+//! The page of a run under attack by users of the machine with another user id and without the token.
 //!
 //! By default one run of some seconds is attacked. A campaign compares runs with and without intruders, in turn:
-//! `SKINBUS_INTRUDERS=5x12 cargo test -p skinbus-tests --test process intruders -- --nocapture` takes five pairs of 12 s each.
+//! `SKINBUS_INTRUDERS=5x12 cargo test -p skinbus-tests --test process intruders -- --nocapture` runs five pairs of 12 s
+//! each.
 
 use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
@@ -15,13 +16,13 @@ use rustix::process::{Resource, Rlimit, getrlimit, getuid, setrlimit};
 use skinbus_tests::process::page::{Address, Page, address};
 use skinbus_tests::process::{PRESSED, Place, Running, Summary, program, skin};
 
-/// Attacks; each intruder repeats one of them.
+/// The kinds of attacks; each intruder repeats one of them.
 const KINDS: [&str; 6] = ["no token", "old token", "slow heads", "silence", "storm", "foreign host"];
-/// A user that has nothing.
+/// The id of a user without permissions.
 const NOBODY: u32 = 65_534;
-/// The exit code of an intruder whose commands were let in.
+/// The exit code of an intruder whose commands were accepted.
 const LET_IN: i32 = 9;
-/// Everything that a page may do to a run.
+/// All commands that a page may send to a run.
 const COMMANDS: [&str; 7] = [
     r#"{"do":"halt"}"#,
     r#"{"do":"press","bus":0,"node":1,"force_n":30}"#,
@@ -48,7 +49,7 @@ impl Intruder {
         }
         match command.spawn() {
             Ok(child) => Self(child),
-            // Others may not reach the folder of this program.
+            // Other users may not reach the folder of this program.
             Err(error) if is_root && error.kind() == ErrorKind::PermissionDenied => {
                 Self(command.uid(0).gid(0).spawn().unwrap())
             }
@@ -56,7 +57,7 @@ impl Intruder {
         }
     }
 
-    /// Checks that it still attacks, and was never let in.
+    /// Checks that it still attacks, and was never accepted.
     fn is_kept_out(&mut self) -> bool {
         self.0.try_wait().unwrap().is_none()
     }
@@ -98,7 +99,7 @@ fn intruder() {
     }
 }
 
-/// Asks to be a page, and sends commands without waiting for the answer.
+/// Requests a WebSocket, and sends commands without waiting for the answer.
 fn intrude(address: &str, host: &str, query: &str) {
     let Ok(mut stream) = TcpStream::connect(address) else { return };
     let _ = stream.set_read_timeout(Some(Duration::from_secs(1)));
@@ -127,7 +128,7 @@ fn intrude(address: &str, host: &str, query: &str) {
     }
 }
 
-/// Holds so many connections, and sends a piece more on some of them.
+/// Holds a number of connections, and sends a further piece on some of them.
 fn hold(address: &str, held: &mut Vec<TcpStream>, count: usize, begin: &[u8], more: &[u8]) {
     while held.len() < count {
         let Ok(mut stream) = TcpStream::connect(address) else { return };
@@ -147,16 +148,16 @@ fn hold(address: &str, held: &mut Vec<TcpStream>, count: usize, begin: &[u8], mo
 /// The outcome of a run.
 struct Outcome {
     summary: Summary,
-    /// Pages that were opened with the token, and how often that was tried.
+    /// The number of pages that were opened with the token, and of attempts.
     pages: [usize; 2],
-    /// The longest time from the first try to the page, in ms.
+    /// The longest time from the first attempt to the page, in ms.
     longest_ms: u128,
 }
 
-/// A run of so many seconds; pages are opened with the token as long as it lasts.
+/// Runs for a number of seconds, and opens pages with the token as long as the run lasts.
 fn run(seconds: u64, with_intruders: bool) -> Outcome {
     let place = Place::new();
-    // Intruders that take the processors' time halt no robot.
+    // Intruders that take processor time must not halt the robot.
     place.write("skin.toml", &(skin(12) + "\n[safety]\nbad_cycles = 10000\n"));
     place.scenario(&PRESSED.replace("600.0", "3600.0"));
     let words = "run skin.toml --bus-kind embedded --scenario scenario.toml --view --duration 3600 --summary run.json --quiet";
@@ -178,7 +179,7 @@ fn run(seconds: u64, with_intruders: bool) -> Outcome {
             seen > 10
         });
         if first {
-            // The time counts from when everything is there.
+            // The time counts from when everything runs.
             (first, began) = (false, Instant::now());
         }
     }
@@ -201,7 +202,7 @@ fn run(seconds: u64, with_intruders: bool) -> Outcome {
     Outcome { summary, pages: outcome, longest_ms: longest.as_millis() }
 }
 
-/// Opens a page; among thousands of connections one may be turned away before its head is read.
+/// Opens a page; among thousands of connections one may be refused before its head is read.
 fn open(address: &Address, [opened, tries]: &mut [usize; 2]) -> Page {
     skinbus_tests::process::until("a page, for somebody who has the token", || {
         *tries += 1;
@@ -252,7 +253,7 @@ fn a_page_that_may_open_few_files_still_lets_in_who_has_the_token() {
     let address = address(&served);
     let mut held = Vec::new();
     for _ in 0..100 {
-        // All of them are there, however many it turns away.
+        // All of them stay connected, however many the server refuses.
         hold(&address.host, &mut held, 200, b"GET / HTTP/1.1\r\nX: ", b"a");
     }
     let mut page = open(&address, &mut [0, 0]);

@@ -1,4 +1,4 @@
-//! A bus in virtual time with one cell on it, which may do something wrong.
+//! A bus in virtual time with one cell on it, which may be faulty.
 
 use std::collections::VecDeque;
 
@@ -13,67 +13,67 @@ use protocol::time::{Micros, Span};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// From one frame on the bus to the next.
+/// The time between two frames on the bus.
 const FRAME: Span = Span(20);
-/// What a cell takes for a frame, or for a timer.
+/// The time that a cell needs for a frame or a timer.
 const THINKS: Span = Span(30);
-/// How long it is off in a restart.
+/// The time that the cell is off in a restart.
 const OFF: Span = Span::from_millis(40);
 
-/// What a cell does wrong: it changes what goes in and what comes out.
+/// A fault of a cell: it changes the cell's input and output.
 pub(crate) trait Mutant {
-    /// A frame that came, and its age; what the cell is given in its place.
+    /// Returns the frames that the cell receives instead of an arriving one, with their ages.
     fn hears(&mut self, _now: Micros, age: Span, frame: Frame) -> Vec<(Span, Frame)> {
         vec![(age, frame)]
     }
 
-    /// A packet that the cell sends; what is sent in its place, and how much later.
+    /// Returns the packets that are sent instead of one of the cell's, with their delays.
     fn says(&mut self, _now: Micros, packet: Packet) -> Vec<(Span, Packet)> {
         vec![(Span(0), packet)]
     }
 
-    /// What is sent beside that, after each call of the cell.
+    /// Returns additional packets, after each call of the cell.
     fn adds(&mut self, _now: Micros) -> Vec<(Span, Packet)> {
         Vec::new()
     }
 
-    /// The frames of a packet.
+    /// Returns the frames of a packet.
     fn frames(&mut self, packet: &Packet, format: Format) -> Vec<Frame> {
         packet.frames(format).collect()
     }
 
-    /// What flash keeps.
+    /// Returns the content that flash keeps.
     fn stores(&mut self, flash: Flash) -> Flash {
         flash
     }
 
-    /// It is switched on with this flash.
+    /// Returns the flash with which the cell is switched on.
     fn starts(&mut self, _now: Micros, flash: Flash) -> Flash {
         flash
     }
 
-    /// When it has to be called, beside the cell.
+    /// Returns the time at which it must be called, independently of the cell.
     fn wakes(&self) -> Option<Micros> {
         None
     }
 
-    /// Goes silent when the cell gave way.
+    /// Returns true if it goes silent when the cell gave way.
     fn obeys_claims(&self) -> bool {
         true
     }
 }
 
-/// A cell that does nothing wrong.
+/// A cell without a fault.
 pub(crate) struct Right;
 
 impl Mutant for Right {}
 
-/// A cell that is kept from its processor now and then.
+/// A cell that sometimes has to wait for its processor.
 struct Starved {
     dice: Pcg64Mcg,
-    /// When it is next.
+    /// The time of the next wait.
     at: Micros,
-    /// Whether the bench notices, and by how much it was late.
+    /// True if the bench notices, with its lateness.
     is_seen: bool,
     late: Span,
 }
@@ -87,37 +87,37 @@ pub(crate) struct Virtual {
     node: Option<Node>,
     flash: Flash,
     mutant: Box<dyn Mutant>,
-    /// On the bus from then on, in order: the time, the frame, whether the bench sent it.
+    /// Frames in order, each on the bus from its time on, and marked as the bench's own or not.
     wire: VecDeque<Seen>,
-    /// The bus is free from then on.
+    /// The time from which the bus is free.
     free: Micros,
-    /// For the cell, and when they came.
+    /// Frames for the cell, with their arrival times.
     inbox: VecDeque<(Micros, Frame)>,
-    /// The cell is at work until then.
+    /// The time until which the cell is busy.
     busy: Micros,
-    /// Packets that wait to be sent by the cell.
+    /// Frames that wait to be sent by the cell.
     later: Vec<(Micros, Frame)>,
     restart: Option<Micros>,
     restarts: bool,
     starved: Option<Starved>,
-    /// Time from one frame on the bus to the next.
+    /// The time between two frames on the bus.
     frame: Span,
-    /// Duration of a commit.
+    /// The duration of a commit.
     stores: Span,
     cuts: Cuts,
 }
 
-/// Times at which restarts end a life of the cell: each a step later after its command than the one before.
+/// The times at which restarts end a life of the cell: each a step later after its command than the one before.
 #[derive(Default)]
 struct Cuts {
     step: Span,
-    /// Delay after which the steps begin again.
+    /// The delay after which the steps begin again.
     longest: Span,
     next: Span,
-    /// End of the present life.
+    /// The end of the present life.
     at: Option<Micros>,
     restarts: usize,
-    /// Restarts that kept a frame of the cell from the bus.
+    /// The number of restarts that kept a frame of the cell from the bus.
     torn: usize,
 }
 
@@ -149,21 +149,22 @@ impl Virtual {
         bus
     }
 
-    /// A cell that measures when it is switched on.
+    /// Makes it a cell that measures when it is switched on.
     pub(crate) fn measuring(mut self) -> Self {
         self.test_mode = false;
         self.start();
         self
     }
 
-    /// Once in a second or so the cell gets no processor for up to 90 ms; the bench notices that on its own computer only.
+    /// Makes the cell wait for a processor for up to 90 ms, about once a second; the bench notices that only on its own
+    /// computer.
     pub(crate) fn starved(mut self, seed: u64, is_seen: bool) -> Self {
         let dice = Pcg64Mcg::seed_from_u64(seed);
         self.starved = Some(Starved { dice, at: self.now, is_seen, late: Span(0) });
         self
     }
 
-    /// Its processor is taken from the cell, if it is time for that.
+    /// Takes the processor from the cell, if it is time for that.
     fn starve(&mut self) {
         let Some(starved) = self.starved.as_mut().filter(|starved| starved.at <= self.now) else { return };
         let span = Span(starved.dice.random_range(5_000..90_000));
@@ -172,8 +173,8 @@ impl Virtual {
         self.busy = self.busy.max(self.now + span);
     }
 
-    /// A bus on which a classic frame takes as long as at 1 Mbit/s, and a cell whose commits take 1 ms and which lives for a
-    /// while after the command of a restart: from `first` to `longest`, each time a `step` longer.
+    /// Makes a bus on which a classic frame takes as long as at 1 Mbit/s, with a cell whose commits take 1 ms and which
+    /// lives for a while after the command of a restart: from `first` to `longest`, each time a `step` longer.
     pub(crate) fn cut(mut self, first: Span, step: Span, longest: Span) -> Self {
         self.frame = Span(120);
         self.stores = Span(1_000);
@@ -181,12 +182,12 @@ impl Virtual {
         self
     }
 
-    /// Returns how often it was restarted, and how often that kept a frame of the cell from the bus.
+    /// Returns the number of restarts, and the number of those that kept a frame of the cell from the bus.
     pub(crate) fn restarted(&self) -> (usize, usize) {
         (self.cuts.restarts, self.cuts.torn)
     }
 
-    /// The cell is switched off: what is not on the bus as a whole never will be.
+    /// Switches the cell off: frames that are not completely on the bus are lost.
     fn cut_off(&mut self, at: Micros) {
         self.now = self.now.max(at);
         self.cuts.at = None;
@@ -211,7 +212,7 @@ impl Virtual {
         self.inbox.clear();
     }
 
-    /// What the cell has to send goes onto the bus, and into flash what it keeps.
+    /// Puts the cell's packets on the bus, and its committed values into flash.
     fn collect(&mut self, at: Micros) {
         let Some(node) = &mut self.node else { return };
         let mut stored = Span(0);
@@ -248,7 +249,7 @@ impl Virtual {
         }
     }
 
-    /// The next thing that happens to the cell, if one does until then.
+    /// Returns the next event of the cell, if there is one by then.
     fn next(&self, until: Micros) -> Option<(Micros, Event)> {
         let heard = self.inbox.front().filter(|_| self.node.is_some());
         let heard = heard.map(|(at, _)| ((*at).max(self.busy) + THINKS, Event::Hears));
@@ -315,7 +316,7 @@ impl Bus for Virtual {
 
     fn send(&mut self, frames: &[Frame]) -> Result<(), Stop> {
         for frame in frames {
-            // What a real bus does, a frame at a time.
+            // A real bus does the same, one frame at a time.
             self.put(self.now, *frame, true);
         }
         Ok(())

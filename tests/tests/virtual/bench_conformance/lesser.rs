@@ -1,11 +1,11 @@
-//! Cells that are right and are not as this project's: they lack options, or are slow.
+//! Correct cells that differ from this project's: they lack options, or are slow.
 
 use protocol::can::Format;
 use protocol::message::{Answer, Message, Request, SensorPage};
 
 use crate::bench_conformance::wrong::{Memory, Wrong};
 
-/// Its name, and how it is made of this project's cell.
+/// Its name, and the function that makes it from this project's cell.
 type Lesser = (&'static str, fn(&mut Wrong));
 
 pub(crate) const ALL: &[Lesser] = &[
@@ -44,7 +44,7 @@ pub(crate) const ALL: &[Lesser] = &[
                 let request = Request::Write { number: 5, words: [0; 6] };
                 let format = frame.format();
                 let message = Message::Configure { to: *to, tag: *tag, request };
-                // On a classic bus this comes with the last segment, and the first one waits already.
+                // On a classic bus this is called with the last segment, while the first one already waits.
                 message.encode().frames(format).skip(usize::from(format == Format::Classic)).collect()
             }
             _ => vec![frame],
@@ -63,7 +63,7 @@ pub(crate) const ALL: &[Lesser] = &[
     ("answers take 3 ms", |it| it.say = |_, message| vec![(3_000, message)]),
 ];
 
-/// The answer of a cell to which these parameters can only be zeros.
+/// Returns the answer of a cell to which these parameters can only be zeros.
 fn without(memory: &Memory, message: Message, parameters: &[u8]) -> Message {
     let Some(Message::Configure { request, .. }) = memory.heard else { return message };
     let Message::Configured { from, tag, .. } = message else { return message };

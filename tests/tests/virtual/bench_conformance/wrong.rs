@@ -1,4 +1,4 @@
-//! Cells that do something wrong: this project's cell, with what goes in and what comes out changed.
+//! Faulty cells: this project's cell, with its input and output changed.
 
 use cell_node::flash::Flash;
 use cell_node::kernel::{Kernel, Wrench};
@@ -14,13 +14,13 @@ use protocol::time::{Micros, Span};
 
 use super::cell::Mutant;
 
-/// What a wrong cell knows of what it does.
+/// The state that a faulty cell tracks.
 #[derive(Debug, Default)]
 pub(crate) struct Memory {
     pub(crate) now: Micros,
-    /// What it is answering; nothing while only time passes.
+    /// The message that it is answering; `None` while only time passes.
     pub(crate) heard: Option<Message>,
-    /// How many joints came, and the last ones.
+    /// The number of joints messages, and the last positions.
     pub(crate) joints: usize,
     pub(crate) last: Option<(Epoch, Joints)>,
     pub(crate) latched: SkinSensors,
@@ -33,25 +33,25 @@ pub(crate) struct Memory {
     pub(crate) starts: usize,
     /// The last torque.
     pub(crate) torque: Option<Words>,
-    /// Of no meaning but that of a mutant.
+    /// A counter for the use of a mutant.
     pub(crate) count: u64,
     pub(crate) at: Micros,
     pub(crate) kept: Vec<[i16; WORDS]>,
     pub(crate) frame: Option<Frame>,
-    /// It is not in test mode at a start.
+    /// True if it is not in test mode at a start.
     pub(crate) measures: bool,
     segments: Vec<(u16, Segment)>,
-    /// Packets that are sent, and those that the right cell inside sent before its present one.
+    /// The number of packets that were sent, and of those that the correct cell inside sent before its present one.
     sent: [u16; 2],
 }
 
 impl Memory {
-    /// What is in use.
+    /// Returns the parameters in use.
     pub(crate) fn in_use(&self) -> Parameters {
         self.commits.last().copied().unwrap_or_default()
     }
 
-    /// The words of a torque of these parameters for the last joints, with an arithmetic of its own.
+    /// Computes the words of a torque with these parameters for the last joints, with a given arithmetic.
     pub(crate) fn torque_of(
         &self,
         parameters: &Parameters,
@@ -69,7 +69,7 @@ impl Memory {
         (force, Words::new(Length::for_joints(parameters.joints.into()), words))
     }
 
-    /// What goes in is followed.
+    /// Tracks an incoming message.
     fn follow(&mut self, message: &Message, cell: CellId) {
         match *message {
             Message::Joints { epoch, joints } => {
@@ -123,7 +123,7 @@ pub(crate) type Hear = fn(&mut Memory, Option<&Message>, Frame) -> Vec<Frame>;
 pub(crate) type Say = fn(&mut Memory, Message) -> Vec<(u64, Message)>;
 pub(crate) type Add = fn(&mut Memory) -> Vec<Message>;
 
-/// A wrong cell.
+/// A faulty cell.
 pub(crate) struct Wrong {
     pub(crate) hear: Hear,
     pub(crate) say: Say,
@@ -203,7 +203,7 @@ impl Mutant for Wrong {
         if let Message::Torque { torque, .. } = message {
             self.memory.torque = Some(torque);
         }
-        // The count of packets is right, whatever is left out or added; unless it is what is wrong.
+        // The count of packets stays right, however many are left out or added, unless the count itself is the fault.
         let all = all.into_iter().map(|(delay, message)| (Span(delay), self.counted(message))).collect();
         self.memory.sent[1] = self.memory.sent[1].wrapping_add(1);
         all
@@ -249,7 +249,7 @@ impl Mutant for Wrong {
 impl Wrong {
     fn counted(&mut self, mut message: Message) -> Packet {
         if let Message::Network { page: NetworkPage::Heartbeat(beat), .. } = &mut message {
-            // What a mutant has added to it stays.
+            // The change that a mutant has made to it stays.
             beat.sent = beat.sent.wrapping_sub(self.memory.sent[1]).wrapping_add(self.memory.sent[0]);
         }
         self.memory.sent[0] = self.memory.sent[0].wrapping_add(1);
@@ -257,12 +257,12 @@ impl Wrong {
     }
 }
 
-/// A heartbeat of a message.
+/// Returns the heartbeat of a message.
 pub(crate) fn beat(message: &mut Message) -> Option<&mut Heartbeat> {
     if let Message::Network { page: NetworkPage::Heartbeat(beat), .. } = message { Some(beat) } else { None }
 }
 
-/// A state with a bit set or not.
+/// Sets or clears a bit of the state.
 pub(crate) fn with(mut message: Message, bit: State, set: bool) -> Message {
     if let Some(beat) = beat(&mut message) {
         beat.state = beat.state.with(bit, set);
@@ -270,12 +270,12 @@ pub(crate) fn with(mut message: Message, bit: State, set: bool) -> Message {
     message
 }
 
-/// The frames of a message on an FD bus.
+/// Returns the frame of a message on an FD bus.
 pub(crate) fn fd(message: &Message) -> Frame {
     message.encode().frames(Format::Fd).next().unwrap()
 }
 
-/// F_z as the document has it, but for one step of it.
+/// Computes F_z as the document defines it, except for one step.
 pub(crate) fn force(
     parameters: &Parameters,
     skin: &SkinSensors,
@@ -294,17 +294,17 @@ pub(crate) fn force(
     round(f_z)
 }
 
-/// The rounding and the range of a torque word as the document has them.
+/// Applies the rounding and the range of a torque word as the document defines them.
 pub(crate) fn rounded(exact: i64, bits: u32) -> i64 {
     ((exact + (1 << (bits - 1))) >> bits).clamp(i16::MIN.into(), i16::MAX.into())
 }
 
-/// F_z as the document has it.
+/// Computes F_z as the document defines it.
 pub(crate) fn right_force(parameters: &Parameters, skin: &SkinSensors) -> i64 {
     force(parameters, skin, |value, threshold| value >= threshold, |sum| sum, |f_z| (f_z + 128) >> 8)
 }
 
-/// A torque with other words; none where its force is 0 and the right one is not.
+/// Returns a torque with other words; none if its force is 0 and the right one is not.
 pub(crate) fn retorqued(
     memory: &Memory,
     message: Message,
@@ -319,7 +319,7 @@ pub(crate) fn retorqued(
     }
 }
 
-/// The same torque with one word changed.
+/// Returns the same torque with one word changed.
 pub(crate) fn with_word(message: Message, change: impl Fn(&mut [i16; MAX_JOINTS])) -> Vec<(u64, Message)> {
     match message {
         Message::Torque { from, epoch, torque } if !torque.is_zero() => {

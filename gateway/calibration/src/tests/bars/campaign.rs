@@ -1,6 +1,7 @@
-//! Recordings of loops that skip ticks: what is stated of poses holds, or the recording is refused.
+//! Recordings of loops that skip ticks: the stated uncertainty of poses holds, or the recording is refused.
 //!
-//! `SKINBUS_RECORDINGS=200` takes so many of each kind, and at most 20 with many gaps, instead of a few.
+//! `SKINBUS_RECORDINGS=200` sets the number of recordings of each kind, with a limit of 20 for many gaps; by default
+//! they are few.
 
 use super::*;
 use model::accelerometer::RobotState;
@@ -16,7 +17,7 @@ use rand_pcg::Pcg64Mcg;
 const TICK: f64 = 0.002;
 const TICKS: u64 = 8;
 
-/// Durations of recordings, in s.
+/// The durations of recordings, in s.
 const DURATIONS: [f64; 5] = [20.0, 30.0, 45.0, 80.0, 150.0];
 
 /// The clock of the motion that sensors measure.
@@ -24,18 +25,18 @@ const DURATIONS: [f64; 5] = [20.0, 30.0, 45.0, 80.0, 150.0];
 enum Clock {
     /// The plan, at the time of each broadcast.
     Plan,
-    /// The plan, at as many periods as there were broadcasts.
+    /// The plan, at the number of broadcasts in periods.
     Counted,
-    /// The plan that stands still during gaps, as the arm does.
+    /// The plan, which stands still during gaps, as the arm does.
     Paused,
-    /// As many periods as there were broadcasts, each of which follows a period after the one before, even if that was
+    /// The number of broadcasts in periods. Each broadcast follows a period after the previous one, even if that was
     /// late.
     Late,
 }
 
 const CLOCKS: [Clock; 3] = [Clock::Plan, Clock::Counted, Clock::Paused];
 
-/// Ticks that are skipped: the first one, and how many.
+/// Returns the skipped ticks: the first one and the number of each gap.
 fn gaps(dice: &mut Pcg64Mcg, count: u64, longest_ms: u64, length_s: f64) -> Vec<(u64, u64)> {
     let ticks = (length_s / TICK) as u64;
     let mut gaps: Vec<_> = (0..count)
@@ -45,7 +46,8 @@ fn gaps(dice: &mut Pcg64Mcg, count: u64, longest_ms: u64, length_s: f64) -> Vec<
     gaps
 }
 
-/// A loop that follows a plan as quickly as joints may, and broadcasts in every eighth tick or as soon after it as it can.
+/// Returns the messages of a loop that follows a plan as quickly as joints allow, and broadcasts in every eighth tick
+/// or as soon after it as possible.
 fn messages(
     skin: &Skin,
     motion: &Motion,
@@ -103,7 +105,7 @@ fn messages(
     sent
 }
 
-/// Takes the messages as observations.
+/// Records the messages as observations.
 fn recording(
     skin: &Skin,
     motion: &Motion,
@@ -117,13 +119,13 @@ fn recording(
     seen
 }
 
-/// Results of the recordings of one kind and length.
+/// The results for the recordings of one kind and length.
 #[derive(Default)]
 struct Tally {
     recordings: usize,
     refused: usize,
     cells: usize,
-    /// Within what is stated: position and orientation.
+    /// The number within the stated uncertainty: position and orientation.
     within: [usize; 2],
     named: usize,
     unsure: usize,
@@ -134,7 +136,8 @@ fn recordings() -> u64 {
     std::env::var("SKINBUS_RECORDINGS").ok().and_then(|it| it.parse().ok()).unwrap_or(5)
 }
 
-/// Whether a part of so many cells is found within what is stated where 90 to 99 % of all are, but for 1 time in 1000.
+/// Returns true if a part of this many cells is plausible, where 90 to 99 % of all cells are within the stated
+/// uncertainty; it is wrong 1 time in 1000.
 fn is_likely(part: f64, cells: usize) -> bool {
     let scatter = |of: f64| 3.1 * (of * (1.0 - of) / cells as f64).sqrt();
     part >= 0.9 - scatter(0.9) && part <= 0.99 + scatter(0.99)
@@ -263,7 +266,7 @@ fn readings_that_scatter_more_than_the_data_sheet_says_are_refused() {
     let seen = recording(&skin, &motion, &sensors, &[], Clock::Plan);
     let refusal = calibrate(&skin, &seen, &settings).unwrap_err();
     assert!(matches!(refusal, Refusal::Scatter { .. }), "{refusal}");
-    // By their own data sheet they are as they should be.
+    // Their own data sheet matches them.
     assert!(calibrate(&skin, &seen, &Settings { sheet, ..settings }).is_ok());
 }
 
@@ -271,7 +274,7 @@ fn readings_that_scatter_more_than_the_data_sheet_says_are_refused() {
 fn joints_of_another_robot_or_at_another_rate_are_refused() {
     let (skin, settings, motion) = small();
     let sensors = Accelerometers::new(&skin, &settings.sheet, 3, GRAVITY);
-    // Frames of the one skin, taken as those of another one.
+    // Frames of one skin are recorded as those of another one.
     let sent = messages(&skin, &motion, &sensors, &[], Clock::Plan);
     let refused = |described: &Skin| {
         let mut heard = Observations::new(described);

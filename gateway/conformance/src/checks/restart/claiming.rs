@@ -1,4 +1,4 @@
-//! A cell that claims its node id: what it takes, whom it gives way to, and whom it answers.
+//! A cell that claims its node id: the packets that it accepts, gives way to, and answers.
 
 use protocol::id::Node;
 use protocol::message::{Message, Request, SensorPage, State};
@@ -12,21 +12,22 @@ use crate::arm;
 use crate::bus::Stop;
 use crate::session::{Heard, Session};
 
-/// Restarts for a check that a late bench has spoilt.
+/// The number of restarts for a check that a late bench has spoilt.
 const ATTEMPTS: usize = 4;
-/// A cell that waits for a processor comes to a frame so late at most, or the whole group is repeated.
+/// The maximum time that a cell which waits for a processor takes to process a frame; beyond it, the whole group is
+/// repeated.
 const MARGIN: Span = Span::from_millis(100);
 const LATE: &str = "the bench was late each time: the claim was over";
 
-/// Returns when the claim of a cell ends at the earliest, by the time of its first heartbeat.
+/// Returns the earliest end of a cell's claim, from the time of its first heartbeat.
 fn earliest_end(session: &Session<'_>, claimed: Micros) -> Micros {
     let Span(whole) = claim(session);
     claimed + Span(whole - whole / 100 - 2_000)
 }
 
-/// What a claiming cell takes, and what it ignores.
+/// Checks the packets that a claiming cell accepts and those that it ignores.
 pub(super) fn while_claiming(session: &mut Session<'_>, after_test_mode: bool) -> Result<(), Stop> {
-    // Test mode is as at any start, whether it was on or off before.
+    // Test mode is off after a start, whatever it was before.
     if session.about.test_mode {
         session.test_mode(false)?;
     }
@@ -43,7 +44,7 @@ pub(super) fn while_claiming(session: &mut Session<'_>, after_test_mode: bool) -
     Ok(())
 }
 
-/// Sends a claiming cell what it has to ignore; whether all of it came to a claiming cell.
+/// Sends packets that a claiming cell must ignore. Returns true if all of them arrived while it was claiming.
 fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Stop> {
     let claimed = restart(session)?;
     let end = earliest_end(session, claimed);
@@ -79,7 +80,7 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
         session.idle(Span::from_millis(3))?;
     }
     if last + MARGIN >= end {
-        // It had to answer some of it, and may send sensor values from now on.
+        // The cell had to answer some of them, and may send sensor values from now on.
         session.idle(Span::from_millis(200))?;
         session.consume();
         session.known.senses = true;
@@ -104,7 +105,7 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
     session.check("CLAIM-2", is_so, || format!("a claiming cell takes joints; of 2: {counters}"));
     let refused = protocol::message::Refused { stimuli: u16::from(!presses), ..Default::default() };
     session.check("CLAIM-2", counters.refused == refused, || {
-        format!("a claiming cell counted what it has to ignore: {counters}")
+        format!("a claiming cell counted packets that it must ignore: {counters}")
     });
     if presses {
         let report = session.report()?;
@@ -120,7 +121,7 @@ fn ignores(session: &mut Session<'_>, after_test_mode: bool) -> Result<bool, Sto
     Ok(true)
 }
 
-/// A claim with a higher serial number, before the first heartbeat and after it.
+/// Checks a claim with a higher serial number, before and after the first heartbeat.
 pub(super) fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
     let own = session.about.serial.unwrap_or_default();
     let Some(higher) = own.checked_add(1) else {
@@ -135,7 +136,9 @@ pub(super) fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
         let claim = twin(session, serial, true);
         let at = session.say(&[claim])?;
         if at + Span::from_millis(20) >= end {
-            session.findings.not_tested("CLAIM-3", "claims with a higher serial number: the claim was over");
+            session
+                .findings
+                .not_tested("CLAIM-3", "claims with a higher serial number: the cell had stopped claiming");
             break;
         }
         let came =
@@ -162,15 +165,16 @@ pub(super) fn stays(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// Claims with a higher serial number come all the time while it starts: when its first heartbeat came. That has DUPLICATE if
-/// one of them came before it, at some (serial mod 64) ms; a computer that is late may delay them.
+/// Sends claims with a higher serial number continuously while the cell starts, and returns the time of its first
+/// heartbeat. DUPLICATE is set in it if one of the claims came before it, (serial mod 64) ms after the start; a late
+/// computer may delay the claims.
 fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Option<Micros>, Stop> {
     const ATTEMPTS: usize = 3;
     let rest = twin(session, higher, true);
     let is_long = session.about.serial.unwrap_or_default() % 64 >= 30;
     let longest = Span::from_millis(3_000);
     for attempt in 1..=ATTEMPTS {
-        // Not too often: each is answered only if the last answer was 10 ms ago.
+        // With pauses: each claim is answered only 10 ms after the last answer.
         let claimed = restart_with(session, longest, |session| session.say(&[rest]).map(|_| ()))?;
         let Some(claimed) = claimed else {
             session.check("CLAIM-3", false, || {
@@ -180,7 +184,7 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
             });
             return Ok(None);
         };
-        // An answer, and then the heartbeat that nothing asked for.
+        // The answer, and then a regular heartbeat.
         session.idle(Span::from_millis(80))?;
         let new = session.answers().iter().filter(|it| it.at >= claimed).filter_map(Heard::beat);
         let is_set = new.clone().next().is_some_and(|(beat, _)| beat.state.has(State::DUPLICATE));
@@ -199,7 +203,7 @@ fn claimed_before_its_first(session: &mut Session<'_>, higher: u32) -> Result<Op
     Ok(None)
 }
 
-/// What is no valid 4nn changes nothing.
+/// Checks that an invalid `4nn` changes nothing.
 pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), Stop> {
     let claimed = restart(session)?;
     session.start();
@@ -221,7 +225,7 @@ pub(super) fn invalid(session: &mut Session<'_>) -> Result<(), Stop> {
     Ok(())
 }
 
-/// A packet to which a claiming cell gives way, and then silence.
+/// Checks that a claiming cell gives way to a packet, and is silent after it.
 pub(super) fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) -> Result<(), Stop> {
     for _ in 0..ATTEMPTS {
         let claimed = restart(session)?;
@@ -235,7 +239,7 @@ pub(super) fn gives_way(session: &mut Session<'_>, what: &str, other: &Message) 
     Ok(())
 }
 
-/// A cell that gave way sends nothing any more.
+/// Checks that a cell that gave way sends nothing.
 fn is_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(), Stop> {
     session.idle(Span::from_millis(3))?;
     session.consume();
@@ -257,7 +261,7 @@ fn is_silent(session: &mut Session<'_>, claimed: Micros, what: &str) -> Result<(
     Ok(())
 }
 
-/// Claiming is over by then, and a heartbeat more is due.
+/// Returns the time after which claiming is over and a further heartbeat is due.
 fn claim_end(session: &Session<'_>) -> Span {
     Span(claim(session).0 + 60_000)
 }

@@ -1,4 +1,4 @@
-//! A restart that cuts the former life off anywhere, and a cell that is wrong about it.
+//! Restarts that cut off the previous life of the cell at any point, and faulty cells.
 
 use std::collections::VecDeque;
 
@@ -12,16 +12,16 @@ use crate::bus::{Bus, Seen};
 
 const OLD: Span = Span(120);
 const NEW: Span = Span::from_millis(60);
-/// The command of a restart ends before the cell sends, or after it.
+/// The restart command ends before the cell sends, or after it.
 const COMMANDS: [Span; 2] = [Span::from_millis(40), Span::from_millis(100)];
 
-/// A bus on which all that the cell sends is written down before.
+/// A bus that plays back a script of the cell's frames.
 struct Script {
     now: Micros,
     wire: VecDeque<Seen>,
-    /// Frames after the command of each restart.
+    /// The frames after the command of each restart.
     next: VecDeque<Vec<(Span, Frame)>>,
-    /// Duration of the command, and when it is done.
+    /// The duration of the command, and the time at which it is done.
     takes: Span,
     restarted: Micros,
 }
@@ -98,12 +98,13 @@ fn former_life(format: Format, start: usize, length: usize) -> Vec<Frame> {
     frames(&all, format).into_iter().skip(start).take(length).collect()
 }
 
-/// Returns the first frames of a right cell.
+/// Returns the first frames of a correct cell.
 fn new_life(format: Format) -> Vec<Frame> {
     frames(&[beat(0, true), beat(1, false), answer(1), beat(3, false)], format)
 }
 
-/// Returns the requirements that fail at a restart, when so many of the frames of the former life came before its command and the others after it.
+/// Returns the requirements that fail at a restart, if the first `before` frames of the former life come before its
+/// command and the others after it.
 fn failed(format: Format, takes: Span, former: &[Frame], before: usize, new: &[Frame]) -> Vec<&'static str> {
     let (before, after) = former.split_at(before);
     let now = Micros(1_000_000);
@@ -130,7 +131,7 @@ fn nothing_of_a_life_that_was_cut_off_counts() {
     let mut restarts = 0;
     for format in [Format::Classic, Format::Fd] {
         let new = new_life(format);
-        // The test may begin in the middle of a packet, too.
+        // The test may also begin in the middle of a packet.
         for start in 0..8 {
             for length in 0..=14.min(former_life(format, start, 99).len()) {
                 let former = former_life(format, start, length);
@@ -165,7 +166,7 @@ fn a_cell_that_is_wrong_about_its_packets_is_still_found() {
     let without = |frames: &[Frame], place: usize| -> Vec<_> {
         frames.iter().enumerate().filter(|(at, _)| *at != place).map(|(_, frame)| *frame).collect()
     };
-    // A packet without its other segment in either life, but for the first and the last of its identifier in the former one.
+    // A segment is missing, in either life, except in the first and the last packet of its identifier in the former life.
     for place in 4..8 {
         let failed = failed(format, takes, &without(&former, place), 0, &new);
         assert!(failed.contains(&"SEND-1"), "former, without {place}: {failed:?}");

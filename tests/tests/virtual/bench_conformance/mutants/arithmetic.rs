@@ -1,4 +1,4 @@
-//! F_z, J and torque words that are wrong.
+//! Cells with wrong F_z, J and torque words.
 
 use protocol::message::State;
 use protocol::parameters::Parameters;
@@ -10,7 +10,7 @@ const UP: fn(i64) -> i64 = |f_z| (f_z + 128) >> 8;
 const AT: fn(i64, i64) -> bool = |value, threshold| value >= threshold;
 const ALL: fn(i64) -> i64 = |sum| sum;
 
-/// Arithmetic.
+/// Faults of the arithmetic.
 pub(crate) const ARITHMETIC: &[Spoilt] = &[
     ("F_z is cut off, not rounded", "FORCE-1", |it| {
         it.say = |memory, message| {
@@ -131,7 +131,7 @@ pub(crate) const ARITHMETIC: &[Spoilt] = &[
                 let set = memory.count > 0;
                 memory.count = memory.count.saturating_sub(1);
                 let again = with(message, State::SATURATED, set);
-                // The next heartbeat has it too: here a second one is sent at once.
+                // The next heartbeat has it too: a second one is sent at once.
                 return if set { vec![(0, again), (50, again)] } else { vec![(0, again)] };
             }
             vec![(0, message)]

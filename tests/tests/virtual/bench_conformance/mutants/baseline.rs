@@ -1,4 +1,4 @@
-//! A zero that is found, followed, held or reported wrong.
+//! Cells that find, track, hold or report the zero wrongly.
 
 use protocol::fixed::{Q, Q5_10};
 use protocol::message::{Answer, Message, Request, SensorPage, SkinSensors};
@@ -7,7 +7,7 @@ use protocol::touch::contact;
 use super::Spoilt;
 use crate::bench_conformance::wrong::Memory;
 
-/// Baseline.
+/// Faults of the baseline.
 pub(crate) const BASELINE: &[Spoilt] = &[
     ("a threshold of 0 is accepted", "BASE-1", |it| {
         it.say = |memory, message| {
@@ -27,7 +27,7 @@ pub(crate) const BASELINE: &[Spoilt] = &[
         };
     }),
     ("a touch at the start is taken for the zero", "BASE-2", |it| {
-        // Readings beyond the limit reach the cell as smaller ones, until something else is written.
+        // Readings beyond the limit reach the cell as smaller ones, until another rule is written.
         it.say = |memory, message| {
             page_0(memory, message, |memory, skin| {
                 if contact(&memory.latched) == 700 {
@@ -124,7 +124,7 @@ pub(crate) const BASELINE: &[Spoilt] = &[
     }),
 ];
 
-/// Changes what page 0 of a report says.
+/// Changes page 0 of a report.
 fn page_0(
     memory: &mut Memory,
     mut message: Message,

@@ -1,11 +1,11 @@
-//! Heartbeats and the defence of a node id done wrong.
+//! Cells with wrong heartbeats and a wrong defence of the node id.
 
 use protocol::message::{Message, NetworkPage, State};
 
 use super::{NODE, Spoilt, is_claim};
 use crate::bench_conformance::wrong::{Memory, beat, with};
 
-/// Heartbeats.
+/// Faults of heartbeats.
 pub(crate) const BEATS: &[Spoilt] = &[
     ("a heartbeat every 300 ms", "BEAT-1", |it| {
         it.say = |memory, mut message| {
@@ -104,12 +104,12 @@ pub(crate) const BEATS: &[Spoilt] = &[
     }),
 ];
 
-/// Whether a heartbeat answers something, or is a regular one.
+/// Returns true if a heartbeat answers a request, false for a regular one.
 fn is_asked(memory: &Memory) -> bool {
     matches!(memory.heard, Some(Message::Sync | Message::Network { .. }))
 }
 
-/// A settled cell that receives its own node id.
+/// Faults of a settled cell that receives its own node id.
 pub(crate) const CLAIMS: &[Spoilt] = &[
     ("claims are not answered", "CLAIM-6", |it| {
         it.say = |memory, mut message| {

@@ -1,4 +1,4 @@
-//! Halt, resume, sync and report done wrong.
+//! Cells that handle halt, resume, sync and report wrongly.
 
 use protocol::message::{Message, NetworkPage, SensorPage, State};
 use protocol::packet::Epoch;
@@ -6,7 +6,7 @@ use protocol::packet::Epoch;
 use super::{NODE, Spoilt};
 use crate::bench_conformance::wrong::with;
 
-/// Halt, resume, sync, report.
+/// Faults of halt, resume, sync and report.
 pub(crate) const COMMANDS: &[Spoilt] = &[
     ("halt is ignored", "CMD-1", |it| {
         it.hear = |_, message, frame| if message == Some(&Message::Halt) { Vec::new() } else { vec![frame] };

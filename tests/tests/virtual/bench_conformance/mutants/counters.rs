@@ -1,4 +1,4 @@
-//! Frames that cannot be used, taken or counted wrong.
+//! Cells that accept or count unusable frames wrongly.
 
 use protocol::can::{EXTENDED, Format, Frame};
 use protocol::message::{Message, NetworkPage, State};
@@ -7,7 +7,7 @@ use protocol::packet::Packet;
 use super::{NODE, Spoilt};
 use crate::bench_conformance::wrong::{beat, fd, with};
 
-/// Frames that cannot be used.
+/// Faults with unusable frames.
 pub(crate) const COUNTERS: &[Spoilt] = &[
     ("a wrong CRC is not counted", "COUNT-1", |it| {
         it.say = |memory, mut message| {
@@ -129,7 +129,7 @@ pub(crate) const COUNTERS: &[Spoilt] = &[
     }),
 ];
 
-/// A frame with its CRC put right, if it is right in these bits.
+/// Corrects the CRC of a frame, if it is right in these bits.
 fn corrected(frame: Frame, bits: u16) -> Frame {
     let is_packet = frame.format() == Format::Fd && [16, 20, 24, 32].contains(&frame.data().len());
     if !is_packet || frame.is_extended() {

@@ -1,4 +1,4 @@
-//! Flash that loses something, and what a commit takes along that it should leave.
+//! Cells whose flash loses values, or whose commits change values that they should leave.
 
 use cell_node::flash::Flash;
 use protocol::fixed::{Q, TorqueFormat};
@@ -8,7 +8,7 @@ use protocol::parameters::{Parameters, Row, RowKind};
 use super::{NODE, Spoilt};
 use crate::bench_conformance::wrong::{Memory, beat, fd, with};
 
-/// What flash keeps is not all that was committed.
+/// Returns flash without some of the committed values.
 fn loses(flash: Flash, lose: fn(&mut Parameters)) -> Flash {
     match flash {
         Flash::Sound(mut parameters) => {
@@ -19,7 +19,7 @@ fn loses(flash: Flash, lose: fn(&mut Parameters)) -> Flash {
     }
 }
 
-/// A restart after a commit.
+/// Faults at a restart after a commit.
 pub(crate) const FLASH: &[Spoilt] = &[
     ("flash takes ten commits and no more", "CONF-8", |it| {
         it.store = |memory, flash| memory.commits.get(9).copied().map_or(flash, Flash::Sound);
@@ -64,7 +64,7 @@ pub(crate) const FLASH: &[Spoilt] = &[
     }),
 ];
 
-/// A commit is followed by what nobody asked for; its answer is not sent.
+/// Adds a request after a commit, whose answer is hidden.
 fn commits(
     memory: &mut Memory,
     message: Option<&Message>,
@@ -84,7 +84,7 @@ fn commits(
     }
 }
 
-/// The answer to what [`commits`] has added.
+/// Hides the answer to the request that [`commits`] has added.
 fn hides(memory: &mut Memory, message: Message) -> Vec<(u64, Message)> {
     match message {
         Message::Configured { tag: 0, answer: Answer::Value { number, written: true, .. }, .. }
@@ -97,7 +97,7 @@ fn hides(memory: &mut Memory, message: Message) -> Vec<(u64, Message)> {
     }
 }
 
-/// What a commit, a resume and a write of the mode take along.
+/// Faults of a commit, a resume and a write of the mode that change other values.
 pub(crate) const LEAVES: &[Spoilt] = &[
     ("a commit clears ACTIVE", "STATE-1", |it| {
         it.say = |memory, message| {
@@ -191,7 +191,7 @@ pub(crate) const LEAVES: &[Spoilt] = &[
                 request: Request::Write { number: 5, .. },
                 ..
             }) => {
-                // Something that has no effect.
+                // A frame without an effect.
                 vec![protocol::can::Frame::fd(0x003, 1, &[0; 1]).unwrap_or(frame)]
             }
             _ => vec![frame],

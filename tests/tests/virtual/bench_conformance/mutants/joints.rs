@@ -1,4 +1,4 @@
-//! Wrong answers to joints.
+//! Cells that answer joints wrongly.
 
 use protocol::message::{Message, NetworkPage, State};
 use protocol::packet::{Epoch, Words};
@@ -6,7 +6,7 @@ use protocol::packet::{Epoch, Words};
 use super::{NODE, Spoilt, decoded};
 use crate::bench_conformance::wrong::{fd, with};
 
-/// Joints and contacts.
+/// Faults with joints and contacts.
 pub(crate) const JOINTS: &[Spoilt] = &[
     ("a cell that measures answers everything with zeros", "JOINTS-6", |it| {
         it.add = |memory| match memory.heard {

@@ -1,4 +1,4 @@
-//! One wrong cell for each thing that a cell can do wrong, and the requirement that it breaks.
+//! One faulty cell for each fault that a cell can have, with the requirement that it breaks.
 
 pub(crate) mod arithmetic;
 pub(crate) mod baseline;
@@ -18,7 +18,7 @@ use protocol::message::{Message, NetworkPage, SensorPage, State};
 
 use crate::bench_conformance::wrong::Wrong;
 
-/// Its name, the requirement, and how it is made of a right one.
+/// Its name, the requirement, and the function that makes it from a correct cell.
 pub(crate) type Spoilt = (&'static str, &'static str, fn(&mut Wrong));
 
 /// The node id of all of them.
@@ -46,7 +46,7 @@ pub(crate) fn decoded(frame: &Frame) -> Option<Message> {
     Message::decode(&protocol::packet::Packet::from_fd(frame).ok()?).ok()
 }
 
-/// Whether it is a heartbeat with CLAIMING.
+/// Returns true for a heartbeat with CLAIMING.
 fn is_claim(message: Option<&Message>) -> bool {
     matches!(
         message,
@@ -54,7 +54,7 @@ fn is_claim(message: Option<&Message>) -> bool {
     )
 }
 
-/// A sensors page that nobody asked for.
+/// Returns an unrequested sensors page.
 fn page_0() -> Message {
     let from = protocol::id::CellId::new(NODE.into()).unwrap();
     let page = SensorPage::Skin(protocol::message::SkinSensors::default());

@@ -1,4 +1,4 @@
-//! Reads, writes and commits done wrong.
+//! Cells that handle reads, writes and commits wrongly.
 
 use protocol::message::{Answer, Message, NetworkPage, Request, State};
 use protocol::parameters::Parameter;
@@ -6,7 +6,7 @@ use protocol::parameters::Parameter;
 use super::{NODE, Spoilt};
 use crate::bench_conformance::wrong::{Memory, beat, fd, with};
 
-/// Parameters.
+/// Faults with parameters.
 pub(crate) const PARAMETERS: &[Spoilt] = &[
     ("the identity has the hash with the high byte first", "CONF-1", |it| {
         it.say = |_, mut message| {
@@ -231,7 +231,7 @@ pub(crate) const PARAMETERS: &[Spoilt] = &[
     }),
 ];
 
-/// A commit whose hash is right in these bits is given the right one.
+/// Corrects the hash of a commit, if it is right in these bits.
 fn hashed(
     memory: &Memory,
     message: Option<&Message>,
@@ -253,7 +253,7 @@ fn hashed(
     }
 }
 
-/// A write that has to be refused is answered as if it was taken.
+/// Answers a write that has to be refused as if it was accepted.
 fn accepted(memory: &Memory, message: Message, of: u8, which: u8) -> Vec<(u64, Message)> {
     let Some(Message::Configure { request: Request::Write { number, words }, .. }) = memory.heard else {
         return vec![(0, message)];

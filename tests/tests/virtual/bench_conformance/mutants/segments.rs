@@ -1,4 +1,4 @@
-//! Segments put together wrong.
+//! Cells that reassemble segments wrongly.
 
 use protocol::message::{Message, NetworkPage};
 use protocol::packet::Packet;
@@ -6,7 +6,7 @@ use protocol::packet::Packet;
 use super::{NODE, Spoilt};
 use crate::bench_conformance::wrong::beat;
 
-/// Segments, on a classic bus.
+/// Faults with segments, on a classic bus.
 pub(crate) const SEGMENTS: &[Spoilt] = &[
     ("segments are taken in either order", "COUNT-3", |it| {
         it.hear = |memory, _, frame| {
@@ -23,7 +23,7 @@ pub(crate) const SEGMENTS: &[Spoilt] = &[
     ("one buffer for the segments of all identifiers", "COUNT-3", |it| {
         it.hear = |memory, _, frame| {
             let before = memory.frame.replace(frame);
-            // A segment under another identifier throws away what waits.
+            // A segment under another identifier discards the waiting one.
             match before {
                 Some(before) if before.id() != frame.id() && memory.count == u64::from(frame.id()) + 1 => {
                     memory.count = u64::from(before.id()) + 1;
@@ -64,7 +64,7 @@ pub(crate) const SEGMENTS: &[Spoilt] = &[
             }
             memory.count += 1;
             let _ = message;
-            // Segments are taken two by two, whatever they are.
+            // Segments are combined in pairs, whatever they are.
             let before = memory.frame.take();
             let Some(before) = before else {
                 memory.frame = Some(frame);

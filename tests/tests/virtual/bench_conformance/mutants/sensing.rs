@@ -1,10 +1,10 @@
-//! Sensors pages without a request, sent wrong.
+//! Cells that send sensors pages without a request wrongly.
 
 use protocol::message::{Answer, Message, Request, SensorPage};
 
 use super::{Spoilt, page_0};
 
-/// Sensor values without a request.
+/// Faults with sensor values without a request.
 pub(crate) const SENSING: &[Spoilt] = &[
     ("a switch sends no pages", "SENSE-4", |it| {
         it.say = |memory, message| {
@@ -110,7 +110,7 @@ pub(crate) const SENSING: &[Spoilt] = &[
     }),
     ("what answers a report is not what was sent last", "SENSE-8", |it| {
         it.hear = |memory, message, frame| {
-            // The values of the report before are restored by a page that nobody sees.
+            // A hidden page restores the values before the report.
             if message == Some(&Message::Report) {
                 memory.count = 3;
             }

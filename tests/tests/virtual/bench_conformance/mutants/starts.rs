@@ -1,4 +1,4 @@
-//! Starts and address claims done wrong.
+//! Cells with wrong starts and address claims.
 
 use cell_node::flash::Flash;
 use protocol::message::{Answer, Message, NetworkPage, Request, State};
@@ -7,7 +7,7 @@ use protocol::time::Micros;
 use super::{NODE, Spoilt, is_claim, page_0};
 use crate::bench_conformance::wrong::{beat, fd, with};
 
-/// What shows at a start.
+/// Faults that show at a start.
 pub(crate) const STARTS: &[Spoilt] = &[
     ("the first heartbeat has no CLAIMING", "CLAIM-1", |it| {
         it.say = |memory, message| {

@@ -1,4 +1,4 @@
-//! Stimuli latched wrong.
+//! Cells that latch stimuli wrongly.
 
 use protocol::message::{Message, NetworkPage, Request, SensorPage};
 use protocol::packet::Epoch;
@@ -6,7 +6,7 @@ use protocol::packet::Epoch;
 use super::{NODE, Spoilt};
 use crate::bench_conformance::wrong::fd;
 
-/// Stimuli.
+/// Faults with stimuli.
 pub(crate) const STIMULI: &[Spoilt] = &[
     ("stimuli of later epochs are latched at once", "STIM-3", |it| {
         it.hear = |_, message, frame| match message {
