@@ -53,7 +53,7 @@ kind = "kill"
 cells = [1]
 "#;
 
-/// Three cells on one bus.
+/// Returns a skin with three cells on one bus.
 fn three() -> Skin {
     let cell = SKIN.get(SKIN.find("[[cell]]").unwrap()..).unwrap();
     let text = [2, 3].map(|node| cell.replace("node = 1", &format!("node = {node}")));
@@ -64,7 +64,7 @@ fn good() -> Scenario {
     Scenario::parse("scenario.toml", GOOD, &three()).unwrap()
 }
 
-/// What is wrong, by its line; columns have a test of their own.
+/// Formats an error with its line only; columns have their own test.
 fn by_line(error: DocumentError) -> String {
     let DocumentError::Wrong { path, line, what, .. } = error else { return error.to_string() };
     format!("{path}:{line}: {what}")
@@ -123,7 +123,7 @@ fn most_keys_have_defaults() {
     assert_eq!(scenario.mode_at(Micros(0)), Mode::Compare);
     let parse = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap();
     assert_eq!(parse(""), Scenario::idle(IDLE));
-    // The shortest that does something: a constant force on one cell, until the end.
+    // The shortest file with an effect: a constant force on one cell, until the end.
     let short = parse("[[touch]]\ncells = [1]\nforce_n = 3.0\n");
     let touch = &short.touches[0];
     assert_eq!((short.duration, touch.at, touch.length), (IDLE, Micros(0), Span(u64::MAX)));
@@ -313,7 +313,7 @@ fn with_several_buses_the_bus_must_be_named() {
     );
 }
 
-/// The force in N of a cell's words in an epoch.
+/// Returns the force in N of a cell's words in an epoch.
 fn force(touches: &Touches, cell: usize, epoch: u64) -> f64 {
     touches.sensors(cell, epoch).contact.iter().map(|word| word.to_f64()).sum()
 }
@@ -321,7 +321,7 @@ fn force(touches: &Touches, cell: usize, epoch: u64) -> f64 {
 #[test]
 fn touches_come_and_go_by_their_profile() {
     let touches = Touches::new(&good(), &three());
-    // 62.5 epochs a second: the half-sine goes from epoch 125 to 225, the step from 187.5 to 218.75.
+    // At 62.5 epochs per second, the half-sine covers epochs 125 to 225, the step 187.5 to 218.75.
     assert_eq!(force(&touches, 0, 125), 0.0);
     assert_eq!(force(&touches, 0, 175), 3.0, "the middle");
     assert!((force(&touches, 0, 150) - 3.0 * 0.5_f64.sqrt()).abs() < 1e-3);
@@ -399,7 +399,7 @@ proptest! {
         let _ = contact_words(force_n);
     }
 
-    /// All changes together give the words of every cell, also when epochs were skipped.
+    /// All changes together give the words of every cell, even with skipped epochs.
     #[test]
     fn changes_add_up_to_the_words_of_every_cell(steps in proptest::collection::vec(1_u64..40, 1..60)) {
         let faults = "[[fault]]\nat_s = 2.5\nkind = \"stuck\"\nfor_s = 0.3\ncells = [1]\n\
