@@ -152,7 +152,7 @@ pub struct Traffic {
 }
 
 impl Traffic {
-    /// Number of packets that are sufficient evidence: a random frame passes the CRC with probability 1/32 768.
+    /// Minimum number of packets as evidence: a random frame is a packet with probability 1/65 536.
     const PACKETS: u64 = 2;
     /// Maximum number of other frames per packet.
     const OTHERS: u64 = 32;

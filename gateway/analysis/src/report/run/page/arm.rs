@@ -1,4 +1,4 @@
-//! What the ticks and the cells' torques come to.
+//! The sections on the arm: figures from the ticks and from the cells' torques.
 
 use hdrhistogram::Histogram;
 
@@ -13,16 +13,16 @@ use model::table::{Accuracy, Errors};
 use protocol::fixed::TorqueFormat;
 use protocol::skin::{JointKind, Reply};
 
-/// The central computation rounds by less than this, in Nm: a smaller error is none.
+/// Upper bound of the central computation's rounding error, in Nm: smaller errors count as zero.
 const ROUNDING_NM: f64 = 1e-12;
 
-/// An error without the rounding of the computation that it is compared with.
+/// Sets errors within the rounding of the reference computation to zero.
 fn without_rounding(error: f64) -> f64 {
     if error.abs() < ROUNDING_NM { 0.0 } else { error }
 }
 
 impl Draft<'_> {
-    /// The paper's Fig. 6.
+    /// Creates the section that corresponds to the paper's Fig. 6.
     pub(super) fn torque(&self) -> Section {
         let joints = 0..self.run.skin.robot.joints.len();
         let (loaded, free): (Vec<_>, Vec<_>) = joints.partition(|joint| self.is_loaded(*joint));
@@ -65,7 +65,7 @@ impl Draft<'_> {
         section.figures(figures.chain(error)).tables(self.errors()).tables(self.formats())
     }
 
-    /// The buses whose cells may load a joint, each with the joint's place in its chain.
+    /// Returns the buses with cells that may load a joint, each with the joint's index in its chain.
     fn buses_of(&self, joint: usize) -> impl Iterator<Item = (usize, usize, &LinkId)> {
         self.run.bus_figures.iter().enumerate().filter_map(move |(bus, bus_figures)| {
             let place = self.run.skin.joints_of(bus).position(|(of_chain, _)| of_chain == joint)?;
@@ -73,7 +73,7 @@ impl Draft<'_> {
         })
     }
 
-    /// One step of the torque words of a bus, in Nm or N.
+    /// Returns one step of the torque words of a bus, in Nm or N.
     fn step(&self, bus: usize) -> f64 {
         let bus = self.run.skin.buses.get(bus);
         let format = bus.map_or_else(TorqueFormat::default, |bus| match bus.reply {
@@ -83,7 +83,7 @@ impl Draft<'_> {
         format.step()
     }
 
-    /// Whether a joint had any torque, to half a step of the words.
+    /// Returns true if a joint had a torque of at least half a step of the words.
     fn is_loaded(&self, joint: usize) -> bool {
         let step = self.buses_of(joint).map(|(bus, ..)| self.step(bus)).fold(f64::INFINITY, f64::min);
         let largest = |line: Option<&Thinned>| {
@@ -97,7 +97,7 @@ impl Draft<'_> {
         ticks.into_iter().chain(epochs).any(|line| largest(line) >= step * 0.5)
     }
 
-    /// The torque on one joint, and below it what that differs by.
+    /// Creates the figure of the torque on one joint, with the difference below.
     fn torque_of(&self, joint: usize) -> Figure {
         let name = self.joint(joint);
         let name =
@@ -125,7 +125,7 @@ impl Draft<'_> {
         figure.below(Below { y: Axis::new("difference", unit), series, marks })
     }
 
-    /// A joint as the skin's file names it; with its number where that is no part of the name.
+    /// Returns a joint's name in the skin's file, with its number unless the name contains it.
     fn joint(&self, index: usize) -> String {
         let number = index + 1;
         match self.run.skin.robot.joints.get(index) {
@@ -134,13 +134,13 @@ impl Draft<'_> {
         }
     }
 
-    /// The unit of torques on all joints together.
+    /// Returns the unit of torques over all joints.
     pub(super) fn torque_unit(&self) -> &'static str {
         let slides = self.run.skin.robot.joints.iter().any(|joint| joint.kind == JointKind::Prismatic);
         if slides { "Nm or N" } else { JointKind::Revolute.torque_unit() }
     }
 
-    /// Errors joint by joint.
+    /// Creates the table of errors by joint.
     fn errors(&self) -> Option<Table> {
         let skin = &self.run.skin;
         let mut by_joint = vec![[Errors::default(); 2]; skin.robot.joints.len()];
@@ -180,7 +180,7 @@ impl Draft<'_> {
         ))
     }
 
-    /// The paper's Fig. 7, and the positions.
+    /// Creates the section that corresponds to the paper's Fig. 7, with the positions.
     pub(super) fn motion(&self) -> Section {
         let motion = &self.run.motion;
         let figures = self.groups().into_iter().enumerate().flat_map(|(group, (kind, joints))| {
@@ -203,7 +203,7 @@ impl Draft<'_> {
         if still.is_empty() { section } else { section.text("What is not drawn here was 0 throughout.") }
     }
 
-    /// Joints that share a figure: those of one kind that a chain adds to the chains before it.
+    /// Groups the joints that share a figure: joints of one kind that a chain adds to the previous chains.
     fn groups(&self) -> Vec<(JointKind, Vec<usize>)> {
         let robot = &self.run.skin.robot;
         let mut rest: Vec<_> = (0..robot.joints.len()).collect();
@@ -243,7 +243,7 @@ impl Draft<'_> {
         }
     }
 
-    /// The paper's Fig. 8.
+    /// Creates the section that corresponds to the paper's Fig. 8.
     pub(super) fn cycle(&self) -> Section {
         let motion = &self.run.motion;
         let lacks = "how long ticks and the central computation in them took, and how late they began";
@@ -287,7 +287,7 @@ impl Draft<'_> {
     }
 }
 
-/// Whether all that is drawn is 0.
+/// Returns true if all values of a figure are 0.
 fn is_zero(figure: &Figure) -> bool {
     figure.series.iter().flat_map(|series| &series.points).all(|(_, y)| y.abs() < 1e-9 || !y.is_finite())
 }

@@ -1,4 +1,4 @@
-//! What became of the cells' replies and packets, and what a real bus would carry.
+//! The sections on the buses: replies and packets of the cells, and the load of real buses.
 
 use super::super::bus_figures::{Latency, LinkId};
 use super::{Draft, shown};
@@ -11,7 +11,7 @@ use crate::shadow::BusShadow;
 use model::quantiles::Quantiles;
 use model::table::{Cell, Event};
 
-/// Cells in the table of the worst.
+/// Maximum number of cells in the table of the worst cells.
 const WORST: usize = 12;
 
 impl Draft<'_> {
@@ -99,13 +99,13 @@ impl Draft<'_> {
         Table::new("Replies by bus", head, rows)
     }
 
-    /// Cells by what went wrong with them, and then by how slow they were.
+    /// Creates the table of cells, by their problems and then by their slowness.
     fn worst(&self) -> Option<Table> {
         let cells = self.run.bus_figures.iter().enumerate().flat_map(|(bus, bus_figures)| {
             let described = self.run.skin.cells_of(bus);
             bus_figures.table.cells().iter().zip(described).zip(&bus_figures.latency).map(
                 move |((cell, described), latency)| {
-                    // As the robot numbers it.
+                    // The robot's numbering of joints.
                     let joint =
                         self.run.skin.joints_of(bus).nth(usize::from(described.joint).saturating_sub(1));
                     (bus_figures, cell, joint.map_or(0, |(joint, _)| joint + 1), latency)
@@ -157,19 +157,20 @@ impl Draft<'_> {
         Some(Table::new(title, head, rows))
     }
 
-    /// A load in % from the first tick or joints on: before it cells start, all at once.
+    /// Returns a load in % from the first tick or joints on; before that, all cells start at once.
     pub(super) fn percent(&self, binned: &Binned) -> Vec<(f64, f64)> {
         let rates = binned.rates().into_iter().map(|(x, part)| (x - self.zero, part * 100.0));
         rates.filter(|(x, _)| *x >= 0.0).collect()
     }
 
-    /// What a real bus would have made of each bus that had frames.
+    /// Returns the timing of the real bus for each bus with frames.
     fn shadows(&self) -> impl Iterator<Item = BusShadow> {
         let buses = self.run.shadow.report().buses;
         buses.into_iter().filter(|bus| self.run.skin.bus_named(&bus.bus).is_some())
     }
 
-    /// Whether real buses would carry it: in this run, and at most. Only chosen rates are rated, not defaults.
+    /// Creates the findings on the fit of real buses, in this run and in the worst case. Only chosen bit rates are
+    /// rated, not defaults.
     pub(super) fn fits(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         let limits = format!("at most 100 %, replies before the next joints, {NODES} nodes");
@@ -189,7 +190,7 @@ impl Draft<'_> {
         findings
     }
 
-    /// What a real bus would carry.
+    /// Creates the section on the load of real buses.
     pub(super) fn load(&self) -> Section {
         let figure = |bus_figures: &LinkId| {
             let LinkId { name, load, load_of_all, rates, .. } = bus_figures;
@@ -258,7 +259,7 @@ impl Draft<'_> {
     }
 }
 
-/// What a bus would carry in operation and in start-up.
+/// Creates the table of a bus's load in operation and in start-up.
 fn carried(bus: &BusShadow) -> Table {
     let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), percent);
     let mut rows = Vec::new();
@@ -293,7 +294,7 @@ fn carried(bus: &BusShadow) -> Table {
     Table::new(format!("{} at {}: does it fit", bus.bus, bus.name), head, rows)
 }
 
-/// With one decimal.
+/// Rounds to one decimal.
 fn tenths(value: f64) -> f64 {
     (value * 10.0).round() / 10.0
 }

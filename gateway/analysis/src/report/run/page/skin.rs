@@ -1,4 +1,4 @@
-//! What the skin was touched with, over time and by place, and where replies and packets were lost.
+//! The section on the skin: touches over time and by position, and the cells with lost replies and packets.
 
 use std::collections::BTreeMap;
 
@@ -10,14 +10,14 @@ use crate::report::figure::{
     Drawing, Legend, Map, Panel, Section, Spot, Strip, StripGroup, StripRow, quantity,
 };
 
-/// Rows of the strip.
+/// Maximum number of rows of the strip.
 const ROWS: usize = 40;
 
 /// A link: a row of a chain, from 1.
 type Link = (usize, u8);
 
 impl Draft<'_> {
-    /// Which cells were touched when and with how much.
+    /// Creates the section on touches, with their times and forces.
     pub(super) fn skin(&self) -> Section {
         let section = Section::new("skin", "The skin");
         let forces = self.by_cell(|bus, place| {
@@ -54,7 +54,7 @@ impl Draft<'_> {
         }
     }
 
-    /// Whether cells of frames without a loop sent torques, and nothing on the buses tells the forces that they are from.
+    /// Returns true for a capture without a loop in which cells sent torques but the forces are unknown.
     pub(super) fn lacks_forces(&self) -> bool {
         let lines = self.run.motion.distributed.iter();
         let is_loaded = lines.flat_map(|line| line.points()).any(|(_, torque)| torque != 0.0);
@@ -62,7 +62,7 @@ impl Draft<'_> {
         self.run.frames_only.is_some() && is_loaded && self.run.bus_figures.iter().all(is_untouched)
     }
 
-    /// Each row's cells over time, those that were touched.
+    /// Creates the strip of touched cells over time.
     fn strip(&self) -> Option<Strip> {
         let mut rows = Vec::new();
         for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
@@ -112,7 +112,7 @@ impl Draft<'_> {
         Some(Strip { name: "touches".to_owned(), title, seconds, legend, groups })
     }
 
-    /// A value of each cell in the skin's order, by bus and place on it.
+    /// Returns a value for each cell in the skin's order, given its bus and its index there.
     fn by_cell(&self, value: impl Fn(usize, usize) -> Option<f64>) -> Vec<Option<f64>> {
         let mut places = vec![0; self.run.skin.buses.len()];
         let of = |cell: &protocol::skin::Cell| {
@@ -123,7 +123,7 @@ impl Draft<'_> {
         self.run.skin.cells.iter().map(of).collect()
     }
 
-    /// The cells at their places, with their values; none where all of them are 0.
+    /// Creates a map of the cells with their values; `None` if all of them are 0.
     fn map(&self, name: &str, title: &str, caption: &str, unit: &str, values: &[Option<f64>]) -> Option<Map> {
         let skin = &self.run.skin;
         let legend = Legend::of(caption, unit, values.iter().copied().flatten());
@@ -148,7 +148,7 @@ impl Draft<'_> {
         Some(Map { name: name.to_owned(), title: title.to_owned(), legend, panels })
     }
 
-    /// From the link before it to this one, in this one's frame.
+    /// Returns the direction from the previous link to this one, in this link's frame.
     fn to_tip(&self, (chain, row): Link) -> [f64; 3] {
         let rows = self.run.skin.robot.chains.get(chain).map(|chain| &chain.rows);
         let row = rows.and_then(|rows| rows.get(usize::from(row).saturating_sub(1)));
@@ -158,7 +158,7 @@ impl Draft<'_> {
         })
     }
 
-    /// What a link is called; with its bus where there are several.
+    /// Returns the name of a link, with its bus if there are several.
     pub(super) fn link(&self, (chain, row): Link, bus: Option<usize>) -> String {
         let skin = &self.run.skin;
         let chains = &skin.robot.chains;
