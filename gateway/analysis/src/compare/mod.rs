@@ -169,8 +169,8 @@ impl<'a> Comparison<'a> {
         self.sides.of_mut(which).not_found()
     }
 
-    /// If fewer than half of the cells that reported a configuration have the skin's, returns the number of those that
-    /// reported one and of those with the skin's.
+    /// Returns the number of cells that reported a configuration, and of those among them with the skin's, if these are
+    /// fewer than half.
     #[must_use]
     pub fn other_configurations(&self, which: Which) -> Option<(usize, usize)> {
         let hash = |bus: usize, node| {

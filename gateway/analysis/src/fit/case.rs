@@ -113,7 +113,7 @@ pub struct Times {
     /// From the due time of the broadcast to the end of the last answer in ns, as a sum: blocking, joints, computation,
     /// blocking, and all answers.
     pub chain_ns: Option<u64>,
-    /// The same time by response-time analysis, for torques.
+    /// The time of `chain_ns` by response-time analysis, for torques.
     pub response_ns: Option<Response>,
     /// From the due time of a heartbeat to its end, in ns; it may be sent a period early.
     pub heartbeat_ns: Option<u64>,

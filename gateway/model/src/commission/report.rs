@@ -13,11 +13,11 @@ pub struct Progress {
     pub doing: &'static str,
     /// Cells of the description on this bus.
     pub cells: usize,
-    /// Of these, found on the bus.
+    /// Described cells that were found on the bus.
     pub found: usize,
-    /// Of these, done.
+    /// Described cells that are done.
     pub done: usize,
-    /// Of these, failed.
+    /// Described cells that failed.
     pub failed: usize,
 }
 

@@ -17,7 +17,7 @@ impl Display for Decoded {
     }
 }
 
-/// A frame in the units of its bus.
+/// A decoded frame, formatted in the units of its bus.
 #[derive(Clone, Copy, Debug)]
 pub struct InUnits<'a>(&'a Decoded, Units);
 

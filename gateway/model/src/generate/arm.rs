@@ -21,7 +21,7 @@ use super::GenerateError;
 const PITCH_MM: usize = 28;
 /// The smallest distance in mm that is plausible for hardware.
 const MIN_PITCH_MM: usize = 3;
-/// Ports of a cell.
+/// Number of ports of a cell.
 const PORTS: usize = 4;
 
 /// An arm that can carry a skin.

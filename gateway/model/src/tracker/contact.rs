@@ -42,7 +42,7 @@ enum Unseen {
     Any,
     /// Stimuli for one of the next `ahead` epochs after the last joints.
     Ahead { last: Epoch, ahead: u8 },
-    /// None can be pending.
+    /// No stimulus can be pending.
     None,
 }
 

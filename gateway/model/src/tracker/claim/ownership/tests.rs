@@ -66,7 +66,7 @@ const fn places(ownership: &Ownership, evidence: E) -> (&[Sample], usize) {
 #[derive(Clone, Copy, Debug)]
 enum Whose {
     Nobody,
-    /// The same life as before.
+    /// Keeps the life from before.
     Same,
     /// The previous owner's, with the new heartbeat.
     Longer,
