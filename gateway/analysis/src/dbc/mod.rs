@@ -93,7 +93,7 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
             Kind::Command => vec![said(Node::Everyone)],
             Kind::Network => {
                 let (from, to, rhythm) = (Party::Gateway, Party::Unnamed, Rhythm::Seldom);
-                let comment = "For several gateways on one bus: no gateway has to send it; receiving it shows that another one is there.";
+                let comment = "For several gateways on one bus: sending it is optional; receiving it shows that there is another gateway.";
                 let other = Message { from, to, rhythm, comment, ..said(Node::Gateway) };
                 iter::once(other).chain(each).collect()
             }

@@ -176,9 +176,9 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
         let name = &bus.name;
         let Some(moment) = moment else {
             if skin.cells_of(index).next().is_some() {
-                explanation
-                    .missing
-                    .push(format!("{name}: these joints are not in the capture; the total is without it"));
+                explanation.missing.push(format!(
+                    "{name}: these joints are not in the capture; the total does not include them"
+                ));
             }
             continue;
         };
@@ -222,7 +222,7 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
                 };
                 let node = cell.node;
                 explanation.missing.push(format!(
-                    "{name} {node}: no torque of this epoch in time: {why}; the words are without it"
+                    "{name} {node}: no torque of this epoch in time: {why}; the sum of words lacks it"
                 ));
             }
             let newtons = force.map_or(0.0, |force| force.fused_or_none());
@@ -262,8 +262,8 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
         }
         if silent > 0 {
             explanation.missing.push(format!(
-                "{name}: {silent} cells sent nothing, and their contact state is not in the capture; they are taken as not \
-                 in contact"
+                "{name}: {silent} cells sent nothing, and their contact state is not in the capture; they are assumed \
+                 not to be in contact"
             ));
         }
     }
@@ -306,7 +306,7 @@ impl Sum {
 #[expect(clippy::cast_precision_loss, reason = "to be read")]
 fn too_late(nanos: u64) -> String {
     let ms = nanos as f64 / 1e6;
-    format!("it came {ms:.3} ms after the joints, when four more had come, and is not used")
+    format!("it came {ms:.3} ms after the joints, after four more joints, and is not used")
 }
 
 /// Returns the likely reason why a cell in contact sent nothing.
@@ -347,7 +347,7 @@ fn known(
             return None;
         }
         None if answered || touched => missing.push(format!(
-            "{bus} {node}: it did not report its configuration; taken to be the skin's, {target:04X}"
+            "{bus} {node}: it did not report its configuration; assumed to be the skin's, {target:04X}"
         )),
         Some(_) | None => {}
     }

@@ -15,7 +15,7 @@ pub enum NotFound {
         skin: String,
     },
     /// The capture has no joints.
-    #[error("there are no joints on {buses}, and cells answer nothing else")]
+    #[error("there are no joints on {buses}, and cells answer only joints")]
     Joints {
         /// The skin's buses that are in the capture.
         buses: String,
@@ -44,6 +44,6 @@ pub enum NotFound {
 #[must_use]
 pub fn another_robot(bus: &str, came: usize, chain: usize) -> String {
     format!(
-        "the joints on {bus} are {came}, and the skin's chain there has {chain}: it is the skin of another robot, name the right one"
+        "{bus} carries {came} joints, but the skin's chain on it has {chain}: the skin is of another robot, name the right one"
     )
 }

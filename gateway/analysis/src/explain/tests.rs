@@ -138,7 +138,7 @@ fn another_configuration_is_named_and_nothing_computed() {
     let said = [press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
     assert_eq!(explained(&skin, &said, first(7)).unwrap().missing, [expected]);
     let without = explained(&skin, &said[..3], first(7)).unwrap();
-    let expected = "vcan0 12: it did not report its configuration; taken to be the skin's, 266D";
+    let expected = "vcan0 12: it did not report its configuration; assumed to be the skin's, 266D";
     assert_eq!(without.missing, [expected]);
     assert!(without.cells[0].force.is_some());
 }
@@ -181,7 +181,7 @@ fn joints_are_found_by_epoch_time_and_occurrence() {
     assert_eq!(at(Requested { occurrence: 2, ..first(7) }), Ok(264));
     assert_eq!(at(Requested { from_ns: 100_000_000, ..first(7) }), Ok(264));
     let error = at(Requested { occurrence: 2, ..first(21) }).unwrap_err().to_string();
-    let expected = "there are no joints of epoch 21 for the 2. time; there are 277 joints in a row, from epoch 0 at \
+    let expected = "there are no joints of epoch 21 (occurrence 2); there are 277 joints in a row, from epoch 0 at \
                     0.000 s to epoch 20 at 0.276 s";
     assert_eq!(error, expected);
 }
@@ -195,7 +195,7 @@ fn what_is_not_there_is_named_with_what_is() {
                     0.001 s; those of epoch 9 at 0.002 s";
     assert_eq!(error, expected);
     let error = explained(&skin, &[heartbeat(0)], first(5)).unwrap_err().to_string();
-    assert_eq!(error, "there are no joints on vcan0, and cells answer nothing else");
+    assert_eq!(error, "there are no joints on vcan0, and cells answer only joints");
     let mut watch = Watch::new(&skin, first(5));
     watch.take(0, "can7", None);
     let error = watch.moments().unwrap_err().to_string();
@@ -203,7 +203,7 @@ fn what_is_not_there_is_named_with_what_is() {
     // Memory is bounded for any input.
     let said: Vec<_> = (0..200).map(|epoch: u8| joints(epoch.wrapping_mul(3))).collect();
     let error = explained(&skin, &said, Requested { occurrence: 9, ..first(5) }).unwrap_err().to_string();
-    assert!(error.ends_with("; 192 further rows"), "{error}");
+    assert!(error.ends_with("; 192 further runs"), "{error}");
 }
 
 #[test]
@@ -226,8 +226,8 @@ fn a_torque_after_four_more_joints_is_named_and_not_used() {
     let in_time = explained(&skin, &said(3), first(7)).unwrap();
     assert_eq!((in_time.cells[0].answered_after_ns, in_time.missing), (Some(4_000_000), Vec::new()));
     let late = explained(&skin, &said(4), first(7)).unwrap();
-    let expected = "vcan0 12: no torque of this epoch in time: it came 5.000 ms after the joints, when four more had \
-                    come, and is not used; the words are without it";
+    let expected = "vcan0 12: no torque of this epoch in time: it came 5.000 ms after the joints, after four more \
+                    joints, and is not used; the sum of words lacks it";
     assert_eq!((late.cells[0].answered_after_ns, late.missing), (None, vec![expected.to_owned()]));
 }
 

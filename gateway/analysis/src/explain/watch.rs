@@ -261,14 +261,14 @@ impl<'a> Watch<'a> {
             };
             let mut requested = format!("of epoch {epoch}");
             if occurrence > 1 {
-                requested += &format!(" for the {occurrence}. time");
+                requested += &format!(" (occurrence {occurrence})");
             }
             if from_ns > 0 {
                 requested += &format!(" at {} s or later", seconds(from_ns));
             }
             let mut runs: Vec<_> = bus_watch.runs.iter().map(|run| run.text(zero)).collect();
             if bus_watch.further_runs > 0 {
-                runs.push(format!("{} further rows", bus_watch.further_runs));
+                runs.push(format!("{} further runs", bus_watch.further_runs));
             }
             return Err(NotFound::Epoch { requested, runs: runs.join("; ") });
         }

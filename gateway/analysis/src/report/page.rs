@@ -39,7 +39,7 @@ pub fn html(page: &Page) -> String {
     }
     out.push_str("</main>\n");
     if !page.facts.is_empty() {
-        out.push_str("<footer>\n<h2>How it came about</h2>\n<dl>\n");
+        out.push_str("<footer>\n<h2>Origin</h2>\n<dl>\n");
         for (name, value) in &page.facts {
             let _ = writeln!(out, "<dt>{}</dt><dd>{}</dd>", escaped(name), escaped(value));
         }

@@ -66,13 +66,13 @@ pub enum Outcome {
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 pub enum Reason {
     /// It sent no heartbeat.
-    #[error("is not on the bus: switch it on, or look at its wires")]
+    #[error("is not on the bus: switch it on, or check its wiring")]
     Missing,
     /// Its heartbeats stopped.
     #[error("has gone from the bus")]
     Gone,
     /// Two cells have its serial number.
-    #[error("is there twice, with the node ids {0} and {1}: give one of them another serial number")]
+    #[error("is on the bus twice, with node ids {0} and {1}: give one of them another serial number")]
     Twins(CellId, CellId),
     /// Another cell uses its node id too.
     #[error("shares node id {number} with the cell of serial number {other}: switch one of them off")]
@@ -105,7 +105,7 @@ pub enum Reason {
         code: i16,
     },
     /// It lacks an ability that the skin needs.
-    #[error("cannot have {0}: give it newer firmware, or leave it out of the skin")]
+    #[error("does not support {0}: install newer firmware, or leave it out of the skin")]
     Cannot(Ability),
     /// Its answer differs from the written value.
     #[error(
@@ -155,7 +155,7 @@ impl Trouble {
     pub fn on(self, bus: &str) -> String {
         match self {
             Self::OtherGateway => format!("another gateway is on {bus}: stop it first"),
-            Self::Meddler => format!("somebody else configures cells on {bus}: let that end first"),
+            Self::Meddler => format!("another program configures cells on {bus}: wait until it has finished"),
         }
     }
 }

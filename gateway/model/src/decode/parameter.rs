@@ -18,8 +18,8 @@ const MAX: u8 = 127;
 pub enum ParameterTextError {
     /// The name is unknown.
     #[error(
-        "{got:?} is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
-         baseline, tare, row1 to row6 and commit are, and every number from 0 to {MAX}"
+        "{got:?} is not a parameter: allowed are identity, mount, pose, contact, timing, mode, reply, sensing, events, \
+         links_down, baseline, tare, row1 to row6, commit, and every number from 0 to {MAX}"
     )]
     Unknown {
         /// The given text.
@@ -245,8 +245,8 @@ mod tests {
     fn errors_name_what_is_allowed() {
         assert_eq!(
             says("poes", &["1"]),
-            "\"poes\" is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
-             baseline, tare, row1 to row6 and commit are, and every number from 0 to 127"
+            "\"poes\" is not a parameter: allowed are identity, mount, pose, contact, timing, mode, reply, sensing, events, \
+             links_down, baseline, tare, row1 to row6, commit, and every number from 0 to 127"
         );
         assert_eq!(says("128", &[]), says("poes", &[]).replace("poes", "128"));
         assert_eq!(

@@ -28,8 +28,8 @@ pub enum Selector {
 /// The error for a word that does not name a kind.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error(
-    "{got:?} is no kind: command, sum, torque, sensors, network, configure, configured, stimulus are; also halt, \
-     joints, sync, resume, report alone, wire, foreign, and damaged"
+    "{got:?} is not a kind of frame: allowed are command, sum, torque, sensors, network, configure, \
+     configured, stimulus; halt, joints, sync, resume, report; wire, foreign and damaged"
 )]
 pub struct UnknownSelector {
     /// The word.
@@ -60,10 +60,9 @@ pub fn node(word: &str) -> Result<Node, String> {
     match word {
         "gateway" => Ok(Node::Gateway),
         "everyone" => Ok(Node::Everyone),
-        number => number
-            .parse()
-            .map(Node::Cell)
-            .map_err(|_| format!("{word:?} is no node: node ids are 1 to 254, or gateway, or everyone")),
+        number => number.parse().map(Node::Cell).map_err(|_| {
+            format!("{word:?} is not a node: allowed are node ids 1 to 254, gateway and everyone")
+        }),
     }
 }
 
@@ -181,7 +180,7 @@ impl Pick {
             Some(Party { bus: Some(bus), node }) => {
                 let buses = self.buses.join(", ");
                 Err(format!(
-                    "{bus}:{node} is on no bus that is picked: {buses} are; leave one of the two out"
+                    "{bus}:{node} is not on a selected bus ({buses}): leave out one of the two filters"
                 ))
             }
             _ => Ok(()),
@@ -323,8 +322,11 @@ mod tests {
     #[test]
     fn unknown_words_are_errors_that_list_the_known_ones() {
         let kind = "torqe".parse::<Selector>().unwrap_err().to_string();
-        assert!(kind.starts_with("\"torqe\" is no kind: command, sum, torque, "), "{kind}");
-        let expected = "\"255\" is no node: node ids are 1 to 254, or gateway, or everyone";
+        assert!(
+            kind.starts_with("\"torqe\" is not a kind of frame: allowed are command, sum, torque, "),
+            "{kind}"
+        );
+        let expected = "\"255\" is not a node: allowed are node ids 1 to 254, gateway and everyone";
         assert_eq!(node("255"), Err(expected.to_owned()));
     }
 }

@@ -110,7 +110,7 @@ pub enum Difference {
     #[error("cell {0} is configured for another skin: configure it with `skinbus commission`")]
     OtherSkin(CellId),
     /// A described wire does not work.
-    #[error("the wire from {first} to {second} {}: look at its plugs", carries.between(first.cell, second.cell))]
+    #[error("the wire from {first} to {second} {}: check its plugs", carries.between(first.cell, second.cell))]
     MissingWire {
         /// The end with the smaller node id.
         first: End,
@@ -142,7 +142,7 @@ pub enum Difference {
     Circle(Vec<CellId>),
     /// Cells without a route to a root.
     #[error(
-        "{} {} no route to a root: their torques are in no sum; look at their wires",
+        "{} {} no route to a root: their torques are missing from all sums; check their wires",
         names(.0),
         if .0.len() == 1 { "has" } else { "have" }
     )]

@@ -114,7 +114,7 @@ fn modes(raw: &[raw::Mode], end: EndS) -> Checked<Vec<ModeChange>> {
         let path = Place::named("mode").nth(index);
         let at = end.moment(&path.key("at_s"), raw.at_s)?;
         if modes.last().is_some_and(|last| last.at >= at) {
-            return Err(path.key("at_s").fault(raw.at_s, "modes come in the order of time"));
+            return Err(path.key("at_s").fault(raw.at_s, "modes must be in order of time"));
         }
         let kinds = [Mode::Compare, Mode::Distributed].map(|mode| (mode.name(), mode));
         modes.push(ModeChange { at, mode: path.key("kind").word(&raw.kind, &kinds)? });

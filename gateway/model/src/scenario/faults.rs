@@ -159,7 +159,7 @@ impl Entry<'_> {
         ];
         let senseless = given.into_iter().find(|(key, given)| *given && !keys.contains(key));
         senseless.map_or(Ok(()), |(key, _)| {
-            Err(self.at.key(key).fault("", format_args!("means nothing with kind = {:?}", raw.kind)))
+            Err(self.at.key(key).fault("", format_args!("is not allowed with kind = {:?}", raw.kind)))
         })
     }
 }

@@ -138,7 +138,7 @@ impl<'a> Names<'a> {
         let path = given.at.key("cells");
         match given.cells {
             Some(_) if given.all => Err(path.fault("", "either some cells, or all = true")),
-            None if !given.all => Err(path.fault("", "which cells? give their nodes, or all = true")),
+            None if !given.all => Err(path.fault("", "which cells? give their node ids, or all = true")),
             None => {
                 let bus = given.bus.map(|_| self.key(given)).transpose()?;
                 let cells = self.skin.cells.iter().enumerate();
@@ -163,7 +163,7 @@ impl<'a> Names<'a> {
             let at = path.nth(index);
             if !is_here(self.cell(&at, named, given)?) {
                 let why = format_args!(
-                    "it is about one bus, {:?}: give another table for this cell",
+                    "this fault is on one bus, {:?}: use another table for this cell",
                     self.bus_name(bus)
                 );
                 return Err(at.fault(named, why));
@@ -178,7 +178,7 @@ impl<'a> Names<'a> {
         self.cells(given)?;
         let named = given.cells.unwrap_or_default();
         let [one, other] = named else {
-            return Err(path.fault(format_args!("{} cells", named.len()), "a wire is between two"));
+            return Err(path.fault(format_args!("{} cells", named.len()), "a wire connects two cells"));
         };
         let bus = self.bus(given)?;
         self.cells_on(given, bus)?;
@@ -193,7 +193,7 @@ impl<'a> Names<'a> {
             (0..PORTS).any(|port| wires.other_end(from, port).is_some_and(|(other, _)| other == to))
         };
         let pair = (self.cell(&path.nth(0), one, given)?, self.cell(&path.nth(1), other, given)?);
-        let wrong = || path.fault(format_args!("[{one}, {other}]"), "no wire is between them");
+        let wrong = || path.fault(format_args!("[{one}, {other}]"), "no wire connects them");
         Some(pair).filter(leads).ok_or_else(wrong)
     }
 }

@@ -137,7 +137,7 @@ fn together(at: &Place, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
             let force = last.force_n + others.map(|touch| touch.force_n).sum::<f64>();
             if force > MAX_FORCE_N {
                 let why = format!(
-                    "with the touches before it that makes {force} N on {}, more than the \
+                    "together with earlier touches this makes {force} N on {}, more than the \
                      {MAX_FORCE_N:.3} N of three contact words",
                     names.name(*cell)
                 );
@@ -243,7 +243,7 @@ mod tests {
             ("force_n = 3.0\nprofile = \"poke\"", "\"ramp\" or points [[t_s, force_n], ...]"),
             (
                 "profile = [[1.0, 90.0]]\n[[touch]]\nall = true\nprofile = [[2.0, 7.0]]",
-                "7:11: touch[1].profile = up to 7 N: with the touches before it that makes 97 N on cell 1",
+                "7:11: touch[1].profile = up to 7 N: together with earlier touches this makes 97 N on cell 1",
             ),
         ] {
             let got = read(touch).unwrap_err();

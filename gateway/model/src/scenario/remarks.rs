@@ -22,8 +22,8 @@ fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
     let unused = !matches!(motion, MotionKind::Kinesthetic);
     unused.then(|| {
         format!(
-            "motion.kind = {:?}: the scenario moves the robot, and the external controller at {socket} is not asked; \
-             with \"kinesthetic\" it moves it",
+            "motion.kind = {:?}: the scenario moves the robot, and the external controller at {socket} is not used; \
+             with \"kinesthetic\" the controller moves it",
             motion.name()
         )
     })

@@ -112,7 +112,7 @@ fn temperature(at: &Place, points: &[[f64; 2]], end: EndS) -> Checked<Vec<(Micro
         let at = at.nth(index);
         let moment = end.moment_or_end(&at.nth(0), seconds)?;
         if temperature.last().is_some_and(|(last, _)| *last >= moment) {
-            return Err(at.nth(0).fault(seconds, "times come in their order, each once"));
+            return Err(at.nth(0).fault(seconds, "times must increase"));
         }
         at.nth(1).fit(degrees, Q9_6::try_nearest)?;
         temperature.push((moment, degrees));
@@ -195,7 +195,7 @@ mod tests {
         let cases = [
             (
                 "[sensors]\ntemperature_c = [[0.0, 25.0], [0.0, 26.0]]\n",
-                "sensors.temperature_c[1][0] = 0: times come in their order, each once",
+                "sensors.temperature_c[1][0] = 0: times must increase",
             ),
             ("[sensors]\ntemperature_c = [[601.0, 25.0]]\n", "the scenario goes from 0 to duration_s = 600"),
             ("[sensors.force]\nkind = \"good\"\n", "\"perfect\", \"piezoresistive\" or \"resistive\""),

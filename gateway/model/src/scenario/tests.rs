@@ -230,7 +230,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("at_s = 5.7", "at_s = 0.0"),
-        "s.toml:15: mode[1].at_s = 0: modes come in the order of time"
+        "s.toml:15: mode[1].at_s = 0: modes must be in order of time"
     );
     assert_eq!(
         says("\"distributed\"", "\"central\""),
@@ -252,7 +252,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     assert_eq!(says("[1, 3]", "[]"), "s.toml:22: touch[0].cells = []: at least one cell is needed");
     assert_eq!(
         says("cells = [1, 3]\n", ""),
-        "s.toml:18: touch[0].cells: which cells? give their nodes, or all = true"
+        "s.toml:18: touch[0].cells: which cells? give their node ids, or all = true"
     );
     assert_eq!(
         says("force_n = 3.0", "force_n = 96.0"),
@@ -268,7 +268,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("cells = [2]\nforce_n = 1.0", "all = true\nforce_n = 94.0"),
-        "s.toml:30: touch[1].force_n = 94: with the touches before it that makes 97 N on cell 1 of \
+        "s.toml:30: touch[1].force_n = 94: together with earlier touches this makes 97 N on cell 1 of \
          \"vcan0\", more than the 95.997 N of three contact words"
     );
     assert_eq!(
@@ -281,7 +281,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("kind = \"kill\"", "kind = \"kill\"\nprobability = 0.5"),
-        "s.toml:46: fault[1].probability: means nothing with kind = \"kill\""
+        "s.toml:46: fault[1].probability: is not allowed with kind = \"kill\""
     );
     assert!(
         says("\"kill\"", "\"kil\"").starts_with("s.toml:45: fault[1].kind = \"kil\": of processes \"kill\"")
@@ -469,15 +469,15 @@ fn a_link_between_two_wired_cells_goes_down_and_comes_up_in_time() {
     let wrong = |skin, text| fault(skin, text).unwrap_err();
     assert_eq!(
         wrong(&sums, "kind = \"link_down\"\ncells = [3, 1]"),
-        "s.toml:6: fault[0].cells = [3, 1]: no wire is between them"
+        "s.toml:6: fault[0].cells = [3, 1]: no wire connects them"
     );
     assert_eq!(
         wrong(&sums, "kind = \"link_down\"\ncells = [1]"),
-        "s.toml:6: fault[0].cells = 1 cells: a wire is between two"
+        "s.toml:6: fault[0].cells = 1 cells: a wire connects two cells"
     );
     assert_eq!(
         wrong(&sums, "kind = \"link_up\"\nfor_s = 1.0\ncells = [1, 2]"),
-        "s.toml:6: fault[0].for_s: means nothing with kind = \"link_up\""
+        "s.toml:6: fault[0].for_s: is not allowed with kind = \"link_up\""
     );
     let torques = described("reply = \"torque\"", line);
     assert_eq!(

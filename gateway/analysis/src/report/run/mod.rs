@@ -477,6 +477,6 @@ impl Run {
         let lacks = planned.filter(|planned| *planned > here).map_or_else(String::new, |planned| {
             format!(" of the {planned} s that the run was to last: {:.2} s are missing", planned - here)
         });
-        format!("{why}. What is here holds {here:.2} s{lacks}")
+        format!("{why}. It covers {here:.2} s{lacks}")
     }
 }

@@ -40,7 +40,7 @@ pub(super) fn page(run: &Run, command: &str, missing: Option<&str>) -> Page {
         None => intro_of_run(run),
     };
     if let Some(missing) = missing {
-        intro = format!("Not all of the run is here: {missing}. {intro}");
+        intro = format!("The run is incomplete: {missing}. {intro}");
     }
     let mut sections = vec![draft.summary(), draft.skin()];
     if run.motion.counts.ticks > 0 || run.has_joints() {
@@ -174,7 +174,7 @@ impl Draft<'_> {
         let accounts = self.run.bus_figures.iter().map(LinkId::account);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
         if due > 0 {
-            let what = format!("replies not there before the next joints, of {due} that were due");
+            let what = format!("replies not received before the next joints, of {due} due");
             let period = 1.0 / skin.timing.broadcast_hz();
             let bar = format!("none after {}", quantity(period, "s"));
             let late = due - in_time;
@@ -189,8 +189,8 @@ impl Draft<'_> {
         findings.push(lost.look(self.worst_loss(|loss| loss.packets)));
         findings.extend(self.stuck());
         Section::new("summary", "In numbers").findings(findings).text(
-            "Beside the paper's numbers (Efficient Distributed Torque Computation for Large Scale Robot Skin). Within \
-             5 % of the paper's, a number is the same. A command shows the recording where the number is worst.",
+            "Compared with the paper (Efficient Distributed Torque Computation for Large Scale Robot Skin). Numbers within \
+             5 % of the paper's count as the same. The commands show the recording where a number is worst.",
         )
     }
 
@@ -208,7 +208,10 @@ impl Draft<'_> {
         let cells: Vec<_> = cells.collect();
         let more = if cells.len() > NAMED { ", and others" } else { "" };
         let named: Vec<_> = cells.iter().take(NAMED).map(String::as_str).collect();
-        let what = format!("stuck cells, which should have sent other words ({}{more})", named.join("; "));
+        let what = format!(
+            "stuck cells, which sent constant words while others were due ({}{more})",
+            named.join("; ")
+        );
         (!cells.is_empty()).then(|| none(what, cells.len() as u64))
     }
 

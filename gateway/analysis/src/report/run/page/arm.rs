@@ -43,8 +43,8 @@ impl Draft<'_> {
         let mut section = Section::new("torque", "Torque, and its difference from the central one");
         if !loaded.is_empty() {
             let when = if self.run.frames_only.is_some() { "before each joints" } else { "at each tick" };
-            section = section.text(format!("The upper curve is the sum of what has come {when}. The difference below it compares like with like, once \
-             an epoch: what all cells answered to these joints, less the central computation for them; an epoch without an \
+            section = section.text(format!("The upper curve is the sum of the torques received {when}. The lower curve is the \
+             difference, once per epoch, of all cells' answers to the same joints and the central computation for them; an epoch without an \
              answer in time is a gap. Dotted: one step of the torque words."));
             let is_compared = self.run.bus_figures.iter().any(|it| it.lines.error.count() > 0);
             let lacks = self
@@ -54,7 +54,7 @@ impl Draft<'_> {
         if !free.is_empty() {
             let names: Vec<_> = free.iter().map(|joint| self.joint(*joint)).collect();
             section = section.text(format!(
-                "No torque as large as half a step of the words, distributed or central, on {}.",
+                "Torques below the resolution (half a step of the words), distributed and central: {}.",
                 names.join(", ")
             ));
         }
@@ -200,7 +200,11 @@ impl Draft<'_> {
         let (still, figures): (Vec<_>, Vec<_>) = figures.filter(is_there).partition(is_zero);
         let mut section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
         section.text.extend(no_velocity);
-        if still.is_empty() { section } else { section.text("What is not drawn here was 0 throughout.") }
+        if still.is_empty() {
+            section
+        } else {
+            section.text("Quantities that are not drawn were 0 throughout.")
+        }
     }
 
     /// Groups the joints that share a figure: joints of one kind that a chain adds to the previous chains.
@@ -246,7 +250,7 @@ impl Draft<'_> {
     /// Creates the section that corresponds to the paper's Fig. 8.
     pub(super) fn cycle(&self) -> Section {
         let motion = &self.run.motion;
-        let lacks = "how long ticks and the central computation in them took, and how late they began";
+        let lacks = "the durations of ticks and of the central computation, and the lateness of ticks";
         if let Some(lacks) = self.lacks(lacks) {
             return Section::new("cycle", "Cycle times").text(lacks);
         }
@@ -281,7 +285,9 @@ impl Draft<'_> {
         }
         let head = ["", "median", "90 %", "99 %", "max", "values"];
         Section::new("cycle", "Cycle times")
-            .text("The distributed computation has no part in a tick: the sum is kept while replies come.")
+            .text(
+                "The distributed computation takes no time in a tick: the sum is updated as replies arrive.",
+            )
             .figures(figures.into_iter().filter_map(shown))
             .tables([Table::new("The control loop", head, rows)])
     }

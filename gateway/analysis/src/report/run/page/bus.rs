@@ -197,19 +197,20 @@ impl Draft<'_> {
             let (rates, width) = (rates.rates, quantity(load.width(), "s"));
             let title = format!("{name}: load of a real bus at {rates}, over {width} each");
             self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
-                .draw("what a real bus would carry", Shape::Steps, self.percent(load))
-                .draw("with what only a bench sends", Shape::Dashed, stairs(&self.percent(load_of_all)))
-                .marks([Mark::y(100.0, "all that it can")])
+                .draw("load of a real bus", Shape::Steps, self.percent(load))
+                .draw("including bench-only frames", Shape::Dashed, stairs(&self.percent(load_of_all)))
+                .marks([Mark::y(100.0, "full load")])
         };
-        let text = "Here a frame took no time. On a real bus it takes that of its bits: counted with the stuff bits that its \
-                    own bits make. This run is rated by its second with the highest load; in the worst case all cells \
-                    answer, with the longest frames there can be. Stimuli, sync and report with their answers and simulated \
-                    wires exist on a bench only and are left out. Start-up, before the first joints, stands apart.";
+        let text = "On this bus a frame took no time. On a real bus it takes the time of its bits, including its stuff bits. \
+                    This run is rated by its second with the highest load; the worst case assumes that all cells answer \
+                    with the longest possible frames. Frames that only a bench sends are left out: stimuli, sync and \
+                    report with their answers, and simulated wires. Start-up, before the first joints, is shown separately.";
         let assumed = self.run.bus_figures.iter().any(|bus_figures| !bus_figures.rates.is_chosen);
         let mut section = Section::new("load", "Load of the buses").text(text);
         if assumed {
-            section = section
-                .text("The skin has no bit rates for every bus, so common ones are shown, for information.");
+            section = section.text(
+                "The skin does not give bit rates for every bus; common ones are shown for information.",
+            );
         }
         section
             .figures(self.run.bus_figures.iter().map(figure).filter_map(shown))
@@ -227,7 +228,7 @@ impl Draft<'_> {
         let has_loop = run.frames_only.is_none();
         if has_loop {
             row("ticks skipped by the loop".to_owned(), ticks.skipped, true);
-            row("ticks that happened and are not in the recording".to_owned(), ticks.unrecorded, true);
+            row("ticks missing from the recording".to_owned(), ticks.unrecorded, true);
         }
         row("bad cycles".to_owned(), ticks.bad, false);
         row("ticks while the robot was halted".to_owned(), ticks.halted, false);
@@ -236,15 +237,11 @@ impl Draft<'_> {
             let name = &bus_figures.name;
             let uplink = bus_figures.table.uplink();
             row(format!("{name}: frames recorded"), bus_figures.frames, true);
-            row(
-                format!("{name}: frames that are not in the recording, by its own notes"),
-                bus_figures.dropped,
-                true,
-            );
+            row(format!("{name}: frames lost by the recorder, by its own notes"), bus_figures.dropped, true);
             row(format!("{name}: packets that cells sent, by their own count"), uplink.sent, true);
             row(format!("{name}: of these lost"), uplink.lost, true);
             row(format!("{name}: of these refused"), uplink.rejected, false);
-            row(format!("{name}: starts of cells while it ran"), u64::from(uplink.restarts), false);
+            row(format!("{name}: restarts of cells during the run"), u64::from(uplink.restarts), false);
             for event in Event::ALL {
                 row(format!("{name}: {}", event.name()), bus_figures.table.counters().events(event), false);
             }
@@ -254,7 +251,7 @@ impl Draft<'_> {
         row("messages or lines that cannot be read".to_owned(), run.unreadable, false);
         let mut section = Section::new("losses", "Losses")
             .text("Rows of possible losses are always shown; other rows only when they are not 0.");
-        section.text.extend(self.lacks("ticks that the loop skipped, and bad cycles"));
+        section.text.extend(self.lacks("skipped ticks and bad cycles"));
         section.tables(self.lost()).tables([Table::new("All counts", ["what", "count"], rows)])
     }
 }
@@ -281,17 +278,10 @@ fn carried(bus: &BusShadow) -> Table {
         row(["start-up", "", &share(start.load.mean), &second, &short, &frames]);
     }
     if bus.counts.bench.total() > 0 {
-        row([
-            "left out",
-            "",
-            "",
-            "",
-            "",
-            &format!("{} frames that only a bench sends", bus.counts.bench.total()),
-        ]);
+        row(["left out", "", "", "", "", &format!("{} bench-only frames", bus.counts.bench.total())]);
     }
     let head = ["", "verdict", "load on average", "in any second", "in any 16 ms", "what"];
-    Table::new(format!("{} at {}: does it fit", bus.bus, bus.name), head, rows)
+    Table::new(format!("Fit of {} at {}", bus.bus, bus.name), head, rows)
 }
 
 /// Rounds to one decimal.

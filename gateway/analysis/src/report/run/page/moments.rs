@@ -10,7 +10,7 @@ use crate::report::figure::{Table, quantity};
 const ROWS: usize = 25;
 
 /// The heading of such a table.
-const HEAD: [&str; 3] = ["at", "what", "look at it"];
+const HEAD: [&str; 3] = ["at", "what", "command"];
 
 /// A moment, its weight, and its description.
 struct Moment {

@@ -27,9 +27,10 @@ impl Draft<'_> {
             let cell = self.run.bus_figures.get(bus)?.table.cells().get(place)?;
             Some((cell.replies.late + cell.replies.missing + cell.uplink().lost) as f64)
         });
-        let title = "Where: the largest force on each cell, as seen from outside; links are unrolled, the side of the tip is below";
+        let title =
+            "Largest force on each cell, seen from outside; links are unrolled, with the tip at the bottom";
         let force = self.map("map-force", title, "force", "N", &forces);
-        let title = "Where replies were late or missing or packets lost, added up for each cell";
+        let title = "Late and missing replies and lost packets, by cell";
         let loss = self.map("map-losses", title, "losses", "", &losses);
         let section = match (self.strip(), force) {
             (Some(strip), Some(force)) => section
@@ -39,7 +40,7 @@ impl Draft<'_> {
             (..) if self.lacks_forces() => section.text(
                 self.lacks("stimuli or sensors of the cells that sent torques, and so the forces on them").unwrap_or_default(),
             ),
-            (..) => section.text("No cell was touched, as far as the frames say."),
+            (..) => section.text("The frames show no touch of a cell."),
         };
         let sums = self.run.bus_figures.iter().any(|bus_figures| bus_figures.sums);
         match (loss, sums) {
@@ -48,8 +49,8 @@ impl Draft<'_> {
                 section.text("No cell's reply was late or missing, and no packet of a cell was lost.")
             }
             (None, true) => section.text(
-                "No packet of a cell was lost. Which cells were late or missing in a sum is not on the bus, so there is no \
-                 map of it.",
+                "No packet of a cell was lost. Frames do not show which cells were late or missing in a sum, so there is no \
+                 map of them.",
             ),
         }
     }
@@ -85,12 +86,11 @@ impl Draft<'_> {
         let rest = rows.split_off(touched.min(ROWS));
         let legend = Legend::of("force", "N", rows.iter().map(|(_, max, _)| *max));
         let title = match rest.first() {
-            None => format!(
-                "When: the force on each cell that was touched, {touched} of {}",
-                self.run.skin.cells.len()
-            ),
+            None => {
+                format!("Force over time on the {touched} touched cells of {}", self.run.skin.cells.len())
+            }
             Some((_, max, _)) => format!(
-                "When: the force on the {ROWS} cells with the largest one; {} more were touched, with at most {}",
+                "Force over time on the {ROWS} cells with the largest forces; {} more were touched, with at most {}",
                 rest.len(),
                 quantity(*max, "N")
             ),
