@@ -329,13 +329,13 @@ impl Stats {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "to be read")]
+#[expect(clippy::cast_precision_loss, reason = "for display")]
 fn seconds(nanos: u64) -> f64 {
     nanos as f64 / 1e9
 }
 
 /// Returns the rate per second of a count in a time in ns; `None` if either is zero.
-#[expect(clippy::cast_precision_loss, reason = "to be read")]
+#[expect(clippy::cast_precision_loss, reason = "for display")]
 fn rate(count: u64, nanos: u64) -> Option<f64> {
     (count > 0 && nanos > 0).then(|| count as f64 * 1e9 / nanos as f64)
 }

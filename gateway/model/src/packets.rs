@@ -2,7 +2,7 @@
 //!
 //! ```text
 //!   frame, time ──> PacketReader ──> Received ─┬─> table (state of the cells)
-//!                     └ pending segments     ├─> Classifier (text, JSON)
+//!                     └ pending segments       ├─> Classifier (text, JSON)
 //!                                              └─> latched packets, sorted traffic
 //! ```
 //!
@@ -52,7 +52,7 @@ pub enum Content {
     Meaningless(Id, Packet, MessageError),
     /// A segment of a packet in classic frames; the packet needs more segments.
     Segment(Id),
-    /// A segment that starts a new packet before the previous one was complete: that packet is lost.
+    /// A segment that does not belong to the pending ones, or arrived too late for them: their packet is lost.
     AfterLost(Id),
     /// Neither a packet nor a segment.
     Damaged(Id, PacketError),
@@ -137,7 +137,7 @@ impl PacketReader {
         if self.segments.is_empty() {
             self.segments.resize(IDS, None);
         }
-        let segments = self.segments.get_mut(usize::from(id.to_bits())).expect("11 bits");
+        let segments = self.segments.get_mut(usize::from(id.to_bits())).expect("an identifier has 11 bits");
         let segment = segments.get_or_insert_default();
         let waited = segment.waiting();
         let reassembly = segment.push(at, id, lengths, frame.data());

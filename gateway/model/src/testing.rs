@@ -60,7 +60,7 @@ const LIFT: &str = include_str!("../tests/data/lift.toml");
 /// Never: the skin is valid, as are the next two.
 #[must_use]
 pub fn ur5() -> Skin {
-    Skin::parse("ur5-253.toml", UR5).expect("the tests' skin is sound")
+    Skin::parse("ur5-253.toml", UR5).expect("the tests' skin is valid")
 }
 
 /// Returns a skin with cells on all links of an arm with seven joints.
@@ -69,7 +69,7 @@ pub fn ur5() -> Skin {
 /// See [`ur5`].
 #[must_use]
 pub fn panda() -> Skin {
-    Skin::parse("panda.toml", PANDA).expect("the tests' skin is sound")
+    Skin::parse("panda.toml", PANDA).expect("the tests' skin is valid")
 }
 
 /// Returns a skin with one cell on an arm on a lift.
@@ -78,7 +78,7 @@ pub fn panda() -> Skin {
 /// See [`ur5`].
 #[must_use]
 pub fn lift() -> Skin {
-    Skin::parse("lift.toml", LIFT).expect("the tests' skin is sound")
+    Skin::parse("lift.toml", LIFT).expect("the tests' skin is valid")
 }
 
 /// Returns [`SKIN`] with a second bus like the first one.
@@ -91,7 +91,7 @@ pub fn two_buses() -> Skin {
     let cell = SKIN.find("[[cell]]").and_then(|from| SKIN.get(from..));
     let more = bus.into_iter().chain(cell).map(|part| format!("\n{}", part.replace("vcan0", "vcan1")));
     let text = SKIN.to_owned() + &more.collect::<String>();
-    Skin::parse("skin.toml", &text).expect("the tests' skin is sound")
+    Skin::parse("skin.toml", &text).expect("the tests' skin is valid")
 }
 
 /// Returns [`SKIN`], parsed and checked.
@@ -100,5 +100,5 @@ pub fn two_buses() -> Skin {
 /// Never: the skin is valid.
 #[must_use]
 pub fn skin() -> Skin {
-    Skin::parse("skin.toml", SKIN).expect("the tests' skin is sound")
+    Skin::parse("skin.toml", SKIN).expect("the tests' skin is valid")
 }

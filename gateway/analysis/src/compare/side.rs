@@ -266,7 +266,7 @@ impl<'a> Side<'a> {
     }
 
     /// Returns the time of joints in s of the run; `None` if the capture has no times.
-    #[expect(clippy::cast_precision_loss, reason = "to be read")]
+    #[expect(clippy::cast_precision_loss, reason = "for display")]
     pub(super) fn seconds(&self, nanos: u64) -> Option<f64> {
         let (first, began) = self.first.filter(|_| self.has_times)?;
         let earlier = first.number as f64 * self.period_ns as f64;

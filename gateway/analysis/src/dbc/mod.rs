@@ -39,7 +39,7 @@ pub fn dbc(skin: &Skin, bus: usize) -> String {
     let mut out = String::new();
     if let Some(description) = skin.buses.get(bus) {
         text::write(&mut out, skin, bus, description, &messages(skin, bus))
-            .expect("a string takes whatever is written");
+            .expect("writing to a string cannot fail");
     }
     out
 }

@@ -1,7 +1,7 @@
 //! Derives a torque step by step: `skinbus explain`.
 //!
 //! ```text
-//!   frames up to the joints  ──>  Watch ──> contact state and answer of each cell ─┐
+//!   frames up to the joints ───> Watch ──> contact state and answer of each cell ─┐
 //!                                                                                 ├──> Explanation
 //!   Skin ──> Central, f64 ────────────> force, Jacobian, product, step ───────────┘
 //! ```
@@ -303,7 +303,7 @@ impl Sum {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "to be read")]
+#[expect(clippy::cast_precision_loss, reason = "for display")]
 fn too_late(nanos: u64) -> String {
     let ms = nanos as f64 / 1e6;
     format!("it came {ms:.3} ms after the joints, after four more joints, and is not used")

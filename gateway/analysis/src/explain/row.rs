@@ -61,7 +61,7 @@ pub(super) fn number(joint: usize) -> u8 {
     u8::try_from(joint + 1).unwrap_or(u8::MAX)
 }
 
-#[expect(clippy::too_many_arguments, reason = "what a row shows")]
+#[expect(clippy::too_many_arguments, reason = "each is a column of the row")]
 pub(super) fn row(
     &(joint, described): &(usize, &Joint),
     at: usize,

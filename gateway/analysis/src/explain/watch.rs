@@ -277,7 +277,7 @@ impl<'a> Watch<'a> {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "to be read")]
+#[expect(clippy::cast_precision_loss, reason = "for display")]
 fn seconds(nanos: u64) -> String {
     format!("{:.3}", nanos as f64 / 1e9)
 }

@@ -97,7 +97,7 @@ impl Ranged for Span {
 
     #[expect(
         clippy::cast_possible_truncation,
-        reason = "a place in a picture; what is beyond it is at its edge"
+        reason = "a position in a picture; saturating at its edge is right"
     )]
     fn map(&self, value: &f64, (from, to): (i32, i32)) -> i32 {
         let place = f64::from(from) + self.place(*value) * f64::from(to - from);

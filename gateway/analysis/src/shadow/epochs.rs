@@ -95,7 +95,7 @@ impl Epochs {
 
     fn numbered(&mut self, epoch: Epoch) -> &mut Numbered {
         self.numbered.resize(256, Numbered::default());
-        self.numbered.get_mut(usize::from(epoch.0)).expect("a number is one byte")
+        self.numbered.get_mut(usize::from(epoch.0)).expect("an epoch is one byte")
     }
 
     /// Records the end of an answer that was to be sent at `at`.

@@ -119,7 +119,7 @@ impl Foreigners {
         seen.wrong_crc += wrong_crc;
     }
 
-    #[expect(clippy::cast_precision_loss, reason = "to be read")]
+    #[expect(clippy::cast_precision_loss, reason = "for display")]
     pub(super) fn report(&self, earliest: u64) -> ForeignFrames {
         let mut foreign = ForeignFrames {
             frames: self.others,

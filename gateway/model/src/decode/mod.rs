@@ -271,7 +271,10 @@ impl Classifier {
         if self.ids.is_empty() {
             self.ids.resize(IDS, None);
         }
-        self.ids.get_mut(usize::from(id.to_bits())).expect("11 bits").get_or_insert_default()
+        self.ids
+            .get_mut(usize::from(id.to_bits()))
+            .expect("an identifier has 11 bits")
+            .get_or_insert_default()
     }
 }
 

@@ -156,7 +156,7 @@ impl State {
         self.since.retain(|message| !is_forgotten(message));
     }
 
-    /// Applies the messages so far before the coming ones.
+    /// Moves the messages so far into the state before the joints.
     fn fold(&mut self) {
         let last = self.joints.map(|(epoch, _)| epoch);
         if let Some(epoch) = last {

@@ -70,7 +70,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
         if !(start - reach >= min && start + reach <= max) {
             let swings =
                 if reach > 0.0 { format!(", and it swings by {reach} {unit}") } else { String::new() };
-            let why = format!("{} may go from {min:.4} to {max:.4} {unit}{swings}", joint.name);
+            let why = format!("{} is limited to {min:.4} to {max:.4} {unit}{swings}", joint.name);
             return Err(at.key(start_key).nth(index).fault(format_args!("{start} {unit}"), why));
         }
     }
@@ -99,7 +99,7 @@ fn speeds(at: &Place, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period_s
         let (speed, unit) = (TAU * amplitude.abs() / period_s, joint.kind.unit());
         if speed.is_nan() || speed > max {
             let why = format!(
-                "in {period_s} s this takes {speed:.3} {unit}/s, and joint {} may make {max}",
+                "in {period_s} s this takes {speed:.3} {unit}/s, but the limit of joint {} is {max}",
                 index + 1
             );
             return Err(at.nth(index).fault(amplitude, why));

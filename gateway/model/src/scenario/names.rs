@@ -280,9 +280,9 @@ mod tests {
             assert!(got.contains(said), "{keys}\n{got}");
         }
         let two = "kind = \"drop\"\nprobability = 0.5\ncells = [\"vcan0:1\", \"vcan1:5\"]";
-        let said = "fault[0].cells[1] = \"vcan1:5\": it is about one bus, \"vcan0\": give another table for this cell";
+        let said = "fault[0].cells[1] = \"vcan1:5\": this fault is on one bus, \"vcan0\": use another table for this cell";
         assert!(fault(two).unwrap_err().contains(said));
         let wire = fault("kind = \"link_down\"\ncells = [\"vcan0:1\", \"vcan1:5\"]").unwrap_err();
-        assert!(wire.contains("it is about one bus, \"vcan0\""), "{wire}");
+        assert!(wire.contains("this fault is on one bus, \"vcan0\""), "{wire}");
     }
 }

@@ -80,7 +80,7 @@ fn drawn(at: &Place, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile, 
             return Err(point.fault("", why));
         };
         if !(0.0..=LONGEST_S).contains(&seconds) {
-            let why = format!("0 to {LONGEST_S:e} s after the begin of the touch are possible");
+            let why = format!("0 to {LONGEST_S:e} s after the start of the touch are possible");
             return Err(point.nth(0).fault(seconds, why));
         }
         let moment = span(seconds);

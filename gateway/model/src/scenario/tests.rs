@@ -222,11 +222,11 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("start_rad = [0.0", "start_rad = [6.0"),
-        "s.toml:7: motion.start_rad[0] = 6 rad: joint1 may go from -6.2832 to 6.2832 rad, and it swings by 0.5 rad"
+        "s.toml:7: motion.start_rad[0] = 6 rad: joint1 is limited to -6.2832 to 6.2832 rad, and it swings by 0.5 rad"
     );
     assert_eq!(
         says("[0.5, 0.1", "[1.5, 0.1"),
-        "s.toml:8: motion.amplitude_rad[0] = 1.5: in 4 s this takes 2.356 rad/s, and joint 1 may make 2"
+        "s.toml:8: motion.amplitude_rad[0] = 1.5: in 4 s this takes 2.356 rad/s, but the limit of joint 1 is 2"
     );
     assert_eq!(
         says("at_s = 5.7", "at_s = 0.0"),

@@ -2,7 +2,7 @@
 //! module.
 //!
 //! ```text
-//!                                ┌─ Claim    which cell has the node id, and its restarts
+//!                                ┌─ Claim    the owner of the node id, and its restarts
 //!   a cell's packets ─> Tracked ─┼─ Account  packets sent and lost
 //!                                ├─ Pages    its last pages since it started
 //!                                └─          alive or silent

@@ -237,12 +237,12 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bo
 
 /// Creates the computation of real buses for these buses.
 fn shadow(skin: &Skin, bus_figures: &[LinkId]) -> Shadow {
-    let rates = Requested::default().rates().expect("common rates are possible");
+    let rates = Requested::default().rates().expect("the default rates are valid");
     let of_bus =
         bus_figures.iter().map(|bus_figures| (bus_figures.name.clone(), bus_figures.rates.rates)).collect();
     let options =
         shadow::Options { of_bus, each_frame: true, skin: Some(skin.clone()), ..shadow::Options::new(rates) };
-    Shadow::new(options).expect("no bit is damaged")
+    Shadow::new(options).expect("a bit-error rate of 0 is valid")
 }
 
 /// The content of a recording, as far as it has been read.

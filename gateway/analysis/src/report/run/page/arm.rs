@@ -228,7 +228,7 @@ impl Draft<'_> {
         let motion = &self.run.motion;
         let is_known = motion.active.count() > 0 && !self.lacks_forces();
         let active = if is_known { self.points(&motion.active) } else { Vec::new() };
-        let title = "Active cells: those whose torque is in the sum, and those that are in contact";
+        let title = "Active cells: cells in the torque sum, and cells in contact";
         let figure = self
             .figure("active-cells", title, Axis::new("cells", ""))
             .draw("in the torque", Shape::Steps, self.points(&motion.contributing))
@@ -260,7 +260,7 @@ impl Draft<'_> {
         };
         let took = [("tick", &motion.took.line), ("central computation in it", &motion.central_took.line)];
         let figures = [
-            figure("cycle", "How long each tick took, and the central computation in it", &took),
+            figure("cycle", "Duration of each tick, and of the central computation in it", &took),
             figure("lateness", "How late each tick began", &[("", &motion.late.line)]),
         ];
         let rows = [

@@ -58,7 +58,7 @@ impl Draft<'_> {
             [("late", &bus_figures.lines.late), ("missing", &bus_figures.lines.missing)],
         ];
         let mut figures = vec![steps("replies", "due and in time, epoch by epoch", y.clone(), due)];
-        figures.extend((lost > 0).then(|| steps("late", "late and missing, when that was settled", y, late)));
+        figures.extend((lost > 0).then(|| steps("late", "late and missing, when settled", y, late)));
         let slowest = self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
         let slowest = slowest.series([self.line("", &bus_figures.lines.slowest)]);
         figures.push(if lost > 0 { slowest } else { slowest.half() });
