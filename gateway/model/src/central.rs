@@ -218,8 +218,8 @@ impl Frames {
         self.frames.get(row)
     }
 
-    /// Adds the torques about joints 1 to k of a cell at `place` with the force `f_z` on it: `z_(l-1) x (t - t_(l-1)) .
-    /// force`, for prismatic joints `z_(l-1) . force`.
+    /// Adds the torques about joints 1 to k of a cell at `place` with the force `f_z` on it:
+    /// `z_(l-1) x (t - t_(l-1)) . force`, for prismatic joints `z_(l-1) . force`.
     fn add_torque(&self, place: &Place, f_z: f64, torque: &mut [f64; MAX_JOINTS]) {
         let Some(limb) = self.frames.get(place.row) else { return };
         let position = limb * place.position;
