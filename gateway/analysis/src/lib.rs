@@ -1,13 +1,13 @@
-//! Evaluation of captures, and what a bus can carry.
+//! Evaluation of captures, and the capacity of buses.
 //!
-//! | module | what |
+//! | module | content |
 //! |---|---|
-//! | [`stats`] | counts of each bus and each cell |
-//! | [`explain`] | where a torque comes from |
+//! | [`stats`] | counts per bus and per cell |
+//! | [`explain`] | the derivation of a torque |
 //! | [`compare`] | two captures of one skin, side by side |
 //! | [`fit`], [`shadow`] | timing of buses: a bench before it is built, a capture on its bus |
-//! | [`report`] | pages with figures |
-//! | [`dbc`] | packets for other tools |
+//! | [`report`] | HTML pages with figures |
+//! | [`dbc`] | a CAN database (DBC) of the packets for other tools |
 //! | [`paper`] | figures of the paper |
 
 pub mod compare;

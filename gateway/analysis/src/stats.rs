@@ -1,11 +1,11 @@
-//! What a capture holds, in numbers: `skinbus dump --stats`.
+//! Statistics of a capture: `skinbus dump --stats`.
 //!
 //! ```text
 //!   frames, each decoded ──> Stats ──> Report: buses, kinds, epochs, refused frames, losses, cells
 //! ```
 //!
-//! The work for a frame is bounded, and so is the memory: it grows with the buses, of which it distinguishes
-//! [`BUSES`], and not with the frames.
+//! The work per frame is bounded. Memory grows with the number of buses, up to [`BUSES`], not with the number of
+//! frames.
 
 use model::decode::{BUSES, Decoded};
 use model::tracker::{Tracked, Word};
@@ -26,29 +26,29 @@ mod foreign;
 pub struct Stats {
     /// Times of the earliest and the latest frame.
     span: Option<(u64, u64)>,
-    /// What grows as frames come.
+    /// The figures that grow with each frame.
     counts: Report,
     bus_stats: Vec<LinkId>,
     is_untimed: bool,
 }
 
-/// One bus.
+/// The statistics of one bus.
 #[derive(Debug)]
 struct LinkId {
-    /// Time of the frame before.
+    /// Time of the previous frame.
     last: u64,
     all: Count,
-    /// What grows as frames come.
+    /// The figures that grow with each frame.
     counts: BusReport,
     kinds: [Count; NAMES.len()],
     wires: Count,
     foreign: Foreigners,
     joints: Option<Joints>,
-    /// By the cell's place.
+    /// By index of the cell.
     cells: Vec<Option<Box<Cell>>>,
 }
 
-/// What packets are counted as, in the order in which they are shown.
+/// The packet kinds that are counted, in display order.
 const NAMES: [&str; 12] = [
     "halt",
     "joints",
@@ -64,7 +64,7 @@ const NAMES: [&str; 12] = [
     "stimulus",
 ];
 
-/// Packets or frames of one kind, and when the first and the last of them came.
+/// Number of packets or frames of one kind, with the times of the first and the last.
 #[derive(Clone, Copy, Debug, Default)]
 struct Count {
     packets: u64,
@@ -81,12 +81,12 @@ impl Count {
         self.last = nanos;
     }
 
-    /// From the first to the last, in ns.
+    /// Returns the time from the first to the last, in ns.
     const fn span(self) -> u64 {
         self.last.saturating_sub(self.first)
     }
 
-    /// How many a second, from the first to the last; `None` where that is no time.
+    /// Returns the rate per second, from the first to the last; `None` if they have the same time.
     fn per_s(self) -> Option<f64> {
         rate(self.packets.saturating_sub(1), self.span())
     }
@@ -96,121 +96,121 @@ impl Count {
 #[derive(Clone, Copy, Debug)]
 struct Joints {
     epoch: Epoch,
-    /// Their number since the capture began, those counted that are missing.
+    /// Their number since the capture began, including missing ones.
     number: u64,
 }
 
 impl Joints {
-    /// The number of the joints of an epoch not long before these.
+    /// Returns the number of the joints of an epoch shortly before these.
     fn of(self, epoch: Epoch) -> Option<u64> {
         let age = u64::try_from(self.epoch.since(epoch)).ok()?;
         self.number.checked_sub(age)
     }
 }
 
-/// What one cell sent.
+/// The packets of one cell.
 #[derive(Debug, Default)]
 struct Cell {
     tracked: Tracked,
-    /// What grows as packets come.
+    /// The figures that grow with each packet.
     counts: CellReport,
     /// The epoch of the last sum.
     summed: Option<Epoch>,
     /// Time and epoch of the first torque and of the last.
     torque_span: Option<[(u64, Epoch); 2]>,
-    /// The number of the joints that the last torque answers, while the contact lasts.
+    /// The number of the joints that the last torque answers, during a contact.
     touching: Option<u64>,
 }
 
-/// What the numbers come to.
+/// The result of the statistics.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Report {
-    /// From the earliest frame to the latest, in s.
+    /// Time from the earliest frame to the latest, in s.
     pub duration_s: f64,
     /// Frames of all buses.
     pub frames: u64,
-    /// Frames whose time is before that of the frame before them on their bus.
+    /// Frames with an earlier time than the previous frame on their bus.
     pub times_backwards: u64,
-    /// Lost frames of an unknown bus, by the notes of the recorder.
+    /// Frames lost on an unknown bus, by the recorder's notes.
     pub dropped: u64,
     /// Frames of buses beyond the first 64.
     pub frames_of_other_buses: u64,
-    /// The buses, in the order in which they came.
+    /// The buses, in order of appearance.
     pub buses: Vec<BusReport>,
 }
 
-/// One bus.
+/// The statistics of one bus.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct BusReport {
     /// Its name.
     pub bus: String,
-    /// All frames but those of simulated wires, which no real bus has.
+    /// All frames except those of simulated wires, which real buses do not have.
     pub frames: u64,
-    /// Frames a second, over the whole capture; `None` where all of them have one time.
+    /// Frames per second, over the whole capture; `None` if all have the same time.
     pub frames_per_s: Option<f64>,
     /// Frames of simulated wires.
     pub wires: u64,
-    /// The same by second, from the first to the last.
+    /// Frames of simulated wires per second, from the first to the last.
     pub wires_per_s: Option<f64>,
-    /// From the first to the last, in s.
+    /// Time from the first to the last of them, in s.
     pub wires_span_s: f64,
-    /// Packets by kind, those that there are.
+    /// Packets by kind, for the kinds that occur.
     pub kinds: Vec<KindReport>,
     /// Epochs of the joints.
     pub epochs: Epochs,
-    /// Damaged frames, and packets without a meaning, by reason.
+    /// Damaged frames, and packets that cannot be decoded, by reason.
     pub refused: RefusedFrames,
-    /// Frames that are none of this protocol.
+    /// Frames that do not belong to this protocol.
     pub foreign: ForeignFrames,
-    /// Frames that the recorder lost here, by its own notes.
+    /// Frames that the recorder lost on this bus, by its own notes.
     pub dropped: u64,
-    /// The cells that sent something, by node id.
+    /// The cells that sent packets, by node id.
     pub cells: Vec<CellReport>,
 }
 
-/// One kind.
+/// The statistics of one packet kind.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct KindReport {
     /// Its name.
     pub kind: &'static str,
     /// Packets.
     pub packets: u64,
-    /// The same by second, from the first to the last.
+    /// Packets per second, from the first to the last.
     pub packets_per_s: Option<f64>,
-    /// From the first to the last, in s.
+    /// Time from the first to the last, in s.
     pub span_s: f64,
 }
 
-/// Joints by their numbers.
+/// The epochs of joints.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Epochs {
     /// Epoch of the first joints.
     pub first: Option<u8>,
     /// Epoch of the last joints.
     pub last: Option<u8>,
-    /// Joints that are not there between two that are.
+    /// Missing joints between two that are present.
     pub missing: u64,
-    /// Joints of the epoch of those before them.
+    /// Joints with the same epoch as the previous ones.
     pub repeated: u64,
-    /// Steps back: the counting restarted.
+    /// Steps back: the numbering restarted.
     pub jumps: u64,
 }
 
-/// Damaged frames under identifiers that carry packets, and packets without a known meaning, by reason.
+/// Damaged frames with identifiers that carry packets, and packets that cannot be decoded, by reason.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct RefusedFrames {
     /// Wrong length.
     pub length: u64,
     /// Wrong CRC.
     pub crc: u64,
-    /// Packets whose meaning this version does not know.
+    /// Packets that this version cannot decode.
     pub meaning: u64,
-    /// Segments whose packet is incomplete.
+    /// Segments of incomplete packets.
     pub incomplete: u64,
 }
 
 impl RefusedFrames {
-    /// The reasons by name, with how many frames each.
+    /// Returns the reasons by name, each with its number of frames.
     #[must_use]
     pub const fn by_reason(&self) -> [(&'static str, u64); 4] {
         let Self { length, crc, meaning, incomplete } = *self;
@@ -218,7 +218,7 @@ impl RefusedFrames {
     }
 }
 
-/// One cell.
+/// The statistics of one cell.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct CellReport {
     /// Its node id.
@@ -227,25 +227,25 @@ pub struct CellReport {
     pub packets: u64,
     /// Torques among them.
     pub torques: u64,
-    /// Torques a second, from the first to the last.
+    /// Torques per second, from the first to the last.
     pub torques_per_s: Option<f64>,
-    /// From the first to the last of them, in s.
+    /// Time from the first to the last of them, in s.
     pub torques_span_s: f64,
     /// Sums of its own and its children's torques.
     pub sums: u64,
-    /// Of these, sums of the epoch of the one before: with more cells in it.
+    /// Sums for the same epoch as the previous one, with more cells in them.
     pub resent: u64,
-    /// Its parent, by its last tree page: a node id, 0 for the gateway's side.
+    /// Its parent, by its last tree page: a node id, or 0 for the gateway.
     pub parent: Option<u8>,
-    /// Wires to the root of its tree, by the same page.
+    /// Number of wires to the root of its tree, by the same page.
     pub depth: Option<u8>,
     /// The epoch that its first torque answers.
     pub first_epoch: Option<u8>,
     /// The epoch that its last torque answers.
     pub last_epoch: Option<u8>,
-    /// Joints within a contact that it did not answer.
+    /// Joints during a contact that it did not answer.
     pub unanswered: u64,
-    /// Torques of the epoch of the one before.
+    /// Torques for the same epoch as the previous one.
     pub repeated: u64,
     /// Torques and sums with a saturated word.
     pub saturated: u64,
@@ -253,7 +253,7 @@ pub struct CellReport {
     pub heartbeats: u64,
     /// Frames that it refused, by its last heartbeat.
     pub refused: Option<u16>,
-    /// Packets that it counted between two heartbeats and that are not here.
+    /// Packets that it counted between two heartbeats but that are not in the capture.
     pub lost: u64,
     /// Restarts.
     pub restarts: u64,
@@ -273,12 +273,12 @@ impl Stats {
             return;
         };
         bus_stats.take(record, decoded);
-        // Buses are read in turn, so that only frames of one bus have an order.
+        // Buses are read in turn, so only frames of the same bus are ordered.
         let back = nanos < std::mem::replace(&mut bus_stats.last, nanos);
         self.counts.times_backwards += u64::from(back);
     }
 
-    /// Frames were lost before this point; the bus is empty where it is unknown.
+    /// Records that frames were lost before this point; `bus` is empty if unknown.
     pub fn dropped(&mut self, bus: &str, frames: u64) {
         let bus_stats = if bus.is_empty() { None } else { self.bus_stats(bus) };
         let dropped = bus_stats.map(|bus_stats| &mut bus_stats.counts.dropped);
@@ -299,12 +299,12 @@ impl Stats {
         self.bus_stats.get_mut(at?)
     }
 
-    /// The times of the frames are none: they stand for the order alone, and there are no rates.
+    /// Declares that the frames have no times: their times only give the order, and rates are omitted.
     pub const fn without_times(&mut self) {
         self.is_untimed = true;
     }
 
-    /// What it comes to so far.
+    /// Returns the result so far.
     #[must_use]
     pub fn report(&self) -> Report {
         let mut report = self.timed();
@@ -329,13 +329,13 @@ impl Stats {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "to be read")]
+#[expect(clippy::cast_precision_loss, reason = "for display")]
 fn seconds(nanos: u64) -> f64 {
     nanos as f64 / 1e9
 }
 
-/// So many in so many ns, by second; `None` where there are none or no time.
-#[expect(clippy::cast_precision_loss, reason = "to be read")]
+/// Returns the rate per second of a count in a time in ns; `None` if either is zero.
+#[expect(clippy::cast_precision_loss, reason = "for display")]
 fn rate(count: u64, nanos: u64) -> Option<f64> {
     (count > 0 && nanos > 0).then(|| count as f64 * 1e9 / nanos as f64)
 }

@@ -1,6 +1,6 @@
-//! The central computation: every cell's joint torques from joint positions and sensor words, in `f64`
-//! and by forward kinematics (paper, Algorithm 1 and Eq. 8). It is the reference that the distributed
-//! torques are compared with, and the work that the distributed computation saves.
+//! The central computation: the joint torques of every cell from joint positions and sensor words, in `f64` and by
+//! forward kinematics (paper, Algorithm 1 and Eq. 8). Distributed torques are compared with it, and its cost is what
+//! the distributed computation saves.
 //!
 //! ```text
 //!   joint words ─> Central::frames ─> Frames ─┐
@@ -8,9 +8,9 @@
 //!  sensor words ─> Central::force  ─> F_z ────┘
 //! ```
 //!
-//! [`Central::new`] computes with the quantised parameters, as the cells do: what remains is the error
-//! of the cells' arithmetic. [`Central::unquantised`] computes with the numbers of the file: the
-//! difference then also holds what rounding poses, lengths and angles to words does.
+//! [`Central::new`] computes with the quantised parameters, as the cells do, so that a difference is the error of the
+//! cells' arithmetic. [`Central::unquantised`] computes with the numbers of the file: the difference then includes the
+//! rounding of poses, lengths and angles to words.
 //!
 //! A contact pushes against the outward normal: force = -F_z * normal.
 
@@ -20,10 +20,10 @@ use protocol::message::SkinSensors;
 use protocol::parameters::{Contact, MAX_JOINTS, MAX_ROWS, Parameters, Row, RowKind};
 use protocol::skin::{Base, Cell, Chain, Skin};
 
-/// The reference for the cells of one chain. Cells are named by their index in [`Skin::cells`].
+/// The central computation for the cells of one chain. Cells are named by their index in [`Skin::cells`].
 #[derive(Clone, Debug)]
 pub struct Central {
-    /// From the robot's base to frame 0.
+    /// Pose of frame 0 in the robot's base frame.
     base: IsometryMatrix3<f64>,
     links: Vec<Link>,
     cells: Vec<Place>,
@@ -33,11 +33,11 @@ pub struct Central {
 #[derive(Clone, Copy, Debug)]
 struct Link {
     kind: RowKind,
-    /// What does not move: `Tz(d) Tx(a) Rx(alpha)`.
+    /// The part of the transform that does not depend on the joint: `Tz(d) Tx(a) Rx(alpha)`.
     fixed: IsometryMatrix3<f64>,
-    /// Added to the joint's word, as the cells do it.
+    /// Angle added to the joint's word, in the cells' arithmetic.
     offset_word: Q1_14,
-    /// Added to the joint's angle in rad.
+    /// Angle added to the joint's angle, in rad.
     offset: f64,
 }
 
@@ -50,7 +50,8 @@ struct Place {
     contact: Contact,
 }
 
-/// Where all links are, for one set of joint positions: frame 0 (the base) and those of the rows, seen from the base.
+/// Poses of all links for one set of joint positions: frame 0 (the base), then one frame per row, all in the robot's
+/// base frame.
 #[derive(Clone, Debug)]
 pub struct Frames {
     frames: [IsometryMatrix3<f64>; MAX_ROWS + 1],
@@ -67,8 +68,8 @@ pub struct ReferenceTorque {
 }
 
 impl Central {
-    /// The reference on the words that the cells compute with. All cells of the skin sit on one chain: take
-    /// [`Skin::part_on`] a bus, where there are several.
+    /// Builds the reference from the quantised words that the cells compute with. All cells of the skin must sit on one
+    /// chain: for a skin with several buses, pass [`Skin::part_on`] of one bus.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let mut links = Vec::new();
@@ -84,7 +85,7 @@ impl Central {
         Self { base: base(skin), links, cells }
     }
 
-    /// The reference on the numbers of the skin's file; of one chain, as above.
+    /// Builds the reference from the numbers of the skin's file, for a skin with one chain as in [`Self::new`].
     #[must_use]
     pub fn unquantised(skin: &Skin) -> Self {
         let rows = |chain: &Chain| {
@@ -100,7 +101,7 @@ impl Central {
         Self { base: base(skin), links, cells: cells.collect() }
     }
 
-    /// The reference for one cell with these words, its first and only one, seen from frame 0 of its chain.
+    /// Builds the reference for a single cell (index 0) with these parameters, in frame 0 of its chain.
     #[must_use]
     pub fn of_cell(parameters: &Parameters) -> Self {
         let Parameters { pose, contact, .. } = *parameters;
@@ -111,7 +112,7 @@ impl Central {
         Self { base: IsometryMatrix3::identity(), links, cells: vec![place] }
     }
 
-    /// Where all links are when the joints of the chain stand as these words say. Bounded work, no allocation.
+    /// Returns the poses of all links for these joint words. Bounded work, no allocation.
     #[must_use]
     pub fn frames(&self, joints: &[Q1_14]) -> Frames {
         self.chain(joints, |link, word| match (link.kind, word) {
@@ -121,8 +122,7 @@ impl Central {
         })
     }
 
-    /// Where all links are when the joints of the chain stand at these positions, in rad or m. Bounded work, no
-    /// allocation.
+    /// Returns the poses of all links for these joint positions, in rad or m. Bounded work, no allocation.
     #[must_use]
     pub fn frames_at(&self, q: &[f64]) -> Frames {
         self.chain(q, |link, q| match (link.kind, q) {
@@ -132,7 +132,7 @@ impl Central {
         })
     }
 
-    /// The positions of the chain's joints, in rad or m, that words stand for.
+    /// Converts joint words to joint positions, in rad or m.
     #[must_use]
     pub fn positions(&self, joints: &[Q1_14]) -> [f64; MAX_JOINTS] {
         let mut positions = [0.0; MAX_JOINTS];
@@ -143,7 +143,7 @@ impl Central {
         positions
     }
 
-    /// `place` gives the angle of a row and how far it slides.
+    /// Multiplies the transforms of the rows; `place` returns the angle and the displacement of a row.
     fn chain<T>(&self, joints: &[T], place: impl Fn(&Link, Option<&T>) -> (f64, f64)) -> Frames {
         let mut tip = self.base;
         let mut frames = Frames { frames: [tip; MAX_ROWS + 1], kinds: [RowKind::Fixed; MAX_ROWS] };
@@ -161,14 +161,14 @@ impl Central {
         frames
     }
 
-    /// The force F_z in N that a cell computes from its sensor words: Algorithm 1, exactly. Zero means not in
-    /// contact, as for a cell that does not exist.
+    /// Returns the force F_z in N that a cell computes from its sensor words, exactly by Algorithm 1. Returns zero
+    /// without contact and for an unknown cell.
     #[must_use]
     pub fn force(&self, cell: usize, sensors: &SkinSensors) -> f64 {
         self.cells.get(cell).map_or(0.0, |place| force(&place.contact, sensors))
     }
 
-    /// Where a cell is, seen from the base, in m; the base itself for a cell that does not exist.
+    /// Returns the position of a cell in the base frame, in m; zero for an unknown cell.
     #[must_use]
     pub fn position(&self, cell: usize, frames: &Frames) -> [f64; 3] {
         let place =
@@ -176,8 +176,8 @@ impl Central {
         place.map_or([0.0; 3], |position| position.coords.into())
     }
 
-    /// The joint torques in Nm, of prismatic joints the forces in N, of one cell with the force `f_z` on it (paper, Eq. 8); zero in joints that do not
-    /// move it, and for a cell that does not exist. Bounded work, no allocation.
+    /// Returns the joint torques in Nm (forces in N for prismatic joints) of one cell with the force `f_z` on it
+    /// (paper, Eq. 8). Joints that do not move the cell get zero, as does an unknown cell. Bounded work, no allocation.
     #[must_use]
     pub fn torque(&self, cell: usize, frames: &Frames, f_z: f64) -> [f64; MAX_JOINTS] {
         let mut torque = [0.0; MAX_JOINTS];
@@ -187,9 +187,9 @@ impl Central {
         torque
     }
 
-    /// The torque of the whole skin, computed cell by cell; `sensors` are in the order of [`Skin::cells`]. This is the
-    /// work of a gateway without computing cells in every tick. It grows with the cells and again with the active
-    /// ones; no allocation.
+    /// Returns the torque of the whole skin, summed cell by cell; `sensors` are in the order of [`Skin::cells`]. A
+    /// gateway without computing cells does this work in every tick. The work grows with the number of cells and with
+    /// the number of active ones. No allocation.
     #[must_use]
     pub fn total(&self, frames: &Frames, sensors: &[SkinSensors]) -> ReferenceTorque {
         let mut reference_torque = ReferenceTorque::default();
@@ -204,7 +204,7 @@ impl Central {
     }
 }
 
-/// Frame 0 of the chain that the cells sit on, seen from the robot's base.
+/// Returns the pose of frame 0 of the cells' chain in the robot's base frame.
 fn base(skin: &Skin) -> IsometryMatrix3<f64> {
     let base = skin.cells.first().map_or_else(Base::default, |cell| skin.chain(cell.bus).base);
     let turn = Matrix4::from(base.matrix()).fixed_view::<3, 3>(0, 0).into_owned();
@@ -212,14 +212,14 @@ fn base(skin: &Skin) -> IsometryMatrix3<f64> {
 }
 
 impl Frames {
-    /// The frame of a row, counted from 1, seen from the robot's base; of 0, frame 0 of the chain.
+    /// Returns the frame of a row, counted from 1, in the robot's base frame; row 0 is frame 0 of the chain.
     #[must_use]
     pub fn row(&self, row: usize) -> Option<&IsometryMatrix3<f64>> {
         self.frames.get(row)
     }
 
-    /// Adds the torques of a cell at `place` with the force `f_z` on it about joints 1 to k:
-    /// `z_(l-1) x (t - t_(l-1)) . force`, of prismatic joints `z_(l-1) . force`.
+    /// Adds the torques about joints 1 to k of a cell at `place` with the force `f_z` on it:
+    /// `z_(l-1) x (t - t_(l-1)) . force`, for prismatic joints `z_(l-1) . force`.
     fn add_torque(&self, place: &Place, f_z: f64, torque: &mut [f64; MAX_JOINTS]) {
         let Some(limb) = self.frames.get(place.row) else { return };
         let position = limb * place.position;
@@ -256,7 +256,7 @@ impl Place {
     }
 }
 
-/// Algorithm 1. Every word, sum and product is exact in `f64`.
+/// Algorithm 1 of the paper. Every word, sum and product is exact in `f64`.
 pub(crate) fn force(contact: &Contact, sensors: &SkinSensors) -> f64 {
     let above = |value: f64, threshold: f64| if value < threshold { 0.0 } else { value };
     let touch = sensors.contact.iter().map(|word| word.to_f64()).sum();

@@ -1,19 +1,20 @@
-//! What is known of cells and buses, and the requests to them. Nothing here opens a file or a socket, or reads a clock.
+//! Models of cells and buses, fed with frames and times, and the requests to cells. This crate opens no files or
+//! sockets and reads no clock; its callers do.
 //!
-//! | module | what |
+//! | module | content |
 //! |---|---|
 //! | [`packets`] | frames into packets and messages |
 //! | [`decode`] | classes of frames, as text and JSON |
 //! | [`tracker`] | the state of a cell from its packets: identity, restarts, losses |
 //! | [`table`] | the state of a live bus: each cell, and sums |
-//! | [`latched`] | what the cells of a bus were told and still hold |
+//! | [`latched`] | the state that the cells of a bus hold from earlier commands |
 //! | [`central`] | torques computed centrally, in double precision |
 //! | [`network`] | the tree of cells, compared with the skin |
-//! | [`commission`], [`listing`] | which cells are on a bus; node ids and configuration for them |
-//! | [`surface`] | the surface that a link's cells lie on, and that laid flat |
+//! | [`commission`], [`listing`] | discovery of the cells on a bus; their node ids and configuration |
+//! | [`surface`] | the surface that a link's cells lie on, and its flat map |
 //! | [`repeat`] | requests that are repeated until they are confirmed |
-//! | [`accelerometer`] | what the accelerometers of cells show while a robot moves |
-//! | [`scenario`], [`generate`] | what a run does, and skins made from a recipe |
+//! | [`accelerometer`] | accelerometer readings of the cells while a robot moves |
+//! | [`scenario`], [`generate`] | the course of a run, and skins generated from a recipe |
 
 pub mod accelerometer;
 pub mod central;

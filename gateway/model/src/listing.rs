@@ -1,4 +1,4 @@
-//! What the cells of a bus report of themselves, and nothing else.
+//! A list of the cells of a bus, made only from the cells' own reports.
 
 use std::collections::BTreeMap;
 
@@ -8,7 +8,7 @@ use protocol::time::{Micros, Span};
 
 use crate::tracker::{Claim, Word};
 
-/// Writes node ids, which are in order, as text: three and more in a row as one, `1-3`, `5`.
+/// Formats sorted node ids as text. Three or more consecutive ids become a range: `1-3`, `5`.
 #[must_use]
 pub fn ranges(nodes: &[u8]) -> Vec<String> {
     let in_a_row = nodes.chunk_by(|one, next| one.checked_add(1) == Some(*next));
@@ -26,21 +26,21 @@ pub struct Cell {
     pub heartbeat: Option<Heartbeat>,
     /// Counters of what it received.
     pub heard: Option<Heard>,
-    /// What it refused.
+    /// Counters of what the cell refused.
     pub refused: Option<Refused>,
     /// Its place in the tree.
     pub tree: Option<Tree>,
-    /// What its ports lead to.
+    /// The neighbours at its ports.
     pub ports: Option<Ports>,
-    /// The serial number that claims its node id, or had it before.
+    /// The serial number of another cell that claims this node id, or held it before.
     pub other: Option<u32>,
     claim: Claim,
-    /// When its last packet came.
+    /// Arrival time of its last packet.
     last: Micros,
 }
 
 impl Cell {
-    /// How long ago its last packet came.
+    /// Returns the time since its last packet.
     #[must_use]
     pub const fn age(&self, now: Micros) -> Span {
         now.since(self.last)
@@ -53,7 +53,7 @@ impl Cell {
                 if matches!(self.claim.hear(now, &heartbeat), Word::Claimant | Word::Outsider) {
                     self.other = Some(heartbeat.serial);
                 } else if before.is_some_and(|before| before != heartbeat.serial) {
-                    // All that is known is of the other cell.
+                    // The reports so far belong to the previous cell: start again.
                     *self = Self { other: before, claim: self.claim, last: self.last, ..Self::default() };
                 }
                 self.heartbeat = self.claim.heartbeat();
@@ -66,7 +66,7 @@ impl Cell {
     }
 }
 
-/// All that came on a bus.
+/// All cells that were seen on a bus.
 #[derive(Clone, Debug, Default)]
 pub struct Listing {
     cells: BTreeMap<u8, Cell>,
@@ -75,13 +75,13 @@ pub struct Listing {
 }
 
 impl Listing {
-    /// Nothing received yet.
+    /// Creates an empty list.
     #[must_use]
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Takes a message, which came in frames of this format.
+    /// Records a message that arrived in frames of this format.
     pub fn hear(&mut self, now: Micros, format: Format, message: &Message) {
         let Some(from) = message.sender() else {
             self.gateway |= matches!(message, Message::Joints { .. } | Message::Network { .. });
@@ -95,24 +95,24 @@ impl Listing {
         }
     }
 
-    /// The cells, by node id.
+    /// Returns the cells by node id.
     pub fn cells(&self) -> impl ExactSizeIterator<Item = (u8, &Cell)> {
         self.cells.iter().map(|(&node, cell)| (node, cell))
     }
 
-    /// Whether a gateway sends on the bus.
+    /// Returns true if a gateway sends on the bus.
     #[must_use]
     pub const fn has_gateway(&self) -> bool {
         self.gateway
     }
 
-    /// The frame format of the first cell.
+    /// Returns the frame format of the first cell's packets.
     #[must_use]
     pub const fn format(&self) -> Option<Format> {
         self.format
     }
 
-    /// The node id of the cell with this serial number, if it is there.
+    /// Returns the node id of the cell with this serial number, if it is on the bus.
     #[must_use]
     pub fn number_of(&self, serial: u32) -> Option<u8> {
         let is = |cell: &Cell| cell.claim.serial() == Some(serial);

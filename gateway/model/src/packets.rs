@@ -1,12 +1,13 @@
-//! The packets of one bus: each frame is reassembled and decoded here, once, and handed on to all that follow the bus.
+//! The packets of one bus. Each frame is reassembled and decoded here once, for all consumers of the bus.
 //!
 //! ```text
 //!   frame, time ──> PacketReader ──> Received ─┬─> table (state of the cells)
-//!                     └ segments that wait     ├─> Classifier (text, JSON)
+//!                     └ pending segments       ├─> Classifier (text, JSON)
 //!                                              └─> latched packets, sorted traffic
 //! ```
 //!
-//! Cells receive by code of their own, as on a microcontroller, and `conformance` judges them by its own.
+//! Cells have their own receiver, which fits a microcontroller, and `conformance` has another one to test them
+//! independently.
 
 use protocol::can::{Format, Frame};
 use protocol::id::{Command, Id};
@@ -15,63 +16,63 @@ use protocol::packet::{Length, Lengths, Packet, PacketError, Reassembly, Segment
 use protocol::skin::Skin;
 use protocol::time::Micros;
 
-/// Identifiers of 11 bits.
+/// The number of identifiers of 11 bits.
 const IDS: usize = 1 << 11;
 
-/// The length of joints, torques and sums on a bus.
+/// The number of joints in joints, torques and sums on a bus, and how it is known.
 #[derive(Clone, Copy, Debug)]
 enum ChainLength {
-    /// Described by a skin.
+    /// Given by a skin.
     Described(Length),
-    /// Taken from the newest joints; `None` before them.
+    /// Taken from the newest joints packet; `None` before the first.
     FromJoints(Option<Length>),
 }
 
-/// A frame of a bus and its meaning.
+/// A frame of a bus with its decoded content.
 #[derive(Clone, Copy, Debug)]
 pub struct Received<'f> {
     /// The frame.
     pub frame: &'f Frame,
     /// Its content.
     pub content: Content,
-    /// Segments of its identifier that waited before it.
+    /// Number of segments of its identifier that were pending before it.
     pub waited: usize,
-    /// Segments of its identifier that wait after it.
+    /// Number of segments of its identifier that are pending after it.
     pub waiting: usize,
 }
 
 /// The content of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Content {
-    /// A remote or error frame, or a 29-bit identifier: never a packet.
+    /// A remote or error frame, or a 29-bit identifier: not a packet of this protocol.
     NotData,
-    /// The frame is or completes a packet with a meaning.
+    /// The frame is or completes a packet that decodes to a message.
     Message(Id, Packet, Message),
-    /// The frame is or completes a packet without a meaning in this version.
+    /// The frame is or completes a packet that this version cannot decode.
     Meaningless(Id, Packet, MessageError),
-    /// A segment of a packet in classic frames; others are awaited.
+    /// A segment of a packet in classic frames; the packet needs more segments.
     Segment(Id),
-    /// A segment after which the packet of the segments before it is known to be lost.
+    /// A segment that does not belong to the pending ones, or arrived too late for them: their packet is lost.
     AfterLost(Id),
-    /// Not a packet and not a segment.
+    /// Neither a packet nor a segment.
     Damaged(Id, PacketError),
 }
 
 impl Received<'_> {
-    /// The message that the frame is or completes.
+    /// Returns the message that the frame is or completes.
     #[must_use]
     pub const fn message(&self) -> Option<&Message> {
         if let Content::Message(_, _, message) = &self.content { Some(message) } else { None }
     }
 }
 
-/// Reassembles and decodes the frames of one bus. Memory is bounded, whatever comes.
+/// Reassembles and decodes the frames of one bus. Memory is bounded for any input.
 #[derive(Clone, Debug)]
 pub struct PacketReader {
-    /// With `None`, each frame has its own.
+    /// With `None`, each frame is read in its own format.
     format: Option<Format>,
     length: ChainLength,
-    /// By identifier, of those that came.
+    /// Reassembly state by identifier.
     segments: Vec<Option<Box<Segment>>>,
 }
 
@@ -82,13 +83,13 @@ impl Default for PacketReader {
 }
 
 impl PacketReader {
-    /// Reads a bus of unknown chain; with `None` each frame is read in its own format.
+    /// Reads a bus with an unknown chain; with `None`, each frame is read in its own format.
     #[must_use]
     pub const fn new(format: Option<Format>) -> Self {
         Self { format, length: ChainLength::FromJoints(None), segments: Vec::new() }
     }
 
-    /// Reads a bus of a skin: packets have its format, and torques, joints and sums its chain's length.
+    /// Reads a bus of a skin: packets have its format; torques, joints and sums have its chain's length.
     #[must_use]
     pub fn of_skin(skin: &Skin, bus: usize) -> Self {
         Self {
@@ -98,7 +99,7 @@ impl PacketReader {
         }
     }
 
-    /// Takes the next frame, which arrived `at`. Never panics.
+    /// Reads the next frame, which arrived `at`. Never panics.
     pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> Received<'f> {
         let Ok(id) = data_id(frame) else {
             return Received { frame, content: Content::NotData, waited: 0, waiting: 0 };
@@ -114,7 +115,7 @@ impl PacketReader {
         Received { frame, content: self.content(id, packet), waited: 0, waiting: 0 }
     }
 
-    /// Refuses a packet that is longer or shorter than its kind is on a described bus.
+    /// Refuses a packet whose length does not fit the described chain.
     fn of_described_length(&self, id: Id, packet: Packet) -> Result<Packet, PacketError> {
         match self.length {
             ChainLength::Described(length)
@@ -129,14 +130,14 @@ impl PacketReader {
     fn read_segment<'f>(&mut self, at: Micros, id: Id, frame: &'f Frame) -> Received<'f> {
         let lengths = match self.length {
             ChainLength::Described(length) => Lengths::only(length),
-            // Joints contain their own length.
+            // Joints packets contain their own length.
             ChainLength::FromJoints(_) if id == Id::command(Command::Joints) => Lengths::ALL,
             ChainLength::FromJoints(length) => Lengths::of_chain(length),
         };
         if self.segments.is_empty() {
             self.segments.resize(IDS, None);
         }
-        let segments = self.segments.get_mut(usize::from(id.to_bits())).expect("11 bits");
+        let segments = self.segments.get_mut(usize::from(id.to_bits())).expect("an identifier has 11 bits");
         let segment = segments.get_or_insert_default();
         let waited = segment.waiting();
         let reassembly = segment.push(at, id, lengths, frame.data());
@@ -169,7 +170,7 @@ impl PacketReader {
         }
     }
 
-    /// Drops the segments that wait under an identifier.
+    /// Drops the pending segments of an identifier.
     pub fn drop_segments(&mut self, id: Id) {
         if let Some(segments) = self.segments.get_mut(usize::from(id.to_bits())) {
             *segments = None;

@@ -1,16 +1,16 @@
-//! Distributions of times, and their quantiles.
+//! Histograms of times and their quantiles.
 
 use hdrhistogram::Histogram;
 use serde::{Deserialize, Serialize};
 
-/// An empty histogram with three digits that grows by itself.
+/// Creates an empty, auto-resizing histogram with three significant digits.
 #[must_use]
 #[expect(clippy::missing_panics_doc, reason = "three digits are a valid precision")]
 pub fn histogram() -> Histogram<u64> {
     Histogram::new(3).expect("three digits are a valid precision")
 }
 
-/// Times in ns, of which the longest is known exactly.
+/// A histogram of times in ns that also keeps the exact maximum.
 #[derive(Clone, Debug)]
 pub struct Times {
     histogram: Histogram<u64>,
@@ -24,27 +24,27 @@ impl Default for Times {
 }
 
 impl Times {
-    /// Takes one more.
+    /// Adds a time in ns.
     pub fn record(&mut self, nanos: u64) {
-        // The histogram grows by itself; it cannot refuse.
+        // Recording cannot fail: the histogram resizes itself.
         let _ = self.histogram.record(nanos);
         self.longest = self.longest.max(nanos);
     }
 
-    /// All of them.
+    /// Returns the histogram of all times.
     #[must_use]
     pub const fn histogram(&self) -> &Histogram<u64> {
         &self.histogram
     }
 
-    /// The longest; 0 of none.
+    /// Returns the longest time in ns; 0 if empty.
     #[must_use]
     pub const fn longest(&self) -> u64 {
         self.longest
     }
 }
 
-/// Median, 90th and 99th percentile, maximum, and of how many values; in µs.
+/// Median, 90th and 99th percentile and maximum in µs, and the number of values.
 #[derive(Clone, Copy, Debug, Default, Deserialize, PartialEq, Serialize)]
 pub struct Quantiles {
     /// Median.
@@ -55,12 +55,12 @@ pub struct Quantiles {
     pub p99: f64,
     /// Maximum.
     pub max: f64,
-    /// How many.
+    /// Number of values.
     pub count: u64,
 }
 
 impl Quantiles {
-    /// Of a histogram that counts in units of `unit_us`.
+    /// Computes the quantiles of a histogram that counts in units of `unit_us`.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "times far below 2^53 ns")]
     pub fn of(histogram: &Histogram<u64>, unit_us: f64) -> Self {

@@ -1,6 +1,6 @@
 //! Requests that are repeated until they are confirmed: when each is due again, and when it fails.
 //!
-//! The caller knows which requests are open, and asks here which of them to send now. Nothing here has a clock.
+//! The caller keeps the open requests and asks here which of them to send now. This module has no clock.
 
 use std::collections::BTreeMap;
 
@@ -9,15 +9,15 @@ use protocol::time::{Micros, Span};
 /// The retry limit and the timeouts of a request.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Limits {
-    /// Timeout after the first time.
+    /// Timeout after the first transmission.
     pub first: Span,
-    /// The longest timeout; it doubles after each time.
+    /// The longest timeout. The timeout doubles after each transmission.
     pub longest: Span,
-    /// How often it is sent before it fails.
+    /// Number of transmissions before the request fails.
     pub tries: u8,
 }
 
-/// A request without an answer yet.
+/// A request that has not been answered yet.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Attempt {
     limits: Limits,
@@ -25,7 +25,7 @@ pub struct Attempt {
     due: Micros,
 }
 
-/// What to do with a request now.
+/// The action for a request now.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Turn {
     /// Nothing yet.
@@ -37,25 +37,25 @@ pub enum Turn {
 }
 
 impl Attempt {
-    /// It is sent for the first time now.
+    /// Starts with the first transmission at `now`.
     #[must_use]
     pub fn new(now: Micros, limits: Limits) -> Self {
         Self { limits, tries: 1, due: now + limits.first }
     }
 
-    /// How often it was sent.
+    /// Returns the number of transmissions.
     #[must_use]
     pub const fn tries(&self) -> u8 {
         self.tries
     }
 
-    /// When [`Attempt::turn`] is due.
+    /// Returns the time when [`Attempt::turn`] is due.
     #[must_use]
     pub const fn due(&self) -> Micros {
         self.due
     }
 
-    /// Handles the timeout; after [`Turn::Again`] it counts as sent again. Harmless when called early.
+    /// Handles the timeout. [`Turn::Again`] counts as a transmission. Has no effect before the timeout.
     pub fn turn(&mut self, now: Micros) -> Turn {
         if now < self.due {
             return Turn::Wait;
@@ -68,30 +68,30 @@ impl Attempt {
         Turn::Again
     }
 
-    /// Restarts the timeout: a cell has answered, so others may still do.
+    /// Restarts the timeout: a cell has answered, so others may still answer.
     pub fn extend(&mut self, now: Micros) {
         let doubled = self.limits.first.0.saturating_mul(1 << (self.tries - 1).min(32));
         self.due = now + Span(doubled.min(self.limits.longest.0));
     }
 }
 
-/// Requests to many that are repeated without end, each at most so often.
+/// Requests to many cells that are repeated without a limit, each at most once per interval.
 #[derive(Clone, Debug)]
 pub struct Repeats<K> {
     every: Span,
-    /// When each was sent last, and when all were at once.
+    /// Last transmission by request, and of the last request to all.
     sent: BTreeMap<K, Micros>,
     all: Option<Micros>,
 }
 
 impl<K: Copy + Ord> Repeats<K> {
-    /// None was sent yet.
+    /// Starts with no request sent.
     #[must_use]
     pub const fn new(every: Span) -> Self {
         Self { every, sent: BTreeMap::new(), all: None }
     }
 
-    /// Of the `open` requests, those to send now; they count as sent.
+    /// Returns those of the `open` requests that are due now, and counts them as sent.
     pub fn due(&mut self, now: Micros, open: impl IntoIterator<Item = K>) -> Vec<K> {
         let last = |key: &K| self.sent.get(key).copied().max(self.all);
         let is_due = |key: &K| last(key).is_none_or(|at| now.since(at) >= self.every);
@@ -100,12 +100,12 @@ impl<K: Copy + Ord> Repeats<K> {
         due
     }
 
-    /// All were sent at once, to everyone.
+    /// Records that all requests were sent in one message to all cells.
     pub const fn said_to_all(&mut self, now: Micros) {
         self.all = Some(now);
     }
 
-    /// The request has changed: it is due at once.
+    /// Makes a changed request due at once.
     pub fn renew(&mut self, key: K) {
         self.sent.remove(&key);
     }

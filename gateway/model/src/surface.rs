@@ -1,30 +1,30 @@
-//! The surface that the cells of a link lie on: a cylinder about it, or a plate; and that surface laid flat.
+//! The surface that the cells of a link lie on, a cylinder around the link or a plate, and its flat map.
 
 use nalgebra::{Matrix3, Vector3};
 
 /// The smallest number of cells on a link to which a cylinder is fitted.
 const CYLINDER_CELLS: usize = 6;
 
-/// A cell on a link: its middle in m and its unit normal, in the link's frame.
+/// A cell on a link: its centre in m and its unit normal, in the link's frame.
 pub type Placed = ([f64; 3], [f64; 3]);
 
 /// A cylinder in a link's frame; lengths in m.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cylinder {
-    /// A point of its axis.
+    /// A point on its axis.
     pub middle: [f64; 3],
-    /// The direction of its axis, of length 1.
+    /// The unit vector along its axis.
     pub axis: [f64; 3],
     /// Its radius, 0.005 to 0.5.
     pub radius: f64,
-    /// Where along the axis the first and the last cell lie, counted from `middle`.
+    /// Positions of the first and the last cell along the axis, from `middle`.
     pub along: [f64; 2],
 }
 
 impl Cylinder {
-    /// The cylinder of which these cells are best a part: its axis is at right angles to their normals, and what is left
-    /// of their positions less the radius along the normal lies on a line. None of fewer than 6 cells, and none where
-    /// they face one way, as on a plate.
+    /// Fits a cylinder to the cells. Its axis is perpendicular to their normals as well as possible, and each position
+    /// minus the radius along the normal lies on the axis (least squares). Returns `None` for fewer than 6 cells, and
+    /// for cells that face one way, as on a plate.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a number of cells")]
     pub fn fit(cells: &[Placed]) -> Option<Self> {
@@ -38,7 +38,7 @@ impl Cylinder {
         let mut values: Vec<_> = eigen.eigenvalues.iter().copied().zip(0..).collect();
         values.sort_by(|one, other| one.0.total_cmp(&other.0));
         let &[(along, column), (across, _), _] = values.as_slice() else { return None };
-        // Round about the axis: normals spread evenly over both directions at right angles to it.
+        // The normals of a cylinder spread evenly over both directions perpendicular to the axis.
         if along > 0.1 || across < 0.2 {
             return None;
         }
@@ -64,25 +64,26 @@ impl Cylinder {
         Some(Self { middle: middle.into(), axis: axis.into(), radius, along: [from, to] })
     }
 
-    /// A point of the axis, by how far along it is.
+    /// Returns the point of the axis at this distance along it.
     #[must_use]
     pub fn at(&self, along: f64) -> [f64; 3] {
         (Vector3::from(self.middle) + Vector3::from(self.axis) * along).into()
     }
 }
 
-/// The cells of a link, laid flat as seen from outside.
+/// The cells of a link on a flat map, seen from outside.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Flat {
-    /// Of each cell, to the right and down in m. On a cylinder 0 to the right is where the link's x axis, or its y axis,
-    /// passes through it.
+    /// Position of each cell, to the right and down, in m. On a cylinder, 0 to the right is where the link's x axis (or
+    /// y axis, if the cylinder lies along x) passes through it.
     pub places: Vec<[f64; 2]>,
-    /// The radius in m of what was unrolled; none of a plate.
+    /// The radius in m of the unrolled cylinder; `None` for a plate.
     pub radius: Option<f64>,
 }
 
-/// Lays the cells of a link flat: a cylinder unrolled, with the angle about its axis to the right; a plate seen along its
-/// mean normal. `tip` is the direction that becomes down, as far as it lies in the surface: along the link, to its tip.
+/// Maps the cells of a link to a plane. A cylinder is unrolled, with the angle around its axis to the right; a plate is
+/// seen along its mean normal. `tip` is the direction along the link to its tip; its component in the surface points
+/// down.
 #[must_use]
 #[expect(clippy::cast_precision_loss, reason = "a number of cells")]
 pub fn lay_flat(cells: &[Placed], tip: [f64; 3]) -> Flat {
@@ -111,7 +112,8 @@ pub fn lay_flat(cells: &[Placed], tip: [f64; 3]) -> Flat {
     Flat { places: places.collect(), radius: None }
 }
 
-/// The direction of the x axis, or of the y axis where that is nearer to a right angle, at a right angle to another one.
+/// Returns the unit vector perpendicular to `axis` that is nearest to the x axis, or to the y axis if `axis` is close
+/// to x.
 fn beside(axis: &Vector3<f64>) -> Vector3<f64> {
     let chosen = if axis.x.abs() < 0.9 { Vector3::x() } else { Vector3::y() };
     (chosen - axis * axis.dot(&chosen)).normalize()
@@ -126,7 +128,7 @@ mod tests {
     use super::*;
     use core::f64::consts::{FRAC_PI_2, TAU};
 
-    /// Six rings of twelve cells about the axis through (0.1, 0.2, z).
+    /// Six rings of twelve cells around the axis through (0.1, 0.2, z).
     fn ring() -> Vec<Placed> {
         let cells = (0..72_u32).map(|at| {
             let (angle, z) = (f64::from(at % 12) / 12.0 * TAU, f64::from(at / 12) * 0.03);
@@ -151,7 +153,7 @@ mod tests {
     fn a_cylinder_is_unrolled_as_seen_from_outside_with_the_tip_below() {
         let flat = lay_flat(&ring(), [0.0, 0.0, 1.0]);
         assert_eq!(flat.radius.map(|radius| (radius * 1e6).round()), Some(50_000.0));
-        // The cell that faces x; with z downwards and x to the reader, y is to the left.
+        // The first cell faces x. With z down and x towards the reader, y points left.
         let [first, side, below] = [0, 3, 12].map(|at| flat.places[at]);
         assert!(first[0].abs() < 1e-9 && (below[1] - first[1] - 0.03).abs() < 1e-9, "{first:?} {below:?}");
         assert!((side[0] + FRAC_PI_2 * 0.05).abs() < 1e-9, "{side:?}");

@@ -1,4 +1,4 @@
-//! Skins that the tests of these crates begin with.
+//! Skins for the tests of these crates.
 
 use protocol::skin::Skin;
 
@@ -49,56 +49,56 @@ orientation = [0.7071068, 0.0, 0.0, 0.7071068]
 
 /// The skin of the demo: 253 cells on two links of a UR5.
 pub const UR5: &str = include_str!("../../examples/ur5-253.toml");
-/// 126 cells on all links of an arm of seven joints, imported from its URDF.
+/// 126 cells on all links of an arm with seven joints, imported from its URDF.
 const PANDA: &str = include_str!("../tests/data/panda.toml");
 /// A cell on an arm on a lift.
 const LIFT: &str = include_str!("../tests/data/lift.toml");
 
-/// [`UR5`].
+/// Returns the skin [`UR5`].
 ///
 /// # Panics
-/// Never: the skin is sound, as the next two are.
+/// Never: the skin is valid, as are the next two.
 #[must_use]
 pub fn ur5() -> Skin {
-    Skin::parse("ur5-253.toml", UR5).expect("the tests' skin is sound")
+    Skin::parse("ur5-253.toml", UR5).expect("the tests' skin is valid")
 }
 
-/// Cells on all links of an arm of seven joints.
+/// Returns a skin with cells on all links of an arm with seven joints.
 ///
 /// # Panics
 /// See [`ur5`].
 #[must_use]
 pub fn panda() -> Skin {
-    Skin::parse("panda.toml", PANDA).expect("the tests' skin is sound")
+    Skin::parse("panda.toml", PANDA).expect("the tests' skin is valid")
 }
 
-/// A cell on an arm on a lift.
+/// Returns a skin with one cell on an arm on a lift.
 ///
 /// # Panics
 /// See [`ur5`].
 #[must_use]
 pub fn lift() -> Skin {
-    Skin::parse("lift.toml", LIFT).expect("the tests' skin is sound")
+    Skin::parse("lift.toml", LIFT).expect("the tests' skin is valid")
 }
 
-/// [`SKIN`] with a second bus like the first one.
+/// Returns [`SKIN`] with a second bus like the first one.
 ///
 /// # Panics
-/// Never: the skin is sound.
+/// Never: the skin is valid.
 #[must_use]
 pub fn two_buses() -> Skin {
     let bus = SKIN.find("[[bus]]").zip(SKIN.find("[controller]")).and_then(|(from, to)| SKIN.get(from..to));
     let cell = SKIN.find("[[cell]]").and_then(|from| SKIN.get(from..));
     let more = bus.into_iter().chain(cell).map(|part| format!("\n{}", part.replace("vcan0", "vcan1")));
     let text = SKIN.to_owned() + &more.collect::<String>();
-    Skin::parse("skin.toml", &text).expect("the tests' skin is sound")
+    Skin::parse("skin.toml", &text).expect("the tests' skin is valid")
 }
 
-/// [`SKIN`], checked.
+/// Returns [`SKIN`], parsed and checked.
 ///
 /// # Panics
-/// Never: the skin is sound.
+/// Never: the skin is valid.
 #[must_use]
 pub fn skin() -> Skin {
-    Skin::parse("skin.toml", SKIN).expect("the tests' skin is sound")
+    Skin::parse("skin.toml", SKIN).expect("the tests' skin is valid")
 }

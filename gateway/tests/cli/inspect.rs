@@ -259,8 +259,8 @@ fn the_worked_example_of_the_document_is_explained_in_a_terminal() {
         "  F_z        1.0000 F_c + 0.0000 F_p = 3.000000 N, not below 0.1006 N",
         "  in words   196608 steps of 2^-16 N = 3.000000 N",
         "  answered   0.500 ms after the joints",
-        "  vcan0 12: it did not report its configuration; taken to be the skin's, 266D",
-        "  vcan0: 1 cells sent nothing, and their contact state is not in the capture; they are taken as not in contact",
+        "  vcan0 12: it did not report its configuration; assumed to be the skin's, 266D",
+        "  vcan0: 1 cells sent nothing, and their contact state is not in the capture; they are assumed not to be in contact",
     ] {
         assert!(text.lines().any(|there| there == line), "{line}\n{text}");
     }
@@ -302,7 +302,7 @@ fn what_cannot_be_explained_is_one_line() {
         (
             "explain run.log --skin skin.toml --epoch 7 --at 0.3 --occurrence 2",
             1,
-            "run.log: there are no joints of epoch 7 for the 2. time at 0.300 s or later; there are those of epoch 7 at \
+            "run.log: there are no joints of epoch 7 (occurrence 2) at 0.300 s or later; there are those of epoch 7 at \
              0.200 s",
         ),
         (

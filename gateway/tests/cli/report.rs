@@ -148,8 +148,8 @@ fn a_log_gives_the_accounts_of_the_recording_of_the_same_run_and_names_what_it_l
     for text in [
         format!("Not in a log: {lacks}."),
         "Not in a log: joint velocities, as joints frames have positions.".to_owned(),
-        "Not in a log: how long ticks and the central computation in them took".to_owned(),
-        "Not in a log: ticks that the loop skipped, and bad cycles.".to_owned(),
+        "Not in a log: the durations of ticks and of the central computation".to_owned(),
+        "Not in a log: skipped ticks and bad cycles.".to_owned(),
         "skinbus view classic.log --skin classic.toml --at ".to_owned(),
     ] {
         assert!(of_log.contains(&text), "{text}");
@@ -203,7 +203,7 @@ fn a_log_without_stimuli_does_not_say_that_nothing_was_touched() {
     ] {
         assert!(page.contains(text), "{text}");
     }
-    assert!(!page.contains("No cell was touched") && !page.contains("No cell was in contact"));
+    assert!(!page.contains("The frames show no touch of a cell") && !page.contains("No cell was in contact"));
     assert!(page.contains("id=\"torque-joint1\"") && !page.contains("id=\"torque-error\""));
 }
 

@@ -253,7 +253,7 @@ fn a_page_and_its_figures_are_complete_and_that_of_a_truncated_recording_names_w
     {
         assert!(ended.stderr.contains(words), "{words}: {ended:?}");
     }
-    assert!(place.read("cut.html").contains("Not all of the run is here: it has no end"));
+    assert!(place.read("cut.html").contains("The run is incomplete: it has no end"));
     // As much as a recovery finds.
     place.start("skinbus", "recover cut.mcap -o recovered.mcap").end().well();
     let recovered = Recorded::read(&place.path("recovered.mcap"));

@@ -318,5 +318,8 @@ fn a_cell_that_sends_one_torque_for_ever_is_named_in_the_table_the_summary_and_t
     assert_eq!(stuck, [(&json!(5), true)], "{:#}", summary.0["cells"]);
     place.start("skinbus", "report run.mcap -o run.html").end().well();
     let page = place.read("run.html");
-    assert!(page.contains("stuck cells, which should have sent other words (vcan0 5: "), "not in the report");
+    assert!(
+        page.contains("stuck cells, which sent constant words while others were due (vcan0 5: "),
+        "not in the report"
+    );
 }

@@ -142,7 +142,7 @@ fn cells_that_are_wired_otherwise_than_described_are_named() {
              change the description",
             "port 3 of cell 7 leads to port 2 of cell 10 and should lead to port 2 of cell 11: plug it there, or \
              change the description",
-            "the wire from port 3 of cell 8 to port 2 of cell 12 does not work: look at its plugs",
+            "the wire from port 3 of cell 8 to port 2 of cell 12 does not work: check its plugs",
         ]
     );
 }

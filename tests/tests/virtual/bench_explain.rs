@@ -168,7 +168,7 @@ fn a_cell_that_has_just_started_sends_nothing_and_one_that_releases_sends_zeros(
     // Its stimulus was sent again, and it answers nothing during its address claim.
     assert!(cell(0).unwrap().answered_after_ns.is_some() && cell(2).unwrap().answered_after_ns.is_none());
     let why = format!(
-        "vcan0 {}: no torque of this epoch in time: it had just started and was claiming its node id; the words are without it",
+        "vcan0 {}: no torque of this epoch in time: it had just started and was claiming its node id; the sum of words lacks it",
         node(2)
     );
     assert_eq!(explanation.missing, [why]);

@@ -1,7 +1,7 @@
-//! Where captures stand that did not begin with their run.
+//! Aligns captures that did not begin with their run.
 //!
-//! A capture that begins in the middle of a run has the epochs of its joints modulo 256. Which of the numbers these are is
-//! found by the joints themselves: the place where most of them are those of the other capture.
+//! A capture that begins in the middle of a run has the epochs of its joints only modulo 256. Their numbers follow from
+//! the joints themselves: the alignment at which most of them equal those of the other capture.
 
 use protocol::message::{Joints, Message};
 use protocol::packet::Epoch;
@@ -10,25 +10,25 @@ use protocol::skin::Skin;
 use super::Both;
 use super::numbering::Numbering;
 
-/// Joints that are kept: at 62.5 Hz a day has 5.4 million. Of longer captures the first ones.
+/// Maximum number of joints that are kept, from the start; at 62.5 Hz a day has 5.4 million.
 const MOST: usize = 6_000_000;
-/// Joints that are compared for each place.
+/// Number of joints that are compared for each alignment.
 const SAMPLES: usize = 512;
-/// Epochs that captures have in common where they are laid over each other by their joints.
+/// Minimum number of common epochs of two captures that are aligned by their joints.
 const COMMON: usize = 8;
 
-/// The joints of a capture, each as a number that tells different ones apart.
+/// The joints of a capture, each as a hash.
 #[derive(Debug)]
 pub struct Trace {
     bus: Option<String>,
     numbering: Numbering,
     first: Option<Epoch>,
-    /// By number since the first; `None` where joints are missing.
+    /// Hashes by number since the first joints; `None` for missing joints.
     joints: Vec<Option<u32>>,
 }
 
 impl Trace {
-    /// Follows the joints of the first bus of a skin that has cells.
+    /// Follows the joints of the first bus with cells.
     #[must_use]
     pub fn new(skin: &Skin) -> Self {
         let bus = skin.cells.first().and_then(|cell| skin.buses.get(cell.bus));
@@ -40,13 +40,13 @@ impl Trace {
         }
     }
 
-    /// The epoch of the first joints.
+    /// Returns the epoch of the first joints.
     #[must_use]
     pub fn first(&self) -> Option<u8> {
         self.first.map(|first| first.0)
     }
 
-    /// Takes the next message of a bus.
+    /// Records the next message of a bus.
     pub fn take(&mut self, nanos: u64, bus: &str, message: &Message) {
         let Message::Joints { epoch, joints } = message else { return };
         if self.bus.as_deref() != Some(bus) {
@@ -65,13 +65,13 @@ impl Trace {
     }
 }
 
-/// FNV-1a of the words.
+/// Hashes the words with FNV-1a.
 fn number_of(joints: &Joints) -> u32 {
     let words = joints.positions.iter().flat_map(|word| word.to_bits().to_le_bytes());
     words.fold(0x811C_9DC5, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193))
 }
 
-/// The numbers of the first joints of two captures of one skin.
+/// Returns the numbers of the first joints of two captures of one skin.
 #[must_use]
 pub fn starts(a: &Trace, b: &Trace) -> Both<Option<u64>> {
     let (Some(first_a), Some(first_b)) = (a.first, b.first) else { return Both { a: None, b: None } };
@@ -89,7 +89,7 @@ pub fn starts(a: &Trace, b: &Trace) -> Both<Option<u64>> {
     Both { a: Some(of(first_a, best.1)), b: Some(of(first_b, best.2)) }
 }
 
-/// The share of equal joints where two captures begin with these numbers; `None` where too few are in both.
+/// Returns the share of equal joints if two captures begin with these numbers; `None` if they have too few in common.
 fn share(a: &Trace, b: &Trace, start_a: u64, start_b: u64) -> Option<f64> {
     let begin = start_a.max(start_b);
     let [skip_a, skip_b] =

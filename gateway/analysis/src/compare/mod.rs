@@ -1,4 +1,4 @@
-//! Two captures of one skin, joints by joints: `skinbus compare`.
+//! Compares two captures of one skin, epoch by epoch: `skinbus compare`.
 //!
 //! ```text
 //!   frames of A ──> Side: Moments by Key ──┐
@@ -6,8 +6,8 @@
 //!   frames of B ──> Side: Moments by Key ──┘
 //! ```
 //!
-//! A `Key` is the number of some joints since the run began. The captures are read in lockstep, always the one that is
-//! behind ([`Comparison::next`]), so that memory does not grow with them: of each bus some 100 joints are held.
+//! A `Key` is the number of a joints packet since the run began. The captures are read in lockstep, always the one that
+//! is behind ([`Comparison::next`]), so that memory does not grow with their length: about 100 joints per bus are held.
 
 mod align;
 mod numbering;
@@ -46,7 +46,7 @@ impl Which {
     }
 }
 
-/// Something of each capture.
+/// A value for each capture.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Both<T> {
     /// The value of the first one.
@@ -56,7 +56,7 @@ pub struct Both<T> {
 }
 
 impl<T> Both<T> {
-    /// That of one.
+    /// Returns the value of one capture.
     #[must_use]
     pub const fn of(&self, which: Which) -> &T {
         match which {
@@ -65,7 +65,7 @@ impl<T> Both<T> {
         }
     }
 
-    /// That of one, to be changed.
+    /// Returns the mutable value of one capture.
     pub const fn of_mut(&mut self, which: Which) -> &mut T {
         match which {
             Which::A => &mut self.a,
@@ -74,14 +74,14 @@ impl<T> Both<T> {
     }
 }
 
-/// Differences that do not count.
+/// The tolerances of a comparison.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Options {
-    /// Steps by which words of torques (1/4096 Nm) and sums (1/256 Nm) may differ.
+    /// Tolerance for words of torques (in 1/4096 Nm) and sums (in 1/256 Nm).
     pub tolerance: u32,
-    /// Steps by which words of joints may differ: 2^-14 quarter turns, of prismatic joints m.
+    /// Tolerance for words of joints, in steps of 2^-14 quarter turns, or m for prismatic joints.
     pub joints_tolerance: u32,
-    /// Replies and joints that one capture alone may have.
+    /// Number of replies and joints that may be missing from one capture.
     pub missing: u64,
 }
 
@@ -93,18 +93,19 @@ pub struct Comparison<'a> {
     sides: Both<Side<'a>>,
     tallies: Vec<Tally>,
     epochs: Epochs,
-    /// The first difference that counts in any case, and the first of what is missing; with its joints and bus.
+    /// The first difference that always counts, and the first missing item; with joints and bus.
     first: Option<(Key, usize, First)>,
     first_missing: Option<(Key, usize, First)>,
 }
 
-/// From one epoch to the next, in ns.
+/// Returns the period of epochs, in ns.
 fn period_ns(skin: &Skin) -> u64 {
     skin.timing.tick_nanos() * u64::from(skin.timing.ticks_per_broadcast)
 }
 
 impl<'a> Comparison<'a> {
-    /// Begins before the first frames; the numbers of the first joints are those of `starts`, else their epochs.
+    /// Creates a comparison before the first frames. The first joints have the numbers in `starts`, or else their
+    /// epochs.
     #[must_use]
     pub fn new(skin: &'a Skin, options: Options, starts: Both<Option<u64>>) -> Self {
         let period = period_ns(skin);
@@ -120,7 +121,7 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    /// The capture to read from next: the one that is behind; `None` when both have ended.
+    /// Returns the capture to read from next, which is the one behind; `None` when both have ended.
     #[must_use]
     pub fn next(&self) -> Option<Which> {
         let Both { a, b } = &self.sides;
@@ -132,12 +133,12 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    /// Takes a frame from before a capture that is latched when it begins.
+    /// Handles a frame that was latched before the start of a capture.
     pub fn begin(&mut self, which: Which, nanos: u64, bus: &str, message: &Message) {
         self.sides.of_mut(which).begin(nanos, bus, message);
     }
 
-    /// Takes the next frame of a capture; `message` is its meaning, if it has one.
+    /// Handles the next frame of a capture; `message` is its meaning, if it has one.
     pub fn take(&mut self, which: Which, nanos: u64, bus: &str, message: Option<&Message>) {
         if self.sides.of_mut(which).take(nanos, bus, message) {
             self.pair();
@@ -150,12 +151,12 @@ impl<'a> Comparison<'a> {
         *dropped = dropped.saturating_add(frames);
     }
 
-    /// Notes that a capture's times mean nothing.
+    /// Declares that the times of a capture are meaningless.
     pub fn without_times(&mut self, which: Which) {
         self.sides.of_mut(which).has_times = false;
     }
 
-    /// Notes that a capture has no more frames; `is_unfinished` if its end is missing.
+    /// Declares the end of a capture; `is_unfinished` if it was cut off.
     pub fn end(&mut self, which: Which, is_unfinished: bool) {
         let side = self.sides.of_mut(which);
         side.counts.unfinished = is_unfinished;
@@ -163,13 +164,13 @@ impl<'a> Comparison<'a> {
         self.pair();
     }
 
-    /// The reason why a capture that has ended has no joints of the skin; `None` if it has.
+    /// Returns the reason why a complete capture has no joints of the skin; `None` if it has some.
     pub fn not_found(&mut self, which: Which) -> Option<NotFound> {
         self.sides.of_mut(which).not_found()
     }
 
-    /// Cells of a capture that have reported a configuration, and those of them with the skin's, if these are fewer than
-    /// half.
+    /// Returns the number of cells that reported a configuration, and of those among them with the skin's, if these are
+    /// fewer than half.
     #[must_use]
     pub fn other_configurations(&self, which: Which) -> Option<(usize, usize)> {
         let hash = |bus: usize, node| {
@@ -183,7 +184,7 @@ impl<'a> Comparison<'a> {
         (same * 2 < all).then_some((all, same))
     }
 
-    /// Compares all joints that are complete.
+    /// Compares all complete joints.
     fn pair(&mut self) {
         for bus in 0..self.skin.buses.len() {
             while self.pair_on(bus).is_some() {}
@@ -224,7 +225,7 @@ impl<'a> Comparison<'a> {
         self.note(bus, Both { a: Some(a), b: Some(b) }, found);
     }
 
-    /// Counts joints that one capture alone has.
+    /// Counts joints that only one capture has.
     fn alone(&mut self, bus: usize, which: Which, moment: &Moment) {
         let other = self.sides.of(which.other());
         let is_a = which == Which::A;
@@ -247,7 +248,7 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    /// Keeps differences if they are the first ones so far: buses are not compared in the order of time.
+    /// Keeps differences if they are the earliest so far: buses are not compared in order of time.
     fn note(&mut self, bus: usize, moments: Both<Option<&Moment>>, firsts: Firsts) {
         let Some(key) = moments.a.or(moments.b).map(|moment| moment.key) else { return };
         let is_first = |kept: &Option<(Key, usize, First)>| {
@@ -280,7 +281,7 @@ impl<'a> Comparison<'a> {
         cell.map_or(0, |cell| cell.tracked.account.uplink().restarts)
     }
 
-    /// Moments that are held.
+    /// Returns the number of joints that are held.
     #[cfg(test)]
     fn held(&self) -> usize {
         self.sides.a.held() + self.sides.b.held()

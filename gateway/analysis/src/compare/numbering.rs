@@ -1,31 +1,31 @@
 //! Numbers of joints that do not wrap.
 //!
-//! An epoch is a number modulo 256. The step from one epoch to the next that is there is known modulo 256 too; how often
-//! 256 were left out in between follows from the time that passed. A step that does not fit the time is a pause of the
-//! gateway, or the counting began again: then a new run begins.
+//! An epoch is a number modulo 256, so the step between two received epochs is known only modulo 256. The elapsed time
+//! gives the number of complete laps in between. A step that does not fit the time is a pause of the gateway, or a
+//! restart of the numbering, which begins a new run.
 
 use protocol::packet::Epoch;
 
-/// The place of some joints among all of a capture: which counting, and their number in it.
+/// The position of a joints packet among all of a capture: its run and its number there.
 #[derive(Clone, Copy, Debug, Default, Eq, Ord, PartialEq, PartialOrd)]
 pub(super) struct Key {
-    /// How often the counting began again before.
+    /// Number of earlier restarts of the numbering.
     pub(super) run: u32,
-    /// The number since that counting began.
+    /// The number since the start of that run.
     pub(super) number: u64,
 }
 
-/// Joints of one bus may stand so many epochs behind those of another.
+/// Maximum number of epochs by which one bus may lag another.
 const BEHIND: u64 = 16;
-/// Epochs by which the time that passed may be wrong.
+/// Tolerance for the elapsed time, in epochs.
 const SLACK: u64 = 4;
 
-/// Numbers the joints of all buses of a capture: they share one counter.
+/// Numbers the joints of all buses of a capture, which share one counter.
 #[derive(Debug)]
 pub(super) struct Numbering {
-    /// From one epoch to the next, in ns; at least 1.
+    /// Period of epochs in ns, at least 1.
     period_ns: u64,
-    /// The number of the first joints, if that is known.
+    /// The number of the first joints, if known.
     start: Option<u64>,
     newest: Option<Newest>,
 }
@@ -38,17 +38,17 @@ struct Newest {
 }
 
 impl Numbering {
-    /// Begins before the first joints; their number is `start`, else their epoch.
+    /// Creates a numbering; the first joints get the number `start`, or else their epoch.
     pub(super) const fn new(period_ns: u64, start: Option<u64>) -> Self {
         Self { period_ns: if period_ns == 0 { 1 } else { period_ns }, start, newest: None }
     }
 
-    /// The newest joints.
+    /// Returns the key of the newest joints.
     pub(super) fn newest(&self) -> Option<Key> {
         self.newest.map(|newest| newest.key)
     }
 
-    /// The key of joints that came on a bus behind `last`; `None` if they are not behind it.
+    /// Returns the key of joints that follow `last` on their bus; `None` if they do not follow it.
     pub(super) fn take(&mut self, nanos: u64, epoch: Epoch, last: Option<Key>) -> Option<Key> {
         let Some(newest) = self.newest else {
             let key = Key { run: 0, number: self.start.unwrap_or_else(|| epoch.0.into()) };
@@ -56,7 +56,7 @@ impl Numbering {
             return Some(key);
         };
         let elapsed = nanos.saturating_sub(newest.nanos) / self.period_ns;
-        // Of another bus, or out of order.
+        // The joints of another bus, or out of order.
         let back = u64::from(newest.epoch.0.wrapping_sub(epoch.0));
         if back <= BEHIND && elapsed <= BEHIND {
             let number = newest.key.number.checked_sub(back)?;
@@ -71,19 +71,20 @@ impl Numbering {
         last.is_none_or(|last| last < key).then_some(key)
     }
 
-    /// Steps from the newest joints to those of an epoch after so many periods; `None` if the counting began again.
+    /// Returns the number of steps from the newest joints to those of an epoch after this number of periods; `None` if
+    /// the numbering restarted.
     fn steps(&self, newest: Newest, epoch: Epoch, elapsed: u64) -> Option<u64> {
         let modulo = u64::from(epoch.0.wrapping_sub(newest.epoch.0));
         let laps = (elapsed + 128).saturating_sub(modulo) / 256;
         let steps = modulo + 256 * laps;
         let fits = steps.abs_diff(elapsed) <= SLACK + elapsed / 1_000;
         match modulo {
-            // The next one after a pause is as frequent as 257 lost ones are rare.
+            // A step of one after a pause is common, 257 lost joints in a row are rare.
             1 if elapsed < 252 => Some(1),
             _ if fits => Some(steps),
             1 => Some(1),
             _ if epoch.0 == 0 && modulo > 0 || modulo >= 128 => None,
-            // The gateway was late: the epochs are in order, and the times are not.
+            // The gateway was late: the epochs are in order, but the times are not.
             _ => Some(modulo),
         }
     }
@@ -100,7 +101,7 @@ mod tests {
         Some(Key { run: 0, number })
     }
 
-    /// Takes joints by number and period, on one bus.
+    /// Numbers joints, given as number and period, on one bus.
     fn numbers(joints: &[(u64, u64)]) -> Vec<Option<Key>> {
         let (mut numbering, mut last) = (Numbering::new(PERIOD, None), None);
         let each = joints.iter().map(|&(number, period)| {

@@ -1,4 +1,4 @@
-//! Sums of a comparison over all epochs and cells.
+//! Sums the results of a comparison over all epochs and cells.
 
 use model::quantiles::Quantiles;
 use protocol::id::CellId;
@@ -9,7 +9,7 @@ use super::side::{Cell, Side};
 use super::{ASPECTS, Both, Comparison, Which};
 
 impl Comparison<'_> {
-    /// The outcome, when both captures have ended.
+    /// Returns the outcome, once both captures have ended.
     #[must_use]
     pub fn report(self) -> Report {
         let captures = Both { a: source(&self.sides.a), b: source(&self.sides.b) };
@@ -52,7 +52,7 @@ impl Comparison<'_> {
         report
     }
 
-    /// Cells that differ, or lost something.
+    /// Returns the cells with differences or losses.
     fn cells(&self) -> Vec<CellRow> {
         let mut rows = Vec::new();
         for (at, (bus, tally)) in self.skin.buses.iter().zip(&self.tallies).enumerate() {
@@ -73,7 +73,7 @@ impl Comparison<'_> {
         self.sides.of(which).buses.get(bus)?.cells.get(node)
     }
 
-    /// Cells that one capture alone has, in the time of both.
+    /// Returns the cells that occur in one capture only, within the common time.
     fn extra_cells(&self) -> Vec<ExtraCell> {
         let range = |which| {
             let side = self.sides.of(which);
@@ -99,7 +99,7 @@ impl Comparison<'_> {
     }
 }
 
-/// The aspects that differ.
+/// Returns the aspects that differ.
 fn differs(report: &Report, lost: u64, are_missing: bool) -> Vec<&'static str> {
     let Report { epochs, joints, halts, contacts, torques, sums, extra_cells, .. } = report;
     let replies = |it: &Replies| it.different > 0 || are_missing && it.missing() > 0;

@@ -1,4 +1,4 @@
-//! Pairs of the same joints in both captures.
+//! Compares the same joints of both captures.
 
 use model::tracker::PerCell;
 use protocol::fixed::{Q1_14, TorqueFormat};
@@ -13,7 +13,7 @@ use super::side::Moment;
 use super::{Both, Options};
 use crate::explain::CellMoment;
 
-/// The counts of one bus.
+/// The figures of one bus.
 #[derive(Debug, Default)]
 pub(super) struct Tally {
     pub(super) joints: Joints,
@@ -24,19 +24,19 @@ pub(super) struct Tally {
     pub(super) cells: PerCell<Replies>,
 }
 
-/// A difference before it is described.
+/// A difference, before it is described.
 #[derive(Debug, Default)]
 pub(super) struct Found {
     what: &'static str,
     how: &'static str,
     cell: Option<CellId>,
-    /// The place in the chain, from 0, the steps, both words, their values and unit.
+    /// The words that differ most.
     word: Option<Differing>,
     pub(super) inputs: Vec<&'static str>,
     unknown: Vec<&'static str>,
 }
 
-/// The first differences of some joints. What is missing may be allowed, so it is kept apart.
+/// The first differences at an epoch. Missing items may be within the tolerance, so they are kept apart.
 #[derive(Debug, Default)]
 pub(super) struct Firsts {
     pub(super) missing: Option<Found>,
@@ -65,12 +65,12 @@ impl Found {
         Firsts { missing: Some(found), other: None }
     }
 
-    /// The cell, if it is one's.
+    /// Returns the cell, if the difference belongs to one.
     pub(super) const fn cell(&self) -> Option<CellId> {
         self.cell
     }
 
-    /// Describes it on a bus; `moments` are those of both captures, as far as they are there.
+    /// Describes the difference; `moments` are those of the two captures, if present.
     pub(super) fn describe(
         self,
         (skin, bus): (&Skin, usize),
@@ -202,13 +202,13 @@ fn sums(
     }
 }
 
-/// A cell's reply in both captures.
+/// A cell's reply in the two captures.
 struct Reply {
     what: &'static str,
     cell: CellId,
     words: [Option<Words>; 2],
     format: TorqueFormat,
-    /// Cells in each sum.
+    /// Number of cells in each sum.
     cells_in: Option<[u8; 2]>,
 }
 
@@ -263,9 +263,9 @@ impl Reply {
         }
     }
 
-    /// The word that differs most.
+    /// Returns the word with the largest difference.
     fn largest(&self, a: &Words, b: &Words, units: Units) -> Option<Differing> {
-        // Tolerances are in steps of 1/4096, those of sums in steps of 1/256.
+        // Tolerances are in steps of 1/4096, for sums in steps of 1/256.
         let fine =
             |word| if self.cells_in.is_some() { i32::from(word) } else { self.format.finest_steps(word) };
         let places = a.padded().into_iter().zip(b.padded()).enumerate();
@@ -296,7 +296,7 @@ impl Replies {
     }
 }
 
-/// The joint whose words differ most.
+/// Returns the joint whose words differ most.
 fn joints(skin: &Skin, bus: usize, moments: Both<&Moment>) -> Option<Differing> {
     let Both { a, b } = moments;
     let pairs = a.watched.joints.positions.iter().zip(&b.watched.joints.positions);
@@ -305,7 +305,7 @@ fn joints(skin: &Skin, bus: usize, moments: Both<&Moment>) -> Option<Differing> 
         let words = [a.to_bits(), b.to_bits()];
         let [one, other] = words;
         let steps = match kind {
-            // Angles wrap.
+            // Angles wrap around.
             JointKind::Revolute => u32::from(one.wrapping_sub(other).unsigned_abs()),
             JointKind::Prismatic => u32::from(one.abs_diff(other)),
         };
@@ -320,7 +320,7 @@ fn is_touched(skin: &SkinSensors) -> bool {
     *skin != SkinSensors { temperature: skin.temperature, ..SkinSensors::default() }
 }
 
-/// Compares whether something touches a cell.
+/// Compares the contact of a cell.
 fn contact(
     contacts: &mut Contacts,
     cell: CellId,
@@ -329,7 +329,7 @@ fn contact(
 ) {
     let both = match (&in_a.contact_state, &in_b.contact_state) {
         (Some((a, _)), Some((b, _))) => Some((is_touched(a), is_touched(b))),
-        // By the torques, where stimuli do not show it.
+        // Torques decide where stimuli do not.
         _ => in_a.answer.zip(in_b.answer).map(|((_, a), (_, b))| (!a.is_zero(), !b.is_zero())),
     };
     match both {
@@ -347,7 +347,7 @@ fn contact(
     }
 }
 
-/// The inputs of a cell that differ, and those that are not known.
+/// Returns the inputs of a cell that differ, and those that are unknown.
 fn inputs(
     Both { a, b }: Both<&Moment>,
     same_joints: bool,

@@ -1,4 +1,4 @@
-//! The outcome of a comparison; `skinbus compare --json` prints it.
+//! The outcome of a comparison, as printed by `skinbus compare --json`.
 
 use model::quantiles::Quantiles;
 use serde::Serialize;
@@ -8,36 +8,36 @@ use super::Both;
 /// The outcome of a comparison.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
-    /// True if nothing differs that counts.
+    /// True without relevant differences.
     pub equal: bool,
     /// The aspects that differ, in the order of [`ASPECTS`].
     pub differs: Vec<&'static str>,
     /// The two captures.
     pub captures: Both<Source>,
-    /// Joints that both, one or none has.
+    /// Counts of joints that are in both captures or missing from one.
     pub epochs: Epochs,
     /// Words of joints.
     pub joints: Joints,
-    /// Joints at which one run was halted and the other was not.
+    /// Epochs at which only one run was halted.
     pub halts: Only,
-    /// Touches, cell by cell and epoch by epoch.
+    /// Touches, by cell and epoch.
     pub contacts: Contacts,
     /// Torques of single cells.
     pub torques: Replies,
     /// Sums of roots.
     pub sums: Replies,
-    /// Cells that differ, or lost something, by bus and node id.
+    /// Cells with differences or losses, by bus and node id.
     pub cells: Vec<CellRow>,
-    /// Cells of which one capture has no packet.
+    /// Cells without packets in one of the captures.
     pub extra_cells: Vec<ExtraCell>,
     /// The first difference.
     pub first: Option<First>,
 }
 
-/// The aspects that are compared.
+/// The compared aspects.
 pub const ASPECTS: [&str; 7] = ["epochs", "joints", "halts", "contacts", "torques", "sums", "cells"];
 
-/// One capture.
+/// The figures of one capture.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Source {
     /// Frames.
@@ -48,53 +48,53 @@ pub struct Source {
     pub first: Option<u64>,
     /// The number of the last joints.
     pub last: Option<u64>,
-    /// The time of the last joints in s of the run; absent where a log has no times.
+    /// The time of the last joints in s of the run; absent if the log has no times.
     pub last_s: Option<f64>,
-    /// How often epochs were counted from 0.
+    /// Number of runs, each with epochs from 0.
     pub countings: u32,
-    /// Joints out of order, which are left out.
+    /// Number of joints out of order, which are skipped.
     pub out_of_order: u64,
     /// Frames that the recorder lost.
     pub dropped: u64,
-    /// Whether the capture has no end.
+    /// True if the capture was cut off.
     pub unfinished: bool,
-    /// Torques that came in time to be used.
+    /// Torques that arrived in time to be used.
     pub torques: u64,
-    /// Sums of roots that came in time to be used.
+    /// Sums of roots that arrived in time to be used.
     pub sums: u64,
     /// Replies after the next joints.
     pub late: u64,
-    /// Of these, replies too late to be used.
+    /// Late replies that were too late to be used.
     pub too_late: u64,
-    /// Packets that cells counted and that are not in the capture.
+    /// Packets that cells counted but that are not in the capture.
     pub lost: u64,
     /// Restarts of cells.
     pub restarts: u64,
-    /// Times from joints to their replies, in µs; absent without replies, and where a log has no times.
+    /// Times from joints to their replies, in µs; absent without replies, and if the log has no times.
     pub reply_us: Option<Quantiles>,
 }
 
-/// Joints by number, those of each bus.
+/// Counts of joints by number, over all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Epochs {
-    /// In both.
+    /// Joints in both captures.
     pub compared: u64,
-    /// Not in A, and in B within the time of both.
+    /// Joints missing from A, but in B within the common time.
     pub missing_in_a: u64,
-    /// Not in B, and in A within the time of both.
+    /// Joints missing from B, but in A within the common time.
     pub missing_in_b: u64,
-    /// In one before the other begins.
+    /// Joints in one capture before the start of the other.
     pub before: Only,
-    /// In one after the other has ended.
+    /// Joints in one capture after the end of the other.
     pub after: Only,
 }
 
-/// Counts of what one has and the other has not.
+/// Counts of items that only one capture has.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Only {
-    /// In A.
+    /// Items in A only.
     pub only_a: u64,
-    /// In B.
+    /// Items in B only.
     pub only_b: u64,
 }
 
@@ -103,66 +103,66 @@ impl Only {
         *(if is_a { &mut self.only_a } else { &mut self.only_b }) += 1;
     }
 
-    /// Returns the count of both.
+    /// Returns the sum of both counts.
     #[must_use]
     pub const fn sum(self) -> u64 {
         self.only_a + self.only_b
     }
 }
 
-/// Words of joints in epochs that both have.
+/// Words of joints in epochs that both captures have.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Joints {
-    /// The same words.
+    /// Epochs with equal words.
     pub equal: u64,
-    /// Other words within the tolerance.
+    /// Epochs with differences within the tolerance.
     pub tolerated: u64,
-    /// Other words.
+    /// Epochs with larger differences.
     pub different: u64,
     /// The largest difference of a word.
     pub max_steps: u32,
 }
 
-/// Touches: a cell in an epoch.
+/// Touches; each counts a cell in an epoch.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Contacts {
-    /// In both.
+    /// Touches in both captures.
     pub both: u64,
-    /// In one and not in the other.
+    /// Touches in one capture only.
     #[serde(flatten)]
     pub only: Only,
 }
 
-/// Replies in epochs that both have.
+/// Replies in epochs that both captures have.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Replies {
-    /// The same words.
+    /// Replies with equal words.
     pub equal: u64,
-    /// Other words within the tolerance.
+    /// Replies with differences within the tolerance.
     pub tolerated: u64,
-    /// Other words.
+    /// Replies with larger differences.
     pub different: u64,
-    /// Of these, with the same joints, contact state and configuration.
+    /// Different replies despite the same joints, contact state and configuration.
     pub different_with_same_inputs: u64,
-    /// In B and not in A.
+    /// Replies in B only.
     pub missing_in_a: u64,
-    /// In A and not in B.
+    /// Replies in A only.
     pub missing_in_b: u64,
-    /// In one alone, at the last joints of the other, which ended before it answered.
+    /// Replies in one capture only, at the last joints of the other, which ended before the reply.
     pub open: u64,
     /// The largest difference of a word.
     pub max_steps: u32,
 }
 
 impl Replies {
-    /// Returns the count of those that one capture alone has.
+    /// Returns the number of replies that only one capture has.
     #[must_use]
     pub const fn missing(&self) -> u64 {
         self.missing_in_a + self.missing_in_b
     }
 }
 
-/// One cell.
+/// The figures of one cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CellRow {
     /// Its bus.
@@ -181,15 +181,15 @@ pub struct CellRow {
 pub struct Losses {
     /// Replies after the next joints.
     pub late: u64,
-    /// Of these, replies too late to be used.
+    /// Late replies that were too late to be used.
     pub too_late: u64,
-    /// Packets that it counted and that are not in the capture.
+    /// Packets that it counted but that are not in the capture.
     pub lost: u64,
     /// Restarts.
     pub restarts: u64,
 }
 
-/// A cell of one capture alone.
+/// A cell that occurs in one capture only.
 #[derive(Clone, Debug, Eq, PartialEq, Serialize)]
 pub struct ExtraCell {
     /// Its bus.
@@ -203,13 +203,13 @@ pub struct ExtraCell {
 /// The first difference.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct First {
-    /// What differs: `epoch`, `joints`, `halt`, `contact`, `torque` or `sum`.
+    /// The item: `epoch`, `joints`, `halt`, `contact`, `torque` or `sum`.
     pub what: &'static str,
-    /// How: `different`, `missing in a` or `missing in b`.
+    /// The difference: `different`, `missing in a` or `missing in b`.
     pub how: &'static str,
     /// The bus.
     pub bus: String,
-    /// The cell, if it is one's.
+    /// The cell, if the difference belongs to one.
     pub cell: Option<u8>,
     /// The robot's joint, from 1, if words differ.
     pub joint: Option<u8>,
@@ -217,11 +217,11 @@ pub struct First {
     pub epoch: u8,
     /// The number of its joints since the run began.
     pub number: u64,
-    /// The time of the joints in s of each run; absent where there are none, and where a log has no times.
+    /// The time of the joints in s of each run; absent without joints, and if a log has no times.
     pub time_s: Both<Option<f64>>,
     /// The words.
     pub words: Both<Option<i16>>,
-    /// The same in [`First::unit`].
+    /// The values of the words, in [`First::unit`].
     pub values: Both<Option<f64>>,
     /// Nm, N, rad or m; absent without words.
     pub unit: Option<&'static str>,
@@ -229,8 +229,8 @@ pub struct First {
     pub steps: Option<u32>,
     /// The inputs of the cell that differ: `joints`, `halt`, `stimulus`, `configuration`, `restart`, `cells`.
     pub inputs: Vec<&'static str>,
-    /// The inputs that one capture or both do not show.
+    /// The inputs that are unknown in at least one capture.
     pub unknown_inputs: Vec<&'static str>,
-    /// Which joints of this epoch they are in each capture, as `skinbus explain --occurrence` counts them.
+    /// The occurrence of this epoch in each capture, as counted by `skinbus explain --occurrence`.
     pub occurrence: Both<Option<u32>>,
 }

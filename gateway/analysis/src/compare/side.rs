@@ -1,4 +1,4 @@
-//! One capture: its joints, and what answers them, in the order of their numbers.
+//! One side of the comparison: the joints of a capture and their answers, in order of their numbers.
 
 use std::collections::VecDeque;
 
@@ -14,21 +14,21 @@ use super::numbering::{Key, Numbering};
 use super::report::Source;
 use crate::explain::{self, NotFound, Watch};
 
-/// Epochs that a capture is ahead when its other buses have passed a bus that is silent.
+/// Number of epochs by which other buses must be ahead before a silent bus is skipped.
 const PASSED: u64 = 64;
 
-/// Some joints of one bus, and their answers.
+/// A joints packet of one bus, and its answers.
 #[derive(Debug)]
 pub(super) struct Moment {
     pub(super) key: Key,
     pub(super) epoch: Epoch,
-    /// Which joints of this epoch on their bus, from 1, as `skinbus explain` counts them.
+    /// The occurrence of this epoch on its bus, from 1, as counted by `skinbus explain`.
     pub(super) occurrence: u32,
     /// The joints, the cells' contact states and torques.
     pub(super) watched: explain::Moment,
     /// The sums of roots.
     pub(super) sums: Vec<(CellId, Sum)>,
-    /// Whether so many joints followed that no answer is outstanding.
+    /// True if enough joints followed that no answer is outstanding.
     pub(super) is_settled: bool,
 }
 
@@ -40,14 +40,14 @@ pub(super) struct Sum {
     nanos: u64,
 }
 
-/// Joints that answers may still come to.
+/// A joints packet with outstanding answers.
 #[derive(Debug)]
 struct Pending {
-    /// `None` for joints out of order, which are left out.
+    /// `None` for joints out of order, which are skipped.
     key: Option<Key>,
     epoch: Epoch,
     occurrence: u32,
-    /// Which joints of their bus, from 0.
+    /// The index of the joints on their bus, from 0.
     index: u64,
     sums: Vec<(CellId, Sum)>,
 }
@@ -56,16 +56,16 @@ struct Pending {
 #[derive(Clone, Debug, Default)]
 pub(super) struct Cell {
     pub(super) tracked: Tracked,
-    /// Answers after the next joints, of these too late to be used.
+    /// Answers after the next joints, and those of them that were too late to be used.
     pub(super) late: u64,
     pub(super) too_late: u64,
-    /// The joints before its first and its last packet.
+    /// The keys of the joints before its first and its last packet.
     pub(super) heard: Option<(Key, Key)>,
 }
 
 #[derive(Debug, Default)]
 pub(super) struct BusSide {
-    /// Joints of the chain.
+    /// Number of joints of the chain.
     chain: usize,
     roots: Vec<CellId>,
     last: Option<Epoch>,
@@ -73,12 +73,12 @@ pub(super) struct BusSide {
     occurrences: Vec<u32>,
     joints: u64,
     pending: VecDeque<Pending>,
-    /// Joints whose answers are complete.
+    /// Joints with complete answers.
     pub(super) ready: VecDeque<Moment>,
     pub(super) cells: PerCell<Cell>,
 }
 
-/// Whether joints are so far behind that none of their bus come any more before the newest ones.
+/// Returns true if joints are so far behind that no more of their bus can arrive before the newest ones.
 const fn is_far(newest: Key, key: Key) -> bool {
     newest.run > key.run || newest.run == key.run && newest.number > key.number + PASSED
 }
@@ -91,14 +91,14 @@ pub(super) struct Side<'a> {
     numbering: Numbering,
     period_ns: u64,
     pub(super) buses: Vec<BusSide>,
-    /// The first joints and when they came.
+    /// The first joints and their time.
     pub(super) first: Option<(Key, u64)>,
-    /// When the last joints came.
+    /// The time of the last joints.
     last_nanos: Option<u64>,
     pub(super) is_ended: bool,
     pub(super) has_times: bool,
     reply: Times,
-    /// What grows as frames come.
+    /// The figures that grow with each frame.
     pub(super) counts: Source,
 }
 
@@ -125,7 +125,7 @@ impl<'a> Side<'a> {
         }
     }
 
-    /// Takes a frame from before the capture that is latched when it begins.
+    /// Handles a frame that was latched before the start of the capture.
     pub(super) fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
         self.watch.begin(nanos, bus, message);
         if let Message::Joints { epoch, joints } = message
@@ -140,7 +140,7 @@ impl<'a> Side<'a> {
         self.buses.get_mut(at)
     }
 
-    /// Takes the next frame; `message` is its meaning, if it has one. Returns true if joints may be complete now.
+    /// Handles the next frame; `message` is its meaning, if it has one. Returns true if joints may now be complete.
     pub(super) fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         self.counts.frames += 1;
         let at = self.skin.bus_named(bus);
@@ -159,7 +159,7 @@ impl<'a> Side<'a> {
         is_new
     }
 
-    /// Takes joints by the same rules as [`Watch`]. Returns true if they are new.
+    /// Handles joints by the same rules as [`Watch`]. Returns true if they are new.
     fn joints(&mut self, at: usize, nanos: u64, epoch: Epoch, joints: &Joints) -> bool {
         let Some(bus) = self.buses.get_mut(at) else { return false };
         if usize::from(joints.in_use) != bus.chain || bus.last == Some(epoch) {
@@ -187,7 +187,7 @@ impl<'a> Side<'a> {
         true
     }
 
-    /// Takes a packet of a cell.
+    /// Handles a packet of a cell.
     fn packet(&mut self, at: usize, nanos: u64, from: CellId, message: &Message) {
         let newest = self.numbering.newest().unwrap_or_default();
         let Some(bus) = self.buses.get_mut(at) else { return };
@@ -217,7 +217,7 @@ impl<'a> Side<'a> {
         }
     }
 
-    /// No more frames come.
+    /// Ends the capture.
     pub(super) fn end(&mut self) {
         self.collect(true);
         self.is_ended = true;
@@ -227,7 +227,7 @@ impl<'a> Side<'a> {
         let newest = self.numbering.newest();
         for (at, bus) in self.buses.iter_mut().enumerate() {
             while let Some(first) = bus.pending.front() {
-                // Behind a gap, and on a bus that is silent while others go on, no reply is waited for.
+                // After a gap, or on a bus that is silent while others continue, do not wait for replies.
                 let is_far = newest.zip(first.key).is_some_and(|(newest, key)| is_far(newest, key));
                 let Some((epoch, watched)) = self.watch.pop(at, is_end || is_far) else { break };
                 let Some(pending) = bus.pending.pop_front() else { break };
@@ -252,12 +252,12 @@ impl<'a> Side<'a> {
         }
     }
 
-    /// The newest joints, if any came.
+    /// Returns the key of the newest joints, if any arrived.
     pub(super) fn newest(&self) -> Option<Key> {
         self.numbering.newest()
     }
 
-    /// Whether joints of a bus that are not ready will not come any more.
+    /// Returns true if joints of a bus that are not ready by now cannot arrive any more.
     pub(super) fn is_past(&self, bus: usize, key: Key) -> bool {
         let Some(side) = self.buses.get(bus) else { return true };
         let is_pending = side.pending.iter().any(|pending| pending.key.is_some_and(|it| it <= key));
@@ -265,31 +265,31 @@ impl<'a> Side<'a> {
         !is_pending && (self.is_ended || is_behind || self.newest().is_some_and(|it| is_far(it, key)))
     }
 
-    /// The time of some joints in s of the run; `None` where captures have no times.
-    #[expect(clippy::cast_precision_loss, reason = "to be read")]
+    /// Returns the time of joints in s of the run; `None` if the capture has no times.
+    #[expect(clippy::cast_precision_loss, reason = "for display")]
     pub(super) fn seconds(&self, nanos: u64) -> Option<f64> {
         let (first, began) = self.first.filter(|_| self.has_times)?;
         let earlier = first.number as f64 * self.period_ns as f64;
         Some((nanos.saturating_sub(began) as f64 + earlier) / 1e9)
     }
 
-    /// The time of the last joints in s of the run.
+    /// Returns the time of the last joints in s of the run.
     pub(super) fn last_s(&self) -> Option<f64> {
         self.seconds(self.last_nanos?)
     }
 
-    /// Times from joints to their answers.
+    /// Returns the times from joints to their answers.
     pub(super) const fn reply(&self) -> &Times {
         &self.reply
     }
 
-    /// Moments that are held.
+    /// Returns the number of joints that are held.
     #[cfg(test)]
     pub(super) fn held(&self) -> usize {
         self.buses.iter().map(|bus| bus.ready.len() + bus.pending.len()).sum()
     }
 
-    /// The reason why the capture has no joints of the skin; `None` if it has.
+    /// Returns the reason why the capture has no joints of the skin; `None` if it has some.
     pub(super) fn not_found(&mut self) -> Option<NotFound> {
         let watch = std::mem::replace(&mut self.watch, Watch::all(self.skin));
         if self.first.is_some() { None } else { watch.moments().err() }

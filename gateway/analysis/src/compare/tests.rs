@@ -1,4 +1,4 @@
-//! Captures by hand: one or two cells, whose joints, stimuli and torques are lost, changed and moved.
+//! Tests on constructed captures with one or two cells, whose joints, stimuli and torques are lost, changed and moved.
 
 use super::*;
 use model::testing::SKIN;
@@ -18,7 +18,7 @@ pub(super) fn skin() -> Skin {
     Skin::parse("skin.toml", SKIN).unwrap()
 }
 
-/// Two buses with a cell each; the second answers with sums.
+/// Returns a skin with two buses with one cell each; the second answers with sums.
 fn two_buses() -> Skin {
     let (head, cell) = SKIN.split_once("[[cell]]").unwrap();
     let cell = cell.replace("bus = \"vcan0\"", "bus = \"vcan1\"") + "root = true\n";
@@ -36,7 +36,7 @@ pub(super) fn epoch(number: u64) -> Epoch {
     Epoch(u8::try_from(number % 256).unwrap())
 }
 
-/// When the joints of a number are sent.
+/// Returns the time of the joints with this number.
 pub(super) fn at(number: u64) -> u64 {
     BEGAN + number * PERIOD
 }
@@ -64,9 +64,9 @@ fn press(from: From, newtons: f64) -> Message {
     Message::Stimulus { to: Node::Cell(cell(1)), from, page }
 }
 
-/// A run: a heartbeat, then joints, each with a torque 1 ms later; cell 1 is pressed from the joints 5 on.
+/// Returns a run: a heartbeat, then joints, each with a torque 1 ms later; cell 1 is pressed from joints 5 on.
 fn run(skin: &Skin, numbers: std::ops::Range<u64>) -> Frames {
-    // Of a cell that has just started the contact state is known.
+    // The contact state of a cell that has just started is known.
     let sent = if numbers.start == 0 { 0 } else { 500 };
     let mut frames = vec![(at(numbers.start) - 20_000_000, "vcan0", heartbeat(skin, sent))];
     for number in numbers {
@@ -81,7 +81,7 @@ fn run(skin: &Skin, numbers: std::ops::Range<u64>) -> Frames {
     frames
 }
 
-/// Reads two captures in lockstep; and how many joints were held at most.
+/// Reads two captures in lockstep; also returns the maximum number of joints that were held.
 pub(super) fn read<'a>(
     skin: &'a Skin,
     (options, starts): (Options, Both<Option<u64>>),
@@ -109,7 +109,7 @@ fn equal(skin: &Skin, a: &Frames, b: &Frames) -> Report {
     compared(skin, Options::default(), a, b)
 }
 
-/// The same with a message of one place changed.
+/// Returns the frames with the first matching message changed.
 fn changed(frames: &Frames, is: impl Fn(&Message) -> bool, to: Option<Message>) -> Frames {
     let mut frames = frames.clone();
     let at = frames.iter().position(|(_, _, message)| is(message)).unwrap();
@@ -141,7 +141,7 @@ fn the_same_run_is_equal_whenever_it_was_and_however_late_it_answered() {
     assert!(report.equal && report.first.is_none(), "{report:?}");
     assert_eq!((report.epochs.compared, report.torques.equal), (600, 595));
     assert_eq!(report.epochs, Epochs { compared: 600, ..Epochs::default() });
-    // The last one came after the last joints.
+    // The last torque arrived after the last joints.
     assert_eq!((report.captures.a.late, report.captures.b.late), (0, 594));
     let [a, b] = [report.captures.a.reply_us.unwrap().p50, report.captures.b.reply_us.unwrap().p50];
     assert!((a - 1e3).abs() < 10.0 && (b - 18e3).abs() < 100.0, "{a} {b}");
@@ -158,7 +158,7 @@ fn a_word_that_is_one_step_off_is_found_and_explained() {
     assert_eq!((report.torques.different, report.torques.different_with_same_inputs), (1, 1));
     assert_eq!((first.what, first.how, first.cell, first.joint), ("torque", "different", Some(1), Some(2)));
     assert_eq!((first.epoch, first.number), (14, 14));
-    // The joints 270 have this epoch too.
+    // Joints 270 have this epoch, too.
     let mut late = a.clone();
     let at_270 = late.iter().rposition(|(_, _, message)| is_torque_of(270)(message)).unwrap();
     late[at_270].2 = torque(1, 270, 98);
@@ -186,7 +186,7 @@ fn an_input_that_differs_is_named() {
     let b = changed(&b, is_torque_of(5), Some(torque(1, 5, 200)));
     let first = equal(&skin, &a, &b).first.unwrap();
     assert_eq!((first.number, first.inputs.as_slice()), (5, &["stimulus"][..]));
-    // The touch comes an epoch later: a contact that only A has, and its torque.
+    // The touch arrives an epoch later: a contact that only A has, and its torque.
     let b = changed(&a, |it| matches!(it, Message::Stimulus { .. }), Some(press(From::Epoch(Epoch(6)), 1.0)));
     let b = changed(&b, is_torque_of(5), None);
     let report = equal(&skin, &a, &b);
@@ -211,7 +211,7 @@ fn a_restart_in_one_of_them_is_an_input() {
     let skin = skin();
     let a = run(&skin, 0..80);
     let mut b = a.clone();
-    // It started again behind the joints 39, and knows of no touch.
+    // The cell restarted after joints 39, and knows of no touch.
     let place = b.iter().position(|(_, _, it)| *it == joints(40)).unwrap();
     b.retain(|(_, _, it)| !(40..80).any(|number| is_torque_of(number)(it)));
     b.insert(place, (at(40) - 2_000_000, "vcan0", heartbeat(&skin, 90)));
@@ -259,7 +259,7 @@ fn what_one_has_before_and_after_the_other_is_no_difference_but_a_missing_epoch_
     let first = report.first.unwrap();
     assert_eq!((first.what, first.how, first.number, first.epoch), ("epoch", "missing in b", 256, 0));
     assert_eq!(first.time_s.b, None);
-    // A recording that was cut off lacks what the other has.
+    // A recording that was cut off lacks joints that the other one has.
     let mut comparison = Comparison::new(&skin, Options::default(), Both::default());
     for (which, frames) in [(Which::A, &a), (Which::B, &run(&skin, 0..300))] {
         frames.iter().for_each(|(nanos, bus, message)| comparison.take(which, *nanos, bus, Some(message)));
@@ -279,7 +279,7 @@ fn joints_that_are_lost_for_more_than_256_epochs_do_not_move_what_follows() {
         let mut b = a.clone();
         b.retain(|(nanos, ..)| *nanos < at(0) || !gone((nanos + 2_000_000 - BEGAN) / PERIOD));
         let report = equal(&skin, &a, &b);
-        // The joints behind 255 that are lost have the epoch of those before: they count as repeated.
+        // The joints after 255 lost ones have the epoch of those before: they count as repeated.
         let more = u64::from(lost == 255);
         assert_eq!(report.epochs.missing_in_b, lost + more, "{lost}");
         assert_eq!((report.joints.different, report.torques.different), (0, 0), "{lost}");
@@ -314,7 +314,7 @@ fn buses_are_compared_each_and_sums_by_their_roots() {
         a.push((at(number), "vcan0", joints(number)));
         a.push((at(number) + 10, "vcan1", joints(number)));
         a.push((at(number) + 1_000, "vcan0", torque(1, number, 5)));
-        // The first one does not have all cells yet.
+        // The first sum does not include all cells yet.
         a.push((at(number) + 2_000, "vcan1", sum(number, 3, 1)));
         a.push((at(number) + 3_000, "vcan1", sum(number, 9, 2)));
     }
@@ -330,16 +330,16 @@ fn buses_are_compared_each_and_sums_by_their_roots() {
     let values = (first.values.a.unwrap(), first.values.b.unwrap());
     assert!((values.1 - values.0 - 1.0 / 256.0).abs() < 1e-12);
     assert!(compared(&skin, Options { tolerance: 1, ..Options::default() }, &a, &b).equal);
-    // A sum without one of its cells is another one, even if the words are the same.
+    // A sum that lacks a cell is different, even with the same words.
     let b = changed(&a, of(30), Some(sum(30, 9, 3)));
     let first = equal(&skin, &a, &b).first.unwrap();
     assert!(first.inputs.contains(&"cells"), "{first:?}");
-    // One bus was down for a while: its joints are missing, and the other one's are compared.
+    // One bus was down for a while: its joints are missing, and those of the other one are compared.
     let mut b = a.clone();
     b.retain(|(nanos, bus, _)| *bus == "vcan0" || !(at(20)..at(290)).contains(nanos));
     let report = equal(&skin, &a, &b);
     assert_eq!((report.epochs.missing_in_b, report.epochs.compared, report.torques.equal), (270, 330, 300));
-    // Of the first difference, the first by time counts, whichever bus it is on.
+    // The first difference is the earliest one, on any bus.
     let first = report.first.unwrap();
     assert_eq!((first.what, first.bus.as_str(), first.number), ("epoch", "vcan1", 20));
 }
@@ -350,13 +350,13 @@ fn few_joints_are_held_however_long_the_captures_are() {
     let a = run(&skin, 0..12_000);
     let mut b = a.clone();
     b.retain(|(nanos, ..)| !(at(3_000)..at(6_000)).contains(nanos));
-    // The cell is touched and does not answer.
+    // The cell is touched but does not answer.
     b.retain(|(nanos, _, it)| *nanos < at(8_000) || !matches!(it, Message::Torque { .. }));
     let (comparison, held) = read(&skin, (Options::default(), Both::default()), &a, &b);
     assert!(held <= 80, "{held} joints were held");
     let report = comparison.report();
     assert_eq!((report.epochs.missing_in_b, report.torques.missing_in_b), (3_000, 3_996));
-    // One bus is silent for long, and one for ever.
+    // One bus is silent for a long time, and one for ever.
     let skin = two_buses();
     let both = (0..9_000).flat_map(|number| {
         [(at(number), "vcan0", joints(number)), (at(number) + 10, "vcan1", joints(number))]
@@ -389,7 +389,7 @@ fn a_part_is_put_where_its_joints_are() {
         assert_eq!((report.equal, report.epochs.before.only_a), (true, first));
         assert_eq!(report.captures.b.first, Some(first));
     }
-    // Where all joints are the same, the epochs alone count.
+    // If all joints are equal, only the epochs count.
     let standing = |frames: &Frames| -> Frames {
         let same = |message: &Message| {
             let (Message::Joints { epoch, .. }, Message::Joints { joints, .. }) = (*message, joints(0))

@@ -1,18 +1,18 @@
-//! A skin's bus as a DBC file, for tools that know nothing of this protocol.
+//! Exports a skin's bus as a DBC file, for tools that do not know this protocol.
 //!
 //! ```text
 //!   Skin, one of its buses ──> messages, each with its signals ──> text
 //! ```
 //!
-//! Every identifier of the bus is a message, every field of a packet a signal with its scale, unit and range;
-//! where byte 13 selects the meaning of the words, it multiplexes them. Angles are in rad, whose step is pi / 2^15: exact to the
-//! last bit of a double.
+//! Every identifier of the bus is a message, every field of a packet a signal with its scale, unit and range; where
+//! byte 13 selects the meaning of the words, it multiplexes them. Angles are in rad, whose step is pi / 2^15: exact to
+//! the last bit of a double.
 //!
-//! Frames of simulated wires are left out: no real bus has them, and their identifiers number wires and not cells.
-//! `skinbus dump` shows them.
+//! Frames of simulated wires are omitted: real buses do not have them, and their identifiers number wires instead of
+//! cells. `skinbus dump` shows them.
 //!
-//! A DBC knows nothing of the CRC beyond its place, nor that a packet on a classic bus travels in several frames
-//! under one identifier. For a classic bus the text describes packets, for programs that join the frames first.
+//! A DBC cannot express the CRC beyond its position, nor that a packet on a classic bus is sent in several frames with
+//! one identifier. For a classic bus the text describes packets, for programs that join the frames first.
 
 mod signal;
 mod text;
@@ -30,43 +30,43 @@ use signal::Signal;
 /// Period of heartbeats, in ms.
 const HEARTBEAT_MS: u32 = 250;
 
-/// The DBC of one bus, an index into [`Skin::buses`]; of one that does not exist, an empty text.
+/// Returns the DBC of one bus, given as an index into [`Skin::buses`]; an empty text if the bus does not exist.
 ///
 /// # Panics
-/// Never: a string takes whatever is written.
+/// Never: writing to a string cannot fail.
 #[must_use]
 pub fn dbc(skin: &Skin, bus: usize) -> String {
     let mut out = String::new();
     if let Some(description) = skin.buses.get(bus) {
         text::write(&mut out, skin, bus, description, &messages(skin, bus))
-            .expect("a string takes whatever is written");
+            .expect("writing to a string cannot fail");
     }
     out
 }
 
-/// Who sends or receives.
+/// A sender or receiver.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Party {
     Gateway,
     Cell(u8),
     /// All cells of the bus.
     Cells,
-    /// No node of the skin.
+    /// A node that is not in the skin.
     Unnamed,
 }
 
-/// When a message is sent.
+/// The send schedule of a message.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Rhythm {
     /// On events.
     Seldom,
-    /// So many ms after the last.
+    /// Periodic, with the period in ms.
     Every(u32),
-    /// The same, while the cell is in contact.
+    /// Periodic while the cell is in contact, with the period in ms.
     WhileActive(u32),
 }
 
-/// One identifier of the bus.
+/// The message of one identifier.
 #[derive(Clone, Debug, PartialEq)]
 struct Message {
     id: Id,
@@ -75,12 +75,12 @@ struct Message {
     to: Party,
     rhythm: Rhythm,
     comment: &'static str,
-    /// How long it is.
+    /// Its length.
     length: Length,
     signals: Vec<Signal>,
 }
 
-/// All messages of a bus, by identifier.
+/// Returns all messages of a bus, by identifier.
 fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
     let mut nodes: Vec<_> = skin.cells_of(bus).map(|cell| Node::Cell(cell.node)).collect();
     nodes.sort_unstable_by_key(|node| node.to_byte());
@@ -93,7 +93,7 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
             Kind::Command => vec![said(Node::Everyone)],
             Kind::Network => {
                 let (from, to, rhythm) = (Party::Gateway, Party::Unnamed, Rhythm::Seldom);
-                let comment = "For several gateways on one bus: no gateway has to send it; receiving it shows that another one is there.";
+                let comment = "For several gateways on one bus: sending it is optional; receiving it shows that there is another gateway.";
                 let other = Message { from, to, rhythm, comment, ..said(Node::Gateway) };
                 iter::once(other).chain(each).collect()
             }
@@ -106,7 +106,7 @@ fn messages(skin: &Skin, bus: usize) -> Vec<Message> {
     packets().iter().flat_map(of).collect()
 }
 
-/// What a cell sends of this kind, or what is sent to it; a command.
+/// Returns the message of this kind from a cell or to it, or a command.
 fn message(schema: &'static PacketSchema, node: Node, period_ms: u32, chain: &signal::Chain) -> Message {
     let PacketSchema { kind, command, meaning, .. } = schema;
     let cell = if command.is_some() { Party::Cells } else { Party::Cell(node.to_byte()) };
@@ -137,7 +137,7 @@ fn message(schema: &'static PacketSchema, node: Node, period_ms: u32, chain: &si
     }
 }
 
-/// The period of the joint broadcast in whole ms, as a DBC has it.
+/// Returns the period of the joint broadcast, rounded to whole ms as a DBC requires.
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_sign_loss,
@@ -147,7 +147,8 @@ fn period_ms(skin: &Skin) -> u32 {
     (1e3 / skin.timing.broadcast_hz()).round() as u32
 }
 
-/// What a bus' DBC describes: its frames, or the packets that are made of them.
+/// Returns true if the DBC of a bus describes packets that are joined from several frames, false if it describes single
+/// frames.
 const fn are_packets(bus: &Bus) -> bool {
     matches!(bus.format, Format::Classic)
 }

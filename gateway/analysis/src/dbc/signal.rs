@@ -1,4 +1,4 @@
-//! Signals: their place in a packet, scale, unit and range.
+//! Signals of the DBC: position in a packet, scale, unit and range.
 
 use core::slice;
 
@@ -8,23 +8,23 @@ use protocol::packet::{Length, WORDS};
 use protocol::parameters::Parameter;
 use protocol::schema::{Field, Format, Layout, PacketSchema, Range, Units, parameters, reasons};
 
-/// Where the words of a packet of six end.
+/// The end of the words in a packet of six words, in bits.
 const END: usize = WORDS * 16;
 
-/// What a bus' joints, torques and sums are.
+/// The joints, torques and sums of a bus.
 #[derive(Debug)]
 pub(super) struct Chain {
-    /// How long they are.
+    /// Their length.
     pub(super) length: Length,
-    /// What they are worth.
+    /// Their units.
     pub(super) units: Units,
-    /// Rows of its table.
+    /// Number of rows of the chain's table.
     pub(super) rows: usize,
 }
 
 impl Chain {
-    /// Whether the packets of a kind have this page on the bus: no cell has more rows than the chain, or than an image
-    /// has at least.
+    /// Returns true if packets of a kind have this page on the bus: cells have no more rows than the chain, or than the
+    /// minimum of an image.
     fn has(&self, kind: Kind, layout: &Layout) -> bool {
         let is_parameter = matches!(kind, Kind::Configure | Kind::Configured);
         match Parameter::from_number(layout.number) {
@@ -36,7 +36,7 @@ impl Chain {
     }
 }
 
-/// When a signal is present.
+/// The presence of a signal.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Page {
     /// In every packet of the message.
@@ -52,23 +52,23 @@ pub(super) enum Page {
 pub(super) struct Signal {
     pub(super) name: String,
     pub(super) page: Page,
-    /// The first bit; bit 0 is the lowest one (LSB) of byte 0.
+    /// The first bit; bit 0 is the least significant bit of byte 0.
     pub(super) start: usize,
     pub(super) bits: u8,
     pub(super) signed: bool,
-    /// What one step is worth, in the unit.
+    /// The value of one step, in the unit.
     pub(super) factor: f64,
-    /// The minimum and maximum value that has a meaning.
+    /// The smallest and the largest valid value.
     pub(super) range: [f64; 2],
     pub(super) unit: &'static str,
-    /// Values that have a name.
+    /// Named values.
     pub(super) names: Vec<(i64, &'static str)>,
 }
 
-/// The signals of a kind of packet: those of its pages, of bytes 12 and 13, and the CRC.
+/// Returns the signals of a kind of packet: those of its pages, of bytes 12 and 13, and the CRC.
 pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) -> Vec<Signal> {
     let one_page = schema.layouts.len() == 1;
-    // What follows the words stands further back in a longer packet.
+    // The fields after the words are further back in a longer packet.
     let further = length.words() * 16 - END;
     let of_layout = |layout: &'static Layout| {
         let page = if one_page { Page::Every } else { Page::Only(layout.number) };
@@ -100,12 +100,12 @@ pub(super) fn all(schema: &'static PacketSchema, length: Length, chain: &Chain) 
     signals
 }
 
-/// What the numbers of pages or parameters mean.
+/// Returns the names of page or parameter numbers.
 fn numbers(layouts: impl IntoIterator<Item = &'static Layout>) -> Vec<(i64, &'static str)> {
     layouts.into_iter().map(|layout| (i64::from(layout.number), layout.name.as_str())).collect()
 }
 
-/// Some bits as they are, unsigned.
+/// Returns an unscaled, unsigned signal.
 fn bits(name: String, start: usize, bits: u8) -> Signal {
     let max = f64::from(u32::MAX >> (32 - u32::from(bits.clamp(1, 32))));
     Signal {
@@ -121,7 +121,7 @@ fn bits(name: String, start: usize, bits: u8) -> Signal {
     }
 }
 
-/// The signals of one field: one for each element, for each bit that has a meaning of its own.
+/// Returns the signals of one field: one per element, and one per bit with its own meaning.
 fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
     let at = field.at();
     let named = |label: &str| field.signal_name(prefix, label);
@@ -154,7 +154,7 @@ fn of(field: &'static Field, prefix: &str, units: Units) -> Vec<Signal> {
     field.labels.iter().enumerate().flat_map(element).collect()
 }
 
-/// The signal of a field's element that has one.
+/// Returns the signal of one element of a field.
 fn one(field: &'static Field, element: usize, units: Units, name: String) -> Signal {
     let unscaled = bits(name, field.at(), field.width());
     let factor = field.step_in(element, units);
@@ -175,7 +175,7 @@ fn one(field: &'static Field, element: usize, units: Units, name: String) -> Sig
     } else {
         field.names.iter().map(named).collect()
     };
-    // Readers differ in which bytes beyond ASCII they take.
+    // Readers differ in the non-ASCII bytes that they accept.
     let unit = match field.unit_in(element, units) {
         "°C" => "degC",
         unit => unit,

@@ -1,4 +1,4 @@
-//! The text as another parser reads it, against the protocol's own encoding.
+//! Reads the text with another parser, and compares it with the protocol's own encoding.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -12,7 +12,7 @@ mod said;
 use super::*;
 use model::generate::{self, Target};
 
-/// A skin with cells 1 to 254 on its one bus.
+/// Returns a skin with cells 1 to 254 on its only bus.
 fn full() -> Skin {
     let target = Target { cells: 254, ..Target::default() };
     Skin::parse("full.toml", &generate::generate(&target).unwrap()).unwrap()
@@ -22,7 +22,7 @@ fn parsed(skin: &Skin, bus: usize) -> Dbc {
     Dbc::try_from(dbc(skin, bus).as_str()).unwrap()
 }
 
-/// A frame decoded by the DBC alone: the message's name, and each signal that is present with its value.
+/// Decodes a frame by the DBC alone: the message's name, and the value of each signal that is present.
 fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8]) -> (String, BTreeMap<String, f64>) {
     let raw = |signal: &can_dbc::Signal| {
         assert_eq!(signal.byte_order, ByteOrder::LittleEndian);
@@ -52,7 +52,7 @@ fn by_dbc(dbc: &can_dbc::Message, bytes: &[u8]) -> (String, BTreeMap<String, f64
     (dbc.name.clone(), values)
 }
 
-/// Every message of the DBC by its identifier.
+/// Returns the messages of the DBC by identifier.
 fn by_id(dbc: &Dbc) -> BTreeMap<u16, &can_dbc::Message> {
     let id = |message: &can_dbc::Message| match message.id {
         MessageId::Standard(id) => id,
@@ -70,13 +70,13 @@ fn every_message_says_through_the_dbc_what_the_protocol_says() {
     let mut met: BTreeSet<(u16, String)> = BTreeSet::new();
     let counts = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 16, 17, 18, 19, 20, 21, 99, 126, 127];
     let counts = counts.into_iter().flat_map(|count: u8| [count, count + 128]);
-    // Few words are a baseline.
+    // Small words select a baseline.
     let counts = counts.chain([10, 200, 255, 139, 139, 139]);
-    // The joints have one identifier of 2048, and are to be met as surely as the cells.
+    // Joints have one identifier of 2048; give them the same weight as the cells.
     let node = prop_oneof![1 => Just(1_u16), 1 => Just(0xFF), 6 => 0_u16..0x100];
     let cases = (
         (0_u16..8, node).prop_map(|(kind, node)| kind << 8 | node),
-        // Kinds of rows are small.
+        // The kinds of rows are small numbers.
         proptest::array::uniform::<_, WORDS>(prop_oneof![any::<i16>(), 0_i16..4]),
         any::<u8>(),
         proptest::sample::select(counts.collect::<Vec<_>>()),
@@ -92,7 +92,7 @@ fn every_message_says_through_the_dbc_what_the_protocol_says() {
         prop_assert_eq!(named, name);
         prop_assert_eq!(found.keys().collect::<Vec<_>>(), expected.keys().collect::<Vec<_>>());
         for (signal, value) in &found {
-            // Angles go through pi in another order.
+            // The conversion of angles multiplies by pi in another order.
             prop_assert!((value - expected[signal]).abs() < 1e-15, "{}: {} and {}", signal, value, expected[signal]);
             met.borrow_mut().insert((id >> 8, signal.clone()));
         }
@@ -138,7 +138,7 @@ fn cells_of_the_bus_alone_are_named_and_send_what_is_theirs() {
         })
         .collect();
     let expected = [
-        // No node of the skin receives it: can-dbc gives none for that.
+        // No node of the skin receives it: can-dbc returns no receiver.
         ("halt", "gateway", "cell_1"),
         ("joints", "gateway", "cell_1"),
         ("sync", "gateway", "cell_1"),
@@ -277,7 +277,7 @@ fn each_bus_has_its_own_cells_and_one_that_is_not_has_no_text() {
 
 #[test]
 fn the_text_is_plain() {
-    // Readers differ in which bytes beyond ASCII they take, and most name no identifier beyond 32 characters.
+    // Readers differ in the non-ASCII bytes that they accept, and most limit names to 32 characters.
     let text = dbc(&full(), 0);
     assert!(text.is_ascii());
     let names = text

@@ -1,4 +1,4 @@
-//! The text.
+//! Writes the text of a DBC file.
 
 use core::fmt::{self, Write};
 
@@ -8,11 +8,11 @@ use protocol::skin::{Bus, Skin};
 use super::signal::{Page, Signal};
 use super::{Message, Party, Rhythm, are_packets};
 
-/// The placeholder of the format for a sender or receiver without a name.
+/// The format's placeholder for an unnamed sender or receiver.
 const UNNAMED: &str = "Vector__XXX";
-/// The sections that a reader may meet.
+/// The sections that may occur.
 const SECTIONS: [&str; 6] = ["CM_", "BA_DEF_", "BA_", "VAL_", "BA_DEF_DEF_", "SIG_VALTYPE_"];
-/// What `VFrameFormat` can be; the last but one is an FD frame with an identifier of 11 bits.
+/// The values of `VFrameFormat`; the last but one is an FD frame with an 11-bit identifier.
 const FRAME_FORMATS: [&str; 16] = [
     "StandardCAN",
     "ExtendedCAN",
@@ -32,7 +32,7 @@ const FRAME_FORMATS: [&str; 16] = [
     "ExtendedCAN_FD",
 ];
 const STANDARD_CAN_FD: u8 = 14;
-/// What `GenMsgSendType` can be.
+/// The values of `GenMsgSendType`.
 const SEND_TYPES: [&str; 3] = ["NoMsgSendType", "Cyclic", "CyclicIfActive"];
 
 pub(super) fn write(
@@ -79,7 +79,7 @@ pub(super) fn write(
     Ok(())
 }
 
-/// A message and its signals.
+/// Writes a message and its signals.
 fn frame(out: &mut impl Write, message: &Message, everyone: &[u8]) -> fmt::Result {
     let Message { id, name, from, .. } = message;
     write!(out, "BO_ {} {name}: {} ", id.to_bits(), message.length.bytes())?;
@@ -94,7 +94,7 @@ fn frame(out: &mut impl Write, message: &Message, everyone: &[u8]) -> fmt::Resul
             Page::Only(page) => write!(out, "m{page} ")?,
         }
         let sign = if *signed { '-' } else { '+' };
-        // `@1`: little-endian.
+        // `@1` means little-endian.
         write!(out, ": {start}|{bits}@1{sign} ({factor},0) [{min}|{max}] \"{unit}\" ")?;
         parties(out, message.to, everyone)?;
         writeln!(out)?;
@@ -117,7 +117,7 @@ fn parties(out: &mut impl Write, party: Party, everyone: &[u8]) -> fmt::Result {
     }
 }
 
-/// What the whole file is.
+/// Writes the comment about the whole file.
 fn about(out: &mut impl Write, skin: &Skin, bus: &Bus) -> fmt::Result {
     // A quotation mark would end the comment.
     let [skin, bus_name] = [&skin.name, &bus.name].map(|name| name.replace('"', "'"));

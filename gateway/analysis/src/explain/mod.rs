@@ -1,15 +1,14 @@
-//! Why a torque is what it is: `skinbus explain`.
+//! Derives a torque step by step: `skinbus explain`.
 //!
 //! ```text
-//!   frames up to some joints ──> Watch ──> contact state and answer of each cell ─┐
+//!   frames up to the joints ───> Watch ──> contact state and answer of each cell ─┐
 //!                                                                                 ├──> Explanation
 //!   Skin ──> Central, f64 ────────────> force, Jacobian, product, step ───────────┘
 //! ```
 //!
-//! A cell's word is `J F_z`, each rounded to 16 bits. The force is an exact function of its contact state, so a
-//! word that is not the step nearest to the exact product comes from the cell's own J: [`Row::verdict`] looks for a J
-//! near the exact one that gives this word. What a capture does not contain is listed in [`Explanation::missing`]
-//! and left open.
+//! A cell's word is `J F_z`, each rounded to 16 bits. The force is an exact function of its contact state, so a word
+//! that is not the step nearest to the exact product comes from the cell's own J: [`Row::verdict`] looks for a J near
+//! the exact one that gives this word. Information that the capture lacks is listed in [`Explanation::missing`].
 
 mod not_found;
 mod read;
@@ -31,41 +30,41 @@ use serde::Serialize;
 use self::row::{jacobian_steps, number, row};
 use model::central::Central;
 
-/// One epoch, explained.
+/// The explanation of one epoch.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Explanation {
-    /// The joints, bus by bus.
+    /// The joints of each bus.
     pub buses: Vec<BusExplained>,
     /// Cells that were in contact or answered, by bus and node id.
     pub cells: Vec<CellExplained>,
     /// The total torque of the skin at each joint.
     pub total: Vec<Total>,
-    /// What is not known, a line each.
+    /// Missing information, one line each.
     pub missing: Vec<String>,
 }
 
-/// What was sent on a bus.
+/// The joints that were sent on a bus.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusExplained {
     /// Its name.
     pub bus: String,
-    /// When the joints came.
+    /// Time of the joints.
     pub at_ns: u64,
-    /// The joints of its chain, as the robot numbers them from 1.
+    /// The joints of its chain, by their number in the robot, from 1.
     pub joints: Vec<u8>,
     /// The words of these joints.
     pub position_words: Vec<i16>,
-    /// The same in rad, of prismatic joints in m.
+    /// The positions in rad, or m for prismatic joints.
     pub position_rad: Vec<f64>,
-    /// The unit of each.
+    /// The units of the positions.
     pub units: Vec<&'static str>,
-    /// How its cells' torque words are to be read.
+    /// The format of its cells' torque words.
     pub torque_format: &'static str,
-    /// Whether it was halted.
+    /// True if it was halted.
     pub halted: bool,
 }
 
-/// One cell.
+/// The explanation of one cell.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct CellExplained {
     /// Its bus.
@@ -74,84 +73,84 @@ pub struct CellExplained {
     pub node: u8,
     /// The robot's joint that moves it, from 1.
     pub joint: u8,
-    /// Its contact state and the force from it; absent when not known.
+    /// Its contact state and the force computed from it; absent if unknown.
     pub force: Option<Force>,
-    /// The time from the joints to its torque; absent when none came.
+    /// The time from the joints to its torque; absent if none arrived.
     pub answered_after_ns: Option<u64>,
-    /// Joint by joint.
+    /// The rows, one per joint.
     pub rows: Vec<Row>,
 }
 
-/// Algorithm 1, step by step.
+/// The steps of Algorithm 1.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Force {
-    /// Where its contact state is known from.
+    /// The source of its contact state.
     pub origin: Origin,
     /// The three contact words in N.
     pub contact_n: [f64; 3],
     /// The proximity.
     pub proximity: f64,
-    /// Their sum in N, F_c.
+    /// The sum of the contact words in N, F_c.
     pub touch_n: f64,
-    /// Below this, F_c counts as none.
+    /// Below this threshold, F_c counts as zero.
     pub contact_threshold_n: f64,
-    /// Below this, the proximity counts as none.
+    /// Below this threshold, the proximity counts as zero.
     pub proximity_threshold: f64,
     /// Weight of F_c.
     pub alpha_c: f64,
     /// Weight of the proximity in N.
     pub alpha_p_n: f64,
-    /// alpha_c F_c + alpha_p F_p, of what counts, in N.
+    /// The fused force in N: alpha_c F_c + alpha_p F_p, each above its threshold.
     pub fused_n: f64,
-    /// Below this, the fused force counts as none.
+    /// Below this threshold, the fused force counts as zero.
     pub force_threshold_n: f64,
-    /// F_z in steps of 2^-16 N, as the cell computes with it.
+    /// F_z in steps of 2^-16 N, as used by the cell.
     pub force_steps: i64,
-    /// The same in N.
+    /// F_z in N.
     pub force_n: f64,
 }
 
-/// One joint of the whole skin.
+/// The totals at one joint of the whole skin.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Total {
     /// The joint, from 1.
     pub joint: u8,
-    /// The unit of its torques: that of a prismatic joint is N.
+    /// The unit of its torques; N for a prismatic joint.
     pub unit: &'static str,
-    /// The sum of the frames' words: steps of 2^-12 Nm.
+    /// The sum of the frames' words in steps of 2^-12 Nm.
     pub word_steps: i64,
-    /// The same in Nm.
+    /// The sum of the words in Nm.
     pub words_nm: f64,
     /// The sum of the exact products of the cells that answered, in Nm.
     pub products_nm: f64,
     /// The central computation on all known contact states, in Nm.
     pub central_nm: f64,
-    /// The same with the unrounded values of the skin's file.
+    /// The central computation with the unrounded values of the skin's file.
     pub unrounded_nm: f64,
-    /// Words less central, in Nm.
+    /// Words minus central computation, in Nm.
     pub difference_nm: f64,
-    /// Cells with a saturated word: the sum is inexact.
+    /// Number of cells with a saturated word, which make the sum inexact.
     pub saturated: u32,
-    /// Cells of which the word or what it should be is not known: the sums do not mean the same.
+    /// Number of cells without a known word or a known force, so that the sums are not comparable.
     pub open: u32,
 }
 
-/// Explains what was found, by the skin's bus.
+/// Explains the joints found on each of the skin's buses.
 #[must_use]
 pub fn explain(skin: &Skin, moments: &[Option<Moment>]) -> Explanation {
     Explainer::new(skin).explain(moments)
 }
 
-/// What every epoch of a skin is explained with.
+/// The precomputed data for explaining any epoch of a skin.
 #[derive(Debug)]
 pub struct Explainer<'a> {
     skin: &'a Skin,
-    /// Of each bus: its part of the skin, and the central computation in words and in the file's numbers.
+    /// For each bus: its part of the skin, and the central computation with words and with the file's numbers.
     buses: Vec<(Skin, [Central; 2])>,
 }
 
 impl<'a> Explainer<'a> {
-    /// That of a skin.
+    /// Prepares the explanation of a skin's epochs.
     #[must_use]
     pub fn new(skin: &'a Skin) -> Self {
         let parts = (0..skin.buses.len()).map(|bus| {
@@ -162,7 +161,7 @@ impl<'a> Explainer<'a> {
         Self { skin, buses: parts.collect() }
     }
 
-    /// Explains what was found, by the skin's bus.
+    /// Explains the joints found on each of the skin's buses.
     #[must_use]
     pub fn explain(&self, moments: &[Option<Moment>]) -> Explanation {
         explain_with(self.skin, &self.buses, moments)
@@ -177,9 +176,9 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
         let name = &bus.name;
         let Some(moment) = moment else {
             if skin.cells_of(index).next().is_some() {
-                explanation
-                    .missing
-                    .push(format!("{name}: these joints are not in the capture; the total is without it"));
+                explanation.missing.push(format!(
+                    "{name}: these joints are not in the capture; the total does not include them"
+                ));
             }
             continue;
         };
@@ -223,7 +222,7 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
                 };
                 let node = cell.node;
                 explanation.missing.push(format!(
-                    "{name} {node}: no torque of this epoch in time: {why}; the words are without it"
+                    "{name} {node}: no torque of this epoch in time: {why}; the sum of words lacks it"
                 ));
             }
             let newtons = force.map_or(0.0, |force| force.fused_or_none());
@@ -263,8 +262,8 @@ fn explain_with(skin: &Skin, parts: &[(Skin, [Central; 2])], moments: &[Option<M
         }
         if silent > 0 {
             explanation.missing.push(format!(
-                "{name}: {silent} cells sent nothing, and their contact state is not in the capture; they are taken as not \
-                 in contact"
+                "{name}: {silent} cells sent nothing, and their contact state is not in the capture; they are assumed \
+                 not to be in contact"
             ));
         }
     }
@@ -304,13 +303,13 @@ impl Sum {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "to be read")]
+#[expect(clippy::cast_precision_loss, reason = "for display")]
 fn too_late(nanos: u64) -> String {
     let ms = nanos as f64 / 1e6;
-    format!("it came {ms:.3} ms after the joints, when four more had come, and is not used")
+    format!("it came {ms:.3} ms after the joints, after four more joints, and is not used")
 }
 
-/// Why a cell in contact sends nothing, as far as is known.
+/// Returns the likely reason why a cell in contact sent nothing.
 fn silence(halted: bool, state: Option<State>) -> &'static str {
     let has = |bit| state.is_some_and(|state| state.has(bit));
     if halted || has(State::HALTED) {
@@ -324,7 +323,8 @@ fn silence(halted: bool, state: Option<State>) -> &'static str {
     }
 }
 
-/// The contact state of a cell, if its torque can be computed from it; else why not, when it matters.
+/// Returns the contact state of a cell, if its torque can be computed from it; otherwise adds the reason to `missing`,
+/// if it matters.
 fn known(
     skin: &Skin,
     bus: &str,
@@ -347,7 +347,7 @@ fn known(
             return None;
         }
         None if answered || touched => missing.push(format!(
-            "{bus} {node}: it did not report its configuration; taken to be the skin's, {target:04X}"
+            "{bus} {node}: it did not report its configuration; assumed to be the skin's, {target:04X}"
         )),
         Some(_) | None => {}
     }
@@ -365,13 +365,13 @@ fn known(
 }
 
 impl Force {
-    /// The fused force if it counts, in N: exact, before the cell rounds it.
+    /// Returns the fused force above the threshold, in N: exact, before the cell rounds it.
     const fn fused_or_none(&self) -> f64 {
         if self.force_steps > 0 { self.fused_n } else { 0.0 }
     }
 }
 
-/// Algorithm 1 in `f64`, where every word, sum and product of it is exact.
+/// Algorithm 1 in `f64`, in which every word, sum and product of it is exact.
 #[expect(clippy::cast_possible_truncation, reason = "at most 2^36 steps of 2^-24: exact")]
 fn force(cell: &Cell, sensors: &SkinSensors, origin: Origin) -> Force {
     let rule = &cell.contact;

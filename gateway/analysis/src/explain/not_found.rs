@@ -1,49 +1,49 @@
-//! Why a capture has nothing to explain.
+//! The errors of a capture that has nothing to explain.
 
 use thiserror::Error;
 
-/// Why there is nothing to explain.
+/// The reason why there is nothing to explain.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum NotFound {
-    /// No bus of the capture is one of the skin's.
+    /// The capture has none of the skin's buses.
     #[error("none of its buses ({capture}) is one of the skin's ({skin})")]
     Buses {
-        /// Those of the capture.
+        /// The buses of the capture.
         capture: String,
-        /// Those of the skin.
+        /// The buses of the skin.
         skin: String,
     },
-    /// There are no joints at all.
-    #[error("there are no joints on {buses}, and cells answer nothing else")]
+    /// The capture has no joints.
+    #[error("there are no joints on {buses}, and cells answer only joints")]
     Joints {
         /// The skin's buses that are in the capture.
         buses: String,
     },
-    /// The joints are those of another robot.
+    /// The joints belong to another robot.
     #[error("{}", another_robot(bus, *came, *chain))]
     Robot {
         /// The bus.
         bus: String,
-        /// Joints that came.
+        /// Number of joints in the packet.
         came: usize,
-        /// Joints of the skin's chain.
+        /// Number of joints of the skin's chain.
         chain: usize,
     },
-    /// The epoch is not there, or not so often, or not so late.
+    /// The requested epoch does not occur, or not often or late enough.
     #[error("there are no joints {requested}; there are {runs}")]
     Epoch {
         /// The requested joints.
         requested: String,
-        /// Epochs that are there, in their order, and from when to when.
+        /// The epochs that occur, in order, with their times.
         runs: String,
     },
 }
 
-/// Says that a skin is of another robot than a bus' joints.
+/// Returns the text for a skin and a bus' joints that belong to different robots.
 #[must_use]
 pub fn another_robot(bus: &str, came: usize, chain: usize) -> String {
     format!(
-        "the joints on {bus} are {came}, and the skin's chain there has {chain}: it is the skin of another robot, name the right one"
+        "{bus} carries {came} joints, but the skin's chain on it has {chain}: the skin is of another robot, name the right one"
     )
 }

@@ -8,27 +8,27 @@ use trace::capture::{CaptureError, Entry, NoteKind, Reader};
 use super::NotFound;
 use super::watch::{Moment, Requested, Watch};
 
-/// What a capture contains up to some joints.
+/// The content of a capture up to the requested joints.
 #[derive(Debug)]
 pub struct Found {
-    /// What was sent on each bus until then.
+    /// The joints and answers on each bus.
     pub moments: Result<Vec<Option<Moment>>, NotFound>,
-    /// The time that seconds count from, in ns since 1970.
+    /// The origin of times in s, in ns since 1970.
     pub zero_ns: u64,
-    /// True if that is the first tick of the run, not the first frame.
+    /// True if the origin is the first tick of the run, false if it is the first frame.
     pub is_of_run: bool,
-    /// Frames before that which the recorder lost.
+    /// Number of frames before the joints that the recorder lost.
     pub dropped: u64,
-    /// Lines before that which cannot be read.
+    /// Number of unreadable lines before the joints.
     pub unreadable: u64,
-    /// Whether there is no frame at all.
+    /// True if the capture has no frames.
     pub is_empty: bool,
 }
 
-/// Reads a capture from its beginning up to the requested joints.
+/// Reads a capture from its start up to the requested joints.
 ///
 /// # Errors
-/// When it cannot be read, or is damaged.
+/// Returns [`CaptureError`] if the capture cannot be read, or is damaged.
 pub fn find(reader: &mut Reader, skin: &Skin, requested: Requested) -> Result<Found, CaptureError> {
     let mut watch = Watch::new(skin, requested);
     let mut decoder = Decoder::new(None);

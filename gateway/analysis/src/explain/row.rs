@@ -1,4 +1,4 @@
-//! One word of a cell's torque: what it should be, and where a difference comes from.
+//! One word of a cell's torque: its expected value, and the cause of a difference.
 
 use protocol::fixed::{Acc, TorqueFormat, is_saturated};
 use protocol::packet::Words;
@@ -8,38 +8,38 @@ use serde::Serialize;
 
 use super::Force;
 
-/// The most by which the J of a cell that computes in 16 bits may err, in steps of 2^-14 m: the 5e-4 m that the
-/// kernels promise for arms of any shape. Each row of the chain after the sixth, up to the cell's, allows one more.
+/// Maximum error of J in a cell with 16-bit arithmetic, in steps of 2^-14 m: the 5e-4 m that the kernels guarantee for
+/// arms of any shape. Each row of the chain after the sixth, up to the cell's, adds one.
 pub const JACOBIAN_STEPS: i64 = 8;
 
-/// One joint of one cell.
+/// One joint of one cell's torque.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Row {
     /// The joint, from 1.
     pub joint: u8,
-    /// The unit of its torques: that of a prismatic joint is N.
+    /// The unit of its torques; N for a prismatic joint.
     pub unit: &'static str,
-    /// The exact J of the quantised parameters in m; absent when they are not known.
+    /// The exact J of the quantised parameters in m; absent if unknown.
     pub jacobian_m: Option<f64>,
     /// J F_z in f64, in Nm.
     pub product_nm: Option<f64>,
-    /// The nearest step of 2^-12 Nm, held within the word.
+    /// The product, rounded to a step of 2^-12 Nm and clamped to the word.
     pub nearest_word: Option<i16>,
     /// The word of the frame.
     pub word: Option<i16>,
-    /// The same in Nm.
+    /// The word's value in Nm.
     pub word_nm: Option<f64>,
-    /// The word less the nearest step.
+    /// The word minus the nearest word.
     pub difference_steps: Option<i32>,
-    /// Where the difference comes from.
+    /// The cause of the difference.
     pub verdict: Verdict,
 }
 
-/// Whether a word is what it should be.
+/// The assessment of a word.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case", tag = "is")]
 pub enum Verdict {
-    /// The step nearest to the exact product.
+    /// The word is nearest to the exact product.
     Nearest,
     /// Out of range: the word is saturated, as required.
     Saturated,
@@ -47,21 +47,21 @@ pub enum Verdict {
     Rounded {
         /// The J in m.
         jacobian_m: f64,
-        /// How far it is from the exact one, in steps of 2^-14 m.
+        /// Its distance from the exact J, in steps of 2^-14 m.
         jacobian_steps: f64,
     },
     /// No J near the exact one gives this word.
     Unexplained,
-    /// The word or what it is to be compared with is not known.
+    /// The word or its expected value is unknown.
     Open,
 }
 
-/// A joint's number, from its place in the robot.
+/// Returns a joint's number, from 1, given its index in the robot.
 pub(super) fn number(joint: usize) -> u8 {
     u8::try_from(joint + 1).unwrap_or(u8::MAX)
 }
 
-#[expect(clippy::too_many_arguments, reason = "what a row shows")]
+#[expect(clippy::too_many_arguments, reason = "each is a column of the row")]
 pub(super) fn row(
     &(joint, described): &(usize, &Joint),
     at: usize,
@@ -96,12 +96,13 @@ pub(super) fn row(
     }
 }
 
-/// How many steps a cell's J may err that so many rows carry.
+/// Returns the maximum error of J, in steps, for a cell on this number of rows.
 pub(super) fn jacobian_steps(rows: usize) -> i64 {
     JACOBIAN_STEPS + i64::try_from(rows.saturating_sub(6)).unwrap_or(i64::MAX - JACOBIAN_STEPS)
 }
 
-/// Where a word that should be `nearest` comes from. A joint that does not move the cell has no J that could err.
+/// Assesses a word whose expected value is `nearest`. A joint that does not move the cell has an exact J of zero
+/// (`steps` is `None`).
 #[expect(
     clippy::cast_possible_truncation,
     clippy::cast_precision_loss,

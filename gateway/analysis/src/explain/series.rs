@@ -1,7 +1,7 @@
 //! The torque of every epoch of a capture, each as [`explain`](super::explain) computes it.
 //!
-//! Buses carry the joints of an epoch one after the other: moments are put together by their epochs, counted on from the
-//! first one beyond 255.
+//! Buses carry the joints of an epoch one after the other. They are joined by epoch, with the count continued beyond
+//! 255.
 
 use std::collections::BTreeMap;
 
@@ -15,55 +15,55 @@ use trace::capture::{CaptureError, Entry, Note, Reader};
 use super::watch::{Moment, Watch};
 use super::{Explainer, Explanation, NotFound};
 
-/// A bus that is so many epochs behind another one is not waited for.
+/// Maximum number of epochs that a bus may lag before it is no longer waited for.
 const BEHIND: i64 = 64;
 
-/// One epoch.
+/// The torques of one epoch.
 #[derive(Clone, Debug, PartialEq)]
 pub struct EpochTorque {
-    /// When its first joints came, in ns since 1970.
+    /// Time of its first joints, in ns since 1970.
     pub at_ns: u64,
     /// Its number, modulo 256.
     pub epoch: u8,
-    /// The position of each joint of the robot in rad or m; `None` where its bus has no such joints.
+    /// The position of each joint of the robot in rad or m; `None` if its bus has no such joints.
     pub positions: Vec<Option<f64>>,
     /// Its explanation.
     pub explanation: Explanation,
 }
 
-/// Why there are no torques, or not all.
+/// The error of a series.
 #[derive(Debug, Error)]
 pub enum SeriesError<E> {
-    /// It cannot be read, or is damaged.
+    /// The capture cannot be read, or is damaged.
     #[error(transparent)]
     Capture(#[from] CaptureError),
-    /// There are no joints of this skin.
+    /// The capture has no joints of this skin.
     #[error("{name}: {source}")]
     NotFound {
         /// The capture.
         name: String,
-        /// Why.
+        /// The reason.
         source: NotFound,
     },
-    /// What takes the epochs has failed.
+    /// The consumer of the epochs has failed.
     #[error("{0}")]
     Taken(E),
 }
 
-/// What a capture came to.
+/// The totals of a series.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Counted {
-    /// Epochs.
+    /// Number of epochs.
     pub epochs: u64,
-    /// The time that seconds count from, in ns since 1970: the first tick of the run, else the first frame.
+    /// The origin of times in s, in ns since 1970: the first tick of the run, or else the first frame.
     pub zero_ns: u64,
 }
 
-/// Reads a capture to its end, and gives out each epoch when nothing more can come of it, with the time that
-/// seconds count from. Bounded memory.
+/// Reads a capture to its end, and passes each complete epoch to `take`, with the origin of times. Memory is bounded.
 ///
 /// # Errors
-/// When it cannot be read, or has no joints of the skin; the first error of `take`.
+/// Returns [`SeriesError`] if the capture cannot be read or has no joints of the skin, or with the first error of
+/// `take`.
 pub fn each_epoch<E>(
     reader: &mut Reader,
     skin: &Skin,
@@ -112,19 +112,19 @@ pub fn each_epoch<E>(
     Ok(counted)
 }
 
-/// Whether a joint's torques come in sums, which do not contain those of single cells.
+/// Returns true if a joint's torques arrive in sums, which do not contain the torques of single cells.
 #[must_use]
 pub fn is_summed(skin: &Skin, joint: usize) -> bool {
     let mut buses = skin.buses.iter().enumerate();
     buses.any(|(at, bus)| bus.reply != Reply::Torque && skin.joints_of(at).any(|(of_bus, _)| of_bus == joint))
 }
 
-/// Moments of several buses on their way to be put together.
+/// Joins the joints of several buses into epochs.
 struct Series<'a> {
     skin: &'a Skin,
     watch: Watch<'a>,
     explainer: Explainer<'a>,
-    /// By number, and by bus.
+    /// Incomplete epochs: by number, then by bus.
     waiting: BTreeMap<i64, (Epoch, Vec<Option<Moment>>)>,
     /// The newest number of each bus that has cells.
     last: Vec<(usize, Option<i64>)>,
@@ -144,7 +144,7 @@ impl<'a> Series<'a> {
         }
     }
 
-    /// Takes the moments of which all is known, or all of them at the end.
+    /// Collects the complete joints, or all of them at the end.
     fn collect(&mut self, is_end: bool) {
         for (bus, last) in &mut self.last {
             while let Some((epoch, moment)) = self.watch.pop(*bus, is_end) {
@@ -166,7 +166,7 @@ impl<'a> Series<'a> {
         }
     }
 
-    /// The next epoch, if no bus can add to it.
+    /// Returns the next epoch, once no bus can add to it.
     fn next(&mut self, is_end: bool) -> Option<EpochTorque> {
         let (number, _) = self.waiting.first_key_value()?;
         let newest = self.newest.map_or(*number, |(newest, _)| newest);

@@ -1,4 +1,4 @@
-//! One cell by hand, and what is found of which joints. Whole benches are explained in `tests/tests/virtual/bench_explain.rs`.
+//! Tests on single cells. `tests/tests/virtual/bench_explain.rs` explains whole benches.
 
 use super::*;
 use protocol::fixed::{Q1_14, Q5_10};
@@ -8,7 +8,8 @@ use protocol::packet::padded;
 use protocol::packet::{self, Epoch};
 use protocol::parameters::Parameter;
 
-/// The document's cell 12 on the second link of a UR5: its configuration, its joints, its touch, its torque.
+/// Returns a skin with the document's cell 12 on the second link of a UR5; the next functions give its joints, its
+/// touch and its torque.
 fn skin() -> Skin {
     let cell = "node = 12\njoint = 2\nposition = [0.1, 0.05, 0.06]";
     let text = model::testing::SKIN.replace("node = 1\njoint = 3\nposition = [0.2, 0.01, 0.15]", cell);
@@ -48,7 +49,7 @@ fn heartbeat(configuration: u16) -> Message {
     Message::Network { from: Node::Cell(cell()), epoch: Epoch(0), page }
 }
 
-/// What these messages, a millisecond apart, explain.
+/// Explains these messages, which are a millisecond apart.
 fn explained(skin: &Skin, messages: &[Message], requested: Requested) -> Result<Explanation, NotFound> {
     let mut watch = Watch::new(skin, requested);
     for (at, message) in (1..).zip(messages) {
@@ -94,7 +95,7 @@ fn a_word_that_no_jacobian_near_makes_is_not_explained() {
         let explanation = explained(&skin, &said, first(7)).unwrap();
         [0, 1].map(|at| explanation.cells[0].rows[at].verdict)
     };
-    // 3 N and 8 steps of 2^-14 m are 6 steps of 2^-12 Nm.
+    // 3 N times 8 steps of 2^-14 m make 6 steps of 2^-12 Nm.
     assert!(matches!(verdicts([-1075 + 5, 3195 - 5]), [Verdict::Rounded { .. }, Verdict::Rounded { .. }]));
     assert_eq!(verdicts([-1075 + 9, 3195 - 9]), [Verdict::Unexplained; 2]);
     assert_eq!(verdicts([i16::MAX, -3195]), [Verdict::Unexplained; 2]);
@@ -133,11 +134,11 @@ fn another_configuration_is_named_and_nothing_computed() {
     assert_eq!(explanation.missing, [expected]);
     assert!(explanation.cells[0].force.is_none());
     assert_eq!((explanation.total[0].open, explanation.total[0].word_steps), (1, -1075));
-    // Its first report came after the torque: it was the same before.
+    // Its first report follows the torque; its configuration was the same before.
     let said = [press(From::Next, 1.0), joints(7), torque(7, [-1075, 3195]), heartbeat(0x1234)];
     assert_eq!(explained(&skin, &said, first(7)).unwrap().missing, [expected]);
     let without = explained(&skin, &said[..3], first(7)).unwrap();
-    let expected = "vcan0 12: it did not report its configuration; taken to be the skin's, 266D";
+    let expected = "vcan0 12: it did not report its configuration; assumed to be the skin's, 266D";
     assert_eq!(without.missing, [expected]);
     assert!(without.cells[0].force.is_some());
 }
@@ -158,7 +159,7 @@ fn a_measuring_cell_is_known_by_its_own_page_of_that_epoch_only() {
         let skin = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
         Message::Sensors { from: cell(), epoch: Epoch(epoch), page: SensorPage::Skin(skin) }
     };
-    // A stimulus is refused by a cell that measures.
+    // A measuring cell refuses a stimulus.
     let said = [measuring, press(From::Next, 9.0), page(6), joints(7), torque(7, [-1075, 3195])];
     let explanation = explained(&skin, &said, first(7)).unwrap();
     let expected = "vcan0 12: its contact state is not in the capture: it measures, and sent no sensors page in this epoch";
@@ -180,7 +181,7 @@ fn joints_are_found_by_epoch_time_and_occurrence() {
     assert_eq!(at(Requested { occurrence: 2, ..first(7) }), Ok(264));
     assert_eq!(at(Requested { from_ns: 100_000_000, ..first(7) }), Ok(264));
     let error = at(Requested { occurrence: 2, ..first(21) }).unwrap_err().to_string();
-    let expected = "there are no joints of epoch 21 for the 2. time; there are 277 joints in a row, from epoch 0 at \
+    let expected = "there are no joints of epoch 21 (occurrence 2); there are 277 joints in a row, from epoch 0 at \
                     0.000 s to epoch 20 at 0.276 s";
     assert_eq!(error, expected);
 }
@@ -194,15 +195,15 @@ fn what_is_not_there_is_named_with_what_is() {
                     0.001 s; those of epoch 9 at 0.002 s";
     assert_eq!(error, expected);
     let error = explained(&skin, &[heartbeat(0)], first(5)).unwrap_err().to_string();
-    assert_eq!(error, "there are no joints on vcan0, and cells answer nothing else");
+    assert_eq!(error, "there are no joints on vcan0, and cells answer only joints");
     let mut watch = Watch::new(&skin, first(5));
     watch.take(0, "can7", None);
     let error = watch.moments().unwrap_err().to_string();
     assert_eq!(error, "none of its buses (can7) is one of the skin's (vcan0)");
-    // Memory is bounded whatever comes.
+    // Memory is bounded for any input.
     let said: Vec<_> = (0..200).map(|epoch: u8| joints(epoch.wrapping_mul(3))).collect();
     let error = explained(&skin, &said, Requested { occurrence: 9, ..first(5) }).unwrap_err().to_string();
-    assert!(error.ends_with("; 192 further rows"), "{error}");
+    assert!(error.ends_with("; 192 further runs"), "{error}");
 }
 
 #[test]
@@ -225,8 +226,8 @@ fn a_torque_after_four_more_joints_is_named_and_not_used() {
     let in_time = explained(&skin, &said(3), first(7)).unwrap();
     assert_eq!((in_time.cells[0].answered_after_ns, in_time.missing), (Some(4_000_000), Vec::new()));
     let late = explained(&skin, &said(4), first(7)).unwrap();
-    let expected = "vcan0 12: no torque of this epoch in time: it came 5.000 ms after the joints, when four more had \
-                    come, and is not used; the words are without it";
+    let expected = "vcan0 12: no torque of this epoch in time: it came 5.000 ms after the joints, after four more \
+                    joints, and is not used; the sum of words lacks it";
     assert_eq!((late.cells[0].answered_after_ns, late.missing), (None, vec![expected.to_owned()]));
 }
 
@@ -241,7 +242,7 @@ fn a_claim_of_an_owned_node_id_changes_nothing() {
     let mut said =
         vec![heartbeat(0x266D), press(From::Next, 1.0), joints(6), joints(7), torque(7, [-1075, 3195])];
     let without = explained(&skin, &said, first(7)).unwrap();
-    // In the place of other joints, so that the times are the same.
+    // The claim replaces other joints, so that the times are equal.
     said[2] = claim;
     let with = explained(&skin, &said, first(7)).unwrap();
     assert_eq!(with, without);

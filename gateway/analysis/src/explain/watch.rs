@@ -1,4 +1,4 @@
-//! Finds the requested joints, and the contact state and answer of each cell at them.
+//! Finds the requested joints, with the contact state and the answer of each cell.
 
 use std::collections::VecDeque;
 
@@ -16,124 +16,124 @@ use trace::capture::seconds_since;
 
 use super::not_found::NotFound;
 
-/// Joints after them, within which late torques and the configurations of cells are waited for.
+/// Number of joints to wait after them for late torques and for the configurations of cells.
 const TIMEOUT: u32 = 32;
-/// Runs of epochs that an error names.
+/// Maximum number of runs of epochs in an error.
 const RUNS: usize = 8;
 
-/// Where the contact state of a cell is known from.
+/// The source of a cell's known contact state.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(rename_all = "kebab-case", tag = "by")]
 pub enum Origin {
-    /// It had just started: nothing touched it.
+    /// A start of the cell, which clears its contact state.
     Start {
-        /// When it reported that.
+        /// Time of the report of the start.
         at_ns: u64,
     },
-    /// Its mode was written, which clears its contact state.
+    /// A write of its mode, which clears its contact state.
     Mode {
-        /// When.
+        /// The time.
         at_ns: u64,
     },
     /// A stimulus.
     Stimulus {
-        /// When it was sent.
+        /// Time of the stimulus.
         at_ns: u64,
-        /// The epoch from which on it holds; none for the next joints.
+        /// The epoch from which it applies; `None` for the next joints.
         from_epoch: Option<u8>,
-        /// Whether it came after the joints of that epoch.
+        /// True if it came after the joints of that epoch.
         late: bool,
     },
-    /// The cell reported its own contact state.
+    /// The cell's own report of its contact state.
     Said {
-        /// When.
+        /// The time.
         at_ns: u64,
     },
 }
 
-/// Which joints.
+/// The requested joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Requested {
     /// Their epoch.
     pub epoch: Epoch,
-    /// Only from so many ns after the time on that seconds count from.
+    /// Earliest time of the joints in ns, from the origin of times.
     pub from_ns: u64,
-    /// Which of them, from 1.
+    /// The occurrence among them, from 1.
     pub occurrence: u32,
 }
 
-/// What was sent to the cells of one bus, and their answers.
+/// A joints packet on one bus, and the cells' answers.
 #[derive(Clone, Debug)]
 pub struct Moment {
-    /// When the joints came.
+    /// Time of the joints.
     pub at_ns: u64,
     /// The joints.
     pub joints: Joints,
-    /// Whether the bus was halted.
+    /// True if the bus was halted.
     pub halted: bool,
-    /// By the cell's place.
+    /// By index of the cell.
     pub cells: Vec<CellMoment>,
 }
 
-/// One cell at that moment.
+/// The state of one cell at these joints.
 #[derive(Clone, Debug, Default)]
 pub struct CellMoment {
-    /// Its contact state and where that is known from.
+    /// Its contact state and the source of it.
     pub contact_state: Option<(SkinSensors, Origin)>,
-    /// Whether it obeys stimuli; `None` when not reported.
+    /// True if it obeys stimuli; `None` if not reported.
     pub test_mode: Option<bool>,
     /// Its state in its last heartbeat.
     pub state: Option<State>,
-    /// Hash of its configuration; `None` when not reported.
+    /// Hash of its configuration; `None` if not reported.
     pub hash: Option<u16>,
-    /// The torque that it answered, and when.
+    /// The torque of its answer, and the time.
     pub answer: Option<(u64, Words)>,
-    /// When its torque came, if that was too late to be used.
+    /// Time of its torque, if that was too late to be used.
     pub too_late: Option<u64>,
     /// Further torques of this epoch, which are not used.
     pub repeated: u32,
 }
 
-/// Reads a capture up to a moment.
+/// Follows a capture up to the requested joints.
 #[derive(Debug)]
 pub struct Watch<'a> {
     skin: &'a Skin,
-    /// All joints, if none are requested.
+    /// The requested joints; `None` for all joints.
     requested: Option<Requested>,
-    /// The time that seconds count from; else they count from the first frame.
+    /// The origin of times in s; the first frame if not set.
     zero: Option<u64>,
-    /// By the skin's bus.
+    /// By index of the bus in the skin.
     bus_watches: Vec<LinkId>,
-    /// Buses that are not the skin's.
+    /// Buses that are not in the skin.
     others: Vec<String>,
 }
 
 #[derive(Debug, Default)]
 struct LinkId {
-    /// Whether the capture has it.
+    /// True if the capture has the bus.
     there: bool,
-    /// Whether the skin has cells on it.
+    /// True if the skin has cells on the bus.
     cells_here: bool,
     last: Option<Epoch>,
     halted: bool,
-    /// How many of the requested joints there were.
+    /// Number of occurrences of the requested joints so far.
     occurrences: u32,
-    /// Moments that are not complete, oldest first.
+    /// Joints with incomplete answers, oldest first.
     open: VecDeque<Open>,
     cells: PerCell<Cell>,
     runs: Vec<Run>,
-    /// The number of joints, where that is not the chain's.
+    /// The number of joints in packets that do not fit the chain.
     other_joints: Option<usize>,
-    /// Runs beyond those that are kept.
+    /// Number of runs beyond those that are kept.
     further_runs: u64,
 }
 
-/// A moment whose answers may still come.
+/// Joints that may still be answered.
 #[derive(Debug)]
 struct Open {
     epoch: Epoch,
     moment: Moment,
-    /// Joints since the moment.
+    /// Number of joints since then.
     since: u32,
 }
 
@@ -144,7 +144,7 @@ struct Cell {
     hash: Option<u16>,
 }
 
-/// Joints whose epochs follow each other.
+/// Joints with consecutive epochs.
 #[derive(Clone, Copy, Debug)]
 struct Run {
     first: (Epoch, u64),
@@ -153,13 +153,13 @@ struct Run {
 }
 
 impl<'a> Watch<'a> {
-    /// Begins before the first frame.
+    /// Starts before the first frame.
     #[must_use]
     pub fn new(skin: &'a Skin, requested: Requested) -> Self {
         Self::of(skin, Some(requested))
     }
 
-    /// The same for all joints; moments are taken with [`Watch::pop`].
+    /// Starts before the first frame, for all joints; [`Watch::pop`] returns them.
     #[must_use]
     pub fn all(skin: &'a Skin) -> Self {
         Self::of(skin, None)
@@ -171,12 +171,12 @@ impl<'a> Watch<'a> {
         Self { skin, requested, zero: None, bus_watches, others: Vec::new() }
     }
 
-    /// Counts seconds from this time on, in ns since 1970; else they count from the first frame.
+    /// Sets the origin of times in s, in ns since 1970; the default is the first frame.
     pub const fn count_from(&mut self, zero: u64) {
         self.zero = Some(zero);
     }
 
-    /// Takes in a frame from before the capture that is latched when it begins.
+    /// Handles a frame that was latched before the start of the capture.
     pub fn begin(&mut self, nanos: u64, bus: &str, message: &Message) {
         let at = self.skin.bus_named(bus);
         let joints = at.map_or(0, |at| self.skin.joints_of(at).len());
@@ -191,7 +191,7 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// Takes in the next frame; `message` is its meaning, if it has one. Whether all is known now.
+    /// Handles the next frame; `message` is its meaning, if it has one. Returns true if everything requested is known.
     pub fn take(&mut self, nanos: u64, bus: &str, message: Option<&Message>) -> bool {
         let zero = *self.zero.get_or_insert(nanos);
         let at = self.skin.bus_named(bus);
@@ -214,23 +214,23 @@ impl<'a> Watch<'a> {
         self.is_complete()
     }
 
-    /// The oldest moment of a bus, if all is known of it, or at the end of the capture; each once.
+    /// Removes and returns the oldest joints of a bus, if their answers are complete or the capture is at its end.
     pub fn pop(&mut self, bus: usize, is_end: bool) -> Option<(Epoch, Moment)> {
         let moments = &mut self.bus_watches.get_mut(bus)?.open;
         moments.front().filter(|open| is_end || open.is_complete())?;
         moments.pop_front().map(|open| (open.epoch, open.moment))
     }
 
-    /// Whether nothing more is waited for.
+    /// Returns true if everything requested is known.
     fn is_complete(&self) -> bool {
         self.bus_watches.iter().filter(|bus_watch| bus_watch.cells_here).all(LinkId::is_complete)
     }
 
-    /// What was found, by the skin's bus; a bus that has no such joints has none. The capture is at its end, or
-    /// all is known.
+    /// Returns the requested joints on each of the skin's buses; `None` for a bus that does not have them. Call it at
+    /// the end of the capture, or once everything is known.
     ///
     /// # Errors
-    /// When no bus has them.
+    /// Returns [`NotFound`] if no bus has these joints.
     pub fn moments(self) -> Result<Vec<Option<Moment>>, NotFound> {
         let names = |there: bool| {
             let buses = self
@@ -261,14 +261,14 @@ impl<'a> Watch<'a> {
             };
             let mut requested = format!("of epoch {epoch}");
             if occurrence > 1 {
-                requested += &format!(" for the {occurrence}. time");
+                requested += &format!(" (occurrence {occurrence})");
             }
             if from_ns > 0 {
                 requested += &format!(" at {} s or later", seconds(from_ns));
             }
             let mut runs: Vec<_> = bus_watch.runs.iter().map(|run| run.text(zero)).collect();
             if bus_watch.further_runs > 0 {
-                runs.push(format!("{} further rows", bus_watch.further_runs));
+                runs.push(format!("{} further runs", bus_watch.further_runs));
             }
             return Err(NotFound::Epoch { requested, runs: runs.join("; ") });
         }
@@ -277,7 +277,7 @@ impl<'a> Watch<'a> {
     }
 }
 
-#[expect(clippy::cast_precision_loss, reason = "to be read")]
+#[expect(clippy::cast_precision_loss, reason = "for display")]
 fn seconds(nanos: u64) -> String {
     format!("{:.3}", nanos as f64 / 1e9)
 }
@@ -296,7 +296,7 @@ impl Run {
 
 impl Open {
     fn is_complete(&self) -> bool {
-        // A cell that answered has reported its configuration, and a cell that was touched has answered.
+        // A cell that answered has reported its configuration, and a cell in contact has answered.
         let settled = |cell: &CellMoment| match cell.answer {
             Some(_) => cell.hash.is_some(),
             None => {
@@ -307,14 +307,14 @@ impl Open {
         self.since >= TIMEOUT || self.is_too_late() && self.moment.cells.iter().all(settled)
     }
 
-    /// Whether so many joints have followed that answers are too late to be used.
+    /// Returns true if enough joints have followed that answers are too late to be used.
     const fn is_too_late(&self) -> bool {
         self.since as usize > LATEST
     }
 }
 
 impl LinkId {
-    /// Whether all is known of the requested moment.
+    /// Returns true if everything about the requested joints is known.
     fn is_complete(&self) -> bool {
         self.open.front().is_some_and(Open::is_complete)
     }
@@ -331,7 +331,7 @@ impl LinkId {
         match *message {
             Message::Halt => self.halted = true,
             Message::Resume => self.halted = false,
-            // Other counts are not this robot's, and a cell drops joints of the last epoch.
+            // Joints of another length are those of another robot; cells drop joints of the last epoch.
             Message::Joints { epoch, joints } => {
                 let came = usize::from(joints.in_use);
                 if came != robot {
@@ -379,7 +379,7 @@ impl LinkId {
                 if let Some(cell) = cell.filter(|_| last.is_none_or(|last| last == epoch)) {
                     cell.contact.learn(page, origin);
                 }
-                // A cell that measures has read its sensors at these very joints.
+                // A measuring cell has read its sensors at these very joints.
                 if let Some((cell, _)) = self.answering(from, epoch) {
                     cell.contact_state.get_or_insert((skin, origin));
                 }
@@ -434,7 +434,7 @@ impl LinkId {
         self.cells.iter_mut().for_each(|(_, cell)| cell.contact.latch(epoch, |_| {}));
     }
 
-    /// Notes which epochs there are.
+    /// Records the epoch in the list of runs.
     fn run(&mut self, nanos: u64, epoch: Epoch) {
         let follows = !self.runs.is_empty() && self.last.is_some_and(|last| last.next() == epoch);
         if !follows && self.runs.len() == RUNS {
@@ -447,14 +447,14 @@ impl LinkId {
         }
     }
 
-    /// The cell at the newest moment of this epoch; and whether that is in time.
+    /// Returns the cell at the newest joints of this epoch, and whether an answer is in time.
     fn answering(&mut self, from: CellId, epoch: Epoch) -> Option<(&mut CellMoment, bool)> {
         let open = self.open.iter_mut().rev().find(|open| open.epoch == epoch)?;
         let in_time = !open.is_too_late();
         Some((open.moment.cells.get_mut(from.index())?, in_time))
     }
 
-    /// What a cell computes with became known only after the moment; it was the same then.
+    /// Applies a configuration that was reported after the joints; it was the same then.
     fn learn(&mut self, from: CellId, hash: u16) {
         for open in &mut self.open {
             if let Some(cell) = open.moment.cells.get_mut(from.index()) {
@@ -465,13 +465,13 @@ impl LinkId {
 }
 
 impl Cell {
-    /// Takes a heartbeat under the cell's node id; whether it is the cell's.
+    /// Handles a heartbeat with the cell's node id; returns true if it is from the cell.
     fn heartbeat(&mut self, at_ns: u64, heartbeat: &Heartbeat) -> bool {
         let obeys = heartbeat.state.has(State::TEST_MODE);
         match self.claim.hear(Micros(at_ns / 1_000), heartbeat) {
             Word::Claimant | Word::Outsider | Word::Overtaken => return false,
             Word::Started { .. } => self.mode(obeys, Origin::Start { at_ns }),
-            // What seemed a start was none, and its contact state before that is not kept.
+            // The apparent start was none, and the contact state before it was not kept.
             Word::Shared => self.contact.reset(),
             Word::First | Word::Known if !obeys => self.contact.reset(),
             Word::First | Word::Known => {}
@@ -481,7 +481,8 @@ impl Cell {
         true
     }
 
-    /// It begins to obey stimuli, and nothing touches it; or to measure, and its contact state is not on the bus.
+    /// Sets the mode: a cell that obeys stimuli is free at first; a cell that measures has a contact state that is not
+    /// on the bus.
     fn mode(&mut self, obeys: bool, origin: Origin) {
         if obeys {
             self.contact.start(origin);

@@ -1,4 +1,4 @@
-//! One bus, what its cells send on it, and how long that takes at most.
+//! One bus, the frames of its cells, and their worst-case times.
 
 use protocol::can::Format;
 use protocol::packet::Length;
@@ -10,32 +10,32 @@ use super::response::{Response, Stream, response};
 
 /// Period of heartbeats, in ns.
 const HEARTBEAT_NS: u64 = 250_000_000;
-/// With sensors on, a frame of acceleration follows every fourth heartbeat.
+/// With sensors on, an acceleration frame follows every fourth heartbeat.
 const ACCELERATION_NS: u64 = 4 * HEARTBEAT_NS;
-/// How much of the period `skinbus skin generate` gives to slots, in hundredths.
+/// Share of the period that `skinbus skin generate` gives to slots, in percent.
 const SLOTS_SHARE: u64 = 75;
 
-/// What the cells of a bus answer joints with, all of them in contact.
+/// The cells' answers to joints, with all cells in contact.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub enum Answers {
-    /// Each cell its own torque.
+    /// Each cell sends its own torque.
     Torques {
-        /// So many cells.
+        /// Number of cells.
         cells: u32,
     },
-    /// Each cell on the bus one sum.
+    /// Each cell on the bus sends one sum.
     Sums {
-        /// Cells on the bus by their distance from a root in wires; roots first.
+        /// Number of cells by their distance from a root in wires; roots first.
         by_depth: Vec<u32>,
         /// Width of a slot in ns.
         slot_ns: u64,
-        /// Whether cells below the roots are on the bus too; else they send over wires of their own.
+        /// True if cells below the roots are on the bus, too; otherwise they send over their own wires.
         shared: bool,
     },
 }
 
 impl Answers {
-    /// How many cells are on the bus: each of them answers.
+    /// Returns the number of cells on the bus, each of which answers.
     #[must_use]
     pub fn cells(&self) -> u32 {
         match self {
@@ -45,7 +45,7 @@ impl Answers {
         }
     }
 
-    /// The same skin with more or fewer cells: of sums the tree keeps its shape.
+    /// Returns the answers of another number of cells; for sums, the tree keeps its shape.
     #[must_use]
     pub fn with_cells(&self, cells: u32) -> Self {
         match self {
@@ -68,59 +68,59 @@ impl Answers {
 /// One bus with its rates and its cells.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Case {
-    /// One FD frame a packet, or two classic ones.
+    /// The frame format: one FD frame per packet, or several classic ones.
     pub format: Format,
-    /// How long joints and answers are.
+    /// The length of joints and answers.
     pub length: Length,
     /// Its bit rates.
     pub rates: BitRates,
-    /// From joints to joints in ns.
+    /// Period of joints in ns.
     pub period_ns: u64,
-    /// The longest that a cell takes from the end of the joints until its answer is ready, in ns.
+    /// The longest time of a cell from the end of the joints to its answer, in ns.
     pub computation_ns: u64,
-    /// When cells send what they measure without a request.
+    /// The schedule of sensors frames without a request.
     pub sensing: Sensing,
-    /// What they answer with.
+    /// The answers of the cells.
     pub answers: Answers,
 }
 
-/// Shares of a bus' time, each of the longest frames there can be.
+/// Shares of a bus' time, with all frames as long as possible.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Load {
     /// Joints.
     pub joints: f64,
     /// Torques or sums.
     pub answers: f64,
-    /// What cells measure.
+    /// Sensors frames.
     pub sensors: f64,
     /// Heartbeats.
     pub heartbeats: f64,
 }
 
 impl Load {
-    /// Of everything.
+    /// Returns the total share.
     #[must_use]
     pub fn total(&self) -> f64 {
         self.joints + self.answers + self.sensors + self.heartbeats
     }
 }
 
-/// How long things take on a bus, at most; `None` where there is no bound.
+/// Upper bounds of times on a bus; `None` if there is no bound.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Times {
-    /// From the broadcast's turn to its end, in ns.
+    /// From the due time of the broadcast to its end, in ns.
     pub joints_ns: Option<u64>,
-    /// From the broadcast's turn to the end of the last answer in ns, one after the other: blocking, joints,
-    /// computation, blocking, and all answers.
+    /// From the due time of the broadcast to the end of the last answer in ns, as a sum: blocking, joints, computation,
+    /// blocking, and all answers.
     pub chain_ns: Option<u64>,
-    /// The same by response-time analysis, for torques.
+    /// The time of `chain_ns` by response-time analysis, for torques.
     pub response_ns: Option<Response>,
-    /// From when a heartbeat is due to its end, in ns; it may be sent a period early.
+    /// From the due time of a heartbeat to its end, in ns; it may be sent a period early.
     pub heartbeat_ns: Option<u64>,
 }
 
 impl Times {
-    /// The last answer by the smaller of the bounds.
+    /// Returns the time of the last answer by the smaller bound.
     #[must_use]
     pub fn last_ns(&self) -> Option<u64> {
         self.chain_ns.into_iter().chain(self.response_ns.map(|it| it.worst_ns)).min()
@@ -128,7 +128,7 @@ impl Times {
 }
 
 impl Case {
-    /// One bus of a skin as it is described, at these rates.
+    /// Returns the case of one bus of a skin as described, at these rates.
     #[must_use]
     pub fn of(skin: &Skin, bus: usize, format: Format, rates: BitRates, computation_ns: u64) -> Option<Self> {
         let described = skin.buses.get(bus)?;
@@ -148,7 +148,7 @@ impl Case {
         })
     }
 
-    /// The longest time of a frame of joints or of an answer; on a classic bus of any frame.
+    /// Returns the longest time of a frame of joints or of an answer; on a classic bus, of any frame.
     #[must_use]
     pub fn frame_ns(&self) -> u64 {
         self.frame_of_ns(self.length)
@@ -162,7 +162,7 @@ impl Case {
         Shape { coding, extended: false, len }.worst().nanoseconds(self.rates)
     }
 
-    /// Frames of a packet.
+    /// Returns the number of frames of a packet.
     fn frames_of(&self, length: Length) -> u32 {
         match self.format {
             Format::Fd => 1,
@@ -170,26 +170,26 @@ impl Case {
         }
     }
 
-    /// The longest time of the frames of joints or of an answer. Of a classic packet of three frames the last one has 4
-    /// bytes, and is taken for one of 8.
+    /// Returns the longest time of the frames of joints or of an answer. A classic packet of three frames ends with one
+    /// of 4 bytes, which counts as 8.
     #[must_use]
     pub fn packet_ns(&self) -> u64 {
         u64::from(self.frames_of(self.length)) * self.frame_ns()
     }
 
-    /// The time of the answers of so many cells in ns.
+    /// Returns the time of the answers of this number of cells, in ns.
     fn packets_ns(&self, cells: u32) -> u64 {
         self.packet_ns().saturating_mul(u64::from(cells))
     }
 
-    /// A bit of the arbitration in ns, rounded up.
+    /// Returns the duration of an arbitration bit in ns, rounded up.
     fn bit_ns(&self) -> u64 {
         1_000_000_000_u64.div_ceil(u64::from(self.rates.nominal()))
     }
 
-    /// What is on the bus, highest priority first: joints, answers, sensors (page 0, page 1), heartbeats.
+    /// Returns the streams on the bus, highest priority first: joints, answers, sensors (page 0, page 1), heartbeats.
     ///
-    /// Heartbeats and what goes with them may be sent up to a period of the joints early.
+    /// Heartbeats, and pages that follow them, may be sent up to a period of the joints early.
     fn streams(&self, answers_jitter_ns: u64) -> [Stream; 5] {
         let (cells, early_ns) = (self.answers.cells(), self.period_ns);
         let of = |length, senders: u32, period_ns, jitter_ns| {
@@ -217,18 +217,18 @@ impl Case {
         ]
     }
 
-    /// What the bus is loaded with; of events only those that come when nothing changes.
+    /// Returns the load of the bus. Event-driven sensors count with their rate without changes.
     #[must_use]
     pub fn load(&self) -> Load {
         let [joints, answers, page_0, page_1, heartbeats] = self.streams(0).map(|it| it.load());
         Load { joints, answers, sensors: page_0 + page_1, heartbeats }
     }
 
-    /// The longest times.
+    /// Returns the worst-case times.
     #[must_use]
     pub fn times(&self) -> Times {
         let joints_ns = self.joints_ns();
-        // From the earliest time that it may be sent, a period before it is due.
+        // A heartbeat may be sent a period before it is due; its time counts from then.
         let heartbeat = response(&self.streams(self.jitter_ns(joints_ns)), 4, self.bit_ns());
         Times {
             joints_ns,
@@ -238,7 +238,7 @@ impl Case {
         }
     }
 
-    /// Whether the last answer is there by [`Case::deadline_ns`], by one of the bounds.
+    /// Returns true if one of the bounds proves that the last answer is complete by [`Case::deadline_ns`].
     #[must_use]
     pub fn is_in_time(&self) -> bool {
         let joints_ns = self.joints_ns();
@@ -251,7 +251,7 @@ impl Case {
         response(&self.streams(0), 0, self.bit_ns()).map(|it| it.worst_ns)
     }
 
-    /// By how much answers may come at different times after the joints' turn.
+    /// Returns the release jitter of answers relative to the due time of the joints.
     fn jitter_ns(&self, joints_ns: Option<u64>) -> u64 {
         joints_ns.unwrap_or(0).saturating_add(self.computation_ns)
     }
@@ -259,12 +259,12 @@ impl Case {
     fn response_ns(&self, joints_ns: Option<u64>) -> Option<Response> {
         match self.answers {
             Answers::Torques { .. } => response(&self.streams(self.jitter_ns(joints_ns)), 1, self.bit_ns()),
-            // Their releases depend on each other, which response-time analysis does not know.
+            // The releases of sums depend on each other, which response-time analysis does not cover.
             Answers::Sums { .. } => None,
         }
     }
 
-    /// From the broadcast's turn to the end of the last answer, in ns, one after the other.
+    /// Returns the time from the due time of the broadcast to the end of the last answer in ns, as a sum.
     ///
     /// ```text
     ///   torques         blocking + joints + computation + blocking + N * reply
@@ -272,10 +272,10 @@ impl Case {
     ///   roots' alone    blocking + joints + slot * deepest + computation + blocking + N * reply
     /// ```
     ///
-    /// A frame of lower priority can be in the way twice: one of the joints, and, as the bus is idle while cells compute,
-    /// another of the answers. From then on the bus sends nothing but answers until there are none. Of sums, nothing is
-    /// sent only while every cell that has not sent yet waits for one that computes, which happens once for each wire down
-    /// the tree at most. `None` when it is longer than a period: the remaining frames then delay the next answers.
+    /// A frame of lower priority can block twice: once the joints, and, because the bus is idle while cells compute,
+    /// once the answers. From then on the bus sends only answers until all are sent. With sums, the bus is idle only
+    /// while every cell that has not sent yet waits for one that computes; this happens at most once per level of the
+    /// tree. Returns `None` if the time exceeds a period: the remaining frames would delay the next answers.
     fn chain_ns(&self, joints_ns: u64) -> Option<u64> {
         // Answers that are ready when the joints end leave no gap for other frames.
         let blocking_ns = if self.computation_ns > 0 { self.frame_ns() } else { 0 };
@@ -295,8 +295,8 @@ impl Case {
         (last_ns <= self.period_ns).then_some(last_ns)
     }
 
-    /// When the last answer has to be there, in ns from the broadcast: at the next one; a cell waits for others' sums for
-    /// 7/8 of the period.
+    /// Returns the deadline of the last answer, in ns from the broadcast: the next broadcast for torques; for sums 7/8
+    /// of the period, for which a cell waits for other sums.
     #[must_use]
     pub const fn deadline_ns(&self) -> u64 {
         match self.answers {
@@ -305,7 +305,7 @@ impl Case {
         }
     }
 
-    /// The same bus with more or fewer cells.
+    /// Returns the same bus with another number of cells.
     #[must_use]
     pub fn with_cells(&self, cells: u32) -> Self {
         Self { answers: self.answers.with_cells(cells), ..self.clone() }
@@ -316,8 +316,8 @@ fn torques(skin: &Skin, bus: usize) -> Answers {
     Answers::Torques { cells: u32::try_from(skin.cells_of(bus).count()).unwrap_or(u32::MAX) }
 }
 
-/// The tree as the wires of a bus allow it; `None` when a cell is unreachable. Without a described slot, one as
-/// `skinbus skin generate` would choose.
+/// Returns the sums of the tree that the wires of a bus allow; `None` if a cell is unreachable. Without a described
+/// slot, the slot is that of `skinbus skin generate`.
 pub(super) fn sums(
     skin: &Skin,
     bus: usize,

@@ -9,20 +9,20 @@ use super::case::{self, Answers, Case};
 use super::limits::{Limit, Most, Need, exceeded};
 use super::{COMMON, Rated};
 
-/// The longest period of joints that the wire protocol has a word for, in ns.
+/// The longest period of joints that the wire protocol can express, in ns.
 const LONGEST_NS: u64 = 65_535_000;
 
 /// A change and the bus after it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Hint {
-    /// What to change.
+    /// The change.
     pub change: String,
-    /// The result; of several buses, of the fullest.
+    /// The result; for several buses, that of the fullest.
     #[serde(flatten)]
     pub after: Rated,
 }
 
-/// Hints for a bus; none when it keeps all limits.
+/// Returns the hints for a bus; empty if it keeps all limits.
 #[must_use]
 pub fn hints(skin: &Skin, case: &Case) -> Vec<Hint> {
     let exceeded = exceeded(case);
@@ -30,7 +30,7 @@ pub fn hints(skin: &Skin, case: &Case) -> Vec<Hint> {
         return Vec::new();
     }
     let mut hints = more_buses(case);
-    // The limit of transceivers does not depend on the rate.
+    // The limit of transceivers does not depend on the bit rate.
     if exceeded != [Limit::Nodes] {
         hints.extend(faster(case));
         hints.extend(slower_joints(skin, case));
@@ -43,7 +43,7 @@ fn hint(change: String, case: &Case) -> Hint {
     Hint { change, after: Rated::of(case) }
 }
 
-/// As many as its time takes, and as many as transceivers take.
+/// Returns the numbers of buses that are needed for timing, and for transceivers.
 fn more_buses(case: &Case) -> Vec<Hint> {
     let cells = case.answers.cells();
     let need = Need::of(&Most::of(case), cells);
@@ -57,12 +57,12 @@ fn more_buses(case: &Case) -> Vec<Hint> {
     numbers.into_iter().map(spread).collect()
 }
 
-/// The slowest common rates at which it is in time: of the same format, and CAN FD in the place of classic CAN.
+/// Returns the slowest common rates that are in time: in the same format, and in CAN FD instead of classic CAN.
 fn faster(case: &Case) -> Vec<Hint> {
     let at = |format: Format| {
         let rates = COMMON.iter().filter(|it| it.0 == format).filter_map(|it| it.rates());
         let others = rates.map(|rates| Case { format, rates, ..case.clone() }).filter(is_in_time);
-        // Of equally slow ones the first.
+        // Of equally slow rates, keep the first.
         others.reduce(|slowest, other| if slowest.frame_ns() < other.frame_ns() { other } else { slowest })
     };
     let formats = match case.format {
@@ -77,7 +77,7 @@ fn is_in_time(case: &Case) -> bool {
     exceeded(case).iter().all(|&limit| limit == Limit::Nodes)
 }
 
-/// The shortest period of whole ticks in which everything is in time.
+/// Returns the shortest period of whole ticks that is in time.
 fn slower_joints(skin: &Skin, case: &Case) -> Option<Hint> {
     let tick_ns = skin.timing.tick_nanos();
     let periods = (1_u64..).map(|ticks| case.period_ns + ticks * tick_ns).take_while(|&it| it <= LONGEST_NS);
@@ -90,7 +90,7 @@ fn hertz(period_ns: u64) -> f64 {
     (1e9 / period_ns as f64 * 1e6).round() / 1e6
 }
 
-/// Sensors that send on changes.
+/// Returns the hint of sensors that send on changes only.
 fn events(case: &Case) -> Option<Hint> {
     match case.sensing {
         Sensing::Off | Sensing::Event => None,
@@ -101,8 +101,8 @@ fn events(case: &Case) -> Option<Hint> {
     }
 }
 
-/// What the cells of a bus can answer with instead of what they do: torques, sums with all cells on the bus, and sums
-/// with only the roots on it, where its wires reach all cells.
+/// Returns the alternatives to the answers of a bus: torques, sums with all cells on the bus, and sums with only the
+/// roots on it; sums only if the wires reach all cells.
 #[must_use]
 pub fn answers(skin: &Skin, bus: usize, case: &Case) -> Vec<Hint> {
     let slot_us = match skin.buses.get(bus).map(|it| it.reply) {

@@ -1,4 +1,4 @@
-//! The same as JSON.
+//! The result of `skinbus fit` as JSON.
 
 use protocol::can::Format;
 use protocol::skin::Skin;
@@ -21,17 +21,17 @@ struct Document<'a> {
     table: Vec<BusFit>,
 }
 
-/// Results for single buses and all of them together, or for common rates; all times in µs, loads as shares of 1, and what
-/// has no bound as null.
+/// Returns the results of single buses and all of them together, or for common rates; times in µs, loads as shares of
+/// 1, and null for missing bounds.
 #[must_use]
 pub fn json(skin: &Skin, buses: &[BusFit], whole: Option<&Whole>, table: &[Row]) -> Value {
-    // A row's buses are those for all cells of the skin.
+    // The number of buses in a row is that for all cells of the skin.
     let table = table.iter().map(|row| BusFit { need: row.need, ..row.fullest.clone() });
     let cells = skin.cells.len();
     json!(Document { skin: &skin.name, cells, buses, whole, table: table.collect() })
 }
 
-/// How many buses, and which limits require them.
+/// Serialises the number of buses, and the limits that require it.
 pub(super) fn needed<S: Serializer>(need: &Need, serializer: S) -> Result<S::Ok, S::Error> {
     let Need { bandwidth, deadline, nodes } = need;
     json!({
@@ -83,7 +83,7 @@ impl Serialize for Rated {
     }
 }
 
-/// Nanoseconds in µs.
+/// Converts ns to µs.
 #[expect(clippy::cast_precision_loss, reason = "at most a minute")]
 fn micros(ns: u64) -> f64 {
     ns as f64 / 1e3

@@ -1,29 +1,29 @@
-//! How many cells fit on a bus, how many buses cells need, and which limit decides.
+//! The number of cells that fit on a bus, the number of buses that cells need, and the deciding limit.
 
 use serde::Serialize;
 
 use super::case::Case;
 
-/// About as many nodes as common transceivers drive on one bus; the gateway is one of them.
+/// The approximate number of nodes that common transceivers can drive on one bus, including the gateway.
 pub const NODES: u32 = 110;
 
-/// The most cells that are looked at on one bus.
+/// Maximum number of cells in the search.
 const ENDLESS: u32 = 1 << 20;
 
-/// What keeps more cells from a bus.
+/// A limit on the number of cells on a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Limit {
-    /// All frames together take longer than there is time.
+    /// All frames together take longer than the available time.
     Bandwidth,
     /// The last answer comes after the next joints.
     Deadline,
-    /// Transceivers do not drive more.
+    /// Transceivers cannot drive more nodes.
     Nodes,
 }
 
 impl Limit {
-    /// Its name in texts.
+    /// Returns its name in texts.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -34,19 +34,19 @@ impl Limit {
     }
 }
 
-/// Something for each limit.
+/// A value for each limit.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub struct ByLimit<T> {
-    /// For bandwidth: with heartbeats and everything, at most 100 % load.
+    /// Bandwidth: at most 100 % load, including heartbeats.
     pub bandwidth: T,
-    /// For the deadline: so that the last answer is there in time.
+    /// Deadline: the last answer is in time.
     pub deadline: T,
-    /// For the number of nodes, electrically.
+    /// Number of nodes, electrically.
     pub nodes: T,
 }
 
 impl<T> ByLimit<T> {
-    /// The limits of which something holds, in this order.
+    /// Returns the limits for which a condition holds, in this order.
     fn which(self, holds: impl Fn(T) -> bool) -> Vec<Limit> {
         let Self { bandwidth, deadline, nodes } = self;
         let all = [(Limit::Bandwidth, bandwidth), (Limit::Deadline, deadline), (Limit::Nodes, nodes)];
@@ -55,18 +55,18 @@ impl<T> ByLimit<T> {
 }
 
 impl ByLimit<bool> {
-    /// The limits that do not hold.
+    /// Returns the limits that are exceeded.
     #[must_use]
     pub fn broken(self) -> Vec<Limit> {
         self.which(|holds| !holds)
     }
 }
 
-/// The most cells that each limit lets onto one bus; of nodes [`NODES`] less the gateway.
+/// The maximum number of cells on one bus by each limit; for nodes, [`NODES`] minus the gateway.
 pub type Most = ByLimit<u32>;
 
 impl Most {
-    /// Of a bus like this one.
+    /// Computes the maxima for a bus like this one.
     #[must_use]
     pub fn of(case: &Case) -> Self {
         Self {
@@ -76,19 +76,19 @@ impl Most {
         }
     }
 
-    /// In time: by the tighter of bandwidth and deadline.
+    /// Returns the maximum for timing: the smaller of bandwidth and deadline.
     #[must_use]
     pub fn in_time(&self) -> u32 {
         self.bandwidth.min(self.deadline)
     }
 }
 
-/// Whether all frames find their time.
+/// Returns true if the load is at most 100 %.
 fn has_room(case: &Case) -> bool {
     case.load().total() <= 1.0
 }
 
-/// What is too much on a bus.
+/// Returns the limits that a bus exceeds.
 #[must_use]
 pub fn exceeded(case: &Case) -> Vec<Limit> {
     let holds = ByLimit {
@@ -99,7 +99,7 @@ pub fn exceeded(case: &Case) -> Vec<Limit> {
     holds.broken()
 }
 
-/// The largest number up to which a condition holds; 0 when it does not hold for 1.
+/// Returns the largest number up to which a condition holds; 0 if it does not hold for 1.
 fn max(holds: impl Fn(u32) -> bool) -> u32 {
     let mut beyond = 1;
     while beyond < ENDLESS && holds(beyond) {
@@ -117,18 +117,18 @@ fn max(holds: impl Fn(u32) -> bool) -> u32 {
     min
 }
 
-/// Buses that so many cells take, by each limit; `None` where not even one cell fits.
+/// The number of buses that cells need, by each limit; `None` if not even one cell fits.
 pub type Need = ByLimit<Option<u32>>;
 
 impl Need {
-    /// Of so many cells, spread evenly.
+    /// Computes the number of buses for cells that are spread evenly.
     #[must_use]
     pub fn of(most: &Most, cells: u32) -> Self {
         let buses = |most: u32| (most > 0).then(|| cells.div_ceil(most));
         Self { bandwidth: buses(most.bandwidth), deadline: buses(most.deadline), nodes: buses(most.nodes) }
     }
 
-    /// Those of two chains, which share no bus.
+    /// Adds the needs of two chains, which share no bus.
     #[must_use]
     pub fn with(self, other: Self) -> Self {
         let sum = |one: Option<u32>, other: Option<u32>| Some(one? + other?);
@@ -137,7 +137,7 @@ impl Need {
             deadline: sum(self.deadline, other.deadline),
             nodes: sum(self.nodes, other.nodes),
         };
-        // Each chain may be bound by another limit.
+        // The two chains may be bound by different limits.
         let buses = sum(self.buses(), other.buses());
         for limit in both.binding() {
             *match limit {
@@ -149,28 +149,29 @@ impl Need {
         both
     }
 
-    /// In time, whatever the transceivers.
+    /// Returns the number of buses needed for timing alone.
     #[must_use]
     pub fn in_time(&self) -> Option<u32> {
         Some(self.bandwidth?.max(self.deadline?))
     }
 
-    /// By all limits.
+    /// Returns the number of buses needed by all limits.
     #[must_use]
     pub fn buses(&self) -> Option<u32> {
         Some(self.in_time()?.max(self.nodes?))
     }
 
-    /// The limits that require that many.
+    /// Returns the limits that require this number.
     #[must_use]
     pub fn binding(&self) -> Vec<Limit> {
-        // None is more than any number.
+        // `None` counts as more than any number.
         let key = |buses: Option<u32>| buses.unwrap_or(u32::MAX);
         let most = [self.bandwidth, self.deadline, self.nodes].map(key).into_iter().max();
         self.which(|buses| Some(key(buses)) == most)
     }
 
-    /// How many buses, and which limits require them, in few words: `3 nodes`. Bandwidth and deadline are both a matter of time.
+    /// Returns the number of buses and the limits that require it, in short: `3 nodes`. Bandwidth and deadline are both
+    /// called time.
     #[must_use]
     pub fn in_short(&self) -> String {
         let word = |limit| match limit {

@@ -1,10 +1,12 @@
-//! Would it fit on a real bus: load, the longest time from joints to the last answer, and how many cells and buses that makes.
-//! Every command that reports whether something fits uses this module: limits, verdicts and their words ([`verdict`]), bit
-//! rates ([`rates`]), and what of a bench's traffic a real bus carries ([`traffic`]).
+//! Computes whether a skin fits on real buses: the load, the longest time from joints to the last answer, and the
+//! resulting numbers of cells and buses. Every command that reports a fit uses this module: limits, verdicts and their
+//! texts ([`verdict`]), bit rates ([`rates`]), and the separation of bench traffic from that of a real bus
+//! ([`traffic`]).
 //!
-//! The worst case: all frames are taken as long as stuffing can make them ([`protocol::wire_time`]), all cells as in contact, and the bus
-//! as free of errors. Every node sends its lowest identifier first. Joints, answers, sensors and heartbeats are counted;
-//! stimuli, commands, configuration and simulated wires are not: they are the bench's, or rare.
+//! The worst case assumes that all frames have the maximum of stuff bits ([`protocol::wire_time`]), that all cells are
+//! in contact, and that the bus is free of errors. Every node sends its lowest identifier first. Joints, answers,
+//! sensors and heartbeats count; stimuli, commands, configuration and simulated wires do not, because they belong to
+//! the bench or are rare.
 //!
 //! ```text
 //!   skin, rates ──> Case ──> streams ──> response   ┐
@@ -32,7 +34,7 @@ use hint::Hint;
 use limits::{Limit, Most, Need, exceeded};
 use verdict::Verdict;
 
-/// The paper's cell computes 68.5 µs: 1096 instructions at 16 MIPS.
+/// Computation time of the paper's cell, 68.5 µs: 1096 instructions at 16 MIPS.
 pub const COMPUTATION_NS: u64 = 68_500;
 
 /// Common bit rates, in bit/s: nominal and data.
@@ -51,14 +53,14 @@ pub const COMMON: [Common; 7] = [
 pub struct Common(pub Format, pub u32, pub u32);
 
 impl Common {
-    /// The rates, checked.
+    /// Returns the rates, if valid.
     #[must_use]
     pub fn rates(&self) -> Option<BitRates> {
         BitRates::new(self.1, self.2).ok()
     }
 }
 
-/// A format with its rates as text: `1M/5M`, `classic 1M`.
+/// Formats the name of a format with its rates: `1M/5M`, `classic 1M`.
 #[must_use]
 pub fn name(format: Format, rates: BitRates) -> String {
     match format {
@@ -67,57 +69,57 @@ pub fn name(format: Format, rates: BitRates) -> String {
     }
 }
 
-/// A bus with these rates and cells, rated.
+/// A bus with rates and cells, and its assessment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Rated {
-    /// What was looked at.
+    /// The assessed case.
     pub case: Case,
     /// Shares of its time.
     pub load: Load,
-    /// Longest times.
+    /// Worst-case times.
     pub times: Times,
-    /// What is too much.
+    /// The exceeded limits.
     pub exceeded: Vec<Limit>,
 }
 
 impl Rated {
-    /// Looks at a bus.
+    /// Assesses a bus.
     #[must_use]
     pub fn of(case: &Case) -> Self {
         Self { case: case.clone(), load: case.load(), times: case.times(), exceeded: exceeded(case) }
     }
 
-    /// Whether it fits.
+    /// Returns the verdict.
     #[must_use]
     pub fn verdict(&self) -> Verdict {
         Verdict::of(&self.exceeded, self.case.answers.cells())
     }
 }
 
-/// One bus of the skin.
+/// The fit of one bus of a skin.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct BusFit {
     /// Its name.
     #[serde(rename = "bus")]
     pub name: String,
-    /// As it is described.
+    /// The bus as described.
     #[serde(flatten)]
     pub rated: Rated,
-    /// The most cells that fit on it.
+    /// The maximum number of cells on it.
     #[serde(rename = "most_cells")]
     pub most: Most,
-    /// Buses that its cells need.
+    /// The number of buses that its cells need.
     #[serde(rename = "buses_needed", serialize_with = "json::needed")]
     pub need: Need,
-    /// Other kinds of answers for its cells.
+    /// Alternatives to the answers of its cells.
     #[serde(rename = "other_answers")]
     pub answers: Vec<Hint>,
-    /// Other hints, when it exceeds a limit.
+    /// Other hints, if it exceeds a limit.
     #[serde(rename = "changes")]
     pub hints: Vec<Hint>,
 }
 
-/// Looks at one bus of a skin, given as an index into [`Skin::buses`]; `None` when there is none.
+/// Assesses one bus of a skin, given as an index into [`Skin::buses`]; `None` if it does not exist.
 #[must_use]
 pub fn bus(
     skin: &Skin,
@@ -139,8 +141,8 @@ pub fn bus(
     })
 }
 
-/// One bus of a skin as it is described, at these rates, with all cells answering; `None` where a cell that answers with
-/// sums is unreachable.
+/// Assesses one bus of a skin as described, at these rates, with all cells answering; `None` if a cell that answers
+/// with sums is unreachable.
 #[must_use]
 pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Rated> {
     let format = skin.buses.get(index)?.format;
@@ -151,29 +153,29 @@ pub fn worst_case(skin: &Skin, index: usize, rates: BitRates) -> Option<Rated> {
     Some(Rated::of(&Case::of(skin, index, format, rates, COMPUTATION_NS)?))
 }
 
-/// All cells of a skin, evenly on several buses.
+/// All cells of a skin, spread evenly over several buses.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Whole {
-    /// So many cells.
+    /// Number of cells.
     pub cells: u32,
-    /// Buses that they need.
+    /// The number of buses that they need.
     #[serde(rename = "buses_needed", serialize_with = "json::needed")]
     pub need: Need,
-    /// The same on more and more buses.
+    /// The results for increasing numbers of buses.
     pub spread: Vec<Spread>,
 }
 
-/// Cells on so many buses.
+/// Cells that are spread over several buses.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Spread {
-    /// How many.
+    /// Number of buses.
     pub buses: u32,
     /// The fullest one.
     pub fullest: Rated,
 }
 
-/// Spreads all cells of a skin over more and more buses that are like the fullest one of it; of several chains only the number of
-/// buses is known. `None` without a bus.
+/// Spreads all cells of a skin over increasing numbers of buses like its fullest one. For several chains, only the
+/// number of buses is computed. Returns `None` without a bus.
 #[must_use]
 pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<Whole> {
     let cells = u32::try_from(skin.cells.len()).unwrap_or(u32::MAX);
@@ -181,7 +183,7 @@ pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<Whole> {
     let need = need(skin, buses);
     let most = if carried(skin).count() > 1 { 0 } else { need.buses().unwrap_or(1) };
     let numbers = 1..=most;
-    // Of many only the informative ones: any number below the required one is too small.
+    // Show only informative numbers: all below the required one are too small.
     let is_shown =
         |buses: &u32| *buses <= 6 || Some(*buses) == need.in_time() || Some(*buses) == need.buses();
     let spread = numbers
@@ -191,7 +193,7 @@ pub fn whole(skin: &Skin, buses: &[BusFit]) -> Option<Whole> {
     Some(Whole { cells, need, spread: spread.collect() })
 }
 
-/// The chains that carry cells, each with their number.
+/// Returns the chains with cells, each with its number of cells.
 fn carried(skin: &Skin) -> impl Iterator<Item = (usize, u32)> {
     let on = |cell: &protocol::skin::Cell| skin.buses.get(cell.bus).map(|bus| bus.chain);
     let count = move |chain: usize| skin.cells.iter().filter(|cell| on(cell) == Some(chain)).count();
@@ -201,7 +203,7 @@ fn carried(skin: &Skin) -> impl Iterator<Item = (usize, u32)> {
         .map(|(chain, cells)| (chain, u32::try_from(cells).unwrap_or(u32::MAX)))
 }
 
-/// Buses that all cells of a skin need: for each chain as many as its cells need on buses like its fullest one, because a
+/// Returns the number of buses that all cells of a skin need. Each chain needs its own, like its fullest bus, because a
 /// bus carries one chain.
 fn need(skin: &Skin, buses: &[BusFit]) -> Need {
     let of_chain = |(chain, cells)| {
@@ -216,16 +218,16 @@ fn need(skin: &Skin, buses: &[BusFit]) -> Need {
     carried(skin).filter_map(of_chain).reduce(Need::with).unwrap_or(none)
 }
 
-/// The skin at one format and its rates.
+/// The skin with one format and its rates.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Row {
-    /// The fullest bus as it is described.
+    /// The fullest bus as described.
     pub fullest: BusFit,
-    /// Buses that all cells of the skin need.
+    /// The number of buses that all cells of the skin need.
     pub need: Need,
 }
 
-/// Looks at the fullest bus of a skin at all common rates, or those of one format.
+/// Assesses the fullest bus of a skin at all common rates, or those of one format.
 #[must_use]
 pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<Row> {
     let rows = COMMON.iter().filter(|it| format.is_none_or(|format| format == it.0));
@@ -239,7 +241,7 @@ pub fn table(skin: &Skin, format: Option<Format>, computation_ns: u64) -> Vec<Ro
     rows.filter_map(row).collect()
 }
 
-/// The bus with the highest load.
+/// Returns the bus with the highest load.
 #[must_use]
 pub fn fullest<'a>(buses: impl Iterator<Item = &'a BusFit>) -> Option<&'a BusFit> {
     buses.max_by(|one, other| one.rated.load.total().total_cmp(&other.rated.load.total()))

@@ -1,20 +1,20 @@
-//! The bit rates of a bus: the requested ones, else the skin's, else common ones.
+//! The bit rates of a bus: the requested ones, or else the skin's, or else common ones.
 
 use protocol::can::Format;
 use protocol::skin::Bus;
 use protocol::wire_time::{BitRates, BitRatesError};
 
-/// The default, in bit/s.
+/// The default nominal bit rate, in bit/s.
 const NOMINAL: u32 = 1_000_000;
-/// The default for FD frames' data.
+/// The default data bit rate of FD frames, in bit/s.
 const DATA: u32 = 5_000_000;
 
 /// Requested bit rates, for all buses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Requested {
-    /// Of identifiers, and of all of a classic frame.
+    /// Rate of the arbitration phase, and of all of a classic frame.
     pub nominal: Option<u32>,
-    /// Of FD frames' data.
+    /// Rate of the data phase of FD frames.
     pub data: Option<u32>,
 }
 
@@ -23,24 +23,24 @@ pub struct Requested {
 pub struct Chosen {
     /// The rates.
     pub rates: BitRates,
-    /// Whether the skin or the caller has chosen them; else they are common ones.
+    /// True if the skin or the caller gave the rates, false for defaults.
     pub is_chosen: bool,
 }
 
 impl Requested {
-    /// Of a bus that no skin describes.
+    /// Returns the rates of a bus that is not in a skin.
     ///
     /// # Errors
-    /// When CAN does not have such rates.
+    /// Returns [`BitRatesError`] if CAN does not allow these rates.
     pub fn rates(&self) -> Result<BitRates, BitRatesError> {
         let nominal = self.nominal.unwrap_or(NOMINAL);
         BitRates::new(nominal, self.data.unwrap_or_else(|| nominal.max(DATA)))
     }
 
-    /// Of a bus of a skin.
+    /// Returns the rates of a bus of a skin.
     ///
     /// # Errors
-    /// When CAN does not have such rates.
+    /// Returns [`BitRatesError`] if CAN does not allow these rates.
     pub fn of_bus(&self, bus: &Bus) -> Result<Chosen, BitRatesError> {
         let is_chosen = self.nominal.is_some() || self.data.is_some() || bus.bitrate.is_some();
         let rates = match (self.nominal, self.data, described(bus, bus.format)) {
@@ -58,7 +58,7 @@ impl Requested {
     }
 }
 
-/// The rates that a bus' description has, in a format; a data bit rate that it does not have is the nominal one.
+/// Returns the described rates of a bus in a format; the data bit rate defaults to the nominal one.
 #[must_use]
 pub fn described(bus: &Bus, format: Format) -> Option<Result<BitRates, BitRatesError>> {
     let nominal = bus.bitrate?;

@@ -1,8 +1,8 @@
 //! Response times on a bus with priority by identifier, lowest first, and without preemption.
 //!
 //! Davis, Burns, Bril and Lukkien, *Controller Area Network (CAN) schedulability analysis: Refuted, revisited and
-//! revised*, Real-Time Systems 35 (2007) 239-272, without errors on the bus. With B the longest frame of a lower priority,
-//! C, T and J each stream's frame, period and jitter, and sums over the higher priorities k:
+//! revised*, Real-Time Systems 35 (2007) 239-272, without errors on the bus. With B the longest frame of a lower
+//! priority, C, T and J each stream's frame, period and jitter, and sums over the higher priorities k:
 //!
 //! ```text
 //!   busy period     t    = B + sum ceil((t + J_k) / T_k) C_k, the stream itself included
@@ -11,55 +11,55 @@
 //!   response        R    = max J + w(q) - q T + C
 //! ```
 //!
-//! All instances of the busy period are looked at: the first one is not always the slowest.
+//! All instances of the busy period are examined: the first one is not always the slowest.
 
 /// Busy periods longer than this count as unbounded, in ns.
 const HORIZON_NS: u64 = 60_000_000_000;
 
-/// Frames that come again and again, all of one priority class.
+/// Periodic frames of one priority class.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Stream {
-    /// How many streams like this one there are, each with a priority of its own, one after the other.
+    /// Number of such streams, each with its own priority, in sequence.
     pub count: u32,
-    /// The minimum time from one release to the next in ns, above 0, without the jitter.
+    /// The minimum time between releases in ns, above 0, without the jitter.
     pub period_ns: u64,
-    /// By how much a release may come late in ns.
+    /// The maximum delay of a release in ns.
     pub jitter_ns: u64,
     /// The longest frame in ns, intermission included, above 0.
     pub frame_ns: u64,
 }
 
 impl Stream {
-    /// The part of the bus' time that all of them take.
+    /// Returns the share of the bus' time that all of them take.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a share, to fifteen digits")]
     pub fn load(&self) -> f64 {
         f64::from(self.count) * self.frame_ns as f64 / self.period_ns as f64
     }
 
-    /// The time of all frames that can be released within `window_ns` of `count` of these streams.
+    /// Returns the time of all frames of `count` of these streams that can be released within `window_ns`.
     fn demand_ns(&self, count: u32, window_ns: u64) -> u64 {
         let releases = window_ns.saturating_add(self.jitter_ns).div_ceil(self.period_ns);
         releases.saturating_mul(self.frame_ns).saturating_mul(u64::from(count))
     }
 }
 
-/// What the slowest of some streams can be held up by.
+/// The worst-case response of the slowest of some streams.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Response {
-    /// From the event that a release belongs to (its jitter included) to the end of the intermission, in ns.
+    /// From the event of a release (including its jitter) to the end of the intermission, in ns.
     pub worst_ns: u64,
-    /// Which instance of the busy period that is, from 0.
+    /// The index of that instance in the busy period, from 0.
     pub instance: u64,
-    /// How many instances there are in the busy period.
+    /// Number of instances in the busy period.
     pub instances: u64,
 }
 
-/// The longest response of the last (slowest) of the streams at one place in a list, whose order is that of priority,
-/// highest first. `bit_ns` is a bit of the arbitration: a frame that comes that much later still takes part.
+/// Returns the longest response of the last (slowest) stream at position `at` of a list in order of priority, highest
+/// first. `bit_ns` is the duration of an arbitration bit: a frame that is released up to one bit late still takes part.
 ///
-/// `None` where there is no such stream, and where there is no bound, because what has the same or a higher priority fills
-/// the bus, or none within a minute.
+/// Returns `None` if there is no such stream, or no bound: streams of the same or a higher priority fill the bus, or
+/// the busy period exceeds a minute.
 #[must_use]
 pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> {
     let (before, rest) = streams.split_at_checked(at)?;
@@ -95,7 +95,7 @@ pub fn response(streams: &[Stream], at: usize, bit_ns: u64) -> Option<Response> 
     Some(worst)
 }
 
-/// The lowest fixed point of an increasing function, from below; `None` beyond the horizon.
+/// Returns the lowest fixed point of an increasing function, from below; `None` beyond the horizon.
 fn settle(from_ns: u64, next_ns: impl Fn(u64) -> u64) -> Option<u64> {
     let mut at_ns = from_ns;
     while at_ns <= HORIZON_NS {
@@ -128,8 +128,8 @@ mod tests {
         responses(streams, bit_ns).into_iter().map(|it| it.map(|it| it.worst_ns)).collect()
     }
 
-    /// The paper's example: three messages of 125 bits at 125 kbit/s. The analysis that it refutes looks at the first
-    /// instance only and finds 3 ms for the third message; its second instance takes 3.5 ms and misses 3.25 ms.
+    /// The paper's example: three messages of 125 bits at 125 kbit/s. The analysis that it refutes examines only the
+    /// first instance and finds 3 ms for the third message; its second instance takes 3.5 ms and misses 3.25 ms.
     #[test]
     fn a_later_instance_can_be_slower_than_the_first_as_in_the_papers_example() {
         let streams = [(5, 2), (7, 2), (7, 2)].map(|(twice_ms, two)| stream(1, twice_ms * MS / two, 0, MS));
@@ -167,12 +167,12 @@ mod tests {
     #[test]
     fn jitter_counts_in_full_and_brings_instances_together() {
         let streams = [stream(1, 10 * MS, 9 * MS, MS), stream(1, 20 * MS, 0, MS)];
-        // The higher one once late and once on time: both before the lower one.
+        // The higher stream is released once late and once on time, both before the lower one.
         assert_eq!(worst(&streams, 1)[1], Some(3 * MS));
         assert_eq!(worst(&streams, 1)[0], Some(9 * MS + 2 * MS));
     }
 
-    /// When each of the streams' frames is released at the given times, the longest time from release to end.
+    /// Returns the longest time from release to end, if each of the streams' frames is released at the given times.
     fn simulated(streams: &[Stream], phases: &[u64], until_ns: u64) -> Vec<u64> {
         let mut releases: Vec<(u64, usize)> = Vec::new();
         for (priority, (stream, phase)) in streams.iter().zip(phases).enumerate() {
@@ -194,8 +194,8 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(256))]
 
-        /// Any periods, frames and phases: what a bus does is never slower than what is computed, and with phases
-        /// chosen for it the second of two comes to within a bit of it.
+        /// Property test with any periods, frames and phases: a bus is never slower than computed, and with chosen
+        /// phases the second of two streams comes within a bit of the bound.
         #[test]
         fn no_simulated_response_is_above_the_computed_one(
             sets in prop::collection::vec((10_u64..60, 1_u64..6, 0_u64..60), 1..6),
@@ -217,11 +217,12 @@ mod tests {
             prop_assume!(streams.iter().map(Stream::load).sum::<f64>() < 1.0);
             for at in 0..streams.len() {
                 let (higher, lower) = streams.split_at(at + 1);
-                // Who is blocked starts that much earlier than computed: one that comes at just this time is too late.
+                // A blocked frame starts that much earlier than computed: one that is released at this very time is too
+                // late.
                 let bit_ns = u64::from(lower.is_empty());
                 let computed = responses(&streams, bit_ns)[at];
                 let longest = lower.iter().enumerate().max_by_key(|(_, it)| it.frame_ns).map(|it| it.0);
-                // All start at 1, behind the lower one that starts at 0; the others come after everything.
+                // All are released at 1, behind the lower one that starts at 0; the others follow after everything.
                 let mut phases = vec![1; higher.len()];
                 phases.extend((0..lower.len()).map(|it| if Some(it) == longest { 0 } else { 1_000_000 }));
                 let took = simulated(&streams, &phases, 100_000)[at];

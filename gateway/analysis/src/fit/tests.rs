@@ -1,4 +1,4 @@
-//! Results for skins against known values, and every hint against the skin that it gives.
+//! Tests results for skins against known values, and every hint against the resulting skin.
 
 mod simulated;
 
@@ -37,7 +37,7 @@ fn packets_take_what_is_known_of_them() {
         ("1M/2M", 128.0),
         ("1M/5M", 70.4),
         ("1M/8M", 56.0),
-        // Two of 133 bits; where its CRC is taken for free a classic frame of 8 bytes has 134.
+        // Two frames of 133 bits; without counting the CRC's stuff bits, a classic frame of 8 bytes has 134.
         ("classic 1M", 266.0),
         ("classic 500k", 532.0),
     ] {
@@ -82,7 +82,7 @@ fn a_single_cell_waits_for_joints_and_one_heartbeat_at_most() {
     let case = fit(&skin(&text(&Target { cells: 1, ..Target::default() })), "1M/5M").rated.case;
     // Its own heartbeat: once before the joints, once while it computes.
     assert_eq!(case.times().chain_ns, Some(4 * 70_400 + 68_500));
-    // A cell that needs no time to compute answers before others begin.
+    // A cell that needs no time to compute answers before other frames start.
     let at_once = Case { computation_ns: 0, ..case };
     assert_eq!(at_once.times().chain_ns, Some(3 * 70_400));
 }
@@ -111,7 +111,7 @@ fn sensors_are_loaded_with_what_they_say() {
         let skin = skin(&text.replace(format, &format!("{format}\n{sensing}")));
         fit(&skin, "1M/5M").rated.load.sensors
     };
-    // Page 0 and, once a second, page 1, of 40 cells.
+    // Page 0, and page 1 once a second, of 40 cells.
     let share = |hz: f64| 40.0 * hz * 70.4e-6;
     assert!((sensors("sensing = \"continuous\"\nsensing_hz = 62.5") - share(63.5)).abs() < 1e-9);
     assert!((sensors("sensing = \"event\"") - share(5.0)).abs() < 1e-9);
@@ -175,12 +175,12 @@ fn a_skin_of_sums_is_taken_as_it_is_and_compared_with_torques() {
     assert!(
         matches!(skin.buses[0].reply, protocol::skin::Reply::Sum { slot_us, .. } if u64::from(slot_us) * 1_000 == *slot_ns)
     );
-    // For every wire on the route to the root one computation, and one frame of another node.
+    // One computation, and one frame of another node, for every wire on the route to the root.
     let chain_ns = 70_400 * 62 + (u64::from(deepest) + 1) * (68_500 + 70_400);
     assert_eq!(fit.rated.times.chain_ns, Some(chain_ns));
     let changes: Vec<_> = fit.answers.iter().map(|it| it.change.as_str()).collect();
     assert_eq!(changes, ["torques", "sums, only of roots"]);
-    // Half the cells, half of every depth.
+    // Half of the cells, half of every depth.
     let segment = fit.rated.case.answers.with_cells(30);
     assert_eq!(segment.cells(), 30);
 }

@@ -1,7 +1,7 @@
-//! Which traffic on a bench's bus a real bus carries too, and which only a bench sends.
+//! Separates the traffic on a bench's bus: frames that a real bus carries, too, and frames of the bench only.
 //!
-//! A real bus carries joints, answers, sensors, heartbeats, the tree's messages, commands and configuration. Only a bench
-//! sends stimuli, sync and report with their answers, and what stands for wires between cells.
+//! A real bus carries joints, answers, sensors, heartbeats, the tree's messages, commands and configuration. Only a
+//! bench sends stimuli, sync and report with their answers, and simulated wires between cells.
 
 use protocol::can::{Format, Frame};
 use protocol::id::{CellId, Node};
@@ -13,7 +13,7 @@ use serde::Serialize;
 use model::decode::wired;
 use model::packets::{Content, PacketReader};
 
-/// What only a bench sends.
+/// The kinds of frames that only a bench sends.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Bench {
     /// Stimuli.
@@ -22,11 +22,11 @@ pub enum Bench {
     Sync,
     /// Report, and the pages that answer it.
     Report,
-    /// What stands for a wire between cells.
+    /// A simulated wire between cells.
     Wire,
 }
 
-/// Frames that only a bench sends.
+/// Counts of frames that only a bench sends.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct BenchFrames {
     /// Stimuli.
@@ -40,7 +40,7 @@ pub struct BenchFrames {
 }
 
 impl BenchFrames {
-    /// Counts so many more.
+    /// Adds frames of a kind.
     pub const fn count(&mut self, what: Bench, frames: u64) {
         match what {
             Bench::Stimulus => self.stimuli += frames,
@@ -50,17 +50,17 @@ impl BenchFrames {
         }
     }
 
-    /// All of them.
+    /// Returns the total.
     #[must_use]
     pub const fn total(&self) -> u64 {
         self.stimuli + self.syncs + self.reports + self.wires
     }
 }
 
-/// What a frame means for the course of a run.
+/// The meaning of a frame for the course of a run.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Says {
-    /// Nothing.
+    /// No effect.
     Other,
     /// Joints.
     Joints(Epoch),
@@ -68,22 +68,22 @@ pub enum Says {
     Answer(Epoch),
     /// Cells stop answering.
     Halt,
-    /// They go on.
+    /// Cells answer again.
     Resume,
-    /// Something that is sent before the first joints: address claims, parameters written or read, requests for a report.
+    /// A frame from before the first joints: address claims, parameter writes and reads, report commands.
     Preparation,
 }
 
-/// A frame, sorted.
+/// A classified frame.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Sorted {
     /// Its meaning.
     pub says: Says,
-    /// Set when only a bench sends it.
+    /// The kind, if only a bench sends it.
     pub bench: Option<Bench>,
-    /// Which cell sent it, where it ends a packet.
+    /// The sending cell, if the frame ends a packet.
     pub from: Option<CellId>,
-    /// Whether it ends a packet of two classic frames: all this holds of the one before it under its identifier too.
+    /// True if it ends a packet of classic frames: the previous frame with its identifier belongs to the same class.
     pub ends_pair: bool,
 }
 
@@ -91,30 +91,31 @@ impl Sorted {
     const OTHER: Self = Self { says: Says::Other, bench: None, from: None, ends_pair: false };
 }
 
-/// The frames of one bus as they come, however long that lasts.
+/// Classifies the frames of one bus in order, with bounded memory.
 #[derive(Debug, Default)]
 pub struct Traffic {
-    /// Frames of sound packets, and 11-bit data frames that were none.
+    /// Number of frames of valid packets, and of 11-bit data frames that were not packets.
     ours: u64,
     others: u64,
     packets: PacketReader,
-    /// By cell: replies to the bench that are outstanding.
+    /// Outstanding replies to the bench, by cell.
     owed: Vec<Owed>,
 }
 
 /// Outstanding replies of a cell to sync and report: a heartbeat; sensors 0, sensors 1, the tree.
 type Owed = [bool; 4];
-/// The place of the tree.
+/// The index of the tree page.
 const TREE: usize = 3;
 
 impl Traffic {
-    /// Whether most of what could be packets of this project's protocol were; chance makes one frame in 65 536 a packet.
+    /// Returns true if most candidate frames were packets of this protocol; a random frame is one with probability 1/65
+    /// 536.
     #[must_use]
     pub const fn is_ours(&self) -> bool {
         self.ours > self.others
     }
 
-    /// Takes the next frame. On a bus of another protocol nothing is a bench's. Never panics.
+    /// Classifies the next frame. On a bus of another protocol no frame counts as the bench's. Never panics.
     pub fn sort(&mut self, nanos: u64, frame: &Frame) -> Sorted {
         let received = self.packets.read(Micros(nanos / 1_000), frame);
         let (id, packet) = match received.content {
@@ -161,7 +162,7 @@ impl Traffic {
                 let Node::Cell(from) = from else { return Sorted::OTHER };
                 match page {
                     NetworkPage::Heartbeat(heartbeat) if heartbeat.state.has(State::CLAIMING) => {
-                        // It leaves sync and report unanswered.
+                        // A starting cell leaves sync and report unanswered.
                         self.take(*from);
                         says(Says::Preparation)
                     }
@@ -169,7 +170,7 @@ impl Traffic {
                         let [heartbeat, ..] = self.take(*from);
                         if heartbeat { bench(Bench::Sync) } else { Sorted::OTHER }
                     }
-                    // Nothing but a report makes a cell send these; the others of it follow.
+                    // A cell sends these pages only on a report command; the other pages follow.
                     NetworkPage::Heard(_) | NetworkPage::Refused(_) => {
                         let owed = self.cells().get_mut(from.index());
                         owed.into_iter().for_each(|[_, pages @ ..]| *pages = [true; 3]);
@@ -182,14 +183,14 @@ impl Traffic {
         }
     }
 
-    /// A page that a cell sends on a report, and at other times too.
+    /// Classifies a page that a cell sends on a report command and also at other times.
     fn page(&mut self, from: CellId, page: usize) -> Sorted {
         let owed = self.cells().get_mut(from.index()).and_then(|owed| owed.get_mut(page));
         let owed = owed.map(std::mem::take).unwrap_or(false);
         Sorted { bench: owed.then_some(Bench::Report), ..Sorted::OTHER }
     }
 
-    /// Takes the outstanding replies of a cell.
+    /// Removes and returns the outstanding replies of a cell.
     fn take(&mut self, from: CellId) -> Owed {
         self.cells().get_mut(from.index()).map(std::mem::take).unwrap_or_default()
     }
@@ -244,7 +245,7 @@ mod tests {
             }
             assert_eq!([last(&skin(1)), last(&skin(1)), last(&skin(2))], [Some(Bench::Report), None, None]);
             assert_eq!([last(&tree), last(&tree)], [Some(Bench::Report), None]);
-            // A cell without ports sends no tree; its next one comes by itself.
+            // A cell without ports sends no tree; its next one is unrequested.
             last(&page(1, NetworkPage::Refused(Refused::default())));
             assert_eq!([last(&alive), last(&tree)], [None; 2]);
         }
@@ -269,7 +270,7 @@ mod tests {
         #[test]
         fn chance_makes_no_bench(frames in proptest::collection::vec((0..0x800_u32, any::<[u8; 16]>(), any::<bool>()), 0..400)) {
             let mut traffic = Traffic::default();
-            // Of the first frame alone it would be believed: one in 65 536.
+            // The first frame alone would be accepted with probability 1/65 536.
             let unknown_node = Frame::classic(0x700, &[1]).unwrap();
             (0..4).for_each(|_| assert_eq!(traffic.sort(0, &unknown_node), Sorted::OTHER));
             for (id, data, is_fd) in frames {

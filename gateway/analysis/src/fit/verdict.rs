@@ -1,4 +1,4 @@
-//! Whether a bus carries its traffic, in the words that all commands share.
+//! The verdict whether a bus carries its traffic, in the wording of all commands.
 
 use std::fmt::{self, Display, Formatter};
 
@@ -7,21 +7,21 @@ use serde::{Serialize, Serializer};
 use super::Rated;
 use super::limits::{ByLimit, Limit, NODES};
 
-/// Whether something fits on a bus.
+/// The verdict on a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Verdict {
-    /// In bandwidth, deadline and number of nodes.
+    /// Bandwidth, deadline and number of nodes fit.
     Fits,
-    /// In bandwidth and deadline, but so many nodes are more than transceivers drive.
+    /// Bandwidth and deadline fit, but this number of nodes exceeds the transceivers' limit.
     Nodes(u32),
-    /// The load is higher than the bus carries.
+    /// The load is higher than the bus can carry.
     Bandwidth,
     /// An answer comes after the next joints.
     Deadline,
 }
 
 impl Verdict {
-    /// From the broken limits of a bus of so many cells, see [`ByLimit::broken`].
+    /// Returns the verdict from the exceeded limits of a bus with this number of cells, see [`ByLimit::broken`].
     #[must_use]
     pub fn of(exceeded: &[Limit], cells: u32) -> Self {
         match exceeded.first() {
@@ -32,7 +32,7 @@ impl Verdict {
         }
     }
 
-    /// Whether all limits hold.
+    /// Returns true if all limits hold.
     #[must_use]
     pub const fn fits(self) -> bool {
         matches!(self, Self::Fits)
@@ -56,30 +56,30 @@ impl Serialize for Verdict {
     }
 }
 
-/// Cells that answer joints.
+/// The cells that answer joints.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 #[serde(tag = "answering", rename_all = "lowercase")]
 pub enum Cells {
     /// All of them.
     All {
-        /// So many.
+        /// Number of cells.
         cells: u32,
     },
-    /// As many as did in a run.
+    /// Those that answered in a run.
     Some {
-        /// In the epoch with most of them.
+        /// Number of answers in the epoch with most of them.
         most: u32,
-        /// Of so many on the bus.
+        /// Number of cells on the bus.
         cells: u32,
-        /// Whether that is from the skin; else that many were received.
+        /// True if `cells` is from the skin, false if it was observed.
         described: bool,
     },
-    /// The bus has another protocol.
+    /// The bus carries another protocol.
     Foreign,
 }
 
 impl Cells {
-    /// How many are on the bus.
+    /// Returns the number of cells on the bus.
     #[must_use]
     pub const fn on_the_bus(self) -> u32 {
         match self {
@@ -105,7 +105,7 @@ impl Display for Cells {
     }
 }
 
-/// A bus' answer to "does it fit": in the worst case, or in a run.
+/// The load and the verdict of a bus, in the worst case or in a run.
 ///
 /// ```
 /// # use analysis::fit::verdict::{Answer, Cells, Verdict};
@@ -119,18 +119,18 @@ impl Display for Cells {
 /// ```
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Answer {
-    /// The load; of a run, in the second with the highest one.
+    /// The load; for a run, that of the second with the highest load.
     pub load: f64,
     /// The bus' format and rates.
     pub rates: String,
-    /// Who answers.
+    /// The answering cells.
     pub cells: Cells,
-    /// Whether that fits.
+    /// The verdict.
     pub verdict: Verdict,
 }
 
 impl Answer {
-    /// Of a bus whose cells all answer.
+    /// Returns the assessment of a bus with all cells answering.
     #[must_use]
     pub fn worst_case(rated: &Rated) -> Self {
         Self {
@@ -141,7 +141,8 @@ impl Answer {
         }
     }
 
-    /// Of a run: the load of its fullest second, and how many answers ended after the next joints.
+    /// Returns the assessment of a run, from the load of its fullest second and the number of answers that ended after
+    /// the next joints.
     #[must_use]
     pub fn this_run(load: f64, late: u64, rates: String, cells: Cells) -> Self {
         let on_the_bus = cells.on_the_bus();
@@ -149,7 +150,7 @@ impl Answer {
         Self { load, rates, cells, verdict: Verdict::of(&holds.broken(), on_the_bus) }
     }
 
-    /// Which case it is.
+    /// Returns the name of the case.
     #[must_use]
     pub const fn case(&self) -> &'static str {
         match self.cells {
@@ -159,7 +160,7 @@ impl Answer {
         }
     }
 
-    /// Load and verdict, for a row of a table.
+    /// Formats load and verdict for a row of a table.
     #[must_use]
     pub fn value(&self) -> String {
         format!("{}: {}", percent(self.load), self.verdict)
@@ -173,7 +174,7 @@ impl Display for Answer {
     }
 }
 
-/// A share in %, with one decimal.
+/// Formats a share in %, with one decimal.
 #[must_use]
 pub fn percent(share: f64) -> String {
     format!("{:.1} %", 100.0 * share)

@@ -1,4 +1,4 @@
-//! The contents of a page before it is drawn: sections with figures, findings beside the paper's, and tables.
+//! The contents of a page before it is drawn: sections with figures, findings and tables.
 
 use std::fmt;
 
@@ -13,7 +13,7 @@ pub use super::skin::{Drawing, Legend, Map, Panel, Spot, Strip, StripGroup, Stri
 pub struct Page {
     /// Its heading, in one line.
     pub title: String,
-    /// What it is about, in a sentence or two.
+    /// Its subject, in one or two sentences.
     pub intro: String,
     /// Facts by name: machine, command, revision.
     pub facts: Vec<(String, String)>,
@@ -24,58 +24,58 @@ pub struct Page {
 /// One section of a page.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Section {
-    /// Letters, digits and `-`; the link to it, and what names of its files begin with: `fig6`.
+    /// The link to it, of letters, digits and `-`; the prefix of its files' names: `fig6`.
     pub name: String,
     /// Its heading.
     pub title: String,
     /// Paragraphs before the figures.
     pub text: Vec<String>,
-    /// What is drawn of cells, before the figures.
+    /// Drawings of cells, shown before the figures.
     pub drawings: Vec<Drawing>,
-    /// What is drawn.
+    /// Its figures.
     pub figures: Vec<Figure>,
-    /// Numbers beside the paper's.
+    /// Numbers compared with the paper's.
     pub findings: Vec<Finding>,
-    /// Everything else in rows.
+    /// Tables with everything else.
     pub tables: Vec<Table>,
 }
 
 impl Section {
-    /// An empty section.
+    /// Creates an empty section.
     #[must_use]
     pub fn new(name: &str, title: impl Into<String>) -> Self {
         Self { name: name.to_owned(), title: title.into(), ..Self::default() }
     }
 
-    /// The same with one more paragraph.
+    /// Adds a paragraph.
     #[must_use]
     pub fn text(mut self, paragraph: impl Into<String>) -> Self {
         self.text.push(paragraph.into());
         self
     }
 
-    /// The same with more drawings of cells.
+    /// Adds drawings of cells.
     #[must_use]
     pub fn drawings(mut self, drawings: impl IntoIterator<Item = Drawing>) -> Self {
         self.drawings.extend(drawings);
         self
     }
 
-    /// The same with more figures.
+    /// Adds figures.
     #[must_use]
     pub fn figures(mut self, figures: impl IntoIterator<Item = Figure>) -> Self {
         self.figures.extend(figures);
         self
     }
 
-    /// The same with more findings.
+    /// Adds findings.
     #[must_use]
     pub fn findings(mut self, findings: impl IntoIterator<Item = Finding>) -> Self {
         self.findings.extend(findings);
         self
     }
 
-    /// The same with more tables.
+    /// Adds tables.
     #[must_use]
     pub fn tables(mut self, tables: impl IntoIterator<Item = Table>) -> Self {
         self.tables.extend(tables);
@@ -86,74 +86,74 @@ impl Section {
 /// One diagram.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Figure {
-    /// Letters, digits and `-`, unlike any other in the page; its file is called so: `fig6-joint2`.
+    /// A unique name in the page, of letters, digits and `-`; also that of its file: `fig6-joint2`.
     pub name: String,
     /// Its caption.
     pub title: String,
-    /// How much of the page it takes.
+    /// Its width on the page.
     pub size: Size,
-    /// To the right.
+    /// The horizontal axis.
     pub x: Axis,
-    /// Upwards.
+    /// The vertical axis.
     pub y: Axis,
-    /// What is drawn, the first one lowest. Colours go by place, and there are [`Figure::COLOURS`].
+    /// The series, in drawing order. Their colours follow the order and repeat after [`Figure::COLOURS`].
     pub series: Vec<Series>,
-    /// Places to look at.
+    /// Marked positions.
     pub marks: Vec<Mark>,
-    /// A second diagram below it, with the same axis to the right.
+    /// A second diagram below it, with the same horizontal axis.
     pub below: Option<Below>,
 }
 
-/// A lower diagram: what belongs to the upper one on a scale of its own.
+/// A lower diagram, for series with a scale of their own.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Below {
-    /// Upwards.
+    /// The vertical axis.
     pub y: Axis,
-    /// What is drawn, as in a [`Figure`].
+    /// The series, as in a [`Figure`].
     pub series: Vec<Series>,
-    /// Places to look at.
+    /// Marked positions.
     pub marks: Vec<Mark>,
 }
 
 impl Figure {
-    /// Distinguishable colours; series beyond these begin with the first again.
+    /// Number of distinguishable colours; further series start again with the first.
     pub const COLOURS: usize = 7;
 
-    /// A figure of the page's width in which nothing is drawn yet.
+    /// Creates an empty figure of full width.
     #[must_use]
     pub fn new(name: impl Into<String>, title: impl Into<String>, x: Axis, y: Axis) -> Self {
         Self { name: name.into(), title: title.into(), x, y, ..Self::default() }
     }
 
-    /// The same of half the width.
+    /// Sets half the width.
     #[must_use]
     pub const fn half(mut self) -> Self {
         self.size = Size::Half;
         self
     }
 
-    /// The same with one more series; see [`Series`].
+    /// Adds one series; see [`Series`].
     #[must_use]
     pub fn draw(mut self, caption: impl Into<String>, shape: Shape, points: Vec<(f64, f64)>) -> Self {
         self.series.push(Series::new(caption, shape, points));
         self
     }
 
-    /// The same with more series.
+    /// Adds series.
     #[must_use]
     pub fn series(mut self, series: impl IntoIterator<Item = Series>) -> Self {
         self.series.extend(series);
         self
     }
 
-    /// The same with more marks.
+    /// Adds marks.
     #[must_use]
     pub fn marks(mut self, marks: impl IntoIterator<Item = Mark>) -> Self {
         self.marks.extend(marks);
         self
     }
 
-    /// The same with a diagram below it.
+    /// Adds a diagram below.
     #[must_use]
     pub fn below(mut self, below: Below) -> Self {
         self.below = Some(below);
@@ -161,44 +161,44 @@ impl Figure {
     }
 }
 
-/// How much of a page a figure takes.
+/// The width of a figure on a page.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub enum Size {
-    /// The page's width.
+    /// The full width.
     #[default]
     Wide,
-    /// Half of it: two stand beside each other where there is room.
+    /// Half the width: two figures stand side by side if there is room.
     Half,
 }
 
-/// One direction of a diagram.
+/// One axis of a diagram.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Axis {
-    /// What it counts.
+    /// Name of the quantity.
     pub caption: String,
-    /// In what; empty for numbers of things.
+    /// Unit of the quantity; empty for counts.
     pub unit: String,
-    /// How values become places.
+    /// The mapping from values to positions.
     pub scale: Scale,
-    /// From and to; without it, all that is drawn and a little more. On a logarithmic axis above 0.
+    /// The ends; by default those of the data plus a margin. On a logarithmic axis both must be above 0.
     pub range: Option<(f64, f64)>,
 }
 
 impl Axis {
-    /// A linear axis that fits what is drawn.
+    /// Creates a linear axis that fits the data.
     #[must_use]
     pub fn new(caption: impl Into<String>, unit: impl Into<String>) -> Self {
         Self { caption: caption.into(), unit: unit.into(), scale: Scale::Linear, range: None }
     }
 
-    /// The same, from `from` to `to`.
+    /// Sets the ends.
     #[must_use]
     pub const fn between(mut self, from: f64, to: f64) -> Self {
         self.range = Some((from, to));
         self
     }
 
-    /// The same, by powers of ten.
+    /// Makes the axis logarithmic.
     #[must_use]
     pub const fn log(mut self) -> Self {
         self.scale = Scale::Log;
@@ -216,70 +216,70 @@ impl fmt::Display for Axis {
     }
 }
 
-/// How values become places.
+/// The mapping from values to positions.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub enum Scale {
-    /// Equal steps.
+    /// Linear.
     #[default]
     Linear,
-    /// Equal ratios; what is not above 0 is not drawn.
+    /// Logarithmic; values that are not above 0 are not drawn.
     Log,
 }
 
-/// What belongs together in a diagram.
+/// One series of a diagram.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Series {
-    /// What it is, for the legend; empty: it is not in the legend.
+    /// The name in the legend; empty to omit it there.
     pub caption: String,
-    /// How it is drawn.
+    /// The way of drawing.
     pub shape: Shape,
-    /// x and y, by increasing x for all shapes but points. What is not finite is a gap.
+    /// x and y, by increasing x for all shapes except points. Values that are not finite make a gap.
     pub points: Vec<(f64, f64)>,
 }
 
 impl Series {
-    /// A series of a shape.
+    /// Creates a series.
     #[must_use]
     pub fn new(caption: impl Into<String>, shape: Shape, points: Vec<(f64, f64)>) -> Self {
         Self { caption: caption.into(), shape, points }
     }
 }
 
-/// How a series is drawn.
+/// The way of drawing a series.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub enum Shape {
-    /// Straight from point to point.
+    /// Straight lines between the points.
     #[default]
     Line,
-    /// The same, dashed: a law, a limit, the paper's line.
+    /// Dashed lines, for a law, a limit, or the paper's data.
     Dashed,
     /// Dots.
     Points,
-    /// Each value holds until the next one.
+    /// Steps: each value holds until the next one.
     Steps,
-    /// An area: along the points there and back, as `lower` to the right and `upper` to the left.
+    /// An area. The points go along the lower edge to the right and back along the upper edge.
     Band,
 }
 
-/// A line through a whole diagram.
+/// A line across a whole diagram.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Mark {
-    /// Which axis `at` is on.
+    /// The axis of `at`.
     pub on: On,
-    /// Where.
+    /// The position.
     pub at: f64,
-    /// What is there.
+    /// The text.
     pub caption: String,
 }
 
 impl Mark {
-    /// An upright line.
+    /// Creates a vertical line.
     #[must_use]
     pub fn x(at: f64, caption: impl Into<String>) -> Self {
         Self { on: On::X, at, caption: caption.into() }
     }
 
-    /// A level line.
+    /// Creates a horizontal line.
     #[must_use]
     pub fn y(at: f64, caption: impl Into<String>) -> Self {
         Self { on: On::Y, at, caption: caption.into() }
@@ -289,34 +289,34 @@ impl Mark {
 /// An axis.
 #[derive(Clone, Copy, Debug, Eq, PartialEq, Serialize)]
 pub enum On {
-    /// The one to the right: the mark stands upright.
+    /// The horizontal axis: the line is vertical.
     X,
-    /// The one upwards: the mark lies.
+    /// The vertical axis: the line is horizontal.
     Y,
 }
 
 /// Rows below headings.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Table {
-    /// What is in it.
+    /// The title.
     pub title: String,
     /// The columns' headings.
     pub head: Vec<String>,
-    /// As many cells in each row as there are headings. What reads as a number stands to the right.
+    /// The rows, each with as many cells as there are headings. Columns of numbers are right-aligned.
     pub rows: Vec<Vec<String>>,
-    /// Whether the last column holds commands.
+    /// True if the last column holds commands.
     pub commands: bool,
 }
 
 impl Table {
-    /// The same, with commands in the last column.
+    /// Marks the last column as commands.
     #[must_use]
     pub const fn of_commands(mut self) -> Self {
         self.commands = true;
         self
     }
 
-    /// A table of some columns.
+    /// Creates a table with these columns.
     #[must_use]
     pub fn new<const N: usize>(
         title: impl Into<String>,

@@ -1,4 +1,4 @@
-//! Numbers that were found, and how they compare.
+//! Findings: measured numbers and their comparison.
 
 use std::fmt;
 
@@ -6,43 +6,43 @@ use serde::Serialize;
 
 use super::number::{interval, quantity};
 
-/// A result beside the paper's number.
+/// A result compared with the paper's number or with a limit.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
-    /// What was measured, with how.
+    /// The quantity, with the method of measurement.
     pub what: String,
-    /// What the paper says, where it does.
+    /// The paper's value, if it has one.
     pub paper: Option<Quantity>,
-    /// What was found.
+    /// The measured value.
     pub ours: Quantity,
-    /// What it must reach, in words: `at most 0.005 Nm`.
+    /// The requirement as text: `at most 0.005 Nm`.
     pub bar: Option<String>,
-    /// What it is rated against, when that is no bar, or why it is not rated: `below the paper's`.
+    /// The reference of the rating if there is no requirement, or the reason why it is not rated: `below the paper's`.
     pub against: Option<String>,
-    /// Where the bar comes from: an option, the skin's file, a default.
+    /// The source of the requirement: an option, the skin's file, a default.
     pub origin: Option<String>,
-    /// A command that shows where it comes from.
+    /// A command that shows the details.
     pub command: Option<String>,
-    /// How the two compare.
+    /// The result of the comparison.
     pub verdict: Verdict,
 }
 
 impl Finding {
-    /// A number of which less is better, beside the paper's: within 5 % of that it is the same.
+    /// Creates a finding for which less is better than the paper; within 5 % the two are the same.
     #[must_use]
     pub fn less_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
         let finding = Self::stated(what, ours).beside(paper).against("below the paper's");
         Self { verdict: Verdict::less_is_better(paper, finding.ours.value), ..finding }
     }
 
-    /// A number of which more is better, beside the paper's: within 5 % of that it is the same.
+    /// Creates a finding for which more is better than the paper; within 5 % the two are the same.
     #[must_use]
     pub fn more_is_better(what: impl Into<String>, paper: f64, ours: impl Into<Quantity>) -> Self {
         let finding = Self::stated(what, ours).beside(paper).against("above the paper's");
         Self { verdict: Verdict::less_is_better(finding.ours.value, paper), ..finding }
     }
 
-    /// A number for information, not rated.
+    /// Creates a finding for information, without a rating.
     #[must_use]
     pub fn stated(what: impl Into<String>, ours: impl Into<Quantity>) -> Self {
         Self {
@@ -57,35 +57,35 @@ impl Finding {
         }
     }
 
-    /// The same beside the paper's in the same unit, where neither more nor less is better.
+    /// Adds the paper's value in the same unit, for comparison without a rating.
     #[must_use]
     pub fn beside(mut self, paper: f64) -> Self {
         self.paper = Some(Quantity::new(paper, self.ours.unit.clone()));
         self
     }
 
-    /// The same with what it is rated against, or why it is not rated.
+    /// Sets the reference of the rating, or the reason why it is not rated.
     #[must_use]
     pub fn against(mut self, what: impl Into<String>) -> Self {
         self.against = Some(what.into());
         self
     }
 
-    /// The same with where its bar comes from.
+    /// Sets the source of the requirement.
     #[must_use]
     pub fn from(mut self, origin: impl Into<String>) -> Self {
         self.origin = Some(origin.into());
         self
     }
 
-    /// The same with a command that shows where it comes from, if there is one.
+    /// Sets the command that shows the details, if any.
     #[must_use]
     pub fn look(mut self, command: Option<String>) -> Self {
         self.command = command;
         self
     }
 
-    /// The same, rated by a limit in its own unit.
+    /// Rates the value by an upper limit in its own unit.
     #[must_use]
     pub fn at_most(self, limit: f64) -> Self {
         let kept = self.ours.value <= limit;
@@ -93,7 +93,7 @@ impl Finding {
         self.must(bar, kept)
     }
 
-    /// The same, rated by a requirement: met is [`Verdict::Better`].
+    /// Rates the value by a requirement; if it is met, the verdict is [`Verdict::Better`].
     #[must_use]
     pub fn must(mut self, bar: impl Into<String>, kept: bool) -> Self {
         self.bar = Some(bar.into());
@@ -102,14 +102,14 @@ impl Finding {
     }
 }
 
-/// How a number compares with the paper's, or with what it must reach.
+/// The result of a comparison with the paper or with a requirement.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub enum Verdict {
-    /// Better than the paper's, or within the bar.
+    /// Better than the paper, or meets the requirement.
     Better,
-    /// The paper's, by 5 %.
+    /// Within 5 % of the paper.
     Same,
-    /// Worse than the paper's, or outside of the bar.
+    /// Worse than the paper, or violates the requirement.
     Worse,
     /// Not rated.
     #[default]
@@ -117,7 +117,7 @@ pub enum Verdict {
 }
 
 impl Verdict {
-    /// Compares numbers of which less is better: within 5 % of `paper` they are the same.
+    /// Compares numbers for which less is better; within 5 % of `paper` they are the same.
     #[must_use]
     pub fn less_is_better(paper: f64, ours: f64) -> Self {
         if !(paper.is_finite() && ours.is_finite()) {
@@ -146,22 +146,22 @@ impl fmt::Display for Verdict {
 /// A number with its unit.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Quantity {
-    /// How much.
+    /// The value.
     pub value: f64,
-    /// Of what; empty for numbers of things.
+    /// The unit; empty for counts.
     pub unit: String,
-    /// Half the width of its 95 % interval, where it has one.
+    /// Half the width of its 95 % interval, if known.
     pub plus_minus: Option<f64>,
 }
 
 impl Quantity {
-    /// A number with its unit.
+    /// Creates a quantity.
     #[must_use]
     pub fn new(value: f64, unit: impl Into<String>) -> Self {
         Self { value, unit: unit.into(), plus_minus: None }
     }
 
-    /// The same, with half the width of its 95 % interval.
+    /// Sets half the width of its 95 % interval.
     #[must_use]
     pub const fn plus_minus(mut self, half: f64) -> Self {
         self.plus_minus = Some(half);
@@ -176,7 +176,7 @@ impl<T: Into<String>> From<(f64, T)> for Quantity {
 }
 
 impl From<f64> for Quantity {
-    /// A number of things.
+    /// Creates a count.
     fn from(value: f64) -> Self {
         Self::new(value, "")
     }

@@ -1,4 +1,4 @@
-//! Reports: what was found, as a page with figures.
+//! Reports: HTML pages with figures.
 //!
 //! ```text
 //!   a recording ─> run ─┐

@@ -1,13 +1,11 @@
-//! How numbers are written, everywhere in a report.
-//!
-//! One rule: three significant digits without zeros at the end, and with a unit the SI prefix that leaves 1 to 999 before
-//! it. Numbers of things are whole.
+//! Formats the numbers of a report, by one rule: three significant digits without trailing zeros, and for a unit the SI
+//! prefix that leaves 1 to 999. Counts are whole numbers.
 
 /// Prefixes by their powers of a thousand.
 const PREFIXES: [(i32, &str); 7] = [(-4, "p"), (-3, "n"), (-2, "µ"), (-1, "m"), (0, ""), (1, "k"), (2, "M")];
 
-/// Units that take prefixes: the unit, what one of it is in the unit without a prefix, that unit, and the highest power of
-/// a thousand that is usual with it.
+/// Units that take prefixes: the unit, its size in the base unit, the base unit, and its highest usual power of a
+/// thousand.
 const UNITS: [(&str, f64, &str, i32); 8] = [
     ("Nm", 1.0, "Nm", 1),
     ("N", 1.0, "N", 1),
@@ -22,18 +20,18 @@ const UNITS: [(&str, f64, &str, i32); 8] = [
 /// A unit with the prefix that fits a size.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Fitted {
-    /// What one of the given unit is in this one.
+    /// The factor from the given unit to this one.
     pub(super) factor: f64,
-    /// With its prefix.
+    /// The unit with its prefix.
     pub(super) unit: String,
 }
 
-/// A unit that takes prefixes, as this program keeps it.
+/// Returns the static name of a unit that takes prefixes.
 pub(super) fn known(unit: &str) -> Option<&'static str> {
     UNITS.iter().find(|(name, ..)| *name == unit).map(|(name, ..)| *name)
 }
 
-/// The unit with the prefix that leaves 1 to 999 of a size; none where the unit takes no prefix.
+/// Returns the unit with the prefix that leaves 1 to 999 of a size; `None` for a unit without prefixes.
 pub(super) fn fitted(size: f64, unit: &str) -> Option<Fitted> {
     let (_, scale, base, most) = *UNITS.iter().find(|(name, ..)| *name == unit)?;
     let size = rounded(size.abs() * scale);
@@ -46,12 +44,12 @@ pub(super) fn fitted(size: f64, unit: &str) -> Option<Fitted> {
     Some(Fitted { factor: scale / 1_000_f64.powi(power), unit: format!("{prefix}{base}") })
 }
 
-/// To three digits, as it is written.
+/// Rounds to the three significant digits of the text.
 fn rounded(value: f64) -> f64 {
     format!("{value:.2e}").parse().unwrap_or(value)
 }
 
-/// A number with its unit, which may be empty; what is not finite is a dash.
+/// Formats a number with its unit, which may be empty. A value that is not finite becomes a dash.
 ///
 /// ```
 /// # use analysis::report::figure::quantity;
@@ -66,7 +64,8 @@ pub fn quantity(value: f64, unit: &str) -> String {
     interval(value, None, unit)
 }
 
-/// Formats a number and half the width of its 95 % interval: two digits of the width, and the number to the same place.
+/// Formats a number and half the width of its 95 % interval: two digits of the width, and the number to the same
+/// decimal place.
 pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
     let size = value.abs().max(half.unwrap_or(0.0));
     if !value.is_finite() || unit.is_empty() && half.is_none() {
@@ -86,7 +85,7 @@ pub(super) fn interval(value: f64, half: Option<f64>, unit: &str) -> String {
     if unit.is_empty() { format!("{value}{half}") } else { format!("{value}{half}\u{a0}{unit}") }
 }
 
-/// Counts the digits behind the point up to the second significant one; `None` for a number that is zero, not finite, or
+/// Returns the number of decimals up to the second significant digit; `None` for a number that is zero, not finite, or
 /// written with a power of ten.
 fn second_digit(value: f64) -> Option<usize> {
     let text = format!("{value:.1e}");
@@ -95,13 +94,14 @@ fn second_digit(value: f64) -> Option<usize> {
     is_plain.then(|| usize::try_from(1 - power).unwrap_or(0))
 }
 
-/// A number with at most so many digits behind the point.
+/// Formats a number with at most this number of decimals.
 fn trimmed(value: f64, digits: usize) -> String {
     let text = format!("{:.digits$}", value + 0.0);
     if digits == 0 { text } else { text.trim_end_matches('0').trim_end_matches('.').to_owned() }
 }
 
-/// A number without a unit, of which the part that it lacks to 1 is not rounded away down to a millionth: 0.9995.
+/// Formats a number without a unit. Values close to 1 keep more digits, so that a difference down to a millionth is
+/// visible: 0.9995.
 fn fraction(value: f64) -> String {
     let digits = (4..=6).find(|digits| 1.0 - value >= 10_f64.powi(-digits));
     match digits.and_then(|digits| usize::try_from(digits).ok()) {
@@ -110,8 +110,8 @@ fn fraction(value: f64) -> String {
     }
 }
 
-/// A number without a unit: whole ones below a million as they are, else at most three significant digits; very
-/// small and very large ones by a power of ten; what is not finite is a dash.
+/// Formats a number without a unit: whole numbers below a million in full, others with at most three significant
+/// digits; very small and very large ones with a power of ten. A value that is not finite becomes a dash.
 ///
 /// ```
 /// # use analysis::report::figure::number;

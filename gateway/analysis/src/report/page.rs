@@ -1,4 +1,4 @@
-//! Sets a page: one HTML file that needs nothing else, no network and no script.
+//! Renders a page as one self-contained HTML file, without network or scripts.
 
 use std::fmt::Write as _;
 
@@ -7,10 +7,10 @@ use protocol::xml::escaped;
 use super::figure::{Figure, Finding, Page, Section, Size, Table, Verdict};
 use super::svg;
 
-/// The style of all pages: light, dark on dark screens, and black on white paper.
+/// The style of all pages: light, dark on dark screens, and black on white for paper.
 const STYLE: &str = include_str!("page.css");
 
-/// A whole page.
+/// Renders a whole page.
 #[must_use]
 pub fn html(page: &Page) -> String {
     let mut out = String::new();
@@ -39,7 +39,7 @@ pub fn html(page: &Page) -> String {
     }
     out.push_str("</main>\n");
     if !page.facts.is_empty() {
-        out.push_str("<footer>\n<h2>How it came about</h2>\n<dl>\n");
+        out.push_str("<footer>\n<h2>Origin</h2>\n<dl>\n");
         for (name, value) in &page.facts {
             let _ = writeln!(out, "<dt>{}</dt><dd>{}</dd>", escaped(name), escaped(value));
         }
@@ -89,7 +89,7 @@ fn figure(out: &mut String, figure: &Figure) {
     let _ = writeln!(out, "<figure class=\"{class}\" id=\"{}\">", escaped(&figure.name));
     let natural = svg::height(figure, figure.size);
     if figure.size == Size::Wide {
-        // Letters that can be read across a desk are too small in the hand: a phone gets a drawing of its own.
+        // Letters that are readable on a desktop are too small on a phone, which gets its own drawing.
         out.push_str(&svg::inline(figure, natural, "desk"));
         out.push_str(&svg::inline(figure, svg::height(figure, Size::Half), "hand"));
     } else {
@@ -98,7 +98,7 @@ fn figure(out: &mut String, figure: &Figure) {
     let _ = writeln!(out, "<figcaption>{}</figcaption>\n</figure>", escaped(&figure.title));
 }
 
-/// The attribute of what stands to the right.
+/// The attribute of right-aligned cells.
 const NUMBER: &str = " class=\"n\"";
 
 fn findings(out: &mut String, findings: &[Finding]) {
@@ -139,7 +139,7 @@ fn findings(out: &mut String, findings: &[Finding]) {
 }
 
 fn table(out: &mut String, table: &Table) {
-    // Not as the table's caption, which would be as wide as the table where that is wider than the screen.
+    // A heading, not a caption: a caption would be as wide as the table, even if that is wider than the screen.
     if !table.title.is_empty() {
         let _ = writeln!(out, "<h3>{}</h3>", escaped(&table.title));
     }
@@ -164,7 +164,7 @@ fn table(out: &mut String, table: &Table) {
     out.push_str("</tbody>\n</table></div>\n");
 }
 
-/// A command, of which no line ends within the name of an option: a line may end behind a hyphen.
+/// Formats a command without line breaks inside the names of options, where a break could follow a hyphen.
 fn command(text: &str) -> String {
     let word = |word: &str| match word.starts_with('-') {
         true => format!("<span>{}</span>", escaped(word)),
@@ -173,12 +173,12 @@ fn command(text: &str) -> String {
     format!("<code>{}</code>", text.split(' ').map(word).collect::<Vec<_>>().join(" "))
 }
 
-/// Those of some columns that are shown.
+/// Returns the cells of the shown columns.
 fn some<T, const N: usize>(cells: [T; N], shown: [bool; N]) -> impl Iterator<Item = T> {
     cells.into_iter().zip(shown).filter(|(_, shown)| *shown).map(|(cell, _)| cell)
 }
 
-/// A row of a table: the text of each cell, and its attributes.
+/// Writes a row of a table, given the text and the attributes of each cell.
 fn row<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, &'a str)>) {
     out.push_str("<tr>");
     self::cells(out, tag, cells);
@@ -191,7 +191,7 @@ fn cells<'a>(out: &mut String, tag: &str, cells: impl Iterator<Item = (&'a str, 
     }
 }
 
-/// Whether a column holds numbers, and stands to the right.
+/// Returns true if a column holds numbers, and so is right-aligned.
 fn numbers(table: &Table, column: usize) -> bool {
     let mut cells =
         table.rows.iter().filter_map(|row| row.get(column)).filter(|cell| !cell.is_empty()).peekable();
@@ -256,7 +256,7 @@ mod tests {
         }
     }
 
-    /// All text of an element.
+    /// Returns all text of an element.
     fn text(node: roxmltree::Node<'_, '_>) -> String {
         node.descendants().filter(|node| node.is_text()).filter_map(|node| node.text()).collect()
     }

@@ -1,4 +1,4 @@
-//! From values to places and back, and round numbers to write beside an axis.
+//! Maps values to positions and back, and chooses the round numbers beside an axis.
 
 use std::ops::Range;
 
@@ -7,18 +7,18 @@ use plotters::coord::ranged1d::{DefaultFormatting, KeyPointHint, Ranged};
 use super::figure::{Axis, Scale, quantity};
 use super::number::{Fitted, fitted, known};
 
-/// One axis with its ends.
+/// An axis with its ends.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Span {
     from: f64,
     to: f64,
     scale: Scale,
-    /// The axis' unit, where it takes prefixes.
+    /// The axis' unit, if it takes prefixes.
     unit: Option<&'static str>,
 }
 
 impl Span {
-    /// An axis' ends: its own, or those of all that is drawn and a little more.
+    /// Creates the axis with its own ends, or with those of the data plus a margin.
     pub(crate) fn new(axis: &Axis, values: impl Iterator<Item = f64>, room: f64) -> Self {
         let scale = axis.scale;
         let usable = |value: &f64| value.is_finite() && (scale == Scale::Linear || *value > 0.0);
@@ -33,13 +33,13 @@ impl Span {
         Self { from, to, scale, unit: known(&axis.unit) }
     }
 
-    /// The unit of a linear axis with the prefix for its ends.
+    /// Returns the unit of a linear axis with the prefix for its ends.
     fn fitted(&self) -> Option<Fitted> {
         let unit = self.unit.filter(|_| self.scale == Scale::Linear)?;
         fitted(self.from.abs().max(self.to.abs()), unit)
     }
 
-    /// What stands beside the axis: what it counts, and in what, unless each tick has its unit.
+    /// Returns the axis title: the quantity and its unit, unless each tick shows the unit.
     pub(crate) fn title(&self, axis: &Axis) -> String {
         let unit = match (self.fitted(), self.unit) {
             (Some(fitted), _) => fitted.unit,
@@ -49,7 +49,7 @@ impl Span {
         Axis { unit, ..Axis::new(&axis.caption, "") }.to_string()
     }
 
-    /// Where a value stands: 0 at the axis' beginning, 1 at its end; not a number where it cannot stand.
+    /// Returns the position of a value: 0 at the axis' start, 1 at its end, NaN if it has none.
     pub(crate) fn place(&self, value: f64) -> f64 {
         match self.scale {
             Scale::Linear => (value - self.from) / (self.to - self.from),
@@ -58,7 +58,7 @@ impl Span {
         }
     }
 
-    /// What stands at a place.
+    /// Returns the value at a position.
     pub(crate) fn value(&self, place: f64) -> f64 {
         match self.scale {
             Scale::Linear => self.from + place * (self.to - self.from),
@@ -66,7 +66,7 @@ impl Span {
         }
     }
 
-    /// Round numbers along the axis, at most `most`, by 1, 2 or 5 times a power of ten.
+    /// Returns round numbers along the axis, at most `most`, in steps of 1, 2 or 5 times a power of ten.
     pub(crate) fn ticks(&self, most: usize) -> Vec<f64> {
         match self.scale {
             Scale::Linear => linear_ticks(self.from, self.to, most),
@@ -74,7 +74,7 @@ impl Span {
         }
     }
 
-    /// How a tick is written: with the digits that distinguish neighbours.
+    /// Formats a tick, with enough digits to distinguish neighbours.
     pub(crate) fn caption(&self, tick: f64, most: usize) -> String {
         let factor = self.fitted().map_or(1.0, |fitted| fitted.factor);
         let size = self.from.abs().max(self.to.abs()) * factor;
@@ -97,7 +97,7 @@ impl Ranged for Span {
 
     #[expect(
         clippy::cast_possible_truncation,
-        reason = "a place in a picture; what is beyond it is at its edge"
+        reason = "a position in a picture; saturating at its edge is right"
     )]
     fn map(&self, value: &f64, (from, to): (i32, i32)) -> i32 {
         let place = f64::from(from) + self.place(*value) * f64::from(to - from);
@@ -113,7 +113,7 @@ impl Ranged for Span {
     }
 }
 
-/// Ends with some room beyond them; something where there is nothing.
+/// Returns ends with a margin, and a default range without data.
 fn wider((from, to): (f64, f64), scale: Scale, room: f64) -> (f64, f64) {
     let nothing = !(from.is_finite() && to.is_finite() && from <= to);
     match scale {
@@ -125,7 +125,7 @@ fn wider((from, to): (f64, f64), scale: Scale, room: f64) -> (f64, f64) {
         }
         Scale::Linear => {
             let more = room * (to - from);
-            // What never goes below 0 is drawn from 0 on.
+            // An axis of values that are never below 0 starts at 0.
             let below = if from >= 0.0 && from < more { 0.0 } else { from - more };
             (below, to + more)
         }
@@ -137,7 +137,7 @@ fn wider((from, to): (f64, f64), scale: Scale, room: f64) -> (f64, f64) {
     }
 }
 
-/// The smallest of 1, 2 or 5 times a power of ten that needs no more than `most` ticks.
+/// Returns the smallest step of 1, 2 or 5 times a power of ten that needs at most `most` ticks.
 fn step(from: f64, to: f64, most: usize) -> f64 {
     let most = u32::try_from(most.max(1)).unwrap_or(u32::MAX);
     let min = (to - from) / f64::from(most);
@@ -176,12 +176,12 @@ fn log_ticks(from: f64, to: f64, most: usize) -> Vec<f64> {
     ticks.into_iter().step_by(skip).collect()
 }
 
-/// A number without the last digits that come of arithmetic.
+/// Removes the last digits, which are rounding errors.
 fn round(tick: f64) -> f64 {
     format!("{tick:.9}").parse().unwrap_or(tick)
 }
 
-/// A number by its power of ten: `2·10⁻⁵`.
+/// Formats a number with a power of ten: `2·10⁻⁵`.
 fn power(tick: f64) -> String {
     if tick == 0.0 {
         return "0".to_owned();

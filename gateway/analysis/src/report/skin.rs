@@ -1,4 +1,4 @@
-//! Drawings of a skin's cells: their values over time, and where they are on their links.
+//! Drawings of a skin's cells: their values over time, and their positions on the links.
 
 use serde::Serialize;
 
@@ -7,12 +7,12 @@ use serde::Serialize;
 pub enum Drawing {
     /// Values over time.
     Strip(Strip),
-    /// Values by place.
+    /// Values by position.
     Map(Map),
 }
 
 impl Drawing {
-    /// Letters, digits and `-`, unlike any other in the page.
+    /// Returns the unique name in the page, of letters, digits and `-`.
     #[must_use]
     pub fn name(&self) -> &str {
         match self {
@@ -21,7 +21,7 @@ impl Drawing {
         }
     }
 
-    /// Its caption.
+    /// Returns its caption.
     #[must_use]
     pub fn title(&self) -> &str {
         match self {
@@ -31,18 +31,18 @@ impl Drawing {
     }
 }
 
-/// Time to the right, a row for each cell, its value as a colour.
+/// A chart with time to the right, one row per cell, and values as colours.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Strip {
-    /// Letters, digits and `-`, unlike any other in the page.
+    /// A unique name in the page, of letters, digits and `-`.
     pub name: String,
     /// Its caption.
     pub title: String,
-    /// The time axis in s, from and to.
+    /// The ends of the time axis in s.
     pub seconds: (f64, f64),
-    /// What the colours are.
+    /// The legend of the colours.
     pub legend: Legend,
-    /// Rows that belong together.
+    /// Groups of rows.
     pub groups: Vec<StripGroup>,
 }
 
@@ -58,31 +58,31 @@ pub struct StripGroup {
 /// One cell over time.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct StripRow {
-    /// What stands to the left of it.
+    /// The text to the left of the row.
     pub caption: String,
-    /// From and to in s, and the value between, above 0; by increasing time. Nothing is drawn elsewhere.
+    /// Start and end in s, and the value in between, above 0; by increasing time. The rest of the row stays empty.
     pub values: Vec<(f64, f64, f64)>,
 }
 
-/// Cells where they are on their links, their values as colours.
+/// A map of the cells at their positions on the links, with values as colours.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Map {
-    /// Letters, digits and `-`, unlike any other in the page.
+    /// A unique name in the page, of letters, digits and `-`.
     pub name: String,
     /// Its caption.
     pub title: String,
-    /// What the colours are.
+    /// The legend of the colours.
     pub legend: Legend,
     /// The links.
     pub panels: Vec<Panel>,
 }
 
-/// The cells of a link, laid flat.
+/// The cells of a link, mapped to a plane.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Panel {
     /// The link.
     pub title: String,
-    /// The radius in m of the cylinder that was unrolled; none of a plate.
+    /// The radius in m of the unrolled cylinder; `None` for a plate.
     pub radius: Option<f64>,
     /// Its cells.
     pub cells: Vec<Spot>,
@@ -91,27 +91,27 @@ pub struct Panel {
 /// A cell on a map.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Spot {
-    /// To the right and down, in m.
+    /// Position to the right and down, in m.
     pub at: [f64; 2],
-    /// Its value; 0 has no colour, and a value that is not known is `None`.
+    /// Its value; 0 has no colour, and `None` is unknown.
     pub value: Option<f64>,
-    /// What it is called.
+    /// Its name.
     pub caption: String,
 }
 
-/// What colours stand for: from 0 to a maximum.
+/// The legend of colours, from 0 to a maximum.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct Legend {
-    /// What is shown.
+    /// The quantity.
     pub caption: String,
-    /// In what; empty for numbers of things.
+    /// The unit; empty for counts.
     pub unit: String,
     /// The value of the last colour.
     pub max: f64,
 }
 
 impl Legend {
-    /// Colours from 0 to the largest of some values.
+    /// Creates a legend from 0 to the largest of some values.
     #[must_use]
     pub fn of(caption: &str, unit: &str, values: impl Iterator<Item = f64>) -> Self {
         Self { caption: caption.to_owned(), unit: unit.to_owned(), max: values.fold(0.0, f64::max) }

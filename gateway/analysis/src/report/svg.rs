@@ -1,7 +1,7 @@
 //! Draws a figure as SVG.
 //!
-//! Colours stand in the drawing as they are on paper, so that every program shows it; and each has a class beside it,
-//! by which [`dark()`] gives it another one on a dark screen.
+//! The drawing contains the colours for paper, so that every program can show it. Each colour also has a class, with
+//! which [`dark()`] replaces it on a dark screen.
 
 mod cells;
 mod colour;
@@ -24,21 +24,22 @@ use super::figure::{Axis, Figure, Mark, On, Series, Shape, Size};
 use super::scale::Span;
 use super::thin::thinned;
 
-/// How many units of the drawing are one pixel of its natural size: places are whole units.
+/// Number of drawing units per pixel of the natural size: positions are whole units.
 const UNIT: i32 = 8;
-/// How high a diagram below another one is, in pixels.
+/// Height of a diagram below another one, in pixels.
 const BELOW: u32 = 170;
-/// Of letters, in pixels.
+/// Size of letters, in pixels.
 const LETTERS: f64 = 13.0;
-/// The widths of lines in units. Plotters would draw each dash as a line of its own, which of a noisy curve are
-/// thousands; so dashed lines have widths that no other line has, and are dashed by an attribute.
+/// The widths of lines in units. Plotters would draw each dash as its own line, of which a noisy curve has thousands.
+/// So dashed lines have unique widths, and are dashed by an attribute.
 const LINE: u32 = 13;
 const DASHED: u32 = 14;
 const DOTTED: u32 = 9;
 const DASHES: [(u32, &str); 2] = [(DASHED, "56 36"), (DOTTED, "16 24")];
 
-/// Colour, class, and the colour on a dark screen: of words, of what is faint, of the grid, and of series. On paper those
-/// are Okabe and Ito's, which are distinguishable for colour-blind readers, without the yellow, which is invisible on white.
+/// Colour, class, and colour on a dark screen: of text, of faint text, of the grid, and of series. On paper, those of
+/// series are Okabe and Ito's, which colour-blind readers can distinguish, without the yellow, which is invisible on
+/// white.
 const CLASSES: [(RGBColor, &str, &str); 3 + Figure::COLOURS] = [
     (INK, "ink", "#E4E4E4"),
     (FAINT, "faint", "#A6A6A6"),
@@ -55,12 +56,12 @@ const INK: RGBColor = RGBColor(0x22, 0x22, 0x22);
 const FAINT: RGBColor = RGBColor(0x6B, 0x6B, 0x6B);
 const GRID: RGBColor = RGBColor(0xDD, 0xDD, 0xDD);
 
-/// The colours of series, which begin again behind the last.
+/// Returns the colours of series, repeating from the first.
 fn colours() -> impl Iterator<Item = RGBColor> {
     CLASSES.iter().skip(3).cycle().map(|(colour, ..)| *colour)
 }
 
-/// The rules that give a drawing its colours on a dark screen.
+/// Returns the CSS rules with the colours for dark screens.
 #[must_use]
 pub fn dark() -> String {
     let mut rules = "@media screen and (prefers-color-scheme:dark){".to_owned();
@@ -72,7 +73,7 @@ pub fn dark() -> String {
     rules
 }
 
-/// A figure's natural width and height in pixels.
+/// Returns a figure's natural width and height in pixels.
 #[must_use]
 pub const fn natural(size: Size) -> (u32, u32) {
     match size {
@@ -81,14 +82,14 @@ pub const fn natural(size: Size) -> (u32, u32) {
     }
 }
 
-/// The same with what a diagram below another one takes.
+/// Returns the natural size including a diagram below.
 #[must_use]
 pub(crate) const fn height(figure: &Figure, size: Size) -> (u32, u32) {
     let (width, height) = natural(size);
     (width, if figure.below.is_some() { height + BELOW } else { height })
 }
 
-/// A file of its own, for a paper or a document.
+/// Draws a standalone SVG file, for a paper or a document.
 #[must_use]
 pub fn draw(figure: &Figure) -> String {
     let (width, height) = height(figure, figure.size);
@@ -97,7 +98,7 @@ pub fn draw(figure: &Figure) -> String {
     document(figure, (width, height), &attributes, &style)
 }
 
-/// A part of a page that has the rules of [`dark()`], `size` pixels wide and high when the page shows it as it is.
+/// Draws a part of a page that contains the rules of [`dark()`]; `size` is the natural size in pixels.
 #[must_use]
 pub fn inline(figure: &Figure, size: (u32, u32), class: &str) -> String {
     document(figure, size, &format!("class=\"{class}\""), "")
@@ -107,7 +108,7 @@ fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, styl
     let unit = UNIT.unsigned_abs();
     let mut drawing = String::new();
     let area = SVGBackend::with_string(&mut drawing, (width * unit, height * unit)).into_drawing_area();
-    // A drawing in memory: there is nothing that could fail but what is too small to draw in.
+    // A drawing in memory can only fail if the area is too small.
     let drawn = drawing_of(figure, &area).and_then(|()| area.present());
     drop(area);
     let body = drawing.split_once(">\n").map_or("", |(_, body)| body);
@@ -121,7 +122,7 @@ fn document(figure: &Figure, (width, height): (u32, u32), attributes: &str, styl
     )
 }
 
-/// Gives every colour its class.
+/// Adds the class to every colour.
 fn classed(body: &str) -> String {
     let mut body = body.replace(" opacity=\"1\"", "").replace(" font-family=\"sans-serif\"", "");
     for (RGBColor(r, g, b), class, _) in CLASSES {
@@ -145,12 +146,12 @@ type Drawn = Result<(), DrawingAreaErrorKind<std::io::Error>>;
 #[derive(Clone, Copy)]
 struct Diagram<'a> {
     axes: (&'a Axis, &'a Axis),
-    /// The same fitted to what is drawn.
+    /// The axes, fitted to the data.
     x: Span,
     y: Span,
     series: &'a [Series],
     marks: &'a [Mark],
-    /// Whether the axis to the right has its words.
+    /// True if the horizontal axis is labelled.
     is_lowest: bool,
 }
 
@@ -173,14 +174,14 @@ impl<'a> Diagram<'a> {
         diagrams.collect()
     }
 
-    /// The most ticks upwards in so many units.
+    /// Returns the maximum number of vertical ticks for a height in units.
     const fn ticks(height: u32) -> usize {
-        // A low one would have too few.
+        // A low diagram needs closer ticks.
         let distance = if height > pixels(BELOW) { 42 } else { 32 };
         (height / pixels(distance)) as usize
     }
 
-    /// Letters of the widest caption upwards.
+    /// Returns the number of letters of the widest vertical caption.
     fn letters(&self, height: u32) -> usize {
         let most = Self::ticks(height);
         let ticks = self.y.ticks(most).into_iter();
@@ -197,7 +198,7 @@ fn drawing_of(figure: &Figure, area: &Area<'_>) -> Drawn {
     };
     let areas = [upper, lower];
     let digits = diagrams.iter().zip(&areas).map(|(diagram, area)| diagram.letters(area.dim_in_pixel().1));
-    // Both begin at one place.
+    // Both diagrams have the same left edge.
     let left = pixels(34) + in_pixels(0.62 * LETTERS * digits.max().unwrap_or(1) as f64).unsigned_abs();
     diagrams.iter().zip(&areas).try_for_each(|(diagram, area)| diagram_of(diagram, area, left))
 }
@@ -272,7 +273,7 @@ fn series_of(
         }
         Shape::Points => {
             let mut points: Vec<_> = placed.filter(is_inside).collect();
-            // Dots that cover each other are one.
+            // Dots that cover each other are drawn once.
             let cell = |point: &(f64, f64)| {
                 ((point.0 * f64::from(columns)).floor(), (point.1 * f64::from(lines)).floor())
             };
@@ -296,7 +297,7 @@ fn series_of(
     Ok(())
 }
 
-/// Whether a point is in the picture, which is from 0 to 1 both ways.
+/// Returns true if a point is in the picture, which is from 0 to 1 in both directions.
 fn is_inside(point: &(f64, f64)) -> bool {
     (0.0..=1.0).contains(&point.0) && (0.0..=1.0).contains(&point.1)
 }
@@ -305,12 +306,12 @@ fn is_finite(point: &(f64, f64)) -> bool {
     point.0.is_finite() && point.1.is_finite()
 }
 
-/// The pieces of a line between its gaps.
+/// Returns the pieces of a line between its gaps.
 fn runs(points: &[(f64, f64)]) -> impl Iterator<Item = &[(f64, f64)]> {
     points.split(|point| !is_finite(point)).filter(|run| !run.is_empty())
 }
 
-/// A line that holds each value until the next one.
+/// Returns a line that holds each value until the next one.
 pub(crate) fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     let mut stairs = Vec::with_capacity(points.len() * 2);
     for point in points {
@@ -322,10 +323,10 @@ pub(crate) fn stairs(points: &[(f64, f64)]) -> Vec<(f64, f64)> {
     stairs
 }
 
-/// The pieces of a line inside of the picture.
+/// Returns the pieces of a line inside the picture.
 fn clipped(points: &[(f64, f64)]) -> Vec<Vec<(f64, f64)>> {
     if let [point] = points {
-        // A point alone is a line of no length, and would not be seen.
+        // A single point would be an invisible line of no length.
         let dash = vec![(point.0 - 0.001, point.1), (point.0 + 0.001, point.1)];
         return if is_inside(point) { vec![dash] } else { Vec::new() };
     }
@@ -365,7 +366,7 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Dr
     let ends = if mark.on == On::X { [(place, 0.0), (place, 1.0)] } else { [(0.0, place), (1.0, place)] };
     let line = ends.map(|(across, up)| (x.value(across), y.value(up)));
     chart.draw_series([PathElement::new(line.to_vec(), FAINT.stroke_width(DOTTED))])?;
-    // The words stand on the side where there is room.
+    // Put the text on the side with room.
     let (across, up, side, end) = match mark.on {
         On::X if place > 0.6 => (place, 1.0, HPos::Right, VPos::Top),
         On::X => (place, 1.0, HPos::Left, VPos::Top),
@@ -379,7 +380,7 @@ fn mark_of(chart: &mut Chart<'_, '_>, mark: &Mark, (x, y): (&Span, &Span)) -> Dr
     Ok(())
 }
 
-/// Rows of the legend: where each entry begins, its series and its colour.
+/// Returns the rows of the legend: the start of each entry, its series and its colour.
 fn legend(series: &[Series], width: u32) -> Vec<Vec<(i32, &Series, RGBColor)>> {
     let named = series.iter().zip(colours()).filter(|(series, _)| !series.caption.is_empty());
     let mut rows: Vec<Vec<_>> = Vec::new();
@@ -422,7 +423,7 @@ fn entry_of(area: &Area<'_>, series: &Series, colour: RGBColor, (at, row): (i32,
     area.draw(&Text::new(series.caption.clone(), (end + in_pixels(6.0), middle), style))
 }
 
-/// Letters of a size in pixels: the backend makes them smaller by 1.24.
+/// Returns the style of letters of a size in pixels; the backend shrinks them by 1.24.
 fn letters<'a>(colour: &RGBColor, size: f64) -> TextStyle<'a> {
     ("sans-serif", size * 1.24 * f64::from(UNIT)).into_font().color(colour)
 }

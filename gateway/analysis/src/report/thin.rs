@@ -1,6 +1,6 @@
-//! Many points in a picture of few columns: a column shows its first, minimum, maximum and last point, so these
-//! four are kept. A line through them covers the same pixels as a line through all (Jugel, Jerzak,
-//! Hackenbroich and Markl, *M4: A Visualization-Oriented Time Series Data Aggregation*, 2014).
+//! Reduces many points to the columns of a picture. Of each column, the first, minimum, maximum and last points are
+//! kept: a line through them covers the same pixels as a line through all points (Jugel, Jerzak, Hackenbroich and
+//! Markl, *M4: A Visualization-Oriented Time Series Data Aggregation*, 2014).
 
 /// A column's first, minimum, maximum and last point.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -26,7 +26,7 @@ impl Column {
         self.last = later.last;
     }
 
-    /// The points that are different, in their order.
+    /// Returns the different points, in order.
     fn points(&self) -> impl Iterator<Item = (f64, f64)> + use<> {
         let (a, b) = if self.min.0 <= self.max.0 { (self.min, self.max) } else { (self.max, self.min) };
         let mut before = None;
@@ -34,44 +34,44 @@ impl Column {
     }
 }
 
-/// A line of any length in bounded memory: points come by increasing x, and when there are too many columns, each
-/// two become one.
+/// A line of any length in bounded memory. Points arrive by increasing x; when there are too many columns, pairs of
+/// columns are merged.
 #[derive(Clone, Debug)]
 pub struct Thinned {
     most: usize,
-    /// A column's width; it doubles.
+    /// Width of a column; it doubles with each merge.
     width: f64,
-    /// Where the first column begins.
+    /// Start of the first column.
     from: Option<f64>,
-    /// By place; whether the line has a gap before the column.
+    /// By position, with a flag for a gap in the line before the column.
     columns: Vec<(u64, bool, Column)>,
-    /// Points that were pushed, gaps not among them.
+    /// Number of points, without gaps.
     count: u64,
-    /// Whether a gap came after the last of them.
+    /// True if a gap follows the last point.
     gap: bool,
 }
 
 impl Default for Thinned {
-    /// As many columns as a page has, of 2 ms at first.
+    /// Creates a line with the number of columns of a page, 2 ms wide at first.
     fn default() -> Self {
         Self::new(1_000, 0.002)
     }
 }
 
 impl Thinned {
-    /// Nothing yet: at most `most` columns (at least 2), each of which is at least `width` wide.
+    /// Creates an empty line with at most `most` columns (at least 2), which are at least `width` wide.
     #[must_use]
     pub fn new(most: usize, width: f64) -> Self {
         Self { most: most.max(2), width, from: None, columns: Vec::new(), count: 0, gap: false }
     }
 
-    /// How many points have come.
+    /// Returns the number of points so far.
     #[must_use]
     pub const fn count(&self) -> u64 {
         self.count
     }
 
-    /// Takes the next point. What is not a number is a gap of the line; what lies before the first point is left out.
+    /// Adds the next point. A value that is not a number makes a gap; points before the first one are skipped.
     pub fn push(&mut self, x: f64, y: f64) {
         if !(x.is_finite() && y.is_finite()) {
             self.gap = !self.columns.is_empty();
@@ -102,7 +102,7 @@ impl Thinned {
         (distance / self.width) as u64
     }
 
-    /// Each two columns become one.
+    /// Merges pairs of columns.
     fn merge(&mut self) {
         self.width *= 2.0;
         let mut merged = Vec::with_capacity(self.columns.len());
@@ -110,7 +110,8 @@ impl Thinned {
         self.columns = merged;
     }
 
-    /// The remaining points: at most four a column, by increasing x, and points that are not numbers where it has gaps.
+    /// Returns the remaining points: at most four per column, by increasing x, with points that are not numbers at
+    /// gaps.
     #[must_use]
     pub fn points(&self) -> Vec<(f64, f64)> {
         let mut points = Vec::with_capacity(self.columns.len() * 4);
@@ -122,7 +123,7 @@ impl Thinned {
     }
 }
 
-/// Adds a column behind others, or to the last one: what comes a little late belongs to the newest all the same.
+/// Appends a column, or merges it into the last one: a point that arrives slightly late counts to the newest column.
 fn join(columns: &mut Vec<(u64, bool, Column)>, (at, gap, column): (u64, bool, Column)) {
     match columns.last_mut() {
         Some((last, before, joined)) if *last >= at => {
@@ -133,7 +134,7 @@ fn join(columns: &mut Vec<(u64, bool, Column)>, (at, gap, column): (u64, bool, C
     }
 }
 
-/// The same for points that are there: at most four for each of `columns` equal parts of 0 to 1 in x.
+/// Thins existing points: at most four for each of `columns` equal parts of 0 to 1 in x.
 #[must_use]
 pub fn thinned(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
     if points.len() <= 4 * columns as usize {
@@ -152,7 +153,7 @@ pub fn thinned(points: &[(f64, f64)], columns: u32) -> Vec<(f64, f64)> {
         .collect()
 }
 
-/// Sums over equal times in bounded memory: how much came in each; when there are too many, each two become one.
+/// Sums over equal bins in bounded memory; when there are too many bins, pairs are merged.
 #[derive(Clone, Debug)]
 pub struct Binned {
     most: usize,
@@ -162,20 +163,20 @@ pub struct Binned {
 }
 
 impl Default for Binned {
-    /// 600 bins, of 0.1 s at first.
+    /// Creates 600 bins, 0.1 s wide at first.
     fn default() -> Self {
         Self::new(600, 0.1)
     }
 }
 
 impl Binned {
-    /// Nothing yet: at most `most` bins (at least 2), `width` wide at first.
+    /// Creates at most `most` empty bins (at least 2), `width` wide at first.
     #[must_use]
     pub fn new(most: usize, width: f64) -> Self {
         Self { most: most.max(2), width, from: None, bins: Vec::new() }
     }
 
-    /// Adds `amount` at `x`; what lies before the first belongs to its bin.
+    /// Adds `amount` at `x`; positions before the first one count to its bin.
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
@@ -199,13 +200,14 @@ impl Binned {
         }
     }
 
-    /// How wide bins are now.
+    /// Returns the current width of the bins.
     #[must_use]
     pub const fn width(&self) -> f64 {
         self.width
     }
 
-    /// Each bin's beginning and its sum by its width; the last one, which may not be full, is left out, unless it is the only one.
+    /// Returns the start of each bin and its sum divided by its width. The last bin, which may be incomplete, is
+    /// omitted unless it is the only one.
     #[must_use]
     pub fn rates(&self) -> Vec<(f64, f64)> {
         let from = self.from.unwrap_or(0.0);
@@ -272,7 +274,7 @@ mod tests {
     }
 
     proptest! {
-        /// By brute force: each column's extremes, and no point that was not there.
+        /// Checks by brute force: each column's extremes are kept, and no new points appear.
         #[test]
         fn thinning_keeps_the_extremes_of_every_column(
             ys in proptest::collection::vec(-100..100_i32, 1..4_000), columns in 2_u32..40,

@@ -1,4 +1,4 @@
-//! One bus: its frames in order, the model, and figures.
+//! One bus: its frames in order, its model, and its figures.
 
 use std::collections::VecDeque;
 
@@ -16,48 +16,49 @@ use crate::fit::traffic::{Says, Sorted, Traffic};
 use crate::fit::verdict::{Answer, Cells};
 use bus_model::{Attempt, BitErrors, BusModel, Priority, Request};
 
-/// Frames that may wait on a bus: some minutes of a full one. Beyond them frames are refused, as by a full transmit queue.
+/// Maximum number of waiting frames on a bus: some minutes of a full bus. Further frames are refused, as by a full
+/// transmit queue.
 pub const MAX_QUEUE: usize = 1 << 22;
-/// Identifiers of 11 bits.
+/// The number of identifiers of 11 bits.
 const IDS: usize = 0x800;
 
-/// What is known of a frame while it is in the model.
+/// The data of a frame in the model.
 #[derive(Clone, Copy, Debug)]
 struct Tag {
-    /// Its place in the file.
+    /// Its index in the file.
     place: u64,
-    /// None of one with 29 bits.
+    /// `None` for a 29-bit identifier.
     id: Option<u16>,
     phase: Phase,
-    /// The joints that it answers, and whether later ones had been sent before it.
+    /// The joints that it answers, and whether later joints had been sent before it.
     answer: Option<(Epoch, bool)>,
 }
 
-/// A frame that waits for those that may come before it.
+/// A frame that waits for possible earlier frames.
 #[derive(Clone, Copy, Debug)]
 struct Pending {
     at: u64,
     priority: Priority,
     bits: Bits,
     place: u64,
-    /// None of one with 29 bits.
+    /// `None` for a 29-bit identifier.
     id: Option<u16>,
     sorted: Sorted,
 }
 
-/// What is known of a bus.
+/// The given properties of a bus.
 #[derive(Clone, Debug)]
 pub(super) struct Known {
     pub(super) rates: BitRates,
-    /// How many cells the skin has on it.
+    /// Number of the skin's cells on it.
     pub(super) cells: Option<u32>,
-    /// What it comes to if all of them answer.
+    /// The worst case, with all of them answering.
     pub(super) worst_case: Option<Answer>,
-    /// Whether what only a bench sends is counted.
+    /// True to include frames that only a bench sends.
     pub(super) bench_traffic: bool,
 }
 
-/// One bus.
+/// The model and the figures of one bus.
 #[derive(Debug)]
 pub(super) struct LinkId {
     pub(super) name: String,
@@ -68,9 +69,9 @@ pub(super) struct LinkId {
     frames: u64,
     /// The first and the last time in the capture.
     span: Option<(u64, u64)>,
-    /// The time of the newest frame that is in the model.
+    /// The time of the newest frame in the model.
     released: u64,
-    /// When the wire was taken last.
+    /// The end of the last transmission.
     wire_end: u64,
     traffic: Traffic,
     has_fd: bool,
@@ -102,7 +103,7 @@ impl LinkId {
         }
     }
 
-    /// A frame from before the capture that is latched when it begins.
+    /// Handles a frame that was latched before the start of the capture.
     pub(super) fn latched(&mut self, nanos: u64, frame: &Frame) {
         match self.traffic.sort(nanos, frame).says {
             Says::Joints(_) => self.phases.beginning.in_the_middle = true,
@@ -111,14 +112,14 @@ impl LinkId {
         }
     }
 
-    /// A frame of any kind was there.
+    /// Counts a frame of any kind.
     pub(super) fn count(&mut self, nanos: u64) {
         self.frames += 1;
         let (first, last) = self.span.unwrap_or((nanos, nanos));
         self.span = Some((first.min(nanos), last.max(nanos)));
     }
 
-    /// Takes a frame that is a frame of CAN.
+    /// Handles a frame that real CAN could carry.
     pub(super) fn take(
         &mut self,
         nanos: u64,
@@ -131,7 +132,7 @@ impl LinkId {
         let sorted = self.traffic.sort(nanos, frame);
         self.has_fd |= frame.format() == Format::Fd;
         if sorted.bench.is_some() && sorted.ends_pair {
-            // The last one before it under its identifier, which is near.
+            // The previous frame with its identifier, which is near the end of the queue.
             let first = self.pending.iter_mut().rev().find(|it| it.id == id);
             first.into_iter().for_each(|first| first.sorted.bench = sorted.bench);
         }
@@ -159,7 +160,7 @@ impl LinkId {
         }
     }
 
-    /// There is no more.
+    /// Ends the input.
     pub(super) fn finish(&mut self, mut reported: Option<&mut Reported>) {
         while let Some(first) = self.pending.pop_front() {
             self.enter(first, reported.as_deref_mut());
@@ -168,7 +169,7 @@ impl LinkId {
         self.drain(reported);
     }
 
-    /// Requests the next frame in order of time.
+    /// Requests the transmission of the next frame in order of time.
     fn enter(&mut self, pending: Pending, mut reported: Option<&mut Reported>) {
         let Pending { at, priority, bits, place, id, sorted } = pending;
         let Sorted { says, bench, from, .. } = sorted;
@@ -204,7 +205,7 @@ impl LinkId {
         figures.queue(at, self.model.waiting(), of_one);
     }
 
-    /// Takes in what has ended on the wire.
+    /// Handles completed transmissions.
     fn drain(&mut self, mut reported: Option<&mut Reported>) {
         while let Some(attempt) = self.model.poll() {
             let Attempt { tag: Tag { place, id, phase, answer }, at, start, end, is_damaged } = attempt;
@@ -227,7 +228,7 @@ impl LinkId {
         }
     }
 
-    /// Format and rates, as the skin has them, else as the frames are.
+    /// Returns format and rates, from the skin or else from the frames.
     fn named_rates(&self) -> String {
         if let Some(worst) = &self.known.worst_case {
             return worst.rates.clone();
@@ -245,7 +246,7 @@ impl LinkId {
         if has_times && first < last {
             return timed;
         }
-        // What is figured of one time, or of none, is said of nothing.
+        // With fewer than two different times, timing figures are meaningless.
         BusShadow {
             this_run: None,
             start_up: None,

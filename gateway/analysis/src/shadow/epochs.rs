@@ -1,4 +1,4 @@
-//! How many cells answered joints, and how quickly.
+//! The number of cells that answered joints, and their reply times.
 
 use model::quantiles::Times;
 use protocol::id::CellId;
@@ -22,20 +22,20 @@ impl Set {
     }
 }
 
-/// The joints of one number.
+/// The joints of one epoch.
 #[derive(Clone, Copy, Debug, Default)]
 struct Numbered {
-    /// When they were to go out.
+    /// The time at which they were to be sent.
     at: u64,
-    /// Cells that answered them, if they were sent while cells were not halted.
+    /// The cells that answered them, if they were sent while cells were not halted.
     answered: Option<Set>,
 }
 
-/// Follows joints and what answers them, however long that lasts.
+/// Follows joints and their answers, in bounded memory.
 #[derive(Debug, Default)]
 pub(super) struct Epochs {
     heard: Set,
-    /// By the number of the epoch.
+    /// By epoch.
     numbered: Vec<Numbered>,
     newest: Option<Epoch>,
     halted: bool,
@@ -45,7 +45,7 @@ pub(super) struct Epochs {
     after_joints: Times,
 }
 
-/// What epochs add up to.
+/// Totals over epochs.
 #[derive(Clone, Copy, Debug, Default)]
 struct Counts {
     epochs: u64,
@@ -62,7 +62,7 @@ impl Counts {
 }
 
 impl Epochs {
-    /// Takes what a frame means for joints and answers; the joints that it answers, and whether it is late.
+    /// Handles a frame's meaning for joints and answers. Returns the joints that it answers, and whether it is late.
     pub(super) fn hear(&mut self, at: u64, says: Says, from: Option<CellId>) -> Option<(Epoch, bool)> {
         from.into_iter().for_each(|cell| self.heard.insert(cell));
         match says {
@@ -79,7 +79,7 @@ impl Epochs {
         None
     }
 
-    /// Joints were sent; the same ones again are no others.
+    /// Records new joints; repeated joints count once.
     fn joints(&mut self, at: u64, epoch: Epoch) {
         let halted = self.halted;
         let numbered = self.numbered(epoch);
@@ -95,10 +95,10 @@ impl Epochs {
 
     fn numbered(&mut self, epoch: Epoch) -> &mut Numbered {
         self.numbered.resize(256, Numbered::default());
-        self.numbered.get_mut(usize::from(epoch.0)).expect("a number is one byte")
+        self.numbered.get_mut(usize::from(epoch.0)).expect("an epoch is one byte")
     }
 
-    /// An answer that was to be sent at a time has come to its end.
+    /// Records the end of an answer that was to be sent at `at`.
     pub(super) fn answered(&mut self, epoch: Epoch, was_late: bool, (at, end): (u64, u64)) {
         let Some(newest) = self.newest else { return };
         self.replies.count += 1;
@@ -117,12 +117,12 @@ impl Epochs {
         self.after_joints.record(end.saturating_sub(joints));
     }
 
-    /// Answers to joints, by when they came.
+    /// Returns the answers to joints, by their times.
     pub(super) fn replies(&self) -> Replies {
         Replies { after_joints_us: Delays::of(&self.after_joints), ..self.replies }
     }
 
-    /// Cells that answered; the skin may have the number of cells.
+    /// Returns the figures of answering cells; the number of cells is the skin's if known.
     pub(super) fn answering(&self, described: Option<u32>) -> Answering {
         let mut all = self.closed;
         self.numbered.iter().filter_map(|it| it.answered).for_each(|answered| all.close(answered));
@@ -158,7 +158,7 @@ mod tests {
             let cells = if epoch == 7 { 254 } else { 2 };
             (1..=cells).chain([1]).for_each(|node| answer(&mut epochs, node, epoch));
         }
-        // One is late, and joints come again.
+        // One answer is late, and joints are repeated.
         joints(&mut epochs, 0);
         answer(&mut epochs, 3, 254);
         joints(&mut epochs, 0);

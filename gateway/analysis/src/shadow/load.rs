@@ -1,24 +1,24 @@
-//! The highest load of a bus within any span of a length, and how long it is busy without a pause.
+//! The highest load of a bus within any time window, and its busy stretches without a pause.
 
 use std::collections::VecDeque;
 
 use super::report::{Most, Stretches};
 
-/// Times that are distinguished within a span; more count at the last one.
+/// Maximum number of distinct times within a window; further ones count to the last.
 const MOMENTS: usize = 1 << 16;
 
-/// The highest load within any `SPAN` ns, wherever they begin.
+/// The highest load within any window of `SPAN` ns, with any start.
 #[derive(Debug, Default)]
 pub(super) struct Window<const SPAN: u64> {
-    /// When, and how much.
+    /// Time and duration of requests.
     requested: VecDeque<(u64, u64)>,
     sum: u64,
-    /// As a share of the span, and when the span began.
+    /// The highest share of a window, and its start.
     pub(super) most: Most,
 }
 
 impl<const SPAN: u64> Window<SPAN> {
-    /// A request for so many ns of the bus at a time; times never run backwards.
+    /// Records a request for `nanos` ns of the bus; times never decrease.
     pub(super) fn request(&mut self, at: u64, nanos: u64) {
         while let Some(&(then, gone)) = self.requested.front().filter(|(then, _)| then + SPAN <= at) {
             self.requested.pop_front();
@@ -36,10 +36,10 @@ impl<const SPAN: u64> Window<SPAN> {
     }
 }
 
-/// Times without a pause on the wire.
+/// Stretches without a pause on the wire.
 #[derive(Debug, Default)]
 pub(super) struct Busy {
-    /// All of it, in ns.
+    /// The total busy time, in ns.
     pub(super) total: u64,
     begin: u64,
     end: u64,
@@ -47,7 +47,7 @@ pub(super) struct Busy {
 }
 
 impl Busy {
-    /// The wire was taken, in order of time.
+    /// Records a transmission, in order of time.
     pub(super) fn take(&mut self, start: u64, end: u64, saturated: u64) {
         self.total += end - start;
         if start > self.end {
@@ -66,7 +66,7 @@ impl Busy {
         self.stretches.longest_s.raise(length as f64 / 1e9, self.begin);
     }
 
-    /// All stretches; those that count as saturated have at least this length in ns.
+    /// Returns all stretches; those of at least `saturated` ns count as saturated.
     pub(super) fn stretches(&self, saturated: u64) -> Stretches {
         let mut last = Self { stretches: self.stretches, ..Self::default() };
         (last.begin, last.end) = (self.begin, self.end);

@@ -1,13 +1,14 @@
-//! What a real bus would have made of some traffic: each frame's bits, when it would have gone out, and what that adds up to.
+//! Models the timing of given traffic on a real bus: the bits of each frame, its transmission time, and the resulting
+//! figures.
 //!
 //! ```text
 //!   capture or live bus ──> frame ──> [ window ] ──> [ BusModel ] ──┬──> poll: Shaded, one a frame, in the file's order
 //!                           for each bus:  sorts,   arbitrates       └──> report: load, delays, late replies, queues
 //! ```
 //!
-//! A frame's time stamp is taken as the time at which its sender requested it, which is right on a bus without bit rate (vcan,
-//! the embedded bus); each sender has a transmit buffer for each of its identifiers. In bounded memory, however long it lasts: what is out
-//! of order is sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and no more than [`MAX_QUEUE`] frames wait on a bus.
+//! A frame's time stamp is taken as the time of its sender's request, which is correct on a bus without bit rate (vcan,
+//! the embedded bus). Each sender has a transmit buffer for each of its identifiers. Memory is bounded: frames out of
+//! order are sorted within [`WINDOW_NS`] and [`WINDOW_FRAMES`], and at most [`MAX_QUEUE`] frames wait on a bus.
 
 mod bus_timing;
 mod epochs;
@@ -38,35 +39,35 @@ pub use report::{
 pub use reported::Shaded;
 pub use trace::order::{WINDOW_FRAMES, WINDOW_NS};
 
-/// A bus without a pause for so long, in ns, is saturated: from joints to joints, as mostly set.
+/// Duration without a pause, in ns, from which a bus counts as saturated: the most common period of joints.
 pub const SATURATED_NS: u64 = 16_000_000;
-/// The longer span in which the load is looked at, in ns.
+/// The longer window for the load, in ns.
 const SECOND_NS: u64 = 1_000_000_000;
 
-/// Buses that are modelled.
+/// Maximum number of modelled buses.
 pub const BUSES: usize = 64;
 
-/// What the buses are like.
+/// Properties of the buses.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Bit rates of every bus that is not named.
+    /// Bit rates of buses that are not in `of_bus`.
     pub rates: BitRates,
     /// Bit rates by the name of the bus.
     pub of_bus: Vec<(String, BitRates)>,
-    /// How many bits are damaged, as a share, in [0, [`BitErrors::MAX`]].
+    /// Share of damaged bits, in [0, [`BitErrors::MAX`]].
     pub bit_errors: f64,
-    /// From what errors are drawn; each bus has its own.
+    /// Seed of the errors; each bus has its own.
     pub seed: u64,
-    /// Whether [`Shadow::poll`] returns each frame.
+    /// True if [`Shadow::poll`] returns each frame.
     pub each_frame: bool,
-    /// Whether what only a bench sends is counted.
+    /// True to include frames that only a bench sends.
     pub bench_traffic: bool,
-    /// The skin, for the worst case beside what there was.
+    /// The skin, for the worst case beside the capture.
     pub skin: Option<Skin>,
 }
 
 impl Options {
-    /// All buses at these rates, and nothing else.
+    /// All buses at these rates, with defaults for everything else.
     #[must_use]
     pub const fn new(rates: BitRates) -> Self {
         Self {
@@ -80,7 +81,7 @@ impl Options {
         }
     }
 
-    /// What is known of a bus.
+    /// Returns the properties of a bus.
     fn of(&self, bus: &str) -> Known {
         let named = self.of_bus.iter().find(|(name, _)| name == bus);
         let rates = named.map_or(self.rates, |(_, rates)| *rates);
@@ -96,7 +97,7 @@ impl Options {
 /// The latest time of a frame, in ns since 1970.
 const LATEST: u64 = u64::MAX / 2;
 
-/// Traffic on its way through the model.
+/// The model of the buses' traffic.
 #[derive(Debug)]
 pub struct Shadow {
     options: Options,
@@ -108,18 +109,18 @@ pub struct Shadow {
 }
 
 impl Shadow {
-    /// Nothing seen yet.
+    /// Creates a model without traffic.
     ///
     /// # Errors
-    /// When the bit-error rate is outside its range.
+    /// Returns [`BitErrorsError`] if the bit-error rate is outside its range.
     pub fn new(options: Options) -> Result<Self, BitErrorsError> {
         BitErrors::new(options.bit_errors, options.seed)?;
         let reported = options.each_frame.then(Reported::default);
         Ok(Self { options, bus_timings: Vec::new(), reported, frames: 0, further: 0, has_times: true })
     }
 
-    /// Takes the next frame of a bus, with its time in ns. A time after the year 2262 counts as its end: what a bus makes
-    /// of a frame comes later still, and has to be a time as well.
+    /// Handles the next frame of a bus, with its time in ns. Times after the year 2262 are set to its end, because the
+    /// transmission comes even later and must fit, too.
     pub fn frame(&mut self, bus: &str, nanos: u64, frame: &Frame) {
         let nanos = nanos.min(LATEST);
         let place = self.frames;
@@ -142,13 +143,13 @@ impl Shadow {
         }
     }
 
-    /// A frame from before the capture that is latched when it begins.
+    /// Handles a frame that was latched before the start of the capture.
     pub fn latched(&mut self, bus: &str, nanos: u64, frame: &Frame) {
         let bus_timing = self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing));
         bus_timing.into_iter().for_each(|bus_timing| bus_timing.latched(nanos, frame));
     }
 
-    /// Frames that the recorder lost.
+    /// Records frames that the recorder lost.
     pub fn missing(&mut self, bus: &str, frames: u64) {
         if let Some(bus_timing) =
             self.bus_timing(bus).and_then(|bus_timing| self.bus_timings.get_mut(bus_timing))
@@ -157,29 +158,29 @@ impl Shadow {
         }
     }
 
-    /// The times of the frames are none: they stand for the order alone, and say nothing of loads and delays.
+    /// Declares that the frames have no times: their times only give the order, and loads and delays are omitted.
     pub const fn without_times(&mut self) {
         self.has_times = false;
     }
 
-    /// There is no more: all that waits goes out.
+    /// Ends the input: all waiting frames are sent.
     pub fn finish(&mut self) {
         self.bus_timings.iter_mut().for_each(|bus_timing| bus_timing.finish(self.reported.as_mut()));
         self.reported.iter_mut().for_each(Reported::finish);
     }
 
-    /// The next frame, in the order in which they came, once it is known what became of it.
+    /// Returns the next frame in input order, once its transmission is known.
     pub fn poll(&mut self) -> Option<Shaded> {
         self.reported.as_mut()?.poll()
     }
 
-    /// The name of a bus, by [`Shaded::bus`].
+    /// Returns the name of a bus, given [`Shaded::bus`].
     #[must_use]
     pub fn bus(&self, bus: usize) -> &str {
         self.bus_timings.get(bus).map_or("", |bus_timing| &bus_timing.name)
     }
 
-    /// What it adds up to.
+    /// Returns the result.
     #[must_use]
     pub fn report(&self) -> Report {
         Report {
@@ -192,7 +193,7 @@ impl Shadow {
     }
 
     fn bus_timing(&mut self, bus: &str) -> Option<usize> {
-        // Mostly the one of the frame before, or one of a few.
+        // Usually the bus of the previous frame, or one of a few.
         let known = self.bus_timings.iter().position(|bus_timing| bus_timing.name == bus);
         if known.is_some() || self.bus_timings.len() >= BUSES {
             return known;
@@ -206,7 +207,7 @@ impl Shadow {
     }
 }
 
-/// An identifier as candump prints it; whether it has more than 11 bits.
+/// An identifier, formatted as by candump, and whether it has more than 11 bits.
 #[derive(Clone, Copy, Debug)]
 pub struct Identifier(pub u32, pub bool);
 

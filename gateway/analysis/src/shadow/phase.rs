@@ -1,4 +1,4 @@
-//! Start-up and operation, and the figures of each.
+//! The phases start-up and operation, and their figures.
 
 use model::quantiles::Times;
 use protocol::id::{Id, Kind};
@@ -8,21 +8,23 @@ use super::report::{Delays, KindDelays, Loads, Most, StartUp};
 use super::{SATURATED_NS, SECOND_NS};
 use crate::fit::traffic::Says;
 
-/// Without joints for so long, in ns, cells are not in operation any more.
+/// Time without joints, in ns, after which operation ends.
 pub const PAUSE_NS: u64 = SECOND_NS;
-/// A capture that begins in the middle of a run has joints within so many ns: some periods, and less than a start takes.
+/// Maximum time, in ns, to the first joints in a capture that begins in the middle of a run: some periods, and less
+/// than a start takes.
 const SOON_NS: u64 = 100_000_000;
 
-/// What a bus is doing.
+/// The phase of a bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Phase {
-    /// Cells claim node ids, are configured and build the tree; until joints come, and when none have for [`PAUSE_NS`].
+    /// Cells claim node ids, are configured and build the tree: before joints, and when no joints were sent for
+    /// [`PAUSE_NS`].
     StartUp,
-    /// Joints are sent; or the bus has another protocol.
+    /// Joints are sent, or the bus carries another protocol.
     Operation,
 }
 
-/// Something of each phase.
+/// A value for each phase.
 #[derive(Debug, Default)]
 pub(super) struct Each<T> {
     pub(super) start_up: T,
@@ -38,14 +40,14 @@ impl<T> Each<T> {
     }
 }
 
-/// How a capture begins: what has been seen of it before the first of its frames is looked at.
+/// The start of a capture: observations before the first frame enters the model.
 #[derive(Debug, Default)]
 pub(super) struct Beginning {
     first: Option<u64>,
     joints: Option<u64>,
     is_prepared: bool,
     is_answered: bool,
-    /// Joints were sent before it.
+    /// True if joints were sent before the capture.
     pub(super) in_the_middle: bool,
 }
 
@@ -71,20 +73,20 @@ impl Beginning {
     }
 }
 
-/// Which phase it is, and how long each has lasted.
+/// The current phase, and the durations of both.
 #[derive(Debug, Default)]
 pub(super) struct Phases {
     pub(super) beginning: Beginning,
     now: Option<Phase>,
-    /// Until when time is counted, in ns.
+    /// The time up to which durations are counted, in ns.
     until: u64,
     joints: Option<u64>,
-    /// In ns.
+    /// Durations in ns.
     pub(super) spans: Each<u64>,
 }
 
 impl Phases {
-    /// The phase of a frame at a time, which never runs backwards.
+    /// Returns the phase of a frame at a time; times never decrease.
     pub(super) fn at(&mut self, at: u64, says: Says, is_ours: bool) -> Phase {
         let mut now = *self.now.get_or_insert_with(|| {
             self.until = at;
@@ -124,14 +126,14 @@ pub(super) struct Figures {
     pub(super) busy: Busy,
     pub(super) all: Times,
     kinds: [Times; 8],
-    /// The most frames that waited, of all identifiers and of one.
+    /// The largest number of waiting frames, of all identifiers and of one.
     pub(super) queue: Most,
     pub(super) queue_of_one: Most,
     pub(super) queue_of_one_id: u16,
 }
 
 impl Figures {
-    /// A frame wants so many ns of the bus.
+    /// Records a frame that needs `took` ns of the bus.
     pub(super) fn request(&mut self, at: u64, took: u64) {
         self.frames += 1;
         self.requested += took;
@@ -139,7 +141,7 @@ impl Figures {
         self.in_1_s.request(at, took);
     }
 
-    /// So many frames wait, and of one identifier.
+    /// Records the number of waiting frames, in total and of one identifier.
     pub(super) fn queue(&mut self, at: u64, waiting: usize, of_one: Option<(u32, u16)>) {
         self.queue.raise(waiting as f64, at);
         if let Some((queued, id)) = of_one.filter(|(queued, _)| f64::from(*queued) > self.queue_of_one.value)
@@ -149,7 +151,7 @@ impl Figures {
         }
     }
 
-    /// A frame has been sent, so long after it was to be.
+    /// Records a sent frame and its delay.
     pub(super) fn sent(&mut self, id: Option<u16>, nanos: u64) {
         self.all.record(nanos);
         let kind = id.and_then(|id| self.kinds.get_mut(Id::from_bits(id).kind as usize));
@@ -161,12 +163,13 @@ impl Figures {
         kinds.map(|(kind, delay)| KindDelays { kind: kind.name(), delay_us: Delays::of(delay) }).collect()
     }
 
-    /// The load of a phase that lasted so long, and went on for a while on the wire.
+    /// Returns the load of a phase with this duration, and with transmissions beyond its end.
     pub(super) fn loads(&self, span: u64, overrun: u64) -> Loads {
         let share = |part: u64, whole: u64| (whole > 0).then(|| part as f64 / whole as f64);
         let worst_1_s = self.in_1_s.most;
         let worst_1_s = match span {
-            // Of less than a second, all of it; but a few frames are no load of theirs alone.
+            // A phase of less than a second counts as a whole; but not less than 16 ms, so that a few frames are no
+            // high load.
             0..SECOND_NS => {
                 let all = self.requested as f64 / span.max(SATURATED_NS) as f64;
                 Most { value: worst_1_s.value.max(all), ..worst_1_s }
@@ -178,7 +181,7 @@ impl Figures {
         Loads { mean, worst_16_ms: self.in_16_ms.most, worst_1_s, busy }
     }
 
-    /// All of a start-up that lasted so long; none when nothing was sent in it.
+    /// Returns the figures of a start-up with this duration; `None` without frames.
     pub(super) fn start_up(&self, span: u64) -> Option<StartUp> {
         (self.frames > 0).then(|| StartUp {
             frames: self.frames,

@@ -1,4 +1,4 @@
-//! What a shadow adds up to.
+//! The result of the model.
 
 use model::quantiles::Times;
 use protocol::wire_time::BitRates;
@@ -7,133 +7,134 @@ use serde::{Serialize, Serializer};
 use crate::fit::traffic::BenchFrames;
 use crate::fit::verdict::{Answer, Cells};
 
-/// All buses.
+/// The result for all buses.
 #[derive(Clone, Debug, Serialize)]
 pub struct Report {
     /// Frames of any kind, on all buses.
     pub frames: u64,
-    /// Of those, frames of buses beyond the first 64, which are not modelled.
+    /// Frames of buses beyond the first 64, which are not modelled.
     pub frames_of_other_buses: u64,
-    /// The share of bits that were damaged on purpose.
+    /// Share of bits that were damaged on purpose.
     pub bit_error_rate: f64,
-    /// Set if the frames have times; without, loads and delays are unknown.
+    /// True if the frames have times; otherwise loads and delays are unknown.
     pub has_times: bool,
-    /// Each bus, in the order in which they were met.
+    /// The buses, in order of appearance.
     pub buses: Vec<BusShadow>,
 }
 
-/// One bus.
+/// The result for one bus.
 #[derive(Clone, Debug, Serialize)]
 pub struct BusShadow {
     /// Its name.
     pub bus: String,
-    /// Its format and bit rates, as people write them.
+    /// Its format and bit rates, as text.
     pub name: String,
     /// Its bit rates.
     #[serde(serialize_with = "as_text")]
     pub rates: BitRates,
     /// Frames of any kind.
     pub frames: u64,
-    /// The time of the first one, in ns of the capture's clock.
+    /// The time of the first frame, in ns of the capture's clock.
     pub first_ns: u64,
-    /// The time that seconds count from, in ns of the same clock: the first frame, if nothing else is known.
+    /// The origin of times in s, in ns of the same clock; by default the first frame.
     #[serde(skip)]
     pub zero_ns: u64,
-    /// From the first to the last one.
+    /// The time from the first frame to the last.
     pub duration_s: f64,
-    /// How long it was in operation: load, stretches, delays and queues are of that time.
+    /// The duration of operation, for which load, stretches, delays and queues are computed.
     pub operation_s: f64,
-    /// Whether all cells of the skin fit if all of them answer; none without a skin.
+    /// The fit in the worst case, with all cells of the skin answering; `None` without a skin.
     pub worst_case: Option<Answer>,
-    /// Whether what there was fits; none without operation.
+    /// The fit of the captured traffic; `None` without operation.
     pub this_run: Option<Answer>,
-    /// How many cells answered, where the bus has this project's protocol.
+    /// The answering cells, if the bus carries this project's protocol.
     pub answering: Option<Answering>,
-    /// What was sent before the first joints, and when there were none for a second.
+    /// The traffic before the first joints, and without joints for a second.
     pub start_up: Option<StartUp>,
-    /// What became of the frames.
+    /// The counts of frames.
     #[serde(flatten)]
     pub counts: Counts,
-    /// What was asked of the bus.
+    /// The requested load of the bus.
     pub load: Loads,
-    /// Times without a pause.
+    /// Stretches without a pause.
     pub stretches: Stretches,
-    /// From wanting to send to the end of the intermission, in µs: all frames.
+    /// Delays from the request of a frame to the end of its intermission, in µs, over all frames.
     pub delay_us: Delays,
-    /// The same by kind; empty where the bus has another protocol.
+    /// Delays by kind; empty if the bus carries another protocol.
     pub kinds: Vec<KindDelays>,
-    /// Answers to joints, where the bus has this project's protocol.
+    /// Answers to joints, if the bus carries this project's protocol.
     pub replies: Option<Replies>,
-    /// The most frames that waited at the same time.
+    /// The largest number of waiting frames.
     pub queue: Most,
-    /// The most frames of one identifier of 11 bits that waited at the same time.
+    /// The largest number of waiting frames of one 11-bit identifier.
     pub queue_of_one: Most,
     /// That identifier.
     pub queue_of_one_id: u32,
 }
 
-/// What became of a bus' frames.
+/// Counts of a bus' frames.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Counts {
-    /// Frames that went through the model.
+    /// Frames that were sent in the model.
     pub sent: u64,
     /// Frames that only a bench sends.
     pub bench: BenchFrames,
-    /// Whether they are left out.
+    /// True if these are omitted.
     pub bench_omitted: bool,
-    /// The driver's error frames, which never were on a wire.
+    /// The driver's error frames, which were never on a wire.
     pub error_frames: u64,
     /// Frames that the recorder lost: the load is too low by these.
     pub missing: u64,
-    /// Frames before the one before them, which were sorted.
+    /// Frames with an earlier time than the previous one, which were sorted.
     pub out_of_order: u64,
-    /// Of those, so far out of order that they count at a later time.
+    /// Frames that were so far out of order that they count at a later time.
     pub too_late_to_sort: u64,
-    /// Frames for which no more room was to wait.
+    /// Frames that were refused because the queue was full.
     pub no_room: u64,
-    /// Attempts that were damaged.
+    /// Damaged transmissions.
     pub damaged: u64,
 }
 
-/// Start-up: cells claim numbers, are configured and organise themselves.
+/// The start-up, in which cells claim node ids, are configured and build the tree.
 #[derive(Clone, Copy, Debug, Serialize)]
 pub struct StartUp {
     /// Frames.
     pub frames: u64,
-    /// How long it lasted.
+    /// Its duration.
     pub duration_s: f64,
-    /// What was asked of the bus.
+    /// The requested load of the bus.
     pub load: Loads,
-    /// Times without a pause.
+    /// Stretches without a pause.
     pub stretches: Stretches,
-    /// From wanting to send to the end of the intermission, in µs.
+    /// Delays from the request of a frame to the end of its intermission, in µs.
     pub delay_us: Delays,
 }
 
-/// Shares of the bus that frames ask for, stuff bits and intermissions included; above 1 it cannot carry them.
+/// The shares of the bus' time that frames request, including stuff bits and intermissions; above 1 the bus cannot
+/// carry them.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Loads {
-    /// Over all of the time; none with less than two moments.
+    /// Mean over the whole time; `None` with fewer than two different times.
     pub mean: Option<f64>,
-    /// Within any 16 ms.
+    /// The highest load within any 16 ms.
     pub worst_16_ms: Most,
-    /// Within any second; of less than a second, in all of it.
+    /// The highest load within any second, or within the whole time if that is shorter.
     pub worst_1_s: Most,
-    /// The share of the time in which the bus was taken, by whatever.
+    /// The share of time in which the bus was busy.
     pub busy: Option<f64>,
 }
 
-/// The maximum of something, and when.
+/// The maximum of a quantity, and its time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Most {
-    /// How much.
+    /// The maximum.
     pub value: f64,
-    /// When that was or began, in ns of the capture's clock.
+    /// The time or the start of the maximum, in ns of the capture's clock.
     pub at_ns: u64,
 }
 
 impl Most {
-    /// Takes a value of a time if it is greater than any before it.
+    /// Records a value if it exceeds the maximum.
     pub(super) fn raise(&mut self, value: f64, at_ns: u64) {
         if value > self.value {
             *self = Self { value, at_ns };
@@ -141,27 +142,27 @@ impl Most {
     }
 }
 
-/// Times in which the bus had no pause.
+/// Stretches in which the bus had no pause.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Stretches {
-    /// How many of 16 ms and longer.
+    /// Number of stretches of at least 16 ms.
     pub count: u64,
-    /// How long those are together.
+    /// Their total duration.
     pub total_s: f64,
-    /// The longest of all.
+    /// The longest stretch of all.
     pub longest_s: Most,
 }
 
-/// How long something took, in µs.
+/// Quantiles of a duration, in µs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Delays {
-    /// Of how many.
+    /// Number of values.
     pub count: u64,
-    /// Half of them at most so long.
+    /// Median.
     pub p50: f64,
-    /// 99 of 100 at most so long.
+    /// 99th percentile.
     pub p99: f64,
-    /// The longest.
+    /// Maximum.
     pub max: f64,
 }
 
@@ -170,29 +171,29 @@ pub struct Delays {
 pub struct KindDelays {
     /// Its name.
     pub kind: &'static str,
-    /// How long it took.
+    /// The delays.
     pub delay_us: Delays,
 }
 
-/// Cells that answered, epoch by epoch.
+/// The number of cells that answered, over epochs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct Answering {
-    /// Joints that were sent while cells were not halted.
+    /// Number of joints that were sent while cells were not halted.
     pub epochs: u64,
-    /// Joints that were sent while they were.
+    /// Number of joints that were sent while cells were halted.
     pub epochs_halted: u64,
     /// The mean number of cells that answered joints; absent without joints.
     pub mean: Option<f64>,
     /// The largest number of cells that answered the same joints.
     pub most: u32,
-    /// Cells of the bus, by the skin, else those that were received.
+    /// Number of cells on the bus: the skin's, or else those that sent something.
     pub cells: u32,
     /// True if that number is the skin's.
     pub described: bool,
 }
 
 impl Answering {
-    /// In the words of [`crate::fit::verdict`].
+    /// Returns the figures in the form of [`crate::fit::verdict`].
     #[must_use]
     pub const fn cells(&self) -> Cells {
         Cells::Some { most: self.most, cells: self.cells, described: self.described }
@@ -202,15 +203,15 @@ impl Answering {
 /// Answers to joints.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Replies {
-    /// How many were looked at.
+    /// Number of answers.
     pub count: u64,
-    /// Those that the next joints had overtaken in the recording already.
+    /// Answers that were already later than the next joints in the recording.
     pub late_before: u64,
-    /// Those that came to their end only after the next joints were to go out, and had not been late before.
+    /// Answers that ended after the next joints were to be sent, without being late in the recording.
     pub late: u64,
-    /// Of those, the ones that were ready only in the last eighth of the period: no bus is to blame.
+    /// Late answers that were ready only in the last eighth of the period: the bus is not the cause.
     pub late_when_ready: u64,
-    /// From when joints were to go out to the end of each answer, in µs.
+    /// Times from the request of joints to the end of each answer, in µs.
     pub after_joints_us: Delays,
 }
 

@@ -1,24 +1,25 @@
-//! What became of each frame, in the order in which they came.
+//! The result for each frame, in input order.
 
 use std::collections::VecDeque;
 
 use protocol::wire_time::Bits;
 
-/// What a real bus would have made of a frame.
+/// The transmission of a frame on a real bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Shaded {
     /// Its time in the capture, in ns.
     pub nanos: u64,
-    /// Its bus, for [`super::Shadow::bus`]; none of a bus beyond those that are modelled.
+    /// Its bus, for [`super::Shadow::bus`]; `None` for buses that are not modelled.
     pub bus: Option<usize>,
-    /// Its identifier; of a driver's error frame with its flag.
+    /// Its identifier; with the error flag for a driver's error frame.
     pub id: u32,
-    /// Whether that is more than 11 bits.
+    /// True if the identifier has more than 11 bits.
     pub extended: bool,
-    /// Its bits, intermission included; none when it is on no real bus: what only a bench sends, a driver's error frame.
+    /// Its bits, including the intermission; `None` for frames that real buses do not carry: frames that only a bench
+    /// sends, and the driver's error frames.
     pub bits: Option<Bits>,
-    /// The first bit and the end of the intermission of the attempt that came through, in ns on the capture's clock; none
-    /// when it never went out.
+    /// The first bit and the end of the intermission of the successful attempt, in ns of the capture's clock; `None` if
+    /// it was not sent.
     pub sent: Option<(u64, u64)>,
 }
 
@@ -28,26 +29,26 @@ struct Entry {
     is_open: bool,
 }
 
-/// Frames that wait for those before them.
+/// Frames that wait for earlier ones.
 #[derive(Debug, Default)]
 pub(super) struct Reported {
     entries: VecDeque<Entry>,
-    /// The place of the first one.
+    /// The index of the first entry.
     first: u64,
 }
 
 impl Reported {
-    /// A frame came; of one with bits it is not known yet when it goes out.
+    /// Adds a frame; with bits, its transmission is still unknown.
     pub(super) fn enter(&mut self, shaded: Shaded) {
         self.entries.push_back(Entry { shaded, is_open: shaded.bits.is_some() });
     }
 
-    /// No real bus carries it.
+    /// Marks a frame as not carried by a real bus.
     pub(super) fn omitted(&mut self, place: u64) {
         self.settle(place, |shaded| shaded.bits = None);
     }
 
-    /// When it went out; none if never.
+    /// Records the transmission of a frame; `None` if it was not sent.
     pub(super) fn sent(&mut self, place: u64, sent: Option<(u64, u64)>) {
         self.settle(place, |shaded| shaded.sent = sent);
     }

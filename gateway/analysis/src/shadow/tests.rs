@@ -1,4 +1,4 @@
-//! The shadow of traffic whose times can be worked out by hand.
+//! Tests of traffic whose times can be computed by hand.
 
 mod run;
 
@@ -28,7 +28,7 @@ fn classic(id: u32, bytes: &[u8]) -> Frame {
     Frame::classic(id, bytes).unwrap()
 }
 
-/// How long a frame takes at 1M/5M, in ns.
+/// Returns the duration of a frame at 1M/5M, in ns.
 fn took(frame: &Frame) -> u64 {
     Bits::of(frame).unwrap().nanoseconds(options().rates)
 }
@@ -67,7 +67,7 @@ fn frames_come_back_in_the_files_order_with_the_times_of_the_wire() {
     assert_eq!((can0.counts.sent, can1.counts.sent, report.frames), (3, 1, 4));
     assert_eq!((can0.queue.value, can0.queue_of_one.value, can0.queue_of_one_id), (3.0, 2.0, 0x700));
     assert!((can0.delay_us.max - (2 * a + b - 5) as f64 / 1e3).abs() < 1e-9);
-    // In three digits.
+    // With three significant digits.
     assert!((can0.delay_us.p50 / ((a + b - 6) as f64 / 1e3) - 1.0).abs() < 2e-3, "{:?}", can0.delay_us);
     assert!(can0.kinds.is_empty() && can0.replies.is_none(), "no packets of this protocol");
 }
@@ -100,7 +100,7 @@ fn what_is_too_far_out_of_order_counts_at_a_later_time() {
     [0, 5_000, 100].into_iter().for_each(|time| shadow.frame("can0", time * MS, &classic(1, &[])));
     let (frames, report) = ended(shadow);
     let starts: Vec<_> = frames.iter().map(|frame| frame.sent.unwrap().0 / MS).collect();
-    // 0 had gone before, so 100 ms could still be put in its place; but not before what was released.
+    // Frame 0 had been sent before, so 100 ms could still be sorted in; but not before released frames.
     assert_eq!(starts, [0, 5_000, 100]);
     assert_eq!(report.buses[0].counts.too_late_to_sort, 0);
     let mut shadow = Shadow::new(options()).unwrap();
@@ -117,7 +117,7 @@ fn what_is_on_no_real_bus_takes_no_time() {
     let mut shadow = shadow();
     shadow.frame("vcan0", 0, &wire);
     shadow.frame("vcan0", 0, &classic(ERROR | 4, &[0; 8]));
-    // Somebody else's frame with the bit of a wire set, as J1939 has it.
+    // A frame of another protocol with the bit of a wire set, as in J1939.
     let other = classic(EXTENDED | 0x18FE_F100, &[7; 8]);
     shadow.frame("vcan0", 0, &other);
     let (frames, report) = ended(shadow);
@@ -134,10 +134,10 @@ fn an_answer_is_late_when_the_next_joints_were_to_go_out_before_its_end() {
         for epoch in 0..4 {
             let begin = u64::from(epoch) * 2 * MS;
             say(&mut shadow, format, begin, &joints(epoch));
-            // 20 answers within 2 ms do fit as FD, and do not as pairs of classic frames.
+            // 20 answers fit within 2 ms as FD frames, but not as pairs of classic frames.
             (1..=20).for_each(|cell| say(&mut shadow, format, begin + 1_000, &torque(cell, epoch)));
         }
-        // One that was late before: it answers the joints before the last ones.
+        // One answer was late in the recording: it answers the joints before the last ones.
         say(&mut shadow, format, 8 * MS + 2, &torque(30, 2));
         let (_, report) = ended(shadow);
         let bus = &report.buses[0];
@@ -145,7 +145,7 @@ fn an_answer_is_late_when_the_next_joints_were_to_go_out_before_its_end() {
         assert_eq!((replies.count, replies.late_before), (81, 1));
         match format {
             Format::Fd => assert_eq!(replies.late, 0),
-            // 7 of 20 come in time in the first epoch, and then fewer; after the last joints no answer counts as late.
+            // 7 of 20 are in time in the first epoch, and then fewer; after the last joints no answer counts as late.
             Format::Classic => assert!((30..60).contains(&replies.late), "{replies:?}"),
         }
         let kinds: Vec<_> = bus.kinds.iter().map(|kind| kind.kind).collect();
@@ -184,7 +184,7 @@ fn bit_errors_cost_time_and_are_the_same_for_the_same_seed() {
     let (noisy, report) = run(1e-3, 1);
     assert_eq!(noisy, run(1e-3, 1).0);
     assert_ne!(noisy, run(1e-3, 2).0);
-    // About one in six; the deviation of 2000 is 17.
+    // About one in six; the standard deviation for 2000 is 17.
     assert!((200..600).contains(&report.buses[0].counts.damaged), "{}", report.buses[0].counts.damaged);
     assert!(clean.iter().zip(&noisy).all(|(clean, noisy)| noisy.sent.unwrap().1 >= clean.sent.unwrap().1));
     assert!(Shadow::new(Options { bit_errors: 0.5, ..options() }).is_err());

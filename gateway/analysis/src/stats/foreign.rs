@@ -1,4 +1,4 @@
-//! Foreign frames by identifier.
+//! Counts of foreign frames by identifier.
 
 use core::cmp::Reverse;
 use std::collections::BTreeMap;
@@ -10,28 +10,29 @@ use super::{Count, seconds};
 use model::decode::Foreign;
 use protocol::packet::{Length, Lengths, PacketError, data_id};
 
-/// Identifiers of a bus that are counted separately; frames of others are counted together.
+/// Maximum number of identifiers of a bus that are counted separately; frames of others share one count.
 const IDENTIFIERS: usize = 4096;
 
-/// What kind of frame it is, beside its identifier.
+/// The type of a frame.
 #[derive(Clone, Copy, Debug, Eq, Ord, PartialEq, PartialOrd, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum FrameType {
-    /// It carries data.
+    /// A data frame.
     Data,
-    /// It requests data.
+    /// A remote frame.
     Remote,
-    /// The driver's report of an error; its identifier has the kind.
+    /// The driver's error report; the identifier contains its kind.
     Error,
 }
 
-/// Counts foreign frames of a bus.
+/// Counts the foreign frames of a bus.
 #[derive(Debug, Default)]
 pub(super) struct Foreigners {
     identifiers: BTreeMap<(FrameType, u32), Seen>,
-    /// Frames of identifiers beyond those that are counted separately.
+    /// Number of frames with identifiers beyond those that are counted separately.
     others: u64,
-    /// Groups of frames whose CRC was checked: a frame alone, or with those before it that make a length.
+    /// Number of groups of frames with a checked CRC: a single frame, or one with those before it that complete a
+    /// length.
     tried: u64,
 }
 
@@ -42,10 +43,10 @@ struct Seen {
     wrong_crc: u64,
 }
 
-/// Frames that are none of this protocol.
+/// Frames that do not belong to this protocol.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
 pub struct ForeignFrames {
-    /// All of them.
+    /// Total number.
     pub frames: u64,
     /// Data frames with an 11-bit identifier.
     pub standard: u64,
@@ -55,36 +56,37 @@ pub struct ForeignFrames {
     pub remote: u64,
     /// The driver's error frames.
     pub error: u64,
-    /// Expected number of packets by chance, where the chain is not known: one of 65 536 groups of frames has a right CRC.
-    /// They count as packets.
+    /// Expected number of packets by chance, for an unknown chain: one in 65 536 groups of frames has a valid CRC. They
+    /// count as packets.
     pub packets_by_chance: f64,
-    /// Each, the one with the most frames first.
+    /// The identifiers, by decreasing number of frames.
     pub identifiers: Vec<ForeignId>,
-    /// Frames of identifiers beyond the first 4096.
+    /// Frames with identifiers beyond the first 4096.
     pub frames_of_other_identifiers: u64,
 }
 
-/// Foreign frames under one identifier.
+/// The foreign frames of one identifier.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ForeignId {
-    /// In hexadecimal, as candump prints it: 3 or 8 digits; of an error frame the bits of the kind of error.
+    /// The identifier in hexadecimal, as candump prints it, with 3 or 8 digits; for an error frame, the bits of the
+    /// kind of error.
     pub id: String,
-    /// What kind of frames these are.
+    /// The type of the frames.
     #[serde(rename = "type")]
     pub of: FrameType,
     /// Frames.
     pub frames: u64,
-    /// The same by second, from the first to the last.
+    /// Frames per second, from the first to the last.
     pub frames_per_s: Option<f64>,
-    /// The first, in s after the first frame of the capture.
+    /// Time of the first, in s after the first frame of the capture.
     pub first_s: f64,
-    /// The last.
+    /// Time of the last, in s after the first frame of the capture.
     pub last_s: f64,
-    /// Fewest data bytes; of a remote frame those that it requests.
+    /// Smallest number of data bytes; for a remote frame, of requested bytes.
     pub bytes_min: u8,
-    /// Most data bytes.
+    /// Largest number of data bytes.
     pub bytes_max: u8,
-    /// Frames with the length of a packet and another CRC.
+    /// Frames with the length of a packet but a wrong CRC.
     pub wrong_crc: u64,
 }
 
@@ -117,7 +119,7 @@ impl Foreigners {
         seen.wrong_crc += wrong_crc;
     }
 
-    #[expect(clippy::cast_precision_loss, reason = "to be read")]
+    #[expect(clippy::cast_precision_loss, reason = "for display")]
     pub(super) fn report(&self, earliest: u64) -> ForeignFrames {
         let mut foreign = ForeignFrames {
             frames: self.others,
@@ -136,13 +138,13 @@ impl Foreigners {
             } += frames;
             foreign.identifiers.push(seen.report(of, raw_id, earliest));
         }
-        // Those of one number of frames stay in the order of their identifiers.
+        // Identifiers with the same number of frames stay in order.
         foreign.identifiers.sort_by_key(|id| Reverse(id.frames));
         foreign
     }
 }
 
-/// How many lengths of packets a classic frame can end.
+/// Returns the number of packet lengths that a classic frame can complete.
 fn groups(frame: &Frame) -> u64 {
     let ends = |length: &Length| length.last_segment() == frame.data().len();
     data_id(frame).map_or(0, |id| Lengths::of(id).iter().filter(ends).count() as u64)

@@ -6,7 +6,7 @@ use protocol::id::Node;
 use protocol::message::{self, Heartbeat, Tree};
 use protocol::port;
 
-/// A capture that is being written.
+/// A capture under construction.
 #[derive(Default)]
 struct Tape {
     stats: Stats,
@@ -92,7 +92,7 @@ fn epochs_that_a_cell_in_contact_does_not_answer_are_missed_and_others_are_not()
     tape.joints(0);
     tape.joints(1);
     tape.torque(1, 0);
-    // Not in contact: silence is right.
+    // Without contact, silence is correct.
     for epoch in 2..=9 {
         tape.joints(epoch);
     }
@@ -100,7 +100,7 @@ fn epochs_that_a_cell_in_contact_does_not_answer_are_missed_and_others_are_not()
     let cell = tape.cell();
     assert_eq!((cell.unanswered, cell.repeated, cell.saturated), (2 + 2, 1, 1));
     assert_eq!((cell.first_epoch, cell.last_epoch, cell.torques), (Some(250), Some(9), 6));
-    // A heartbeat after it reports that the contact has ended: its last torque was lost.
+    // A later heartbeat reports the end of the contact: its last torque was lost.
     tape.heartbeat(9, 0, State::default());
     tape.joints(10);
     tape.joints(11);
@@ -307,7 +307,7 @@ fn a_claim_before_the_first_packet_of_the_owner_is_no_restart() {
         tape.page(Heartbeat { serial: 7, sent, ..Heartbeat::default() });
     }
     assert_eq!((tape.cell().restarts, tape.cell().lost), (0, 0));
-    // Another cell owns the node id now: that is a restart.
+    // Another cell owns the node id now, which counts as a restart.
     tape.page(Heartbeat { serial: 9, sent: 3, ..Heartbeat::default() });
     assert_eq!((tape.cell().restarts, tape.cell().lost), (1, 0));
 }

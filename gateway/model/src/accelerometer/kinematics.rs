@@ -1,13 +1,13 @@
-//! What the accelerometer of a cell feels: the specific force at its place while the joints move.
+//! The specific force at a cell, which its accelerometer measures, while the joints move.
 //!
 //! A row of the chain carries its cells rigidly. With the acceleration `a` of the row's origin, its angular velocity
-//! `w` and angular acceleration `w'`, a cell at `p` in the frame of the row feels, in that frame,
+//! `w` and angular acceleration `w'`, a cell at `p` in the frame of the row measures, in that frame,
 //!
 //! ```text
 //!   f(p) = R^T (a - g) + ([w']x + [w]x [w]x) p  =  force + gradient p
 //! ```
 //!
-//! The second part holds the tangential and the centripetal acceleration. All of it is in units of g.
+//! The second term is the tangential and the centripetal acceleration. All terms are in units of g.
 
 use crate::central::Central;
 use nalgebra::{Isometry3, Matrix3, UnitQuaternion, Vector3};
@@ -16,7 +16,7 @@ use protocol::skin::Skin;
 
 /// Standard gravity in m/s2.
 pub const G: f64 = 9.806_65;
-/// Gravity seen from the base of a robot that stands upright, in m/s2.
+/// Gravity in the base frame of an upright robot, in m/s2.
 pub const UPRIGHT: [f64; 3] = [0.0, 0.0, -G];
 
 /// Positions, speeds and accelerations of the joints of a chain, in rad or m and seconds.
@@ -30,41 +30,41 @@ pub struct JointState {
     pub acceleration: [f64; MAX_JOINTS],
 }
 
-/// What the cells on one row feel, in the frame of the row.
+/// The specific force field on one row of the chain, in the frame of the row.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct RowMotion {
     /// The specific force at the row's origin, in g.
     pub force: Vector3<f64>,
-    /// How it changes with the place, in g/m.
+    /// Its gradient with respect to the position, in g/m.
     pub gradient: Matrix3<f64>,
 }
 
 impl RowMotion {
-    /// The specific force at a place, in g.
+    /// Returns the specific force at a position, in g.
     #[must_use]
     pub fn at(&self, position: &Vector3<f64>) -> Vector3<f64> {
         self.force + self.gradient * position
     }
 }
 
-/// The chain of a bus.
+/// The kinematics of a bus's chain.
 #[derive(Clone, Debug)]
 pub struct Arm {
     central: Central,
     kinds: Vec<RowKind>,
-    /// In the robot's base, in m/s2.
+    /// Gravity in the robot's base frame, in m/s2.
     gravity: Vector3<f64>,
 }
 
 impl Arm {
-    /// The chain of a bus that has cells; gravity is seen from the robot's base, in m/s2.
+    /// Builds the chain of a bus that has cells; `gravity` is in the robot's base frame, in m/s2.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize, gravity: [f64; 3]) -> Self {
         let kinds = skin.chain(bus).rows.iter().map(|row| row.kind).collect();
         Self { central: Central::unquantised(&skin.part_on(bus)), kinds, gravity: gravity.into() }
     }
 
-    /// What the cells on each row feel; the first is the base of the chain, which no joint moves.
+    /// Returns the specific force field on each row; the first is the base of the chain, which no joint moves.
     #[must_use]
     pub fn rows(&self, state: &JointState) -> [RowMotion; MAX_ROWS + 1] {
         let frames = self.central.frames_at(&state.position);
@@ -99,7 +99,7 @@ impl Arm {
         rows
     }
 
-    /// From the frame of one row to that of another one of the same link.
+    /// Returns the transform from the frame of one row to that of another row of the same link.
     #[must_use]
     pub fn between(&self, from: u8, to: u8) -> Isometry3<f64> {
         let frames = self.central.frames_at(&[]);
@@ -110,7 +110,7 @@ impl Arm {
         Isometry3::from_parts(change.translation, UnitQuaternion::from_rotation_matrix(&change.rotation))
     }
 
-    /// Where a place in the frame of a row is, seen from the robot's base, in m.
+    /// Returns a position given in the frame of a row in the robot's base frame, in m.
     #[must_use]
     pub fn place(&self, row: usize, position: &Vector3<f64>, joints: &[f64]) -> Vector3<f64> {
         let frames = self.central.frames_at(joints);
@@ -125,7 +125,7 @@ mod tests {
     use super::*;
     use crate::testing;
 
-    /// Joint positions as functions of time, and what of them is known in closed form.
+    /// Joint positions as functions of time, with their derivatives in closed form.
     fn state(t: f64, joints: usize) -> JointState {
         let mut state = JointState::default();
         for joint in 0..joints {

@@ -1,8 +1,8 @@
-//! What the accelerometers of cells show while a robot moves.
+//! Simulated accelerometers of the cells of a moving robot.
 //!
-//! | module | what |
+//! | module | content |
 //! |---|---|
-//! | [`kinematics`] | what an accelerometer at a place of the robot feels |
+//! | [`kinematics`] | the specific force at a point of the robot |
 //! | [`sensor`] | an accelerometer with the errors of its data sheet |
 
 pub mod kinematics;
@@ -27,7 +27,7 @@ pub struct RobotState {
 }
 
 impl RobotState {
-    /// Those of a chain, given the robot's joints in it.
+    /// Returns the state of a chain, given the indices of its joints in the robot.
     #[must_use]
     pub fn of_chain(&self, joints: &[usize]) -> JointState {
         let pick = |from: &[f64; MAX_ROBOT_JOINTS]| {
@@ -49,12 +49,12 @@ impl RobotState {
 #[derive(Clone, Debug)]
 pub struct Accelerometers {
     arms: Vec<Option<Arm>>,
-    /// By cell.
+    /// Sensors by cell index.
     sensors: Vec<Accelerometer>,
 }
 
 impl Accelerometers {
-    /// One for each cell, drawn from a data sheet and a seed; gravity is seen from the robot's base, in m/s2.
+    /// Creates one sensor per cell from a data sheet and a seed; `gravity` is in the robot's base frame, in m/s2.
     #[must_use]
     pub fn new(skin: &Skin, sheet: &DataSheet, seed: u64, gravity: [f64; 3]) -> Self {
         let arm = |bus: usize| skin.cells_of(bus).next().map(|_| Arm::new(skin, bus, gravity));
@@ -65,14 +65,14 @@ impl Accelerometers {
         Self { arms: (0..skin.buses.len()).map(arm).collect(), sensors: sensors.collect() }
     }
 
-    /// The sensor of a cell.
+    /// Returns the sensor of a cell.
     #[must_use]
     pub fn sensor(&self, cell: usize) -> Option<&Accelerometer> {
         self.sensors.get(cell)
     }
 
-    /// What each cell of the skin shows at a time in s, in g; `state` is the robot's at a time, `tilt` turns what a cell
-    /// feels.
+    /// Returns the reading of each cell of the skin at the time `now` in s, in g. `state` returns the robot's state at
+    /// a time; `tilt` rotates the force at a cell.
     pub fn readings<'a>(
         &'a self,
         skin: &'a Skin,

@@ -1,8 +1,8 @@
-//! An accelerometer as it is: what its data sheet leaves open, and one that is drawn from that.
+//! A simulated accelerometer: the tolerances of its data sheet, and one sensor drawn from them.
 //!
-//! A reading is `D (I + gain + cross) f + bias + noise`, `f` the specific force in the frame of the cell at the time of
-//! the sample, held within the range and rounded to a step. Samples come at a rate of the sensor's own; the
-//! newest one is read with the joints, so that a reading is older than these by the delay and up to a period.
+//! A reading is `D (I + gain + cross) f + bias + noise`, where `f` is the specific force in the cell's frame at the
+//! time of the sample, clamped to the range and rounded to a step. The sensor samples at its own rate. The newest
+//! sample is read with the joints, so a reading is older than the joints by the delay plus up to one period.
 
 use core::f64::consts::{PI, TAU};
 
@@ -12,30 +12,30 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
 
-/// What the data sheet of an accelerometer says of all of its kind.
+/// The tolerances from an accelerometer's data sheet.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct DataSheet {
     /// The largest offset of an axis, in g.
     pub bias_g: f64,
-    /// The largest error of an axis' gain, as a part of it.
+    /// The largest relative error of an axis' gain.
     pub gain: f64,
-    /// The largest part of one axis' input that another axis shows: crossed and turned axes.
+    /// The largest share of one axis' input that appears on another axis (tilted or non-orthogonal axes).
     pub cross_axis: f64,
     /// Noise of a sample, root mean square, in g.
     pub noise_g: f64,
-    /// Samples in a second; 0: samples are taken when they are read.
+    /// Samples per second; 0 to sample at each read.
     pub rate_hz: f64,
-    /// The largest error of that rate, as a part of it.
+    /// The largest relative error of that rate.
     pub rate_error: f64,
-    /// The longest delay from the motion to the sample, filters included, in s.
+    /// The longest delay from the motion to the sample, including filters, in s.
     pub delay_s: f64,
     /// The range of an axis, in g.
     pub range_g: f64,
-    /// The step of a reading, in g.
+    /// The resolution of a reading, in g.
     pub step_g: f64,
 }
 
-/// A data sheet as a file has it: a kind, and what is different.
+/// The data sheet in a file: a kind, and the values that differ from it.
 #[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Given {
@@ -52,10 +52,10 @@ pub struct Given {
 }
 
 impl Given {
-    /// The data sheet, if its values can be.
+    /// Returns the data sheet, if all values are in range.
     ///
     /// # Errors
-    /// The first value that cannot be.
+    /// Returns the first value that is out of range.
     pub fn sheet(&self, at: &Place) -> Result<DataSheet, Fault> {
         let kinds = [("perfect", DataSheet::PERFECT), ("bma250", DataSheet::BMA250)];
         let mut sheet = at.key("kind").word(self.kind.as_deref().unwrap_or("bma250"), &kinds)?;
@@ -88,9 +88,9 @@ impl Default for DataSheet {
 }
 
 impl DataSheet {
-    /// A Bosch BMA250, which is on the published hexagonal skin cells, at a range of 2 g and a bandwidth of 62.5 Hz. From
-    /// its data sheet (BST-BMA250-DS002): offset at zero g 80 mg, tolerance of sensitivity 4 %, cross-axis sensitivity
-    /// 1 %, noise 0.8 mg/sqrt(Hz), 10 bits. Delay and the tolerance of the clock are of the cell.
+    /// A Bosch BMA250, the part on the published hexagonal skin cells, at a range of 2 g and a bandwidth of 62.5 Hz.
+    /// From its data sheet (BST-BMA250-DS002): offset at zero g 80 mg, tolerance of sensitivity 4 %, cross-axis
+    /// sensitivity 1 %, noise 0.8 mg/sqrt(Hz), 10 bits. The delay and the clock tolerance are properties of the cell.
     pub const BMA250: Self = Self {
         bias_g: 0.08,
         gain: 0.04,
@@ -103,7 +103,7 @@ impl DataSheet {
         step_g: 1.0 / 256.0,
     };
 
-    /// A sensor without any error, whose samples are taken with the joints.
+    /// A sensor without errors, sampled together with the joints.
     pub const PERFECT: Self = Self {
         bias_g: 0.0,
         gain: 0.0,
@@ -116,27 +116,27 @@ impl DataSheet {
         step_g: 0.0,
     };
 
-    /// The time from one sample to the next, in s; 0 where samples are taken when they are read.
+    /// Returns the time between samples in s; 0 if the sensor samples at each read.
     #[must_use]
     pub fn period_s(&self) -> f64 {
         if self.rate_hz > 0.0 { self.rate_hz.recip() } else { 0.0 }
     }
 
-    /// Mean and standard deviation of the age of a reading, in s.
+    /// Returns the mean and the standard deviation of the age of a reading, in s.
     #[must_use]
     pub fn age(&self) -> (f64, f64) {
         let period = self.period_s();
         ((self.delay_s + period) / 2.0, self.delay_s.hypot(period) / 12.0_f64.sqrt())
     }
 
-    /// Standard deviation of a reading from the mean of many, in g.
+    /// Returns the standard deviation of a single reading, in g.
     #[must_use]
     pub fn deviation(&self) -> f64 {
         self.noise_g.hypot(self.step_g / 12.0_f64.sqrt())
     }
 }
 
-/// One accelerometer.
+/// One simulated accelerometer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Accelerometer {
     sheet: DataSheet,
@@ -145,14 +145,14 @@ pub struct Accelerometer {
     matrix: Matrix3<f64>,
     bias: Vector3<f64>,
     delay: f64,
-    /// From one sample to the next, in s; 0 where samples are taken when they are read.
+    /// Time between samples in s; 0 if the sensor samples at each read.
     period: f64,
-    /// When the first sample is taken, in s.
+    /// Time of the first sample, in s.
     phase: f64,
 }
 
 impl Accelerometer {
-    /// One of this kind; the same for the same seed.
+    /// Draws a sensor of this kind; the same seed gives the same sensor.
     #[must_use]
     pub fn new(sheet: &DataSheet, seed: u64) -> Self {
         let mut dice = Pcg64Mcg::seed_from_u64(seed);
@@ -171,25 +171,25 @@ impl Accelerometer {
         Self { sheet: *sheet, seed, matrix, bias, delay, period, phase }
     }
 
-    /// Its gains: of a force along each axis, what the axis shows.
+    /// Returns the gain of each axis.
     #[must_use]
     pub fn gain(&self) -> Vector3<f64> {
         self.matrix.diagonal()
     }
 
-    /// What it shows without a force, in g.
+    /// Returns the offset of each axis, in g.
     #[must_use]
     pub const fn bias(&self) -> Vector3<f64> {
         self.bias
     }
 
-    /// When the newest of the samples that can be read at a time was taken, and of which moment it tells.
+    /// Returns the instant that the newest readable sample at `now` shows: its sampling time minus the delay, in s.
     #[must_use]
     pub fn sampled(&self, now: f64) -> f64 {
         self.sample(now).1
     }
 
-    /// The number of the newest sample, and the moment that it tells of.
+    /// Returns the number of the newest sample and the instant that it shows.
     fn sample(&self, now: f64) -> (f64, f64) {
         if self.period > 0.0 {
             let number = ((now - self.phase) / self.period).floor();
@@ -199,7 +199,7 @@ impl Accelerometer {
         }
     }
 
-    /// The reading at a time, in g; `force` is the specific force in the frame of the cell at the moment of
+    /// Returns the reading at `now`, in g; `force` is the specific force in the cell's frame at
     /// [`Accelerometer::sampled`], in g.
     #[must_use]
     pub fn reading(&self, now: f64, force: &Vector3<f64>) -> Vector3<f64> {
@@ -214,22 +214,22 @@ impl Accelerometer {
     }
 }
 
-/// A number of the standard normal distribution, by Box and Muller.
+/// Draws from the standard normal distribution (Box-Muller).
 #[must_use]
 pub fn normal(dice: &mut Pcg64Mcg) -> f64 {
     let [u, v]: [f64; 2] = [dice.random(), dice.random()];
     (-2.0 * (1.0 - u).ln()).sqrt() * (TAU * v).cos()
 }
 
-/// Bits that look independent of those of neighbouring numbers: the finaliser of SplitMix64.
+/// Mixes the bits of a number, so that neighbouring numbers give independent ones: the finaliser of SplitMix64.
 const fn mixed(bits: u64) -> u64 {
     let bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     let bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
     bits ^ (bits >> 31)
 }
 
-/// The rotation of an orientation x, y, z, w from the file of a skin, or of a cell of which only the normal is known: its
-/// x axis is then as near as possible to that of its row, or to the y axis where that is the normal.
+/// Returns the rotation of an orientation quaternion x, y, z, w from a skin's file. For a cell with a normal only, its
+/// x axis is as near as possible to that of its row, or to the y axis if the normal is close to x.
 #[must_use]
 pub fn rotation(orientation: Option<[f64; 4]>, normal: [f64; 3]) -> nalgebra::UnitQuaternion<f64> {
     use nalgebra::{Quaternion, Rotation3, UnitQuaternion};

@@ -23,7 +23,7 @@ fn torques_agree_with_the_table_of_another_program() {
         let [joint, q @ .., f_z, _, _, _, _, _, _] = row.as_slice() else { panic!("{line}") };
         let [q1, q2, q3, q4, q5, q6, tx, ty, tz, nx, ny, nz] = *q else { panic!("{line}") };
         let joint = (1..=6_u8).find(|&k| f64::from(k) == *joint).unwrap().into();
-        // The table's n is the direction of the force: inwards.
+        // In the table, n is the direction of the force: inwards.
         central.cells = vec![Place {
             row: joint,
             position: [tx, ty, tz].into(),
@@ -103,8 +103,8 @@ fn the_torque_of_the_skin_is_the_sum_of_its_active_cells() {
 }
 
 proptest! {
-    /// The principle of virtual work, with a finite difference as the oracle: the torque of a joint is
-    /// the force times the displacement of the cell per joint angle. So a pressed joint yields.
+    /// The principle of virtual work, with a finite difference as the oracle: the torque of a joint is the force times
+    /// the displacement of the cell per joint angle. A pressed joint therefore yields.
     #[test]
     fn the_torque_is_the_work_of_the_force_per_angle(q in any::<[i16; 6]>(), k in 1_u8..=6) {
         let mut skin = skin();

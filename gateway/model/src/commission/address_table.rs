@@ -1,4 +1,4 @@
-//! Which cell has which node id.
+//! The assignment of node ids to cells.
 
 use protocol::id::CellId;
 use protocol::message::Heartbeat;
@@ -6,15 +6,15 @@ use protocol::time::Micros;
 
 use crate::tracker::{Claim, PerCell, Word};
 
-/// All node ids of a bus.
+/// The claims to all node ids of a bus.
 #[derive(Debug, Default)]
 pub(super) struct AddressTable(PerCell<Claim>);
 
 impl AddressTable {
-    /// Takes a heartbeat. Returns two serial numbers that use one node id in turn.
+    /// Records a heartbeat. Returns two serial numbers that use one node id in turn.
     ///
-    /// One change is a cell that replaced another one; only a change back shows that both are there. An address claim
-    /// for a taken node id is given up, and does not change the owner.
+    /// A single change means that one cell replaced another; only a change back proves that both are present. A claim
+    /// for a taken node id will be given up and does not change the owner.
     pub(super) fn hear(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat) -> Option<[u32; 2]> {
         let claim = self.0.get_mut(number)?;
         let before = *claim;
@@ -23,12 +23,12 @@ impl AddressTable {
         (took && claim.serial() == Some(earlier) && earlier != holder).then_some([earlier, holder])
     }
 
-    /// The serial number of the owner of a node id.
+    /// Returns the serial number of the owner of a node id.
     pub(super) fn holder(&self, number: CellId) -> Option<u32> {
         self.0.get(number).and_then(Claim::serial)
     }
 
-    /// All node ids in use, with the serial numbers of their owners.
+    /// Returns all node ids in use, with the serial numbers of their owners.
     pub(super) fn all(&self) -> impl Iterator<Item = (CellId, u32)> {
         self.0.iter().filter_map(|(number, claim)| Some((number, claim.serial()?)))
     }

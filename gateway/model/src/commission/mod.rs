@@ -1,4 +1,4 @@
-//! Writes a description into the cells of one bus: the state and the last request of each cell.
+//! Writes a skin's description into the cells of one bus, as a state machine without I/O.
 //!
 //! ```text
 //!   message, now ─> handle_message ─┐                  ┌─> poll_transmit ─> message
@@ -7,12 +7,11 @@
 //! ```
 //!
 //! A cell is identified by its serial number; its node id on the bus may differ from the description's. Its
-//! configuration changes at its commit, as a whole: the commit has the hash of what must be staged. So a
-//! commissioning may end at any moment, intended or not, and the next one continues: cells with the right hash are
-//! left as they are.
+//! configuration changes atomically, at its commit: the commit contains the hash of the parameters that must be staged.
+//! So a commissioning may stop at any moment, and the next one continues: cells with the right hash are skipped.
 //!
-//! It listens first, then sends requests: parameters that all cells share to everyone, one request at a time; the
-//! rest to each cell, some cells at a time. Requests without an answer are repeated. When all cells have committed,
+//! It listens first and then sends requests. Parameters that all cells share are broadcast, one request at a time; the
+//! rest goes to each cell, several cells at a time. Unanswered requests are repeated. When all cells have committed,
 //! all parameters are read back and compared, and so is the hash in the heartbeats.
 
 mod address_table;
@@ -38,48 +37,48 @@ pub use outcome::{Outcome, Reason, Step, Trouble};
 pub use report::{CellReport, Progress, Report, UnknownNode};
 pub use task::Wish;
 
-/// How long it only listens before it sends: two gateways detect each other in this time.
+/// Duration of listening before the first request. Two gateways detect each other in this time.
 pub const LISTEN: Span = Span::from_millis(500);
-/// How long to wait for further cells after the last one appeared.
+/// Time to wait for further cells after the last one appeared.
 const SHOWING: Span = Span::from_millis(3_000);
-/// Cells with a request of their own at the same time.
+/// Maximum number of cells with a pending request of their own.
 const WINDOW: usize = 16;
-/// How often a request to everyone is repeated when most cells do not answer; after so long without any answer, the
-/// remaining cells get requests of their own.
+/// Limits of a broadcast request while most cells do not answer. After this time without any answer, the remaining
+/// cells get requests of their own.
 const CALLS: Limits = Limits { first: QUIET, longest: QUIET, tries: 3 };
 const QUIET: Span = Span::from_millis(150);
-/// From one sync to the next while it waits for heartbeats.
+/// Interval of syncs while waiting for heartbeats.
 const SYNC: Span = Span::from_millis(300);
-/// Interval of this gateway's heartbeats, by which others detect it.
+/// Interval of this gateway's heartbeats, by which other gateways detect it.
 const ANNOUNCE: Span = Span::from_millis(250);
-/// Set in the tags of requests to everyone.
+/// The bit that marks the tags of broadcast requests.
 const EVERYONE: u8 = 0x80;
 
-/// What is done next.
+/// The phases of a commissioning, in order.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Phase {
-    /// Only listening, until this time.
+    /// Listening only, until this time.
     Listen(Micros),
-    /// Waiting for cells; since when no further one has shown up.
+    /// Waiting for cells; with the time when the last one appeared.
     Find(Micros),
-    /// Parameters and commits.
+    /// Writing parameters and committing.
     Write,
-    /// All parameters are read back.
+    /// Reading back all parameters.
     Read,
-    /// Waiting for heartbeats; when the last sync was sent.
+    /// Waiting for heartbeats; with the time of the last sync.
     Beat(Micros),
-    /// Nothing is left to do.
+    /// Finished.
     Over,
 }
 
-/// A request to everyone.
+/// A broadcast request.
 #[derive(Clone, Copy, Debug)]
 struct Call {
     step: Step,
     tag: u8,
-    /// Cells that needed it at first.
+    /// Number of cells that needed it at first.
     needed: usize,
-    /// When it times out, unless a cell answers before that.
+    /// Its retries. An answer from any cell restarts the timeout.
     attempt: Attempt,
 }
 
@@ -87,7 +86,7 @@ struct Call {
 #[derive(Debug)]
 pub struct Commission {
     wish: Wish,
-    /// Answers that a request to everyone may bring at once.
+    /// Number of answers that a broadcast request may bring at once.
     room: usize,
     tasks: Vec<Task>,
     by_serial: HashMap<u32, usize>,
@@ -97,7 +96,7 @@ pub struct Commission {
     phase: Phase,
     calls: VecDeque<Step>,
     call: Option<Call>,
-    /// All requests to everyone so far, with their tags: late answers count too.
+    /// All broadcast requests so far, with their tags: late answers count too.
     called: Vec<(Step, u8)>,
     outbox: VecDeque<Message>,
     announced: Option<Micros>,
@@ -107,7 +106,7 @@ pub struct Commission {
 }
 
 impl Commission {
-    /// The commissioning of a skin's bus, which begins now by listening; `room` is how many packets may come at
+    /// Starts the commissioning of a skin's bus, with listening; `room` is the number of packets that may arrive at
     /// once without loss.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize, wish: Wish, room: usize, now: Micros) -> Self {
@@ -136,19 +135,19 @@ impl Commission {
         }
     }
 
-    /// Whether nothing is left to do.
+    /// Returns true when the commissioning is finished.
     #[must_use]
     pub fn is_over(&self) -> bool {
         self.phase == Phase::Over
     }
 
-    /// Whether it may send on the bus: not while it only listens, and not in a dry run.
+    /// Returns true if it may send on the bus: not while it listens, and not in a dry run.
     #[must_use]
     pub const fn speaks(&self) -> bool {
         !matches!(self.phase, Phase::Listen(_) | Phase::Over) && !self.wish.dry_run
     }
 
-    /// Takes a message of another sender on the bus; [`Commission::handle_time`] acts on it.
+    /// Handles a message from another sender on the bus. [`Commission::handle_time`] acts on it.
     pub fn handle_message(&mut self, now: Micros, message: &Message) {
         if let Message::Joints { .. } | Message::Network { from: Node::Gateway, .. } = message {
             self.end(Trouble::OtherGateway);
@@ -174,7 +173,7 @@ impl Commission {
         }
     }
 
-    /// The described cell that has a node id now.
+    /// Returns the described cell that holds a node id now.
     fn holder(&mut self, number: CellId) -> Option<&mut Task> {
         let serial = self.address_table.holder(number)?;
         let task = self.tasks.get_mut(*self.by_serial.get(&serial)?)?;
@@ -223,13 +222,13 @@ impl Commission {
         }
     }
 
-    /// Ends it now; nothing more is sent.
+    /// Stops now; the outbox is emptied.
     pub fn stop(&mut self) {
         self.outbox.clear();
         self.give_up(Reason::Stopped, Reason::Stopped);
     }
 
-    /// Gives up all cells that are not done.
+    /// Fails all cells that are not done.
     fn give_up(&mut self, unheard: Reason, heard: Reason) {
         for task in self.tasks.iter_mut().filter(|task| !task.is_done()) {
             task.fail(if task.number.is_none() { unheard } else { heard });
@@ -237,7 +236,7 @@ impl Commission {
         self.phase = Phase::Over;
     }
 
-    /// Handles timeouts, and decides what to send. Harmless when called early.
+    /// Handles timeouts, and decides what to send. Has no effect when called early.
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.tasks.len() {
             let again = self.tasks.get_mut(place).and_then(|task| Some((task.number, task.time(now)?)));
@@ -246,7 +245,7 @@ impl Commission {
                 self.request(place, Node::Cell(node), step, tag);
             }
         }
-        // Each turn is a phase that has nothing left to do.
+        // Advance through all phases that are complete.
         while let Some(next) = self.turn(now) {
             self.phase = next;
         }
@@ -258,7 +257,7 @@ impl Commission {
         }
     }
 
-    /// Does what there is to do in a phase; returns the next one, when nothing is left.
+    /// Does the work of the current phase. Returns the next phase if the current one is complete.
     fn turn(&mut self, now: Micros) -> Option<Phase> {
         match self.phase {
             Phase::Listen(until) => {
@@ -266,7 +265,7 @@ impl Commission {
                     return None;
                 }
                 if !self.wish.dry_run {
-                    // For the heartbeats of cells that have not sent one yet.
+                    // Requests heartbeats from cells that have not sent one yet.
                     self.outbox.push_back(Message::Sync);
                 }
                 Some(Phase::Find(now))
@@ -315,7 +314,8 @@ impl Commission {
         self.tasks.iter().any(|task| !task.is_done() && is(task.stage))
     }
 
-    /// Sends the requests that are possible now to cells in such stages; whether any cell remains, or is about to settle.
+    /// Sends the requests that are possible now to cells in these stages. Returns true if any cell remains, or is still
+    /// settling.
     fn works(&mut self, now: Micros, is: impl Fn(Stage) -> bool) -> bool {
         if self.call_everyone(now) {
             return true;
@@ -334,13 +334,13 @@ impl Commission {
         self.any(is) || self.tasks.iter().any(|task| !task.is_done() && task.unsettled.is_some())
     }
 
-    /// Continues with requests to everyone; whether one is pending.
+    /// Continues with broadcast requests. Returns true if one is pending.
     fn call_everyone(&mut self, now: Micros) -> bool {
         loop {
             if let Some(call) = &mut self.call {
                 let mut waiting = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(call.step));
                 let first = waiting.next().map(|(place, _)| place);
-                // When most cells did not answer, repeating it costs less than a request to each.
+                // If most cells did not answer, a repeated broadcast costs less than a request to each.
                 match first.map(|place| (place, call.attempt.turn(now))) {
                     Some((_, Turn::Wait)) => return true,
                     Some((place, Turn::Again)) if 2 * (waiting.count() + 1) > call.needed => {
@@ -354,13 +354,13 @@ impl Commission {
             }
             let Some(step) = self.calls.pop_front() else { return false };
             let mut needing = self.tasks.iter().enumerate().filter(|(_, task)| task.needs(step));
-            // What only one cell needs is a request to that cell.
+            // A write that only one cell needs goes to that cell alone.
             let (Some((place, _)), Some(_)) = (needing.next(), needing.next()) else { continue };
             let needed = needing.count() + 2;
             if !self.may_call(step) {
                 continue;
             }
-            // There are fewer of them than tags.
+            // There are fewer broadcast requests than tags.
             let tag = EVERYONE | self.called.last().map_or(0, |(_, tag)| tag.wrapping_add(1));
             self.called.push((step, tag));
             self.call = Some(Call { step, tag, needed, attempt: Attempt::new(now, CALLS) });
@@ -368,8 +368,8 @@ impl Commission {
         }
     }
 
-    /// Whether this may be sent to everyone: there must be room for all answers, and nothing is written to cells that
-    /// are not described.
+    /// Returns true if this request may be broadcast: the receive buffer must hold all answers, and a write must not
+    /// reach cells outside the description.
     fn may_call(&self, step: Step) -> bool {
         let fits = self.address_table.all().count() <= self.room;
         let known = |serial| self.by_serial.get(&serial).and_then(|&place| self.tasks.get(place));
@@ -377,7 +377,7 @@ impl Commission {
         fits && (matches!(step, Step::Read(_)) || self.address_table.all().all(|(_, serial)| ours(serial)))
     }
 
-    /// Writes that are the same for all cells that need any.
+    /// Returns the writes with the same value for all cells that need any.
     fn common_writes(&self) -> VecDeque<Step> {
         let common = |parameter: &Parameter| {
             let mut words = self
@@ -391,7 +391,7 @@ impl Commission {
         self.all_stored().filter(common).map(Step::Write).collect()
     }
 
-    /// The parameters of the longest table.
+    /// Returns the parameters of the longest table.
     fn all_stored(&self) -> impl Iterator<Item = Parameter> + use<> {
         let longest = self.tasks.iter().map(|task| task.stored().count()).max().unwrap_or_default();
         Parameter::stored(MAX_ROWS).take(longest)
@@ -409,12 +409,12 @@ impl Commission {
         self.outbox.push_back(Message::Configure { to, tag, request });
     }
 
-    /// The next message to send.
+    /// Returns the next message to send.
     pub fn poll_transmit(&mut self) -> Option<Message> {
         self.outbox.pop_front()
     }
 
-    /// When [`Commission::handle_time`] has something to do; `None` when it is over.
+    /// Returns the time of the next call of [`Commission::handle_time`]; `None` when finished.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Micros> {
         let phase = match self.phase {
@@ -435,7 +435,7 @@ const fn is_failed(stage: Stage) -> bool {
     matches!(stage, Stage::Done(Outcome::Failed(_)))
 }
 
-/// Whether a write of this parameter changes stored or staged parameters.
+/// Returns true if a write of this parameter changes stored or staged parameters.
 fn is_stored(number: u8) -> bool {
     let parameter = Parameter::from_number(number);
     parameter.is_some_and(|it| it == Parameter::Commit || it.is_stored())

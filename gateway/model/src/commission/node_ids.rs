@@ -7,7 +7,7 @@ use protocol::skin::Skin;
 use protocol::skin::file::{Edit, EditError, Value};
 use thiserror::Error;
 
-/// Why there is no copy.
+/// The error for a description that cannot be renumbered.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum NodeIdsError {
@@ -16,24 +16,24 @@ pub enum NodeIdsError {
     Missing {
         /// The bus.
         bus: String,
-        /// Cells without a heartbeat.
+        /// Number of cells without a heartbeat.
         missing: usize,
-        /// Cells of the bus.
+        /// Number of cells of the bus.
         cells: usize,
     },
-    /// The file is no longer what was read.
+    /// The text is not that of the skin that was read.
     #[error("the description's text is not that of the skin that was read: {0}")]
     Text(String),
 }
 
-/// The node ids of cells by serial number; `None` of cells without a heartbeat.
+/// Node ids by serial number; `None` for cells without a heartbeat.
 pub type NodeIds = BTreeMap<u32, Option<CellId>>;
 
-/// The text of a description with other node ids, and everything else as it was: comments, order, omitted keys.
-/// Cells that `node_ids` does not have keep theirs. Neighbors are renumbered with the cells.
+/// Returns the text of a description with other node ids, and everything else unchanged: comments, order, omitted keys.
+/// Cells that are not in `node_ids` keep their node ids. Neighbors are renumbered with the cells.
 ///
 /// # Errors
-/// When a node id is not known, or the text is not the skin's.
+/// Returns [`NodeIdsError`] if a node id is not known, or if the text is not the skin's.
 pub fn renumbered(skin: &Skin, text: &str, node_ids: &NodeIds) -> Result<String, NodeIdsError> {
     for (bus, described) in skin.buses.iter().enumerate() {
         let here = || skin.cells_of(bus).filter_map(|cell| node_ids.get(&cell.serial));
@@ -86,7 +86,7 @@ mod tests {
         CellId::new(node.into()).unwrap()
     }
 
-    /// Three cells in a row; the second one's serial number is left out, which makes it 2.
+    /// Three cells in a row. The serial number of the second one is omitted, which makes it 2.
     const CELLS: &str = r#"
 [[cell]]
 bus = "vcan0"
@@ -138,7 +138,7 @@ neighbors = [2, 0, 0, 0]
             );
         let copy = renumbered(&skin, &text, &node_ids).unwrap();
         assert_eq!(copy, expected);
-        // The same cells by their serial numbers, wired as before.
+        // Both skins have the same cells by serial number, with the same wiring.
         let copied = Skin::parse("copy.toml", &copy).unwrap();
         for (old, new) in skin.cells.iter().zip(&copied.cells) {
             assert_eq!((old.serial, node_ids[&old.serial]), (new.serial, Some(new.node)));

@@ -1,4 +1,4 @@
-//! What became of a cell, and of a bus, in words.
+//! The results of commissioning a cell and a bus, and their texts.
 
 use core::fmt;
 
@@ -24,7 +24,7 @@ pub enum Step {
 }
 
 impl Step {
-    /// The parameter that it is about.
+    /// Returns the parameter of the request.
     pub(super) const fn parameter(self) -> Parameter {
         match self {
             Self::Write(parameter) | Self::Read(parameter) => parameter,
@@ -44,35 +44,35 @@ impl fmt::Display for Step {
     }
 }
 
-/// What became of a cell; as JSON in words, `outcome` and `why`.
+/// The result of a cell; as JSON, the texts `outcome` and `why`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 #[serde(tag = "outcome", content = "why", rename_all = "lowercase")]
 pub enum Outcome {
     /// It was written, read back and compared.
     Written,
-    /// It had the skin's configuration already, by its hash.
+    /// Its hash matched the skin's configuration already.
     #[serde(rename = "already so")]
     AlreadySo,
-    /// It had it already, and every word was read and compared.
+    /// Its hash matched already, and all its parameters were read back and compared.
     Verified,
-    /// It would be written, if this were no dry run.
+    /// A dry run: it would be written.
     #[serde(rename = "would be written")]
     WouldWrite,
-    /// It failed; the cell has either its old configuration or all of the new one.
+    /// It failed. The cell has either its old configuration or all of the new one.
     Failed(Reason),
 }
 
-/// Why a cell was not commissioned.
+/// The reason why a cell was not commissioned.
 #[derive(Clone, Copy, Debug, Error, PartialEq)]
 pub enum Reason {
     /// It sent no heartbeat.
-    #[error("is not on the bus: switch it on, or look at its wires")]
+    #[error("is not on the bus: switch it on, or check its wiring")]
     Missing,
-    /// It sent heartbeats, and then no more.
+    /// Its heartbeats stopped.
     #[error("has gone from the bus")]
     Gone,
     /// Two cells have its serial number.
-    #[error("is there twice, with the node ids {0} and {1}: give one of them another serial number")]
+    #[error("is on the bus twice, with node ids {0} and {1}: give one of them another serial number")]
     Twins(CellId, CellId),
     /// Another cell uses its node id too.
     #[error("shares node id {number} with the cell of serial number {other}: switch one of them off")]
@@ -82,7 +82,7 @@ pub enum Reason {
         /// The serial number of the other cell.
         other: u32,
     },
-    /// It speaks another version of the protocol.
+    /// It uses another version of the protocol.
     #[error("speaks version {got} of the protocol, and this program {VERSION}: bring both to one version")]
     Version {
         /// Its version.
@@ -93,7 +93,7 @@ pub enum Reason {
     Silent {
         /// The request.
         step: Step,
-        /// How often.
+        /// Number of transmissions.
         tries: u8,
     },
     /// It refused a request.
@@ -101,13 +101,13 @@ pub enum Reason {
     Refused {
         /// The request.
         step: Step,
-        /// Its reason.
+        /// The reason code in its answer.
         code: i16,
     },
-    /// It cannot compute what the skin asks for.
-    #[error("cannot have {0}: give it newer firmware, or leave it out of the skin")]
+    /// It lacks an ability that the skin needs.
+    #[error("does not support {0}: install newer firmware, or leave it out of the skin")]
     Cannot(Ability),
-    /// Its answer differs from what was written.
+    /// Its answer differs from the written value.
     #[error(
         "answers {step} with {}, not {}",
         Words(.step.parameter().number(), *.got),
@@ -116,20 +116,20 @@ pub enum Reason {
     Differs {
         /// The request.
         step: Step,
-        /// What should be there.
+        /// The expected words.
         target: [i16; WORDS],
-        /// What it answered.
+        /// The words in its answer.
         got: [i16; WORDS],
     },
-    /// The hash in its heartbeats is not that of the parameters it reads back.
+    /// The hash in its heartbeats does not match the parameters that it reads back.
     #[error("sends the configuration hash {got:04X} in its heartbeats, not {target:04X}")]
     Hash {
-        /// That of the skin.
+        /// The skin's hash.
         target: u16,
-        /// Its own.
+        /// The hash in its heartbeats.
         got: u16,
     },
-    /// It ended before its turn was over.
+    /// The commissioning ended before this cell was done.
     #[error("was not reached before the end; its configuration is complete, either the old or the new one")]
     Stopped,
 }
@@ -140,22 +140,22 @@ impl Serialize for Reason {
     }
 }
 
-/// Why a whole bus is left alone from some moment on.
+/// The reason for stopping the commissioning of a whole bus.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Trouble {
-    /// Another gateway speaks.
+    /// Another gateway sends on the bus.
     OtherGateway,
-    /// Somebody else writes parameters.
+    /// Another program writes parameters.
     Meddler,
 }
 
 impl Trouble {
-    /// The same for people, of the bus of this name.
+    /// Returns the text for users, with the name of the bus.
     #[must_use]
     pub fn on(self, bus: &str) -> String {
         match self {
             Self::OtherGateway => format!("another gateway is on {bus}: stop it first"),
-            Self::Meddler => format!("somebody else configures cells on {bus}: let that end first"),
+            Self::Meddler => format!("another program configures cells on {bus}: wait until it has finished"),
         }
     }
 }

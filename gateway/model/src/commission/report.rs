@@ -6,18 +6,18 @@ use serde::Serialize;
 use super::task::{Stage, Task};
 use super::{Commission, Outcome, Phase, Reason, Trouble, is_failed};
 
-/// How far it is, for people.
+/// The progress of a commissioning, for display.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Progress {
-    /// What is being done: listening, looking for cells, writing, reading back, waiting for heartbeats.
+    /// The current activity: listening, looking for cells, writing, reading back, waiting for heartbeats.
     pub doing: &'static str,
     /// Cells of the description on this bus.
     pub cells: usize,
-    /// Of these, found on the bus.
+    /// Described cells that were found on the bus.
     pub found: usize,
-    /// Of these, done.
+    /// Described cells that are done.
     pub done: usize,
-    /// Of these, failed.
+    /// Described cells that failed.
     pub failed: usize,
 }
 
@@ -44,7 +44,7 @@ pub struct UnknownNode {
     pub number: CellId,
     /// Its serial number.
     pub serial: u32,
-    /// The bus on which the description has it.
+    /// The bus to which the description assigns it.
     #[serde(rename = "belongs_to", skip_serializing_if = "Option::is_none")]
     pub belongs: Option<String>,
 }
@@ -54,18 +54,18 @@ pub struct UnknownNode {
 pub struct Report {
     /// The described cells, in the file's order.
     pub cells: Vec<CellReport>,
-    /// The others, by node id; nothing was written to them.
+    /// Cells outside the description, by node id; they were not written to.
     pub unknown_nodes: Vec<UnknownNode>,
-    /// Requests to one cell or to everyone.
+    /// Requests to single cells and broadcast requests.
     pub requests: u64,
-    /// Of these, repeated because no answer came.
+    /// Repeated requests among them.
     pub repeated: u64,
-    /// Why it stopped.
+    /// The reason why it stopped early.
     pub trouble: Option<Trouble>,
 }
 
 impl Commission {
-    /// How far it is.
+    /// Returns the progress so far.
     #[must_use]
     pub fn progress(&self) -> Progress {
         let count = |is: &dyn Fn(&Task) -> bool| self.tasks.iter().filter(|task| is(task)).count();
@@ -87,7 +87,7 @@ impl Commission {
         }
     }
 
-    /// The results so far; of cells that are not done, as if it were stopped now.
+    /// Returns the results so far; unfinished cells are reported as stopped.
     #[must_use]
     pub fn report(&self) -> Report {
         let cell = |task: &Task| CellReport {

@@ -1,4 +1,4 @@
-//! The state of one cell: what it still needs, and its last request.
+//! The state of one cell: its missing parameters and its pending request.
 
 use protocol::id::CellId;
 use protocol::message::{Answer, Heartbeat, State, VERSION};
@@ -11,33 +11,33 @@ use crate::repeat::{Attempt, Limits, Turn};
 
 /// Retry limit and timeout of a request to one cell.
 const ANSWER: Limits = Limits { first: Span::from_millis(100), longest: Span::from_millis(800), tries: 6 };
-/// A commit writes flash, which takes longer.
+/// Retry limit and timeouts of a commit, which writes flash and takes longer.
 const COMMIT: Limits = Limits { first: Span::from_millis(400), ..ANSWER };
-/// How often a cell is written again from the beginning, after it was switched off and on in the middle.
+/// Number of times that a cell is written again from the beginning after it restarted in the middle.
 const ROUNDS: u8 = 6;
-/// How long a cell that has started or fallen out may take to settle.
+/// Longest time to settle for a cell that has started or lost its node id.
 pub(super) const SETTLING: Span = Span::from_millis(3_000);
-/// Timeout of a heartbeat with the right hash, after everything was read back.
+/// Timeout for a heartbeat with the right hash, after everything was read back.
 const BEAT: Span = Span::from_millis(2_000);
 
-/// How far a cell is.
+/// The stage of a cell.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum Stage {
     /// It has sent no heartbeat yet.
     Missing,
-    /// It is asked what it can compute.
+    /// Its abilities are being read.
     Ask,
     /// It needs some parameters, then a commit.
     Write,
-    /// It has committed, or had the right hash; its parameters are to be compared.
+    /// It has committed, or had the right hash; its parameters are being compared.
     Read,
-    /// Waiting for a heartbeat with the right hash; since when.
+    /// Waiting for a heartbeat with the right hash; with the start of the wait.
     Beat(Micros),
-    /// Nothing is left to do.
+    /// Finished.
     Done(Outcome),
 }
 
-/// A request without an answer yet.
+/// A request that has not been answered yet.
 #[derive(Clone, Copy, Debug)]
 struct Pending {
     step: Step,
@@ -58,27 +58,27 @@ pub(super) struct Task {
     pub(super) stage: Stage,
     target: Parameters,
     hash: u16,
-    /// Whether this commissioning has changed, or would change, what it computes with.
+    /// True if this commissioning has changed, or would change, its configuration.
     touched: bool,
-    /// Bit i: the stored parameter i is staged, or reads back right.
+    /// Bit i is set if the stored parameter i is staged, or reads back right.
     written: u64,
     read: u64,
     pending: Option<Pending>,
     tag: u8,
     rounds: u8,
-    /// Its node id before this one.
+    /// Its previous node id.
     before: Option<CellId>,
-    /// Since when no requests can be sent to it: it claims an address, or has lost its node id.
+    /// The time since when it cannot receive requests: it claims an address, or has lost its node id.
     pub(super) unsettled: Option<Micros>,
     said_hash: u16,
 }
 
-/// What may be done to cells that have another configuration, or the right one.
+/// Restrictions on a commissioning, and its checks.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Wish {
-    /// Nothing is written.
+    /// True to write nothing.
     pub dry_run: bool,
-    /// Cells that have the right hash are read back too.
+    /// True to read back cells that have the right hash, too.
     pub verify: bool,
 }
 
@@ -107,7 +107,7 @@ impl Task {
         }
     }
 
-    /// The words of a parameter as the cell should have them.
+    /// Returns the words that the cell should have for a parameter.
     pub(super) fn words(&self, parameter: Parameter) -> [i16; WORDS] {
         if parameter == Parameter::Commit {
             return protocol::packet::words([self.hash.cast_signed()]);
@@ -115,12 +115,12 @@ impl Task {
         self.target.words(parameter)
     }
 
-    /// The parameters that the target has.
+    /// Returns the parameters that the target has.
     pub(super) fn stored(&self) -> impl Iterator<Item = Parameter> + use<> {
         Parameter::stored(self.target.table().len())
     }
 
-    /// The bit of a parameter; none of one that the target has not.
+    /// Returns the bit of a parameter; zero for a parameter that the target lacks.
     fn bit(&self, parameter: Parameter) -> u64 {
         self.stored().position(|stored| stored == parameter).map_or(0, bit)
     }
@@ -137,7 +137,7 @@ impl Task {
         self.pending.is_some()
     }
 
-    /// Whether it still needs this step of a request to everyone.
+    /// Returns true if the cell still needs this step of a broadcast request.
     pub(super) fn needs(&self, step: Step) -> bool {
         let of_step = self.bit(step.parameter());
         let missing = |mask| of_step != 0 && mask & of_step == 0;
@@ -149,7 +149,7 @@ impl Task {
         }
     }
 
-    /// Takes a heartbeat of a node id.
+    /// Records a heartbeat that arrived under a node id.
     pub(super) fn hear(&mut self, now: Micros, number: CellId, heartbeat: &Heartbeat, wish: Wish) {
         if let Some(old) = self.number.filter(|&old| old != number) {
             // One change is a cell with a new node id; a change back means two cells.
@@ -177,8 +177,8 @@ impl Task {
         }
     }
 
-    /// It was switched on, or has another node id now: its staged parameters are gone, and the contents of its flash
-    /// are known when it has settled.
+    /// Handles a restart or a new node id: the staged parameters are lost, and the flash content is known only once the
+    /// cell has settled.
     fn restart(&mut self) {
         self.pending = None;
         (self.written, self.read) = (0, 0);
@@ -187,20 +187,20 @@ impl Task {
         }
     }
 
-    /// It has settled: decides what it needs.
+    /// Chooses the stage of a cell that has settled.
     fn place(&mut self, wish: Wish) {
         let has_it = self.said_hash == self.hash;
         self.stage = match (has_it, wish.dry_run, wish.verify || self.touched) {
             (true, _, true) => Stage::Read,
             (true, _, false) => Stage::Done(Outcome::AlreadySo),
-            // What each cell can need not be asked.
+            // A configuration that needs only the default abilities requires no query.
             (false, ..) if Abilities::default().lacks(&self.target).is_some() => Stage::Ask,
             (false, true, _) => Stage::Done(Outcome::WouldWrite),
             (false, false, _) => Stage::Write,
         };
     }
 
-    /// Another cell has its node id now.
+    /// Handles that another cell now holds its node id.
     pub(super) fn lose_node_id(&mut self, now: Micros) {
         self.number = None;
         self.unsettled.get_or_insert(now);
@@ -218,7 +218,7 @@ impl Task {
         self.stage = Stage::Done(if self.touched { Outcome::Written } else { Outcome::Verified });
     }
 
-    /// Begins the next request, if there is one and none is pending; returns it with its tag.
+    /// Starts the next request, unless one is pending; returns it with its tag.
     pub(super) fn step(&mut self, now: Micros) -> Option<(Step, u8)> {
         if self.pending.is_some() || self.unsettled.is_some() || self.number.is_none() {
             return None;
@@ -229,7 +229,7 @@ impl Task {
             Stage::Read => Step::Read(self.first_missing(self.read)?),
             Stage::Missing | Stage::Beat(_) | Stage::Done(_) => return None,
         };
-        // The upper half of the tags is that of requests to everyone.
+        // The upper half of the tags is reserved for broadcast requests.
         self.tag = self.tag.wrapping_add(1) & 0x7F;
         // A commit may take effect without an answer.
         self.touched |= step == Step::Commit;
@@ -238,7 +238,7 @@ impl Task {
         Some((step, self.tag))
     }
 
-    /// Handles timeouts: repeats the request, and fails at the retry limit, or when the cell does not settle.
+    /// Handles timeouts: repeats the request, and fails at the retry limit or if the cell does not settle.
     pub(super) fn time(&mut self, now: Micros) -> Option<(Step, u8)> {
         if self.unsettled.is_some_and(|since| now.since(since) >= SETTLING) && !self.is_done() {
             self.fail(Reason::Gone);
@@ -260,14 +260,14 @@ impl Task {
         }
     }
 
-    /// When [`Task::time`] has something to do.
+    /// Returns the time of the next call of [`Task::time`].
     pub(super) fn due(&self) -> Option<Micros> {
         let settled = self.unsettled.filter(|_| !self.is_done()).map(|since| since + SETTLING);
         let beat = if let Stage::Beat(since) = self.stage { Some(since + BEAT) } else { None };
         [self.pending.map(|pending| pending.attempt.due()), settled, beat].into_iter().flatten().min()
     }
 
-    /// Takes an answer: to its own request, or to `call`, the request to everyone with this tag.
+    /// Handles an answer to its own request or to `call`, the broadcast request with this tag.
     pub(super) fn answer(&mut self, now: Micros, tag: u8, answer: Answer, call: Option<Step>, wish: Wish) {
         let own = self.pending.filter(|pending| pending.tag == tag).map(|pending| pending.step);
         let called = call.filter(|&step| self.needs(step));
@@ -278,7 +278,7 @@ impl Task {
             Answer::Refused { number, reason } if number == parameter.number() => {
                 self.pending = None;
                 if step == Step::Commit && reason == Answer::WRONG_HASH {
-                    // It restarted in between, without a heartbeat that arrived.
+                    // The cell restarted in between, without a heartbeat that arrived.
                     return self.again(Reason::Refused { step, code: reason });
                 }
                 self.fail(Reason::Refused { step, code: reason });
@@ -308,7 +308,7 @@ impl Task {
                     self.again(differs);
                 }
             }
-            // Of another request that had this tag.
+            // The answer belongs to an earlier request with this tag.
             Answer::Value { .. } | Answer::Refused { .. } => {}
         }
     }
@@ -322,7 +322,7 @@ impl Task {
                 self.read |= bit;
                 if self.first_missing(self.read).is_none() {
                     self.stage = Stage::Beat(now);
-                    // A heartbeat may have had the hash meanwhile.
+                    // A heartbeat may have brought the right hash meanwhile.
                     if self.said_hash == self.hash {
                         self.finish();
                     }

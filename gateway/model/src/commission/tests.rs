@@ -3,7 +3,7 @@ use protocol::message::Answer;
 
 const WISH: Wish = Wish { dry_run: false, verify: false };
 
-/// A skin with so many cells at different positions.
+/// Builds a skin with this number of cells at different positions.
 fn skin(cells: usize) -> Skin {
     let (head, cell) = crate::testing::SKIN.split_once("[[cell]]").unwrap();
     let cells = (1..=cells)
@@ -14,7 +14,7 @@ fn skin(cells: usize) -> Skin {
     Skin::parse("skin.toml", &(head.to_owned() + &cells.collect::<String>())).unwrap()
 }
 
-/// A commissioning in which all cells have sent a heartbeat and need everything, after it has listened.
+/// Returns a commissioning after listening, in which all cells have sent a heartbeat and need everything.
 fn begun(skin: &Skin) -> (Commission, Micros) {
     let mut commission = Commission::new(skin, 0, WISH, 1_000, Micros(0));
     for cell in &skin.cells {
@@ -28,7 +28,7 @@ fn begun(skin: &Skin) -> (Commission, Micros) {
     (commission, now)
 }
 
-/// The requests that it sends now: to whom, with which tag, and what.
+/// Returns the requests that are sent now: receiver, tag and content.
 fn requests(commission: &mut Commission) -> Vec<(Node, u8, Request)> {
     std::iter::from_fn(|| commission.poll_transmit())
         .filter_map(|message| {
@@ -38,7 +38,7 @@ fn requests(commission: &mut Commission) -> Vec<(Node, u8, Request)> {
         .collect()
 }
 
-/// Lets time pass until it sends requests again.
+/// Advances time until requests are sent again.
 fn next_requests(commission: &mut Commission) -> (Micros, Vec<(Node, u8, Request)>) {
     loop {
         let now = commission.poll_timeout().expect("it goes on");
@@ -50,7 +50,7 @@ fn next_requests(commission: &mut Commission) -> (Micros, Vec<(Node, u8, Request
     }
 }
 
-/// A cell has taken a write.
+/// Confirms a write of a cell.
 fn confirm(commission: &mut Commission, now: Micros, from: CellId, tag: u8, request: Request) {
     let Request::Write { number, words } = request else { panic!("{request:?}") };
     let answer = Answer::Value { number, written: true, words };

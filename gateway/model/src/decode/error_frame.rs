@@ -1,10 +1,10 @@
-//! What a driver's error frame reports, in candump's words (`include/linux/can/error.h`).
+//! The content of a driver's error frame, in candump's terms (`include/linux/can/error.h`).
 
 use core::fmt::{Display, Formatter, Result};
 
 use protocol::can::Frame;
 
-/// The bits of the identifier.
+/// Names of the identifier's bits.
 const CLASSES: [&str; 10] = [
     "tx-timeout",
     "lost-arbitration",
@@ -23,7 +23,7 @@ const PROTOCOL: u32 = 1 << 3;
 const TRANSCEIVER: u32 = 1 << 4;
 const COUNTERS: u32 = 1 << 9;
 
-/// The bits of data byte 1.
+/// Names of the bits of data byte 1.
 const CONTROLLER_PROBLEMS: [&str; 7] = [
     "rx-overflow",
     "tx-overflow",
@@ -34,7 +34,7 @@ const CONTROLLER_PROBLEMS: [&str; 7] = [
     "back-to-error-active",
 ];
 
-/// The bits of data byte 2.
+/// Names of the bits of data byte 2.
 const VIOLATIONS: [&str; 8] = [
     "single-bit-error",
     "frame-format-error",
@@ -46,7 +46,7 @@ const VIOLATIONS: [&str; 8] = [
     "error-on-tx",
 ];
 
-/// What an error frame reports.
+/// The errors that an error frame reports.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct ErrorFrame {
     classes: u32,
@@ -61,12 +61,12 @@ impl ErrorFrame {
     }
 }
 
-/// The classes of error that the identifier of an error frame names.
+/// Returns the error classes in the identifier of an error frame.
 pub fn error_classes(id: u32) -> impl Iterator<Item = &'static str> {
     names(id, &CLASSES)
 }
 
-/// The names of the bits that are set.
+/// Returns the names of the bits that are set.
 fn names<'a>(bits: u32, names: &'a [&str]) -> impl Iterator<Item = &'a str> {
     names.iter().enumerate().filter(move |(bit, _)| bits >> bit & 1 != 0).map(|(_, name)| *name)
 }

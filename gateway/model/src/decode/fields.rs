@@ -1,4 +1,4 @@
-//! The text of fields, by their layout.
+//! Text of packet fields, formatted by their layouts.
 
 use core::fmt::{self, Display, Formatter};
 
@@ -8,7 +8,7 @@ use protocol::schema::{self, Field, Format, Layout, Part, Piece, Units};
 
 use super::ports::{Bits, Port, around, joined};
 
-/// The words of the parameter with this number, as values with units.
+/// The words of the parameter with this number, formatted as values with units.
 #[derive(Clone, Copy, Debug)]
 pub struct Words(pub u8, pub [i16; WORDS]);
 
@@ -19,12 +19,12 @@ impl Display for Words {
     }
 }
 
-/// The parameter's name; of a number without one, the number.
+/// The name of the parameter with this number, or the number if it has no name.
 #[derive(Clone, Copy, Debug)]
 pub struct Name(pub u8);
 
 impl Name {
-    /// That of a number as a field has it.
+    /// Converts the number from a field's raw value.
     pub(super) fn of(raw: i64) -> Self {
         Self(raw.to_le_bytes()[0])
     }
@@ -39,19 +39,19 @@ impl Display for Name {
     }
 }
 
-/// The text of a layout's fields in these bytes.
+/// Writes the fields of a layout from these bytes.
 pub(super) fn say(f: &mut Formatter<'_>, layout: &Layout, bytes: &[u8]) -> fmt::Result {
     fields(f, layout, Bytes { bytes, units: Units::default() })
 }
 
-/// The bytes of a packet, and what those of joints, torques and sums are worth.
+/// The bytes of a packet, and the units of joints, torques and sums.
 #[derive(Clone, Copy)]
 pub(super) struct Bytes<'a> {
     pub(super) bytes: &'a [u8],
     pub(super) units: Units,
 }
 
-/// The text of a layout's fields.
+/// Writes the fields of a layout.
 pub(super) fn fields(f: &mut Formatter<'_>, layout: &Layout, words: Bytes<'_>) -> fmt::Result {
     let number = layout.fields.first().map_or(0, |first| first.raw(words.bytes, 0));
     fill(f, &layout.text, u16::try_from(number).unwrap_or_default(), words, &|_, name| {
@@ -59,15 +59,15 @@ pub(super) fn fields(f: &mut Formatter<'_>, layout: &Layout, words: Bytes<'_>) -
     })
 }
 
-/// The field of this name.
+/// Returns the field with this name.
 pub(super) fn field<'a>(fields: &'a [Field], name: &str) -> Option<&'a Field> {
     fields.iter().find(|field| field.name == name)
 }
 
-/// Gives the field of a name, or writes what is none.
+/// Looks up the field of a name, or writes the value itself if it is not a field.
 pub(super) type Find<'a> = dyn Fn(&mut Formatter<'_>, &str) -> Result<Option<&'a Field>, fmt::Error> + 'a;
 
-/// Writes the parts of a text that belong to a number.
+/// Writes the parts of a text that apply to a number.
 pub(super) fn fill<'a>(
     f: &mut Formatter<'_>,
     text: &[Part],
@@ -104,7 +104,8 @@ fn pieces<'a>(f: &mut Formatter<'_>, pieces: &[Piece], words: Bytes<'_>, find: &
     Ok(())
 }
 
-/// Writes a field as a part of a text asks for it. An element whose unit is not the field's has its unit behind it.
+/// Writes a field in the format of its text part. An element with another unit than the field's is followed by its
+/// unit.
 fn show(
     f: &mut Formatter<'_>,
     field: &Field,
@@ -151,7 +152,7 @@ fn show(
     }
 }
 
-/// A state word: `configured+active, joint 2, version 1`.
+/// A state word, for example `configured+active, joint 2, version 1`.
 struct Flags(State);
 
 impl Display for Flags {

@@ -1,4 +1,4 @@
-//! Frames as JSON: one object a frame, the unit at the end of each key that has one.
+//! Frames as JSON: one object per frame; keys end with the unit of their value.
 
 use std::io::{self, Write};
 
@@ -14,12 +14,12 @@ use super::fields::Name;
 use super::ports::Bits;
 use super::{Decoded, Foreign, wires};
 
-/// A frame and its meaning.
+/// The JSON object of a frame.
 #[derive(serde::Serialize)]
 struct Line<'a> {
     time_ns: u64,
     bus: &'a str,
-    /// As candump prints it.
+    /// The identifier, as candump prints it.
     id: String,
     raw: String,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -39,15 +39,15 @@ struct Line<'a> {
     values: Option<Values>,
     #[serde(skip_serializing_if = "Option::is_none")]
     saturated: Option<bool>,
-    /// As in the packet.
+    /// The CRC in the packet.
     #[serde(skip_serializing_if = "Option::is_none")]
     crc: Option<String>,
-    /// As computed from its bytes, when it differs.
+    /// The CRC computed from the packet's bytes, if it differs.
     #[serde(skip_serializing_if = "Option::is_none")]
     crc_expected: Option<String>,
 }
 
-/// The values of the words, by kind and page.
+/// The values of the words, by packet kind and page.
 struct Values {
     link_id: Option<LinkId>,
     end: &'static [Field],
@@ -71,7 +71,7 @@ impl Serialize for Values {
     }
 }
 
-/// The fields of a group within a word.
+/// The fields of a group inside one word.
 struct Group<'a>(&'a [Field], &'a [u8]);
 
 impl Serialize for Group<'_> {
@@ -82,7 +82,7 @@ impl Serialize for Group<'_> {
     }
 }
 
-/// Each field that is there; the epoch and the tag stand beside the values.
+/// Serialises each field that is present. The epoch and the tag are keys beside the values.
 fn entries<M: SerializeMap>(
     map: &mut M,
     fields: &[Field],
@@ -114,7 +114,7 @@ fn entries<M: SerializeMap>(
     Ok(())
 }
 
-/// The value of a field, or those of its elements.
+/// The value of a field, or the values of its elements.
 struct Shown<'a>(&'a Field, &'a [u8], Units);
 
 impl Serialize for Shown<'_> {
@@ -162,10 +162,10 @@ impl Serialize for Shown<'_> {
     }
 }
 
-/// Writes one frame in the units of its bus, and the end of its line.
+/// Writes one frame as a JSON line, with values in the units of its bus.
 ///
 /// # Errors
-/// When `out` fails.
+/// Returns the error of `out`.
 pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units: Units) -> io::Result<()> {
     let raw = record.frame.to_string();
     let id = raw.split('#').next().unwrap_or_default().to_owned();
@@ -225,7 +225,7 @@ pub fn write(out: &mut impl Write, record: &Record<'_>, decoded: &Decoded, units
     out.write_all(b"\n")
 }
 
-/// The CRC of a packet: the last two bytes of its only frame, or of its last one.
+/// Returns the CRC of a packet: the last two bytes of its last frame.
 fn last_word(record: &Record<'_>) -> u16 {
     record.frame.data().last_chunk().map_or(0, |last| u16::from_le_bytes(*last))
 }
@@ -235,13 +235,13 @@ fn word(word: u16) -> String {
 }
 
 impl Line<'_> {
-    /// The kind and the node.
+    /// Sets the kind and the node.
     fn about(&mut self, id: Id) {
         self.kind = Some(id.name());
         self.node = Some(if id.kind == Kind::Command { 0 } else { id.node });
     }
 
-    /// The CRC that would have made a packet of it.
+    /// Sets the received and the expected CRC, if the CRC is wrong.
     fn fails(&mut self, fault: PacketError) {
         if let PacketError::Crc { expected, got } = fault {
             (self.crc, self.crc_expected) = (Some(word(got)), Some(word(expected)));
@@ -272,7 +272,7 @@ mod tests {
     const BAD: &str = include_str!("../../../../protocol/tests/golden/bad.log");
     const WIRE: &str = include_str!("../../../../protocol/tests/golden/wire.log");
 
-    /// Each frame's comment in the log, and its object.
+    /// Returns each frame's comment in the log with its JSON object.
     fn objects(log: &str) -> Vec<(String, Value)> {
         let mut decoder = Decoder::new(None);
         let (mut comment, mut all) = ("", Vec::new());

@@ -1,14 +1,14 @@
-//! What frames mean, as text: `skinbus dump` shows it beside the raw frame.
+//! The meaning of frames as text, as `skinbus dump` shows it beside the raw frame.
 //!
 //! ```text
 //!   frame, time, bus ──> Decoder ──> Decoded ──> one line of text
-//!                          └ for each bus a PacketReader; for each identifier, whether packets use it
+//!                          └ per bus a PacketReader; per identifier, whether it carries packets
 //! ```
 //!
-//! A frame is ours as a whole packet with the right CRC, or as a segment of a classic packet. Every other
-//! frame is foreign; with an identifier that carries packets it is damaged. Each line begins with a verdict of one word:
-//! `ok`, `segment` (a frame before the last of a packet; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`, `ambiguous`; a packet
-//! without a known meaning: `meaning`.
+//! A frame belongs to this protocol if it is a packet with the right CRC, or a segment of a classic packet. Every other
+//! frame is foreign, or damaged if its identifier carries packets. Each line begins with a one-word verdict: `ok`,
+//! `segment` (a frame before the last of a packet; classic buses), `foreign`; damaged: `length`, `CRC`, `incomplete`,
+//! `ambiguous`; a packet without a known meaning: `meaning`.
 
 mod error_frame;
 mod fields;
@@ -34,54 +34,54 @@ use thiserror::Error;
 
 use crate::packets::{Content, PacketReader, Received};
 
-/// Buses that are distinguished at the same time: of more, the oldest is forgotten, or they are taken together.
+/// Maximum number of buses followed at the same time. Beyond it, the oldest is forgotten or buses share state.
 pub const BUSES: usize = 64;
-/// Identifiers of 11 bits.
+/// The number of identifiers of 11 bits.
 const IDS: usize = 0x800;
 
-/// What a frame is.
+/// The class of a frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Decoded {
-    /// No frame of this protocol.
+    /// A frame of another protocol.
     Foreign(Foreign),
-    /// A message of a cell, or of the gateway, over a simulated wire. It is on no real bus.
+    /// A message of a cell, or of the gateway, over a simulated wire. Real buses do not carry such frames.
     Wire(port::LinkId, PortMessage),
-    /// A segment of a packet in classic frames, but the last one; from [`Decoder::decode`], a frame that may be one.
+    /// A segment of a packet in classic frames, except the last one; from [`Decoder::decode`], a frame that may be one.
     Segment {
         /// Its identifier.
         id: Id,
     },
-    /// No packet, under an identifier that carries packets.
+    /// A frame that is not a packet, under an identifier that carries packets.
     Damaged {
         /// Its identifier.
         id: Id,
-        /// Why it is no packet.
+        /// The reason.
         fault: PacketError,
     },
-    /// A packet without a meaning in this version.
+    /// A packet that this version cannot decode.
     Meaningless {
         /// The packet.
         packet: Packet,
-        /// Why.
+        /// The reason.
         error: MessageError,
     },
-    /// A packet and its meaning.
+    /// A decoded packet.
     Message(Message),
 }
 
-/// Why a frame is none of this protocol's.
+/// The reason why a frame does not belong to this protocol.
 #[derive(Clone, Copy, Debug, Eq, Error, PartialEq)]
 pub enum Foreign {
-    /// 29 bits.
+    /// It has a 29-bit identifier.
     #[error("29-bit identifier")]
     Extended,
-    /// It asks for data.
+    /// It is a remote frame.
     #[error("remote frame")]
     Remote,
-    /// The driver's report of an error.
+    /// It is the driver's error report.
     #[error("error frame: {0}")]
     Error(ErrorFrame),
-    /// A data frame with an 11-bit identifier under which no packets come.
+    /// It is a data frame with an 11-bit identifier that carries no packets.
     #[error("no packet: {0}")]
     Data(PacketError),
 }
@@ -99,7 +99,7 @@ impl Foreign {
 }
 
 impl Decoded {
-    /// The verdict, as a line begins with it.
+    /// Returns the verdict with which its line begins.
     #[must_use]
     pub const fn verdict(&self) -> &'static str {
         match self {
@@ -111,40 +111,40 @@ impl Decoded {
         }
     }
 
-    /// The message, if it is one.
+    /// Returns the message, if it is one.
     #[must_use]
     pub const fn message(&self) -> Option<&Message> {
         if let Self::Message(message) = self { Some(message) } else { None }
     }
 
-    /// Whether a word of a torque or a sum means *saturated*.
+    /// Returns true if a word of a torque or a sum is saturated.
     #[must_use]
     pub fn is_saturated(&self) -> bool {
         self.message().and_then(Message::is_saturated).unwrap_or(false)
     }
 
-    /// Whether this shows a touch.
+    /// Returns true if this shows a touch.
     #[must_use]
     pub fn is_contact(&self) -> bool {
         self.message().is_some_and(Message::is_contact)
     }
 }
 
-/// The message of a frame over a simulated wire. `None` if its identifier or CRC is not that of a wire: 29 bits are
-/// common on other buses.
+/// Returns the message of a frame over a simulated wire. Returns `None` if the identifier or the CRC is not that of a
+/// wire: other buses use 29-bit identifiers, too.
 #[must_use]
 pub fn wired(frame: &Frame) -> Option<(port::LinkId, PortMessage)> {
     let link_id = port::LinkId::from_raw_id(frame.raw_id()).filter(|_| frame.format() == Format::Classic)?;
     Some((link_id, link_id.read(frame)?))
 }
 
-/// Classifies a frame that never is a packet.
+/// Classifies a frame that cannot be a packet.
 fn not_data(frame: &Frame) -> Decoded {
     let wired = wired(frame).map(|(link_id, message)| Decoded::Wire(link_id, message));
     wired.unwrap_or_else(|| Decoded::Foreign(Foreign::of(frame)))
 }
 
-/// What came with an identifier, and so whether it is one of ours.
+/// Frame counts of one identifier, which decide whether it carries packets.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Traffic {
     packets: u64,
@@ -152,22 +152,22 @@ pub struct Traffic {
 }
 
 impl Traffic {
-    /// So many packets are enough: chance makes one of two frames in 65 536.
+    /// Minimum number of packets as evidence: a random frame is a packet with probability 1/65 536.
     const PACKETS: u64 = 2;
-    /// For each packet there may be so many frames that are none.
+    /// Maximum number of other frames per packet.
     const OTHERS: u64 = 32;
 
-    /// A packet came.
+    /// Counts a packet.
     pub const fn packet(&mut self) {
         self.packets += 1;
     }
 
-    /// A frame came that is no packet and no segment.
+    /// Counts a frame that is neither a packet nor a segment.
     pub const fn other(&mut self) {
         self.others += 1;
     }
 
-    /// Whether the identifier carries packets: then what is no packet is damaged, else it is foreign.
+    /// Returns true if the identifier carries packets. Other frames with it are then damaged, else foreign.
     #[must_use]
     pub const fn carries_packets(self) -> bool {
         self.packets >= Self::PACKETS && self.others <= Self::OTHERS * self.packets
@@ -179,15 +179,15 @@ impl Traffic {
 pub struct Decoder {
     format: Option<Format>,
     buses: Vec<Bus>,
-    /// Buses seen, also those that are forgotten.
+    /// Number of buses seen, including forgotten ones.
     seen: u64,
 }
 
-/// A bus as it is followed.
+/// The state of one bus.
 #[derive(Clone, Debug)]
 struct Bus {
     name: String,
-    /// Another one than that of any bus before it.
+    /// A number that no earlier bus has had.
     number: u64,
     packets: PacketReader,
     classifier: Classifier,
@@ -196,20 +196,20 @@ struct Bus {
 /// Classifies the frames of one bus that a [`PacketReader`] has read.
 #[derive(Clone, Debug, Default)]
 struct Classifier {
-    /// By identifier, of those that came: a capture may name any number of buses, each with a few of them.
+    /// State by identifier, allocated on first use: a capture may name any number of buses, each with few identifiers.
     ids: Vec<Option<Box<Slot>>>,
 }
 
-/// An identifier of a bus.
+/// The state of one identifier of a bus.
 #[derive(Clone, Debug, Default)]
 struct Slot {
-    /// The numbers of the frames that wait.
+    /// Numbers of the pending frames.
     waiting: VecDeque<u64>,
     traffic: Traffic,
 }
 
 impl Slot {
-    /// Frames that waited are given up, but for so many of the newest.
+    /// Refuses pending frames except the newest `kept`.
     fn drop_beyond(&mut self, kept: usize, id: Id, settled: &mut Vec<(u64, Decoded)>) {
         for _ in kept..self.waiting.len() {
             if let Some(number) = self.waiting.pop_front() {
@@ -218,7 +218,7 @@ impl Slot {
         }
     }
 
-    /// A frame that is no packet and no segment.
+    /// Classifies a frame that is neither a packet nor a segment.
     const fn refuse(&mut self, id: Id, fault: PacketError) -> Decoded {
         self.traffic.other();
         if self.traffic.carries_packets() {
@@ -229,12 +229,12 @@ impl Slot {
     }
 }
 
-/// The class of a frame, and the numbers and classes of those that waited under its identifier and are now settled.
-/// A [`Decoded::Segment`] waits itself.
+/// The class of a frame, and the numbers and classes of earlier frames of its identifier that are settled now. A
+/// [`Decoded::Segment`] is itself pending.
 type Classified = (Decoded, Vec<(u64, Decoded)>);
 
 impl Classifier {
-    /// Classifies a frame under a number.
+    /// Classifies the frame with this number.
     fn take(&mut self, number: u64, received: &Received<'_>) -> Classified {
         match received.content {
             Content::NotData => (not_data(received.frame), Vec::new()),
@@ -258,7 +258,7 @@ impl Classifier {
         }
     }
 
-    /// Counts a packet, and settles the frames that waited for it.
+    /// Counts a packet, and settles the pending frames that belong to it.
     fn packet(&mut self, id: Id, packet: &Packet) -> Vec<(u64, Decoded)> {
         let (slot, mut settled) = (self.slot(id), Vec::new());
         slot.drop_beyond(packet.words.length().segments() - 1, id, &mut settled);
@@ -271,24 +271,27 @@ impl Classifier {
         if self.ids.is_empty() {
             self.ids.resize(IDS, None);
         }
-        self.ids.get_mut(usize::from(id.to_bits())).expect("11 bits").get_or_insert_default()
+        self.ids
+            .get_mut(usize::from(id.to_bits()))
+            .expect("an identifier has 11 bits")
+            .get_or_insert_default()
     }
 }
 
 impl Decoder {
-    /// For buses of one format; with `None` each frame is taken for what it is.
+    /// Creates a decoder for buses of one format; with `None`, each frame is read in its own format.
     #[must_use]
     pub const fn new(format: Option<Format>) -> Self {
         Self { format, buses: Vec::new(), seen: 0 }
     }
 
-    /// Takes the next frame. A classic frame may be settled only later: it is a [`Decoded::Segment`] until then;
-    /// [`settle::Settler`] waits. Bounded memory, whatever comes. Never panics.
+    /// Classifies the next frame. A classic frame may be a [`Decoded::Segment`] first and be settled later;
+    /// [`settle::Settler`] waits for that. Memory is bounded for any input. Never panics.
     pub fn decode(&mut self, at: Micros, bus: &str, frame: &Frame) -> Decoded {
         self.take(0, at, bus, frame).1.0
     }
 
-    /// Takes the next frame under a number; returns the number of its bus, too.
+    /// Classifies the frame with this number; returns the number of its bus, too.
     fn take(&mut self, number: u64, at: Micros, bus: &str, frame: &Frame) -> (u64, Classified) {
         if data_id(frame).is_err() {
             return (0, (not_data(frame), Vec::new()));
@@ -297,7 +300,7 @@ impl Decoder {
         (bus.number, bus.classifier.take(number, &bus.packets.read(at, frame)))
     }
 
-    /// What a segment is when the others of its packet do not come any more.
+    /// Returns the class of a segment whose packet will not be completed.
     fn give_up(&mut self, number: u64, bus: u64, id: Id) -> Decoded {
         let found = self.buses.iter_mut().find(|it| it.number == bus).and_then(|bus| {
             let slot = bus.classifier.ids.get_mut(usize::from(id.to_bits()))?.as_mut()?;

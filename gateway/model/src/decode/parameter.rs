@@ -1,4 +1,4 @@
-//! The parameters of a cell by name, and their words as values with units: to be read and to be written.
+//! The parameters of a cell by name, and their words as values with units, for reading and writing.
 
 use protocol::fixed::{OutOfRange, Q, Q1_14};
 use protocol::packet::WORDS;
@@ -9,56 +9,56 @@ use thiserror::Error;
 
 pub use super::fields::{Name, Words};
 
-/// The largest number of a parameter: the bit above it means a write.
+/// The largest parameter number; the next higher bit marks a write.
 const MAX: u8 = 127;
 
-/// Why text is no parameter, or no value of one.
+/// The error for text that is not a parameter or not a valid value of one.
 #[derive(Clone, Debug, Error, PartialEq)]
 #[non_exhaustive]
 pub enum ParameterTextError {
-    /// No such name.
+    /// The name is unknown.
     #[error(
-        "{got:?} is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
-         baseline, tare, row1 to row6 and commit are, and every number from 0 to {MAX}"
+        "{got:?} is not a parameter: allowed are identity, mount, pose, contact, timing, mode, reply, sensing, events, \
+         links_down, baseline, tare, row1 to row6, commit, and every number from 0 to {MAX}"
     )]
     Unknown {
-        /// What was given instead.
+        /// The given text.
         got: String,
     },
-    /// It cannot be written.
+    /// The parameter cannot be written.
     #[error(
         "identity is read only: write mount, pose, contact, timing, mode, reply, sensing, events, links_down, baseline, \
          tare, row1 to row6 or commit"
     )]
     ReadOnly,
-    /// More or fewer values than it has.
+    /// The number of values does not match.
     #[error("{name} is written with {} ({fields}), not with {got}", values(*.target))]
     Count {
         /// The parameter.
         name: &'static str,
-        /// How many values it has.
+        /// Number of values of the parameter.
         target: usize,
-        /// Their names.
+        /// Names of its values.
         fields: String,
-        /// How many came.
+        /// Number of given values.
         got: usize,
     },
-    /// More words than a packet has.
+    /// More words were given than a packet has.
     #[error("{got} words are too many for parameter {number}: at most {WORDS}")]
     Words {
         /// The parameter.
         number: u8,
-        /// How many came.
+        /// Number of given words.
         got: usize,
     },
-    /// A value that cannot be.
+    /// A value is out of range.
     #[error("{field} = {got}: {allowed}")]
     Value {
-        /// What it is called.
+        /// Name of the field.
         field: String,
-        /// What was given.
+        /// The given text.
         got: String,
-        /// What is allowed.
+        /// Description of the allowed values.
         allowed: String,
     },
 }
@@ -67,20 +67,20 @@ fn values(count: usize) -> String {
     if count == 1 { "one value".to_owned() } else { format!("{count} values") }
 }
 
-/// The number of the parameter with this name, or the number itself.
+/// Returns the number of the parameter with this name, or parses the number itself.
 ///
 /// # Errors
-/// When it is neither a name nor a number up to 127.
+/// Returns [`ParameterTextError::Unknown`] if the text is neither a name nor a number up to 127.
 pub fn number(text: &str) -> Result<u8, ParameterTextError> {
     let named = schema::parameter_named(text).map(|layout| layout.number);
     let number = || text.parse().ok().filter(|&number| number <= MAX);
     named.or_else(number).ok_or_else(|| ParameterTextError::Unknown { got: text.to_owned() })
 }
 
-/// The words with which a parameter is written: by name from values in their units, by number from raw words.
+/// Returns the words of a parameter write: for a name, from values in their units; for a number, from raw words.
 ///
 /// # Errors
-/// When there is no such parameter, or a value cannot be.
+/// Returns [`ParameterTextError`] if the parameter does not exist, or if a value is not allowed.
 pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), ParameterTextError> {
     let number = number(parameter)?;
     let mut words = [0; WORDS];
@@ -114,7 +114,8 @@ pub fn write(parameter: &str, values: &[String]) -> Result<(u8, [i16; WORDS]), P
     Ok((number, words))
 }
 
-/// The values of a parameter and their names, in the order of its words, of which the first may say what follows.
+/// Returns the fields to write and their names, in the order of the words. The first value may decide which fields
+/// follow.
 fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (&'static Field, String)> {
     let first = layout.fields.first().zip(values.first()).and_then(|(field, text)| read(field, text).ok());
     let follows = move |field: &&Field| field.follows(first.map(i64::from));
@@ -125,10 +126,10 @@ fn written(layout: &'static Layout, values: &[String]) -> impl Iterator<Item = (
         .flat_map(|field| field.written_names().into_iter().map(move |name| (field, name)))
 }
 
-/// The word of a value of a field.
+/// Returns the word of a field's value.
 ///
 /// # Errors
-/// What is allowed.
+/// Returns a description of the allowed values.
 pub fn read(field: &Field, text: &str) -> Result<i16, String> {
     let allowed = || field.allowed.clone();
     let known = |number: &i16| match field.range {
@@ -173,10 +174,10 @@ pub fn read(field: &Field, text: &str) -> Result<i16, String> {
     }
 }
 
-/// A word as it is: decimal, or hexadecimal after `0x`.
+/// Parses a raw word: decimal, or hexadecimal after `0x`.
 ///
 /// # Errors
-/// What is allowed.
+/// Returns a description of the allowed values.
 pub fn raw(text: &str) -> Result<i16, String> {
     let word = match text.strip_prefix("0x").or_else(|| text.strip_prefix("0X")) {
         Some(digits) => u16::from_str_radix(digits, 16).ok().map(u16::cast_signed),
@@ -185,30 +186,30 @@ pub fn raw(text: &str) -> Result<i16, String> {
     word.ok_or_else(|| "a word is -32768 to 32767, or 0x0 to 0xFFFF".to_owned())
 }
 
-/// A number.
+/// Parses a finite number.
 ///
 /// # Errors
-/// What is allowed.
+/// Returns a description of the allowed values.
 pub fn real(text: &str) -> Result<f64, String> {
     text.parse().ok().filter(|value: &f64| value.is_finite()).ok_or_else(|| "it must be a number".to_owned())
 }
 
-/// An angle in rad, wrapped to a turn.
+/// Parses an angle in rad, wrapped to one turn.
 ///
 /// # Errors
-/// What is allowed.
+/// Returns a description of the allowed values.
 pub fn angle(text: &str) -> Result<i16, String> {
     Q1_14::from_radians(real(text)?).map(Q::to_bits).ok_or_else(|| "it must be a number".to_owned())
 }
 
-/// A number as steps of 2^-fraction; scaling by a power of two is exact.
+/// Parses a number as steps of 2^-fraction; scaling by a power of two is exact.
 fn step(text: &str, fraction: u32, round: fn(f64) -> Result<Q<0>, OutOfRange>) -> Result<i16, String> {
     let scale = f64::from(1_u32 << fraction);
     let range = |error: OutOfRange| format!("it must be in [{}, {})", error.min / scale, error.bound / scale);
     round(real(text)? * scale).map(Q::to_bits).map_err(range)
 }
 
-/// Ports with a plus or a comma between them, `uplink` among them, or `none`.
+/// Parses ports separated by a plus or a comma, possibly with `uplink`, or `none`.
 fn ports(text: &str) -> Option<i16> {
     let bit = |port: &str| match port {
         "uplink" => Some(1 << UPLINK),
@@ -244,8 +245,8 @@ mod tests {
     fn errors_name_what_is_allowed() {
         assert_eq!(
             says("poes", &["1"]),
-            "\"poes\" is no parameter: identity, mount, pose, contact, timing, mode, reply, sensing, events, links_down, \
-             baseline, tare, row1 to row6 and commit are, and every number from 0 to 127"
+            "\"poes\" is not a parameter: allowed are identity, mount, pose, contact, timing, mode, reply, sensing, events, \
+             links_down, baseline, tare, row1 to row6, commit, and every number from 0 to 127"
         );
         assert_eq!(says("128", &[]), says("poes", &[]).replace("poes", "128"));
         assert_eq!(

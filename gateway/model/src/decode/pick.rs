@@ -1,4 +1,4 @@
-//! Which frames are shown.
+//! Filters that select frames to show.
 
 use core::str::FromStr;
 
@@ -19,17 +19,17 @@ pub enum Selector {
     Command(Command),
     /// Messages over simulated wires.
     Wire,
-    /// What is not of this protocol, and what is damaged.
+    /// Frames that are foreign or damaged.
     Foreign,
-    /// What is no packet, with an identifier that carries packets.
+    /// Damaged frames: not packets, but with an identifier that carries packets.
     Damaged,
 }
 
-/// A word that is no kind.
+/// The error for a word that does not name a kind.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[error(
-    "{got:?} is no kind: command, sum, torque, sensors, network, configure, configured, stimulus are; also halt, \
-     joints, sync, resume, report alone, wire, foreign, and damaged"
+    "{got:?} is not a kind of frame: allowed are command, sum, torque, sensors, network, configure, \
+     configured, stimulus; halt, joints, sync, resume, report; wire, foreign and damaged"
 )]
 pub struct UnknownSelector {
     /// The word.
@@ -52,41 +52,40 @@ impl FromStr for Selector {
     }
 }
 
-/// The node that a word names: `gateway`, `everyone`, or a node id.
+/// Parses a node: `gateway`, `everyone`, or a node id.
 ///
 /// # Errors
-/// What it is and what would be right.
+/// Returns the text with the allowed values.
 pub fn node(word: &str) -> Result<Node, String> {
     match word {
         "gateway" => Ok(Node::Gateway),
         "everyone" => Ok(Node::Everyone),
-        number => number
-            .parse()
-            .map(Node::Cell)
-            .map_err(|_| format!("{word:?} is no node: node ids are 1 to 254, or gateway, or everyone")),
+        number => number.parse().map(Node::Cell).map_err(|_| {
+            format!("{word:?} is not a node: allowed are node ids 1 to 254, gateway and everyone")
+        }),
     }
 }
 
 /// A node, on one bus or on any.
 #[derive(Clone, Debug, Eq, PartialEq)]
 pub struct Party {
-    /// The bus; `None` is any.
+    /// The bus; `None` matches any.
     pub bus: Option<String>,
-    /// The node there.
+    /// The node on it.
     pub node: Node,
 }
 
 impl FromStr for Party {
     type Err = String;
 
-    /// Parses `NODE` or `BUS:NODE`; as a node `gateway`, `everyone`, or a node id.
+    /// Parses `NODE` or `BUS:NODE`; a node is `gateway`, `everyone`, or a node id.
     fn from_str(word: &str) -> Result<Self, String> {
         let (bus, name) = split_bus(word)?;
         Ok(Self { bus: bus.map(str::to_owned), node: node(name)? })
     }
 }
 
-/// Identifiers, by the bits that matter: `ID` alone or `ID:MASK`, in hexadecimal as candump prints them.
+/// An identifier and the bits that are compared: `ID` or `ID:MASK`, in hexadecimal as candump prints it.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct IdMask {
     id: u32,
@@ -95,7 +94,7 @@ pub struct IdMask {
 }
 
 impl IdMask {
-    /// Returns whether a frame's identifier is one of these; 11-bit and 29-bit identifiers are never the same.
+    /// Returns true if a frame's identifier matches. An 11-bit and a 29-bit identifier never match.
     #[must_use]
     pub fn takes(&self, frame: &Frame) -> bool {
         frame.is_extended() == self.is_extended
@@ -107,7 +106,7 @@ impl IdMask {
 impl FromStr for IdMask {
     type Err = String;
 
-    /// Parses an identifier, 11 bits of up to 3 hexadecimal digits or 29 bits of 8, and its mask.
+    /// Parses an identifier (up to 3 hexadecimal digits for 11 bits, 8 digits for 29 bits) and its mask.
     fn from_str(word: &str) -> Result<Self, String> {
         let allowed = || {
             format!(
@@ -135,25 +134,25 @@ impl FromStr for IdMask {
     }
 }
 
-/// What is shown; everything by default.
+/// The filters of a command. The default shows everything.
 #[derive(Clone, Debug, Default)]
 pub struct Pick {
-    /// Any of these; all when empty.
+    /// Shows any of these kinds; all if empty.
     pub kinds: Vec<Selector>,
-    /// Any of these, as sender or addressee; all when empty. Commands are the gateway's.
+    /// Shows frames with any of these senders or addressees; all if empty. Commands are from the gateway.
     pub parties: Vec<Party>,
-    /// Frames of these buses; of all when empty.
+    /// Shows frames of these buses; of all if empty.
     pub buses: Vec<String>,
-    /// Frames with any of these identifiers; with all when empty.
+    /// Shows frames with any of these identifiers; all if empty.
     pub ids: Vec<IdMask>,
-    /// From so many nanoseconds after the origin of times on.
+    /// Start, in ns after the origin of times.
     pub from: Option<u64>,
-    /// Up to, and without, so many nanoseconds after the origin of times.
+    /// End (exclusive), in ns after the origin of times.
     pub to: Option<u64>,
 }
 
 impl Pick {
-    /// Returns whether a frame on a bus is shown that came at `nanos` and is this, when times count from `origin`.
+    /// Returns true if a frame is shown that arrived on `bus` at `nanos` and has this class; times count from `origin`.
     #[must_use]
     pub fn takes(&self, origin: u64, nanos: u64, bus: &str, frame: &Frame, decoded: &Decoded) -> bool {
         let is_foreign = matches!(decoded, Decoded::Foreign(_));
@@ -165,23 +164,23 @@ impl Pick {
             && self.takes_party(id, bus)
     }
 
-    /// The buses that the filters name, each as often as it is named.
+    /// Returns the buses that the filters name, with repetitions.
     pub fn bus_names(&self) -> impl Iterator<Item = &str> {
         let of_parties = self.parties.iter().filter_map(|party| party.bus.as_deref());
         self.buses.iter().map(String::as_str).chain(of_parties)
     }
 
-    /// Sees that each party can be on the buses that are picked.
+    /// Checks that each party is on one of the selected buses.
     ///
     /// # Errors
-    /// The contradiction.
+    /// Returns the contradiction.
     pub fn check(&self) -> Result<(), String> {
         let is_out = |party: &&Party| party.bus.as_ref().is_some_and(|bus| !self.buses.contains(bus));
         match self.parties.iter().find(is_out).filter(|_| !self.buses.is_empty()) {
             Some(Party { bus: Some(bus), node }) => {
                 let buses = self.buses.join(", ");
                 Err(format!(
-                    "{bus}:{node} is on no bus that is picked: {buses} are; leave one of the two out"
+                    "{bus}:{node} is not on a selected bus ({buses}): leave out one of the two filters"
                 ))
             }
             _ => Ok(()),
@@ -231,7 +230,7 @@ mod tests {
     use protocol::port;
     use protocol::time::Micros;
 
-    /// A packet of this identifier, or a foreign frame.
+    /// Returns a packet of this identifier, or a foreign frame.
     fn frame(id: u32) -> Frame {
         let Ok(bits) = u16::try_from(id) else { return Frame::classic(id, &[]).unwrap() };
         let packet = Packet { id: Id::from_bits(bits), words: [0; 6].into(), epoch: Epoch(0), count: 1 };
@@ -323,8 +322,11 @@ mod tests {
     #[test]
     fn unknown_words_are_errors_that_list_the_known_ones() {
         let kind = "torqe".parse::<Selector>().unwrap_err().to_string();
-        assert!(kind.starts_with("\"torqe\" is no kind: command, sum, torque, "), "{kind}");
-        let expected = "\"255\" is no node: node ids are 1 to 254, or gateway, or everyone";
+        assert!(
+            kind.starts_with("\"torqe\" is not a kind of frame: allowed are command, sum, torque, "),
+            "{kind}"
+        );
+        let expected = "\"255\" is not a node: allowed are node ids 1 to 254, gateway and everyone";
         assert_eq!(node("255"), Err(expected.to_owned()));
     }
 }

@@ -1,11 +1,11 @@
-//! The text of ports, and of what they lead to.
+//! Text of ports and of the neighbours at them.
 
 use core::fmt::{self, Display, Formatter};
 
 use protocol::port::UPLINK;
 use protocol::schema::Field;
 
-/// A port by its number; the last one leads to the gateway's side.
+/// A port by its number; the last one is the uplink to the gateway.
 pub(super) struct Port(pub(super) i64);
 
 impl Display for Port {
@@ -17,7 +17,7 @@ impl Display for Port {
     }
 }
 
-/// What each port leads to.
+/// Writes the neighbour at each port.
 pub(super) fn around(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports: usize) -> fmt::Result {
     for index in 0..ports {
         let word = bytes.get(2 * index..).unwrap_or_default();
@@ -46,7 +46,7 @@ pub(super) fn around(f: &mut Formatter<'_>, parts: &[Field], bytes: &[u8], ports
 pub(super) struct Bits(pub(super) i64);
 
 impl Bits {
-    /// Their numbers.
+    /// Returns their numbers.
     pub(super) fn ports(&self) -> impl Iterator<Item = u8> + use<> {
         let bits = self.0;
         (0..8).filter(move |port| bits >> port & 1 == 1)
@@ -59,7 +59,7 @@ impl Display for Bits {
     }
 }
 
-/// Things with a plus between them, or `none`.
+/// Writes items joined with plus signs, or `none`.
 pub(super) fn joined(f: &mut Formatter<'_>, all: impl Iterator<Item = impl Display>) -> fmt::Result {
     let mut any = false;
     for one in all {

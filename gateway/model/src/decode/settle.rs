@@ -1,12 +1,12 @@
-//! Classifies frames once that is certain, in the order in which they came.
+//! Classifies frames in order of arrival, each as soon as its class is certain.
 //!
 //! ```text
-//!   frames ──> Settler ──> the same frames in the same order, each with what it is
-//!                └ those since the oldest of whose packet segments may still come
+//!   frames ──> Settler ──> the same frames in the same order, each with its class
+//!                └ pending frames, from the oldest segment of an open packet
 //! ```
 //!
-//! A classic frame is a segment of a packet or foreign. Which of them is known with the next frame of its identifier,
-//! or when its packet's other segments time out. Until then it waits, and so do all frames that came after it.
+//! A classic frame is a segment of a packet or foreign. The next frame of its identifier, or the timeout of its packet,
+//! decides. Until then it is pending, and all later frames wait behind it.
 
 use std::collections::VecDeque;
 
@@ -17,19 +17,19 @@ use protocol::time::{Micros, Span};
 
 use super::{Decoded, Decoder};
 
-/// Frames that wait at most; beyond them the oldest is given out without the others of its packet.
+/// Maximum number of pending frames. Beyond it, the oldest is given up without the rest of its packet.
 const FRAMES: usize = 1 << 16;
-/// Added to the timeout of segments: frames of several buses may be out of order by that much.
+/// Added to the timeout of segments: frames of several buses may be out of order by this time.
 const SLACK: Span = Span::from_millis(100);
 
-/// Classifies frames in the order in which they came; `T` is given out with each.
+/// Classifies frames in order of arrival; `T` is returned with each.
 #[derive(Debug)]
 pub struct Settler<T> {
     decoder: Decoder,
     waiting: VecDeque<Entry<T>>,
-    /// The number of the oldest frame that waits.
+    /// Number of the oldest pending frame.
     oldest: u64,
-    /// When the last frame came, or what time it is.
+    /// Arrival time of the last frame, or the current time if later.
     now: Micros,
     is_at_end: bool,
 }
@@ -44,12 +44,12 @@ struct Entry<T> {
 #[derive(Debug)]
 enum State {
     Settled(Decoded),
-    /// On a bus, under an identifier.
+    /// Pending, with the number of its bus and its identifier.
     Waits(u64, Id),
 }
 
 impl<T> Settler<T> {
-    /// For buses of one format; with `None` each frame is taken for what it is.
+    /// Creates a settler for buses of one format; with `None`, each frame is read in its own format.
     #[must_use]
     pub const fn new(format: Option<Format>) -> Self {
         Self {
@@ -61,7 +61,7 @@ impl<T> Settler<T> {
         }
     }
 
-    /// Takes the next frame; [`Settler::pop`] until there is none before the next one.
+    /// Adds the next frame. Call [`Settler::pop`] until it returns `None` before adding another.
     pub fn push(&mut self, at: Micros, bus: &str, frame: &Frame, item: T) {
         let number = self.oldest + self.waiting.len() as u64;
         let (bus, (decoded, settled)) = self.decoder.take(number, at, bus, frame);
@@ -80,23 +80,23 @@ impl<T> Settler<T> {
         self.waiting.push_back(Entry { item, at, state });
     }
 
-    /// It is that late, and no frame came.
+    /// Advances the time when no frame arrives.
     pub const fn handle_time(&mut self, now: Micros) {
         self.now = now;
     }
 
-    /// No more frames follow.
+    /// Marks the end of input: pending segments are settled at once.
     pub const fn finish(&mut self) {
         self.is_at_end = true;
     }
 
-    /// Whether frames wait.
+    /// Returns true if frames are pending.
     #[must_use]
     pub fn is_waiting(&self) -> bool {
         !self.waiting.is_empty()
     }
 
-    /// The oldest frame, if it is known what it is.
+    /// Returns the oldest frame, if its class is known.
     pub fn pop(&mut self) -> Option<(T, Decoded)> {
         if let Entry { at, state: State::Waits(bus, id), .. } = *self.waiting.front()? {
             let is_in_time = self.now.since(at) <= Span(Segment::within(id).0 + SLACK.0);

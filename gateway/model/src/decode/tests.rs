@@ -1,5 +1,4 @@
-//! The text of every kind of frame, against lines made by hand from the document and the golden logs'
-//! comments.
+//! The text of every kind of frame, against lines written by hand from the document and the golden logs' comments.
 
 use core::f64::consts::FRAC_PI_2;
 
@@ -18,7 +17,7 @@ const BAD: &str = include_str!("../../../../protocol/tests/golden/bad.log");
 const WIRE: &str = include_str!("../../../../protocol/tests/golden/wire.log");
 const CLASSIC: &str = include_str!("../../../../protocol/tests/golden/classic.log");
 
-/// Each frame's comment in the log and its text here.
+/// Returns each frame's comment in the log with its decoded text.
 fn decoded(log: &str, format: Option<Format>) -> Vec<(String, String)> {
     let mut settler = Settler::new(format);
     let mut comment = "";
@@ -35,7 +34,7 @@ fn decoded(log: &str, format: Option<Format>) -> Vec<(String, String)> {
     std::iter::from_fn(|| settler.pop()).map(|(comment, decoded)| (comment, decoded.to_string())).collect()
 }
 
-/// A decoder for which two packets of cell 12 have come, so that its torques are ours.
+/// Returns a decoder that has seen two packets of cell 12, so that its torque identifier carries packets.
 fn knowing(format: Option<Format>) -> Decoder {
     let mut decoder = Decoder::new(format);
     let packet = Packet {
@@ -52,13 +51,13 @@ fn knowing(format: Option<Format>) -> Decoder {
     decoder
 }
 
-/// The text of a frame as cansend takes it.
+/// Returns the text of a frame in cansend notation.
 fn text(frame: &str) -> String {
     let frame = candump::parse_frame(frame).unwrap();
     Decoder::new(None).decode(Micros(0), "vcan0", &frame).to_string()
 }
 
-/// Holds the text of the only frame with each comment against what is expected.
+/// Compares the text of the only frame with each comment with the expected text.
 fn check(log: &str, expected: &[(&str, &str)]) {
     let all = decoded(log, None);
     for (comment, text) in expected {
@@ -317,7 +316,7 @@ fn segments_are_reassembled_by_bus_and_identifier() {
         let expected: &[&str] = match comment.split(' ').next().unwrap() {
             "waiting" | "incomplete" => &["segment ", "foreign no packet: no other segment", "incomplete "],
             "whole" => {
-                // All but the last segment of a packet wait; 7 and 8 words take three.
+                // All segments of a packet but the last are pending; 7 and 8 words take three.
                 let values = comment.rsplit('=').next().unwrap().split(',').count();
                 packets += if values > protocol::packet::WORDS { 2 } else { 1 };
                 if comment.contains(" bad ") { &["meaning "] } else { &["ok      "] }
@@ -370,7 +369,7 @@ fn messages_over_wires_have_their_text() {
     for ((comment, text), expected) in all.iter().zip(expected) {
         assert_eq!(text, &format!("ok      {expected}"), "{comment}");
     }
-    // 29 bits are common on other buses: what does not prove to be a wire's is nobody's.
+    // Other buses use 29-bit identifiers: a frame that fails the wire checks is foreign.
     for (comment, text) in all.iter().filter(|(comment, _)| comment.starts_with("bad ")) {
         assert!(text.starts_with("foreign "), "{comment}: {text}");
     }
@@ -403,7 +402,7 @@ fn saturation_is_noticed() {
     for line in FD.lines() {
         if let Line::Frame(record) = candump::parse(line).unwrap() {
             let decoded = decoder.decode(Micros(0), record.interface, &record.frame);
-            // `+saturated` is also how a heartbeat lists that bit.
+            // `+saturated` is also the name of a heartbeat flag.
             let said =
                 decoded.to_string().contains(" +saturated") || decoded.to_string().contains(" -saturated");
             assert_eq!(decoded.is_saturated(), said, "{decoded}");
@@ -413,7 +412,7 @@ fn saturation_is_noticed() {
 
 #[test]
 fn contact_is_a_frame_that_shows_a_touch() {
-    // A torque and the zeros that end a contact; a stimulus and the one that releases it; halt.
+    // A torque and the zeros that end a contact; a stimulus and its release; halt.
     let frames = [
         ("20C##1CDFB7B0C000000000000000007014157", true),
         ("20C##100000000000000000000000008010C2F", false),
@@ -474,7 +473,7 @@ fn memory_is_bounded_whatever_buses_a_log_names() {
         decoder.decode(Micros(0), &format!("can{bus}"), &frame);
     }
     assert_eq!(decoder.buses.len(), BUSES);
-    // Identifiers that never came cost no more than a pointer, and no time where a log names 100 000 buses.
+    // Unused identifiers cost no more than a pointer, and no time when a log names 100 000 buses.
     let slots = decoder.buses.iter().flat_map(|bus| &bus.classifier.ids).flatten().count();
     assert_eq!(slots, BUSES);
 }

@@ -1,4 +1,4 @@
-//! The words.
+//! The text form of decoded frames.
 
 use core::fmt::{self, Display, Formatter};
 
@@ -11,18 +11,18 @@ use super::fields::{Bytes, field, fields, fill};
 use super::wires::Said;
 
 impl Display for Decoded {
-    /// As on a bus without a torque format of its own, whose joints are revolute.
+    /// Formats with default units: no torque format of the bus, revolute joints.
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         self.in_units(Units::default()).fmt(f)
     }
 }
 
-/// A frame in the units of its bus.
+/// A decoded frame, formatted in the units of its bus.
 #[derive(Clone, Copy, Debug)]
 pub struct InUnits<'a>(&'a Decoded, Units);
 
 impl Decoded {
-    /// As the bus' joints and torques are meant.
+    /// Formats the frame with the units of its bus' joints and torques.
     #[must_use]
     pub const fn in_units(&self, units: Units) -> InUnits<'_> {
         InUnits(self, units)
@@ -30,7 +30,7 @@ impl Decoded {
 }
 
 impl Display for InUnits<'_> {
-    /// A verdict, a space, and what the frame says.
+    /// Writes the verdict, a space, and the content.
     fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
         let Self(decoded, units) = *self;
         write!(f, "{:<7} ", decoded.verdict())?;
@@ -45,7 +45,7 @@ impl Display for InUnits<'_> {
     }
 }
 
-/// What an identifier is about: `torque 12`, `halt`, `command 9`.
+/// The subject of an identifier: `torque 12`, `halt`, `command 9`.
 struct Subject(Id);
 
 impl Display for Subject {
@@ -62,7 +62,7 @@ impl Display for Subject {
     }
 }
 
-/// A message in words.
+/// The text of a message.
 struct Meaning<'a>(&'a Message, Units);
 
 impl Display for Meaning<'_> {

@@ -1,4 +1,4 @@
-//! The text of messages over wires.
+//! Text of messages over wires.
 
 use core::fmt::{self, Display, Formatter};
 
@@ -10,7 +10,7 @@ use protocol::schema::{self, Layout};
 use super::fields::say;
 use super::ports::Port;
 
-/// The bytes of a message over a wire, and their layout.
+/// Returns the bytes of a message over a wire, and their layout.
 pub(super) fn said(message: PortMessage) -> (Bytes, &'static Layout) {
     let body = message.encode();
     let bytes = body.into_iter().chain([0; BYTES]).take(BYTES).collect();
@@ -20,12 +20,12 @@ pub(super) fn said(message: PortMessage) -> (Bytes, &'static Layout) {
     )
 }
 
-/// The epoch of a message, if it has one.
+/// Returns the epoch of a message, if it has one.
 pub(super) const fn epoch(message: PortMessage) -> Option<u8> {
     if let PortMessage::State(epoch) | PortMessage::Nack(epoch) = message { Some(epoch.0) } else { None }
 }
 
-/// A message over a wire, with the wire and the direction in it: `wire 12 ->: join`.
+/// A message over a wire, formatted with the wire's number and direction: `wire 12 ->: join`.
 pub(super) struct Said(pub(super) LinkId, pub(super) PortMessage);
 
 impl Display for Said {
@@ -66,7 +66,7 @@ fn greet(f: &mut Formatter<'_>, hello: Hello) -> fmt::Result {
     write!(f, ", {}", Far(rank))
 }
 
-/// The rank of a cell.
+/// The rank of a cell, formatted.
 struct Far(Option<Rank>);
 
 impl Display for Far {

@@ -1,7 +1,7 @@
-//! Where the cells lie on an arm, and how they are wired.
+//! Positions and wiring of the cells on an arm.
 //!
 //! ```text
-//!   a limb, unrolled; numbers go to and fro, so that each cell is wired to the next
+//!   a limb, unrolled; numbers run back and forth, so that each cell is wired to the next
 //!
 //!   ring 2    6 - 7 - 8          ports   0 previous in the ring    2 in the ring before
 //!            /   /   /                   1 next in the ring        3 in the ring after
@@ -17,41 +17,41 @@ use protocol::skin::DenavitHartenberg;
 
 use super::GenerateError;
 
-/// From one cell's middle to the next one's, in mm: that of the real skin's cells.
+/// Distance between the centres of adjacent cells, in mm, as on the published skin.
 const PITCH_MM: usize = 28;
-/// Cells that are closer than this cannot be imagined as hardware.
+/// The smallest distance in mm that is plausible for hardware.
 const MIN_PITCH_MM: usize = 3;
-/// Ports of a cell.
+/// Number of ports of a cell.
 const PORTS: usize = 4;
 
-/// An arm that can wear a skin.
+/// An arm that can carry a skin.
 #[derive(Debug)]
 pub(super) struct Arm {
     pub(super) name: &'static str,
     /// Standard Denavit-Hartenberg rows, base to tip.
     pub(super) joints: [DenavitHartenberg; 6],
-    /// From the base outwards.
+    /// From base to tip.
     pub(super) limbs: [Limb; 2],
 }
 
 /// A round limb along the x axis of its joint's frame, whose origin is the limb's far end.
 #[derive(Debug)]
 pub(super) struct Limb {
-    /// What it is called.
+    /// Its name.
     pub(super) name: &'static str,
     /// The joint that moves it.
     pub(super) joint: u8,
-    /// The middle of the limb, in m: along x, and off the axis along z.
+    /// The middle of the limb, in m: along x, and offset along z.
     middle: [f64; 2],
-    /// How much of its length the skin may cover, in m.
+    /// Length that the skin may cover, in m.
     length: f64,
     /// The minimum distance of a cell from the limb's own axis, in m.
     radius: f64,
 }
 
-/// The UR5. Its limbs lie beside the joints' frames: the shoulder is 135.85 mm wide, and the elbow
-/// leads back by 119.7 mm, which in the table is all in the fourth joint's d. The tubes' radii are 60
-/// and 50 mm, and the cells sit 5 mm above them; joints' housings are left free.
+/// The UR5. Its limbs are offset from the joints' frames: the shoulder is 135.85 mm wide, and the elbow leads back by
+/// 119.7 mm; the table has all of this in the d of joint 4. The tubes' radii are 60 and 50 mm, and the cells sit 5 mm
+/// above them; the joints' housings stay uncovered.
 pub(super) const UR5: Arm = Arm {
     name: "UR5",
     joints: [
@@ -78,24 +78,24 @@ pub(super) struct Covered {
     pub(super) name: &'static str,
     pub(super) joints: [DenavitHartenberg; 6],
     pub(super) pitch_mm: usize,
-    /// Each limb's name and how many cells it wears.
+    /// Name and number of cells of each limb.
     pub(super) limbs: [(&'static str, usize); 2],
     pub(super) buses: Vec<Vec<Place>>,
 }
 
-/// A cell; its node is its place in its bus, from 1.
+/// A cell; its node id is its index in its bus, plus 1.
 #[derive(Clone, Debug)]
 pub(super) struct Place {
     pub(super) joint: u8,
     pub(super) position: [f64; 3],
-    /// How far it is turned about the limb, from the z axis to the y axis, in rad.
+    /// Its angle around the limb, from the z axis to the y axis, in rad.
     pub(super) turn: f64,
-    /// By port, the place in the bus of what is wired to it.
+    /// By port, the index in the bus of the neighbour.
     pub(super) wires: [Option<usize>; PORTS],
     pub(super) root: bool,
 }
 
-/// Lays this many cells around the limbs, as far apart as real ones if they fit, else closer.
+/// Places the cells around the limbs at the real distance if they fit, else closer.
 pub(super) fn cover(arm: &Arm, cells: usize, buses: usize) -> Result<Covered, GenerateError> {
     let (pitch_mm, shares) = (MIN_PITCH_MM..=PITCH_MM)
         .rev()
@@ -120,15 +120,15 @@ pub(super) fn cover(arm: &Arm, cells: usize, buses: usize) -> Result<Covered, Ge
     Ok(Covered { name: arm.name, joints: arm.joints, pitch_mm, limbs, buses: on_buses })
 }
 
-/// What a limb gets.
+/// The share of a limb.
 #[derive(Debug)]
 struct Share {
     cells: usize,
     buses: usize,
 }
 
-/// Gives each limb what it has room for; a bus stays on one limb, unless there is only one. `None` when
-/// it does not fit.
+/// Divides the cells by the limbs' capacity. A bus stays on one limb, unless there is only one bus. Returns `None` if
+/// the cells do not fit.
 fn share(limbs: &[Limb; 2], pitch: f64, cells: usize, buses: usize) -> Option<[Share; 2]> {
     let [upper, lower] = limbs.each_ref().map(|limb| Rings::of(limb, pitch).room());
     let nearest = |whole: usize, part: usize, of: usize| (2 * whole * part + of) / (2 * of);
@@ -146,12 +146,12 @@ fn share(limbs: &[Limb; 2], pitch: f64, cells: usize, buses: usize) -> Option<[S
     (shares[0].cells <= upper && shares[1].cells <= lower).then_some(shares)
 }
 
-/// How cells lie around a limb.
+/// The rings of cells around a limb.
 #[derive(Clone, Copy, Debug)]
 struct Rings {
-    /// Cells in a ring, at least 3.
+    /// Number of cells in a ring, at least 3.
     around: usize,
-    /// Rings that the limb has room for.
+    /// Number of rings that fit on the limb.
     count: usize,
     pitch: f64,
 }
@@ -164,7 +164,7 @@ impl Rings {
         Self { around, count, pitch }
     }
 
-    /// From one ring to the next, in m.
+    /// Returns the distance between rings, in m.
     fn step(&self) -> f64 {
         self.pitch * 0.75_f64.sqrt()
     }
@@ -173,18 +173,18 @@ impl Rings {
         self.around * self.count
     }
 
-    /// Ring and place in it of the cell with this number; odd rings are counted backwards.
+    /// Returns the ring of a cell and its index in the ring; odd rings are counted backwards.
     const fn spot(&self, number: usize) -> (usize, usize) {
         let (ring, place) = (number / self.around, number % self.around);
         (ring, if ring % 2 == 0 { place } else { self.around - 1 - place })
     }
 
-    /// The number of the cell at a spot.
+    /// Returns the number of the cell at a spot.
     const fn number(&self, (ring, place): (usize, usize)) -> usize {
         ring * self.around + if ring % 2 == 0 { place } else { self.around - 1 - place }
     }
 
-    /// The cells with these numbers, of the `all` that the limb wears, wired among themselves.
+    /// Returns the cells with these numbers, of the `all` on the limb, wired among themselves.
     fn wired(&self, limb: &Limb, all: usize, numbers: core::ops::Range<usize>) -> Vec<Place> {
         let rings = all.div_ceil(self.around);
         let place = |number| {
@@ -216,8 +216,8 @@ impl Rings {
     }
 }
 
-/// Puts two limbs' cells on one bus: a cable leads from the last cell of the one, whose port 3 is free,
-/// to the first of the other, whose port 2 is.
+/// Puts the cells of two limbs on one bus. A cable connects the free port 3 of the last cell with the free port 2 of
+/// the first cell of the other limb.
 fn join(upper: &mut Vec<Place>, lower: &mut Vec<Place>) {
     let shift = upper.len();
     for wire in lower.iter_mut().flat_map(|place| &mut place.wires).flatten() {
@@ -229,8 +229,8 @@ fn join(upper: &mut Vec<Place>, lower: &mut Vec<Place>) {
     upper.append(lower);
 }
 
-/// Wires the gateway to the middle of a bus' cells: the first one of those from which the farthest cell
-/// is nearest, so that sums have the shortest way.
+/// Wires the gateway to the centre of a bus' cells: the first cell with the smallest distance to its farthest cell, so
+/// that sums have the shortest path.
 fn root(places: &mut [Place]) {
     let nearest = (0..places.len()).min_by_key(|&from| depth(places, from));
     if let Some(root) = nearest.and_then(|at| places.get_mut(at)) {
@@ -238,7 +238,7 @@ fn root(places: &mut [Place]) {
     }
 }
 
-/// Wires from a cell to the farthest one that it can reach.
+/// Returns the number of wires from a cell to the farthest reachable cell.
 pub(super) fn depth(places: &[Place], from: usize) -> usize {
     let mut distance = vec![None; places.len()];
     let mut next = VecDeque::from([(from, 0)]);

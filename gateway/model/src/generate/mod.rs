@@ -1,7 +1,7 @@
 //! `skinbus skin generate`: describes a skin of hexagonal cells on a robot's arm.
 //!
-//! The cells lie in rings around the upper arm and the forearm, each ring turned by half a cell against
-//! the next, so that neighbours are a hexagon's neighbours. The result is the text of a `skin.toml`.
+//! The cells lie in rings around the upper arm and the forearm, each ring turned by half a cell against the next, so
+//! that a cell's neighbours are those of a hexagonal grid. The result is the text of a `skin.toml`.
 
 mod arm;
 mod text;
@@ -12,20 +12,20 @@ use protocol::id::CellId;
 use protocol::skin::Skin;
 use thiserror::Error;
 
-/// What to describe.
+/// The requested skin.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Target {
     /// The robot that wears the skin.
     pub robot: Robot,
-    /// How many cells, 1 to 254 a bus.
+    /// Number of cells, 1 to 254 per bus.
     pub cells: usize,
-    /// How many buses; cells of one bus lie together.
+    /// Number of buses; the cells of one bus are adjacent.
     pub buses: usize,
-    /// Joint broadcasts in a second; must divide the 500 Hz of the control loop.
+    /// Joint broadcasts per second; must divide the control loop's 500 Hz.
     pub broadcast_hz: f64,
-    /// What the cells answer with.
+    /// Replies of the cells.
     pub reply: Reply,
-    /// What their packets travel in.
+    /// Frame format of their packets.
     pub format: Format,
 }
 
@@ -42,14 +42,14 @@ impl Default for Target {
     }
 }
 
-/// A robot whose arm is known.
+/// A robot with a known arm.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Robot {
     /// Universal Robots UR5
     Ur5,
 }
 
-/// What the cells answer with.
+/// The kind of reply that the cells send.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Reply {
     /// Each cell its own torque
@@ -58,11 +58,11 @@ pub enum Reply {
     Sum,
 }
 
-/// Why a skin cannot be described.
+/// The error for a skin that cannot be generated.
 #[derive(Clone, Debug, Eq, Error, PartialEq)]
 #[non_exhaustive]
 pub enum GenerateError {
-    /// More cells than the buses have node ids for.
+    /// More cells than the buses have node ids.
     #[error(
         "{cells} cells do not fit on {}: a bus has {most} node ids; use --buses {needed}",
         if *.buses == 1 { "one bus".to_owned() } else { format!("{buses} buses") },
@@ -73,10 +73,10 @@ pub enum GenerateError {
         cells: usize,
         /// Requested buses.
         buses: usize,
-        /// Buses that this takes.
+        /// Number of buses needed.
         needed: usize,
     },
-    /// Fewer cells than buses, or none.
+    /// Fewer cells than buses, or no cells or buses.
     #[error("{cells} cells on {buses} buses: every bus needs at least one")]
     TooFew {
         /// Requested cells.
@@ -84,7 +84,7 @@ pub enum GenerateError {
         /// Requested buses.
         buses: usize,
     },
-    /// More cells than there is room for.
+    /// More cells than fit on the arm.
     #[error("{cells} cells do not fit on the arm, not even {min_mm} mm apart: ask for fewer")]
     NoRoom {
         /// Requested cells.
@@ -92,15 +92,16 @@ pub enum GenerateError {
         /// The minimum distance in mm.
         min_mm: usize,
     },
-    /// What came out is no skin: a number that was asked for cannot be.
+    /// The generated text is not a valid skin: a requested number is out of range.
     #[error(transparent)]
     Skin(#[from] DocumentError),
 }
 
-/// The text of a `skin.toml`; the same for the same target.
+/// Returns the text of a `skin.toml`; the same target gives the same text.
 ///
 /// # Errors
-/// When the cells do not fit on the buses or on the arm, or a number that was asked for cannot be.
+/// Returns [`GenerateError`] if the cells do not fit on the buses or on the arm, or if a requested number is out of
+/// range.
 pub fn generate(target: &Target) -> Result<String, GenerateError> {
     let (cells, buses) = (target.cells, target.buses);
     if buses == 0 || cells < buses {
@@ -108,7 +109,7 @@ pub fn generate(target: &Target) -> Result<String, GenerateError> {
     }
     let needed = cells.div_ceil(CellId::COUNT);
     if needed > buses {
-        // What would be refused with so many buses too is reported first.
+        // An error that more buses would not fix is reported first.
         generate(&Target { buses: needed, ..*target })?;
         return Err(GenerateError::TooMany { cells, buses, needed });
     }

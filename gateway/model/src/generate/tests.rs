@@ -14,7 +14,7 @@ fn apart(one: &Cell, other: &Cell) -> f64 {
     one.position.iter().zip(other.position).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
 }
 
-/// The cells on the same bus that are wired to this one.
+/// Returns the cells on the same bus that are wired to this one.
 fn wired<'a>(skin: &'a Skin, cell: &'a Cell) -> impl Iterator<Item = &'a Cell> {
     let on_bus = move |node| skin.cells.iter().find(move |it| it.bus == cell.bus && it.node == node);
     cell.neighbors.iter().flatten().map(move |&node| on_bus(node).unwrap())
@@ -53,7 +53,7 @@ fn cells_do_not_overlap_and_look_outwards() {
         for other in skin.cells.iter().take(index).filter(|other| other.joint == cell.joint) {
             assert!(apart(cell, other) > 0.0275, "{} and {}", cell.node, other.node);
         }
-        // From the limb's axis outwards, at right angles to it.
+        // The direction from the limb's axis outwards, perpendicular to it.
         let (radius, offset) = if cell.joint == 2 { (0.066_845, 0.135_85) } else { (0.057_932, 0.016_15) };
         let [_, y, z] = cell.position;
         let [nx, ny, nz] = cell.normal;
@@ -121,7 +121,7 @@ fn the_reply_and_the_format_are_the_requested_ones() {
     assert_eq!(skin.timing.ticks_per_broadcast, 10);
     for bus in &skin.buses {
         assert_eq!(bus.format, Format::Classic);
-        // 15 ms for no more than 20 slots.
+        // The slots share 15 ms; there are at most 20.
         assert!(
             matches!(bus.reply, protocol::skin::Reply::Sum { slot_us: 750..2_000, carry: true }),
             "{bus:?}"

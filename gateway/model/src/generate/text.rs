@@ -1,4 +1,4 @@
-//! The text of a `skin.toml`.
+//! Formats a generated skin as the text of a `skin.toml`.
 
 use protocol::skin::DenavitHartenberg;
 use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
@@ -6,7 +6,7 @@ use protocol::skin::file::{Draft, DraftBus, DraftCell, Facing, Value};
 use super::arm::{self, Covered, Place};
 use super::{Format, Reply, Target};
 
-/// How much of the broadcast period the slots of sums may take.
+/// Maximum share of the broadcast period for the slots of sums.
 const SLOTS_SHARE: f64 = 0.75;
 
 pub(super) fn toml(target: &Target, arm: &Covered) -> String {
@@ -65,9 +65,9 @@ fn bus_name(bus: usize) -> String {
     format!("vcan{bus}")
 }
 
-/// Adds a cell of a bus with its node there.
+/// Adds a cell of a bus with its node id.
 fn cell(draft: &mut Draft, bus: usize, place: &Place, node: usize) {
-    // Turned about x, the limb's own direction: the cell's z axis points away from the limb.
+    // A rotation about x, the limb's direction: the cell's z axis points away from the limb.
     let (sin, cos) = (-place.turn / 2.0).sin_cos();
     let [qx, qw] = [sin, cos].map(|value| round(value, 1e9));
     draft.cell(&DraftCell {
@@ -84,7 +84,7 @@ fn cell(draft: &mut Draft, bus: usize, place: &Place, node: usize) {
     });
 }
 
-/// Slots for every depth of the tree, within a part of the period, in whole 10 µs.
+/// Returns the slot duration in µs: one slot per depth of the tree within a share of the period, in multiples of 10 µs.
 #[expect(
     clippy::cast_precision_loss,
     clippy::cast_possible_truncation,
@@ -97,7 +97,7 @@ fn slot_us(places: &[Place], broadcast_hz: f64) -> u64 {
     (1e5 * SLOTS_SHARE / broadcast_hz / slots as f64).floor().max(1.0) as u64 * 10
 }
 
-/// To a step of `1 / steps`; never minus zero.
+/// Rounds to a step of `1 / steps`; never returns minus zero.
 fn round(value: f64, steps: f64) -> f64 {
     (value * steps).round() / steps + 0.0
 }

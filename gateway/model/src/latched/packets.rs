@@ -1,14 +1,15 @@
-//! The packets of a bus that a reader needs who begins in the middle of a recording.
+//! The packets of a bus that a reader needs to start in the middle of a recording.
 //!
 //! ```text
-//!   frames of a bus ──> take ──> [ Latched ] ──> frames that still count, in the bus' order
+//!   frames of a bus ──> take ──> [ Latched ] ──> frames with a lasting effect, in the bus' order
 //! ```
 //!
-//! Of every cell: its last heartbeat with the hash of its configuration, its last start, its place in the tree, what
-//! was switched and configured at run time, and its stimuli, latched or waiting for their epochs. Of the bus: the last
-//! joints, and whether cells were halted. Epochs count modulo 256, so a stimulus alone does not tell whether it still waits.
-//! Therefore each stimulus is kept with the joints before it and those at which it is latched. A receiver that applies
-//! these packets in order by the protocol's rules reaches the same state as one that received all packets.
+//! For every cell they are its last heartbeat with the hash of its configuration, its last start, its place in the
+//! tree, its switches and parameters written at run time, and its stimuli, latched or pending. For the bus they are the
+//! last joints, and the last halt or resume. Epochs count modulo 256, so a stimulus alone does not show whether it is
+//! still pending. Therefore each stimulus is kept with the joints before it and those at which it is latched. A
+//! receiver that applies these packets in order by the protocol's rules reaches the same state as one that received all
+//! packets.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -23,18 +24,18 @@ use protocol::time::Micros;
 use crate::packets::{Content, PacketReader};
 use crate::tracker::{Claim, Contact, PerCell, Word};
 
-/// A frame that was received.
+/// A received frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Seen {
-    /// When, in ns since 1970.
+    /// Arrival time in ns since 1970.
     pub at_nanos: u64,
-    /// Whether the gateway sent it.
+    /// True if the gateway sent it.
     pub own: bool,
-    /// What.
+    /// The frame.
     pub frame: Frame,
 }
 
-/// The frames of one packet, and its place in the bus' order.
+/// The frames of one packet, and its position in the bus' order.
 #[derive(Debug)]
 struct PlacedPacket {
     place: u64,
@@ -43,7 +44,7 @@ struct PlacedPacket {
 
 type Kept = Option<Arc<PlacedPacket>>;
 
-/// The positions of a latched page: its packet, the last joints before it, and those at which it was latched.
+/// A latched page: its packet, the last joints before it, and the joints at which it was latched.
 #[derive(Clone, Debug)]
 struct ContactPage {
     placed_packet: Arc<PlacedPacket>,
@@ -59,34 +60,35 @@ struct Cell {
     heartbeat: Kept,
     /// The first and the last heartbeat of its last start.
     starts: [Kept; 2],
-    /// Its last report of where its sums go.
+    /// Its last report of its parent in the tree.
     tree: Kept,
-    /// By parameter: the last writes of what is not stored.
+    /// By parameter: the last writes of volatile parameters.
     switches: BTreeMap<u8, Arc<PlacedPacket>>,
-    /// By parameter: the last writes that a commit has taken into use, and that commit.
+    /// By parameter: the last writes that a commit activated, and that commit.
     committed: BTreeMap<u8, Arc<PlacedPacket>>,
     commit: Kept,
     /// By parameter: the last writes since then, and a commit that has not been answered.
     staged: BTreeMap<u8, Arc<PlacedPacket>>,
     requested: Kept,
     contact: Contact<ContactPage>,
-    /// Where the cell showed that all its stimuli are on the bus: its counters, or its answer to a write of its mode.
+    /// The packet with which the cell proved that all its stimuli are on the bus: its counters, or its answer to a
+    /// write of its mode.
     shown: Kept,
 }
 
 /// The packets of one bus that are latched.
 #[derive(Clone, Debug)]
 pub struct Latched {
-    /// Packets so far.
+    /// Number of packets so far.
     places: u64,
     cells: PerCell<Cell>,
     joints: Option<(Epoch, Arc<PlacedPacket>)>,
     /// The last halt or resume.
     halt: Kept,
     packets: PacketReader,
-    /// By identifier: segments whose packet is still to come.
+    /// By identifier: segments of incomplete packets.
     waiting: BTreeMap<u16, Vec<Seen>>,
-    /// Identifiers of the gateway's side of which segments wait, and when the newest came, in ns since 1970.
+    /// Identifiers of the gateway's packets with pending segments, and the time of the newest, in ns since 1970.
     open: BTreeMap<u16, u64>,
 }
 
@@ -105,14 +107,14 @@ impl Default for Latched {
 }
 
 impl Cell {
-    /// It has started, or its mode was written: its contact state is reset.
+    /// Resets the contact state, after a start or a write of the mode.
     fn clear(&mut self, obeys: bool) {
         self.contact.write_mode();
         self.contact.set_obeys(obeys);
         self.shown = None;
     }
 
-    /// It shows that all its stimuli are on the bus, if it does so now.
+    /// Applies a page that may prove that all stimuli are on the bus, and keeps the packet if it does.
     fn show(&mut self, contact_page: ContactPage, show: impl FnOnce(&mut Contact<ContactPage>, ContactPage)) {
         let placed_packet = Arc::clone(&contact_page.placed_packet);
         let before = self.contact.known().is_some();
@@ -158,7 +160,7 @@ impl Cell {
         }
     }
 
-    /// It has taken into use what was written before the last requested commit.
+    /// Activates the parameters that were written before the last requested commit.
     fn commit(&mut self) {
         let Some(requested) = self.requested.take() else { return };
         let staged = std::mem::take(&mut self.staged).into_iter();
@@ -168,7 +170,7 @@ impl Cell {
         (self.staged, self.commit) = (later, Some(requested));
     }
 
-    /// The contact state that the cell itself reports, when nothing else is known of it.
+    /// Sets the contact state from the cell's own report, if it is not known otherwise.
     fn learn(&mut self, page: SensorPage, contact_page: ContactPage) {
         let joints = contact_page.before.as_ref().map_or(0, |joints| joints.place);
         if !self
@@ -196,7 +198,7 @@ impl Cell {
 }
 
 impl Latched {
-    /// Takes a frame that was on the bus. Bounded work; what is no packet is ignored.
+    /// Handles a frame from the bus. Bounded work; frames that are not packets are ignored.
     pub fn take(&mut self, seen: Seen) {
         let Ok(id) = packet::data_id(&seen.frame) else { return };
         match id.kind {
@@ -230,7 +232,7 @@ impl Latched {
         self.hear(message, &Arc::new(PlacedPacket { place: self.places, frames }));
     }
 
-    /// Whether segments of a packet of the gateway's side may still come: no file should begin between them.
+    /// Returns true if segments of a gateway packet are pending: a file must not begin between them.
     #[must_use]
     pub fn is_within_a_packet(&self, now_nanos: u64) -> bool {
         let within = |bits: u16| Segment::within(Id::from_bits(bits)).0 * 1_000;
@@ -293,7 +295,7 @@ impl Latched {
         }
     }
 
-    /// All of them, in the bus' order.
+    /// Returns all frames, in the bus' order.
     #[must_use]
     pub fn frames(&self) -> Vec<Seen> {
         let joints = self.joints.iter().map(|(_, joints)| joints);
@@ -363,7 +365,7 @@ mod tests {
             expected.extend(say(&mut force, 2, format, &write(7, 2)));
             expected.extend(say(&mut force, 2, format, &write(9, 2)));
             expected.extend(say(&mut force, 3, format, &heartbeat(3, 2)));
-            // The order is that of the bus, whatever the times are.
+            // The order is that of the bus, not of the times.
             expected.extend(say(&mut force, 4, format, &joints(1)));
             expected.extend(say(&mut force, 1, format, &stimulus(3, 1.0, 7)));
             expected.extend(say(&mut force, 6, format, &stimulus(255, 2.0, 8)));

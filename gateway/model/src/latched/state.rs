@@ -6,9 +6,8 @@
 //!
 //! A torque is a function of the cell's parameters, one joints packet and the stimuli latched at it; and the end of a
 //! contact is sent once, by a cell that was in contact at the joints before. So a replay that begins in the middle
-//! resends, in this order: the configuration as it was written; resume; the stimuli latched before the last joints;
-//! those that waited then; halt, if the cells were halted; the last joints; and all inputs since then, as they were
-//! sent.
+//! resends, in this order: the configuration as it was written; resume; the stimuli latched before the last joints; the
+//! stimuli pending then; halt, if the cells were halted; the last joints; and all later inputs, as they were sent.
 
 use protocol::fixed::{Q1_14, Q3_12, Q5_10};
 use protocol::id::{CellId, Node};
@@ -20,19 +19,19 @@ use protocol::time::Micros;
 use super::touched::Touched;
 use crate::tracker::{Claim, Contact, PerCell, Word};
 
-/// Messages since the last joints that are kept as they were sent.
+/// Maximum number of messages since the last joints that are kept as they were sent.
 const SINCE: usize = 16_384;
 
 /// The contact state of one cell.
 type ContactState = Contact<()>;
 
-/// Nothing touches it, in either mode.
+/// Resets the contact state to no contact, in either mode.
 fn clear(contact_state: &mut ContactState, obeys: bool) {
     contact_state.reset();
     contact_state.set_obeys(obeys);
 }
 
-/// Whether something touches it from the joints of an epoch on, if that is known.
+/// Returns true if the cell is in contact from the joints of an epoch on; `None` if unknown.
 fn is_touched_from(contact_state: &ContactState, epoch: Epoch) -> Option<bool> {
     let touches =
         |(skin, ()): &(SkinSensors, ())| skin.contact != [Q5_10::ZERO; 3] || skin.proximity != Q1_14::ZERO;
@@ -44,7 +43,7 @@ fn is_touched_from(contact_state: &ContactState, epoch: Epoch) -> Option<bool> {
     then.skin().map(touches)
 }
 
-/// The pages that are latched, without those that equal the state of every cell at its start.
+/// Returns the latched pages that differ from the state of a cell at its start.
 fn pages(contact_state: &ContactState) -> impl Iterator<Item = SensorPage> {
     let nothing = [SensorPage::Skin(SkinSensors::default()), SensorPage::Acceleration([Q3_12::ZERO; 3])];
     contact_state.latched().map(|(page, ())| page).filter(move |page| !nothing.contains(page))
@@ -53,7 +52,7 @@ fn pages(contact_state: &ContactState) -> impl Iterator<Item = SensorPage> {
 /// The state of a bus before its last joints.
 #[derive(Clone, Debug, Default)]
 struct Before {
-    /// Parameters that were written, in order, without those that were written over.
+    /// Parameter writes in order, without overwritten ones.
     writes: Vec<(Node, u8, Message)>,
     halted: bool,
     cells: PerCell<ContactState>,
@@ -65,14 +64,14 @@ pub struct State {
     before: Before,
     /// The owners of node ids.
     claims: PerCell<Claim>,
-    /// The last joints. Whether a cell was in contact at them depends on the state before.
+    /// The last joints. The state before them decides whether a cell was in contact at them.
     joints: Option<(Epoch, Joints)>,
-    /// Messages since then, as they were sent.
+    /// Messages since the last joints, as they were sent.
     since: Vec<Message>,
 }
 
 impl Before {
-    /// Takes in the messages after the joints `last`.
+    /// Applies a message that came after the joints `last`.
     fn take(&mut self, message: &Message, last: Option<Epoch>) {
         if let Message::Halt | Message::Resume = message {
             self.halted = *message == Message::Halt;
@@ -86,14 +85,14 @@ impl Before {
         }
     }
 
-    /// A restarted cell has lost its contact state, and what was switched.
+    /// Resets the contact state and the volatile writes of a restarted cell.
     fn start_again(&mut self, cell: Node) {
         self.cells.named(cell).iter_mut().for_each(|cell| clear(cell, true));
         self.writes.retain(|(to, number, _)| *to != cell || !is_volatile(*number));
     }
 
-    /// Keeps a write. One of the same parameter to the same cells is written over, unless a commit since then has
-    /// taken it into use; so what is kept grows with the commits, and with nothing else.
+    /// Keeps a write. It replaces a write of the same parameter to the same cells, unless a commit in between has
+    /// activated that one. So memory grows only with the number of commits.
     fn write(&mut self, to: Node, number: u8, message: Message) {
         let commit = Parameter::Commit.number();
         let since_commit =
@@ -114,7 +113,7 @@ fn is_volatile(number: u8) -> bool {
 }
 
 impl State {
-    /// Takes in the bus' next message.
+    /// Applies the bus' next message.
     pub fn take(&mut self, message: &Message) {
         if let Message::Joints { epoch, joints } = *message {
             // Cells drop joints of the last epoch.
@@ -132,13 +131,13 @@ impl State {
             }
             self.since.push(*message);
         } else if let Message::Sensors { from, epoch, page } = *message {
-            // The contact state that the cell itself reports, when nothing else is known of it.
+            // The cell's own report counts if its contact state is not known otherwise.
             let cell = self.before.cells.get_mut(from).filter(|cell| cell.waiting().is_empty());
             if let Some(cell) = cell.filter(|_| self.joints.is_none_or(|(last, _)| last == epoch)) {
                 cell.learn(page, ());
             }
         } else if let Message::Network { from, page: NetworkPage::Heartbeat(heartbeat), .. } = message {
-            // In the order of the capture; that its times are right is not sure.
+            // Use the order of the capture: its times may be wrong.
             let hear = |claim: &mut Claim| claim.hear(Micros(0), heartbeat);
             let started = |claim: &mut Claim| matches!(hear(claim), Word::Started { .. });
             if self.claims.named(*from).iter_mut().any(started) {
@@ -157,7 +156,7 @@ impl State {
         self.since.retain(|message| !is_forgotten(message));
     }
 
-    /// Messages up to now apply before those that come.
+    /// Moves the messages so far into the state before the joints.
     fn fold(&mut self) {
         let last = self.joints.map(|(epoch, _)| epoch);
         if let Some(epoch) = last {
@@ -168,19 +167,19 @@ impl State {
         }
     }
 
-    /// The owner of a node id.
+    /// Returns the owner of a node id.
     #[must_use]
     pub fn claim(&self, cell: CellId) -> Option<&Claim> {
         self.claims.get(cell)
     }
 
-    /// The epoch of the last joints.
+    /// Returns the epoch of the last joints.
     #[must_use]
     pub fn last_epoch(&self) -> Option<Epoch> {
         self.joints.map(|(epoch, _)| epoch)
     }
 
-    /// The cells that are touched since the last joints, by the messages before them.
+    /// Returns the cells in contact since the last joints, by the messages before them.
     #[must_use]
     pub fn touched(&self) -> Touched {
         let mut touched = Touched::default();
@@ -193,7 +192,7 @@ impl State {
         touched
     }
 
-    /// Whether a cell that has just started is in this state already.
+    /// Returns true if a cell that has just started is already in this state.
     #[must_use]
     pub fn is_fresh(&self) -> bool {
         let Before { writes, halted, cells } = &self.before;
@@ -202,7 +201,7 @@ impl State {
         !contact && writes.is_empty() && !halted && self.joints.is_none() && self.since.is_empty()
     }
 
-    /// Whether new parameters were taken into use.
+    /// Returns true if new parameters were activated.
     #[must_use]
     pub fn configures(&self) -> bool {
         let commit = Parameter::Commit.number();
@@ -210,12 +209,12 @@ impl State {
         self.before.writes.iter().any(|(_, _, message)| commits(message)) || self.since.iter().any(commits)
     }
 
-    /// The messages that bring `cells` into this state; `next` are the joints that come first then, for a bus that has
-    /// had none yet: they make the cells drop the epoch of an earlier gateway.
+    /// Returns the messages that bring `cells` into this state. `next` are the joints that will follow, for a bus
+    /// without joints so far: they make the cells drop the epoch of an earlier gateway.
     #[must_use]
     pub fn restoring(&self, cells: impl Fn(CellId) -> bool, next: Option<(Epoch, Joints)>) -> Vec<Message> {
         let Before { writes, halted, cells: contact_states } = &self.before;
-        // Links can be down in test mode only, and the mode may have been written again since.
+        // Links can be down only in test mode, and the mode may have been written again since.
         let links_down = |write: &&(Node, u8, Message)| write.1 == Parameter::LinksDown.number();
         let (plan_summary, others): (Vec<_>, Vec<_>) = writes.iter().partition(links_down);
         let mut messages: Vec<_> =
@@ -239,7 +238,7 @@ impl State {
         };
         let last = self.joints.or_else(|| next.map(|(epoch, joints)| (epoch.plus(u8::MAX), joints)));
         if let Some(last) = last.filter(|_| !contact.is_empty() || !pending.is_empty()) {
-            // Joints of a cell's last epoch would be dropped, and so those that matter may not be the first.
+            // A cell drops joints of its last epoch, so the joints that matter must not be the first ones.
             messages.push(steps_before(2, last));
             messages.extend(contact);
             messages.push(steps_before(1, last));

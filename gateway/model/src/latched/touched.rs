@@ -1,8 +1,8 @@
-//! Which cells of a bus something touches, as far as that is known.
+//! The cells of a bus that are in contact, as far as known.
 
 use protocol::id::CellId;
 
-/// Of each cell whether something touches it; none if that is unknown.
+/// The contact of each cell; `None` if unknown.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct Touched([Option<bool>; CellId::COUNT]);
 
@@ -13,13 +13,13 @@ impl Default for Touched {
 }
 
 impl Touched {
-    /// Whether a cell is touched; none if that is unknown.
+    /// Returns true if a cell is in contact; `None` if unknown.
     #[must_use]
     pub fn is(&self, cell: CellId) -> Option<bool> {
         self.0.get(cell.index()).copied().flatten()
     }
 
-    /// Takes in of a cell whether it is touched.
+    /// Records the contact of a cell.
     pub fn insert(&mut self, cell: CellId, is_touched: bool) {
         if let Some(place) = self.0.get_mut(cell.index()) {
             *place = Some(is_touched);

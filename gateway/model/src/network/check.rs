@@ -1,6 +1,6 @@
-//! What is wrong with a network of cells: their reports, compared with the description.
+//! Compares the reports of a network of cells with its description.
 //!
-//! Every difference is named once, by its cause: the wires of a missing cell are not named.
+//! Every difference is reported once, by its cause: the wires of a missing cell are not listed.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
@@ -13,22 +13,22 @@ use thiserror::Error;
 
 use super::tree::{Places, places};
 
-/// What is known of one cell.
+/// The known state of one cell.
 #[derive(Clone, Copy, Debug)]
 pub struct Seen {
     /// Its node id.
     pub node: CellId,
-    /// The serial number that is described with this node id; `None` if the node id is not described.
+    /// The described serial number for this node id; `None` if the node id is not described.
     pub serial: Option<u32>,
-    /// The hash that its configuration must have.
+    /// The expected hash of its configuration.
     pub configuration: u16,
     /// Its last heartbeat.
     pub heartbeat: Option<Heartbeat>,
-    /// Whether it sends now.
+    /// True if it sends now.
     pub alive: bool,
-    /// Its place in the tree, as it reports.
+    /// Its reported place in the tree.
     pub tree: Option<Tree>,
-    /// What its ports lead to, as it reports.
+    /// Its reported neighbours at the ports.
     pub ports: Option<Ports>,
 }
 
@@ -47,10 +47,10 @@ impl fmt::Display for End {
     }
 }
 
-/// In which direction a wire carries something.
+/// The directions in which a damaged wire works.
 #[derive(Clone, Copy, Debug, Eq, Hash, Ord, PartialEq, PartialOrd)]
 pub enum Carries {
-    /// In neither, or it is not known in which.
+    /// Neither direction, or unknown.
     Nothing,
     /// From the first end to the second.
     There,
@@ -59,7 +59,7 @@ pub enum Carries {
 }
 
 impl Carries {
-    /// Of a wire between two cells that does not work both ways, for people.
+    /// Describes a damaged wire between two cells for users.
     fn between(self, first: CellId, second: CellId) -> String {
         match self {
             Self::Nothing => "does not work".to_owned(),
@@ -83,19 +83,19 @@ pub enum Difference {
         /// Its serial number.
         serial: u32,
     },
-    /// A cell of another serial number than described has a node id.
+    /// A cell with another serial number than described holds a node id.
     #[error("{}", other_cell(*cell, *serial, *described, *belongs))]
     OtherCell {
         /// The node id.
         cell: CellId,
         /// The serial number of its owner.
         serial: u32,
-        /// The one that is described.
+        /// The described serial number.
         described: u32,
-        /// The node id with which the owner is described, if it is.
+        /// The node id with which the owner is described, if any.
         belongs: Option<CellId>,
     },
-    /// Two cells have one node id.
+    /// Two cells have the same node id.
     #[error("two cells have node id {0}: stop one of the two")]
     Duplicate(CellId),
     /// A cell has another version of the protocol.
@@ -103,35 +103,35 @@ pub enum Difference {
     Version {
         /// The cell.
         cell: CellId,
-        /// Its version; `None` when only its neighbours report that it differs.
+        /// Its version; `None` if only its neighbours report the difference.
         version: Option<u16>,
     },
     /// A cell computes with other parameters than the skin's.
     #[error("cell {0} is configured for another skin: configure it with `skinbus commission`")]
     OtherSkin(CellId),
     /// A described wire does not work.
-    #[error("the wire from {first} to {second} {}: look at its plugs", carries.between(first.cell, second.cell))]
+    #[error("the wire from {first} to {second} {}: check its plugs", carries.between(first.cell, second.cell))]
     MissingWire {
         /// The end with the smaller node id.
         first: End,
         /// The other end.
         second: End,
-        /// What it still carries.
+        /// The directions that still work.
         carries: Carries,
     },
-    /// A wire that is not described.
+    /// A wire is not described.
     #[error("a wire leads from {0} to {1} and is not described: describe it, or unplug it")]
     ExtraWire(End, End),
-    /// A port leads elsewhere than described.
+    /// A port leads to another end than described.
     #[error(
         "{end} leads to {leads} and should lead to {described}: plug it there, or change the description"
     )]
     SwappedWire {
         /// The port.
         end: End,
-        /// Where it leads.
+        /// The end to which it leads.
         leads: End,
-        /// Where it should lead.
+        /// The end to which it should lead.
         described: End,
     },
     /// A cell without a node id is at a port.
@@ -142,7 +142,7 @@ pub enum Difference {
     Circle(Vec<CellId>),
     /// Cells without a route to a root.
     #[error(
-        "{} {} no route to a root: their torques are in no sum; look at their wires",
+        "{} {} no route to a root: their torques are missing from all sums; check their wires",
         names(.0),
         if .0.len() == 1 { "has" } else { "have" }
     )]
@@ -171,7 +171,7 @@ fn other_version(version: Option<u16>) -> String {
     }
 }
 
-/// Some cells, for people: at most six of them, and how many more.
+/// Lists cells for users: at most six of them, and the number of the others.
 #[must_use]
 pub fn names(cells: &[CellId]) -> String {
     let first: Vec<_> = cells.iter().take(6).map(ToString::to_string).collect();
@@ -183,7 +183,7 @@ pub fn names(cells: &[CellId]) -> String {
 }
 
 impl Difference {
-    /// Whether some cell's torque is in no sum.
+    /// Returns true if the torque of some cell is missing from all sums.
     #[must_use]
     pub const fn breaks_the_tree(&self) -> bool {
         match self {
@@ -200,7 +200,7 @@ impl Difference {
     }
 }
 
-/// All differences, each once.
+/// Returns all differences, each once.
 #[must_use]
 pub fn differences(wires: &Wires, cells: &[Seen]) -> Vec<Difference> {
     let mut found: Vec<_> = cells.iter().flat_map(|cell| of_cell(cell, cells)).collect();
@@ -221,7 +221,7 @@ pub fn differences(wires: &Wires, cells: &[Seen]) -> Vec<Difference> {
     found
 }
 
-/// What is wrong with a cell by itself.
+/// Returns the differences of a cell by itself.
 fn of_cell(cell: &Seen, all: &[Seen]) -> Vec<Difference> {
     let node = cell.node;
     let heartbeat = cell.heartbeat.filter(|_| cell.alive);
@@ -244,7 +244,7 @@ fn of_cell(cell: &Seen, all: &[Seen]) -> Vec<Difference> {
     found
 }
 
-/// The cells with another version, by their own or by their neighbours' reports.
+/// Returns the cells with another version, by their own or by their neighbours' reports.
 fn other_versions(wires: &Wires, cells: &[Seen]) -> BTreeMap<CellId, Option<u16>> {
     let alive = || cells.iter().filter(|cell| cell.alive && cell.serial.is_some());
     let mut versions = BTreeMap::new();
@@ -268,10 +268,10 @@ fn other_versions(wires: &Wires, cells: &[Seen]) -> BTreeMap<CellId, Option<u16>
     versions
 }
 
-/// What ports lead to.
+/// The neighbours of all ports.
 struct Network<'a> {
     wires: &'a Wires,
-    /// The cells whose ports can be compared: present, with one node id each, and of this version.
+    /// The cells with comparable ports: present, with a unique node id, and of this version.
     sound: BTreeMap<CellId, &'a Ports>,
 }
 
@@ -285,7 +285,7 @@ impl<'a> Network<'a> {
         Self { wires, sound: sound.collect() }
     }
 
-    /// Where a port should lead.
+    /// Returns the described end to which a port should lead.
     fn described(&self, end: End) -> Option<End> {
         self.wires.other_end(end.cell, end.port).map(|(cell, port)| End { cell, port })
     }
@@ -294,7 +294,7 @@ impl<'a> Network<'a> {
         self.sound.get(&end.cell)?.ports.get(end.port).copied()
     }
 
-    /// Where a port leads, if its cell receives anything there.
+    /// Returns the end to which a port leads, if its cell receives anything there.
     fn leads(&self, end: End) -> Option<End> {
         let state = self.state(end).filter(|state| state.hears)?;
         let cell = CellId::new(state.number.into()).ok()?;
@@ -316,7 +316,7 @@ impl<'a> Network<'a> {
                 elsewhere.insert(end);
                 continue;
             }
-            // The far ends of a cell that cannot be compared are skipped too.
+            // Skip the far ends of cells that cannot be compared, too.
             let Some(leads) = self.leads(end).filter(|leads| self.sound.contains_key(&leads.cell)) else {
                 continue;
             };

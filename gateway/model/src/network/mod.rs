@@ -1,4 +1,4 @@
-//! The gateway's side of the cells' network: the wires to the roots, the tree, and what is wrong with it.
+//! The gateway's side of the cells' network: the wires to the roots, the tree, and its check against the description.
 
 pub mod check;
 pub mod tree;

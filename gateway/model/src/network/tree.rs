@@ -1,4 +1,4 @@
-//! The tree by the reports of the cells: their depths, unreachable cells, and circles.
+//! The tree according to the cells' reports: depths, unreachable cells, and cycles.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -6,28 +6,28 @@ use protocol::id::CellId;
 use protocol::message::Tree;
 use protocol::port::UPLINK;
 
-/// Where cells are in their tree.
+/// The places of cells in their tree.
 #[derive(Clone, Debug, Default, Eq, PartialEq)]
 pub struct Places {
-    /// Wires from each reachable cell to its root: 0 is a root.
+    /// Number of wires from each reachable cell to its root; a root has 0.
     pub depths: BTreeMap<CellId, u8>,
-    /// Whether each of them reports the same depth.
+    /// True if all these cells report the same depth.
     pub agree: bool,
-    /// Cells that send and have no route to a root, those of circles among them.
+    /// Cells that send but have no route to a root, including those in cycles.
     pub unreachable: Vec<CellId>,
-    /// Parents in a circle.
+    /// Cells whose parents form a cycle.
     pub circles: Vec<Vec<CellId>>,
 }
 
 impl Places {
-    /// The depth of the deepest cell.
+    /// Returns the depth of the deepest cell.
     #[must_use]
     pub fn deepest(&self) -> Option<u8> {
         self.depths.values().copied().max()
     }
 }
 
-/// The places of cells, given their node ids, whether they send, and their reports.
+/// Returns the places of cells, given for each cell its node id, whether it sends, and its report.
 pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Places {
     let alive: BTreeMap<_, _> =
         cells.filter(|(_, alive, _)| *alive).map(|(node, _, tree)| (node, tree)).collect();
@@ -63,7 +63,7 @@ pub fn places(cells: impl Iterator<Item = (CellId, bool, Option<Tree>)>) -> Plac
     places
 }
 
-/// Whether a page is of a cell that is wired to the gateway and uses that wire.
+/// Returns true if the cell is wired to the gateway and uses that wire.
 fn is_root(tree: &Tree) -> bool {
     tree.parent == Some(0) && usize::from(tree.up) == UPLINK
 }
@@ -92,7 +92,7 @@ mod tests {
         let found = places(cells.into_iter());
         assert_eq!((found.deepest(), found.agree), (Some(2), true));
         assert_eq!((found.unreachable, found.circles), (vec![], vec![]));
-        // One that reports another depth is out of date.
+        // A report with another depth is out of date.
         let cells = [says(1, Some(0), 4, 0), says(2, Some(1), 0, 2)];
         assert!(!places(cells.into_iter()).agree);
     }

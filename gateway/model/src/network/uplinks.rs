@@ -3,7 +3,7 @@
 //! ```text
 //!    message of a root ─> handle ──────┐             ┌─> poll_transmit ─> message for a root
 //!                 now ──> handle_time ─┼─ [Uplinks] ─┘
-//!   node id that is used ─> claimed ───┘
+//!   node id in use ─────> claimed ─────┘
 //! ```
 
 use std::collections::{BTreeSet, VecDeque};
@@ -13,7 +13,7 @@ use protocol::message::VERSION;
 use protocol::port::{Hello, PortMessage, Rank, Walk};
 use protocol::time::{Micros, Span};
 
-/// From one hello to the next.
+/// Interval of hellos.
 const HELLO: Span = Span::from_millis(250);
 /// Timeout of a root's hellos.
 const SILENT: Span = Span::from_millis(600);
@@ -25,7 +25,7 @@ const PORT: u8 = 0;
 /// One root's wire.
 #[derive(Clone, Copy, Debug)]
 struct Wire {
-    /// Which wire, in the order of the description.
+    /// The index of the wire in the description.
     root: usize,
     heard: Option<(Hello, Micros)>,
     is_child: bool,
@@ -47,14 +47,15 @@ pub struct Uplinks {
     used: BTreeSet<u8>,
     walks: u8,
     walking: Option<Walking>,
-    /// No walk begins before this: cells with a node id of a lost walk have to claim it first.
+    /// Earliest time of the next walk: cells with a node id from a lost walk must claim it first.
     wait: Micros,
     next_hello: Micros,
     outbox: VecDeque<(usize, PortMessage)>,
 }
 
 impl Uplinks {
-    /// Wires to so many roots; the first walk has the number `walk`, which must differ from that of an earlier gateway.
+    /// Creates the wires to this number of roots. The first walk has the number `walk`, which must differ from that of
+    /// an earlier gateway.
     #[must_use]
     pub fn new(roots: usize, walk: u8, now: Micros) -> Self {
         let wire = |root| Wire { root, heard: None, is_child: false };
@@ -70,17 +71,17 @@ impl Uplinks {
         }
     }
 
-    /// A cell with this node id is on the bus.
+    /// Marks a node id as used by a cell on the bus.
     pub fn claimed(&mut self, cell: CellId) {
         self.used.insert(cell.get());
     }
 
-    /// The next message for a root, by its place among the roots.
+    /// Returns the next message, with the index of its root.
     pub fn poll_transmit(&mut self) -> Option<(usize, PortMessage)> {
         self.outbox.pop_front()
     }
 
-    /// When [`Uplinks::handle_time`] has something to do.
+    /// Returns the time of the next call of [`Uplinks::handle_time`].
     #[must_use]
     pub fn poll_timeout(&self) -> Micros {
         let lost = self.walking.map(|walking| walking.since + LOST);
@@ -88,13 +89,13 @@ impl Uplinks {
         [lost, waits].into_iter().flatten().fold(self.next_hello, Micros::min)
     }
 
-    /// Whether the sums of a root are for the gateway; else another cell takes them.
+    /// Returns true if a root sends its sums to the gateway; otherwise it sends them to another cell.
     #[must_use]
     pub fn is_child(&self, root: usize) -> bool {
         self.wires.get(root).is_some_and(|wire| wire.is_child)
     }
 
-    /// Takes a message of a root over its wire.
+    /// Handles a message from a root over its wire.
     pub fn handle(&mut self, now: Micros, root: usize, message: PortMessage) {
         let rank = Rank { round: self.round, depth: 0 };
         let Some(wire) = self.wires.get_mut(root) else { return };
@@ -102,7 +103,7 @@ impl Uplinks {
             PortMessage::Hello(hello) => {
                 let is_new = wire.heard.is_none_or(|(_, at)| now.since(at) > SILENT);
                 wire.heard = Some((hello, now));
-                // Only the root knows whether a grant came, and whether one of an earlier gateway is still valid.
+                // Only the root knows whether a grant arrived, and whether one from an earlier gateway is still valid.
                 wire.is_child = hello.up;
                 if hello.up && hello.rank.is_some_and(|own| own.is_better_than(rank.below())) {
                     self.renew(now, hello.rank.map_or(self.round, |own| own.round));
@@ -128,7 +129,7 @@ impl Uplinks {
         self.walk(now);
     }
 
-    /// Begins a round later than this one, unless it has begun already.
+    /// Starts a round later than this one, unless one has started already.
     fn renew(&mut self, now: Micros, round: u8) {
         if self.round.wrapping_sub(round).cast_signed() <= 0 {
             self.round = round.wrapping_add(1);
@@ -173,13 +174,13 @@ impl Uplinks {
         self.walk(now);
     }
 
-    /// A root with a cell below it that has no node id.
+    /// Returns a root above a cell without a node id.
     fn needs_node_ids(&self) -> Option<usize> {
         let needs = |wire: &&Wire| wire.is_child && wire.heard.is_some_and(|(hello, _)| hello.unnumbered);
         self.wires.iter().find(needs).map(|wire| wire.root)
     }
 
-    /// Sends a walk to a root that needs one, with the first free node ids.
+    /// Sends a walk to a root that needs one, with the first range of free node ids.
     fn walk(&mut self, now: Micros) {
         if self.walking.is_some() || now < self.wait {
             return;
@@ -191,7 +192,7 @@ impl Uplinks {
         self.outbox.push_back((root, PortMessage::NodeId(walk)));
     }
 
-    /// The first range of free node ids.
+    /// Returns the first range of free node ids.
     fn free(&self) -> Option<(u8, u8)> {
         let first = (1..=CellId::MAX.get()).find(|number| !self.used.contains(number))?;
         let last = (first..=CellId::MAX.get()).take_while(|number| !self.used.contains(number)).last()?;
@@ -206,7 +207,7 @@ impl Uplinks {
         self.used.extend(walking.walk.first..remaining.first.min(walking.walk.last.saturating_add(1)));
         self.walking = None;
         if remaining.first == walking.walk.first {
-            // It assigned none: it does not know its children yet.
+            // The root assigned none: it does not know its children yet.
             self.wait = now + Span::from_millis(20);
         }
     }
@@ -222,7 +223,7 @@ mod tests {
         std::iter::from_fn(|| uplinks.poll_transmit()).collect()
     }
 
-    /// A hello of a root whose parent is the gateway's side.
+    /// Returns a hello of a root with the gateway as its parent.
     fn hello_up(unnumbered: bool) -> PortMessage {
         let rank = Some(Rank { round: 1, depth: 1 });
         PortMessage::Hello(Hello {

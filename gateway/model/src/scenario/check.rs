@@ -40,7 +40,7 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
         Ok(core::array::from_fn(|joint| values.get(joint).copied().unwrap_or(0.0)))
     };
     let (start_key, start) = either(&at, ("start", &raw.start), ("start_rad", &raw.start_rad))?;
-    // What is nearest to zero.
+    // The value in range nearest to zero.
     let mut nearest = [0.0; MAX_ROBOT_JOINTS];
     for (start, joint) in nearest.iter_mut().zip(&robot.joints) {
         *start = f64::clamp(0.0, joint.limits[0], joint.limits[1]);
@@ -66,18 +66,18 @@ fn motion(raw: &raw::Motion, skin: &Skin) -> Checked<Motion> {
     };
     for (index, ((start, reach), joint)) in start.iter().zip(reach).zip(&robot.joints).enumerate() {
         let ([min, max], unit) = (joint.limits, joint.kind.unit());
-        // Written so that NaN is refused too.
+        // This form refuses NaN, too.
         if !(start - reach >= min && start + reach <= max) {
             let swings =
                 if reach > 0.0 { format!(", and it swings by {reach} {unit}") } else { String::new() };
-            let why = format!("{} may go from {min:.4} to {max:.4} {unit}{swings}", joint.name);
+            let why = format!("{} is limited to {min:.4} to {max:.4} {unit}{swings}", joint.name);
             return Err(at.key(start_key).nth(index).fault(format_args!("{start} {unit}"), why));
         }
     }
     Ok(Motion { start, kind })
 }
 
-/// A value under its key or under the former one, and the key.
+/// Returns the value under its key or under the former key, with that key.
 fn either<'a, T>(
     at: &Place,
     (key, value): (&'static str, &'a Option<T>),
@@ -92,14 +92,14 @@ fn either<'a, T>(
     }
 }
 
-/// Whether every joint may be as quick as its swing is at the start.
+/// Checks that no joint exceeds its speed limit; the swing is fastest at the start.
 fn speeds(at: &Place, skin: &Skin, amplitude: &[f64; MAX_ROBOT_JOINTS], period_s: f64) -> Checked<()> {
     let limits = skin.controller.max_speed.iter().zip(&skin.robot.joints);
     for (index, (amplitude, (&max, joint))) in amplitude.iter().zip(limits).enumerate() {
         let (speed, unit) = (TAU * amplitude.abs() / period_s, joint.kind.unit());
         if speed.is_nan() || speed > max {
             let why = format!(
-                "in {period_s} s this takes {speed:.3} {unit}/s, and joint {} may make {max}",
+                "in {period_s} s this takes {speed:.3} {unit}/s, but the limit of joint {} is {max}",
                 index + 1
             );
             return Err(at.nth(index).fault(amplitude, why));
@@ -114,7 +114,7 @@ fn modes(raw: &[raw::Mode], end: EndS) -> Checked<Vec<ModeChange>> {
         let path = Place::named("mode").nth(index);
         let at = end.moment(&path.key("at_s"), raw.at_s)?;
         if modes.last().is_some_and(|last| last.at >= at) {
-            return Err(path.key("at_s").fault(raw.at_s, "modes come in the order of time"));
+            return Err(path.key("at_s").fault(raw.at_s, "modes must be in order of time"));
         }
         let kinds = [Mode::Compare, Mode::Distributed].map(|mode| (mode.name(), mode));
         modes.push(ModeChange { at, mode: path.key("kind").word(&raw.kind, &kinds)? });
@@ -122,11 +122,11 @@ fn modes(raw: &[raw::Mode], end: EndS) -> Checked<Vec<ModeChange>> {
     Ok(modes)
 }
 
-/// The period of the touches: each of them ends before all begin again.
+/// Checks the period of the touches: each touch must end before all begin again.
 fn repeat(raw: &[raw::Touch], touches: &[Touch], seconds: f64) -> Checked<Span> {
     let period = length(&Place::named("touches_repeat_s"), seconds)?;
     for (index, (raw, touch)) in raw.iter().zip(touches).enumerate() {
-        // A touch without a length begins before.
+        // A touch without a length must begin within the period.
         let lasts = if touch.length == Span(u64::MAX) { 0 } else { touch.length.0 };
         if touch.at.0.saturating_add(lasts) > period.0 || touch.at.0 >= period.0 {
             let key = if raw.for_s.is_some() { "for_s" } else { "at_s" };

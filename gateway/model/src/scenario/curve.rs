@@ -1,9 +1,9 @@
-//! Curves over time.
+//! Piecewise linear curves over time.
 
 use protocol::time::Span;
 
-/// The value of a curve at a time in µs: linear between its points, which are in the order of time, and constant before the
-/// first and after the last one; `None` without any.
+/// Interpolates a curve at a time in µs: linear between its points, which are sorted by time, and constant outside
+/// them. Returns `None` without any points.
 pub(super) fn linear<T: Copy>(points: &[(T, f64)], at: u64, micros: impl Fn(T) -> u64) -> Option<f64> {
     let after = points.partition_point(|(point, _)| micros(*point) <= at);
     let before = after.checked_sub(1).and_then(|index| points.get(index));
@@ -17,7 +17,7 @@ pub(super) fn linear<T: Copy>(points: &[(T, f64)], at: u64, micros: impl Fn(T) -
     }
 }
 
-/// A length of time in s.
+/// Converts a time span to s.
 #[expect(clippy::cast_precision_loss, reason = "2^53 us are 285 years")]
 pub(super) fn seconds(span: Span) -> f64 {
     span.0 as f64 * 1e-6

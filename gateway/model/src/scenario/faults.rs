@@ -10,7 +10,7 @@ use super::{BusFault, Fault, FaultKind, ProcessAction, SensorFault, raw};
 pub(super) const KINDS: &str = "of processes \"kill\", \"stop\", \"continue\", \"restart\"; of wires \"link_down\", \"link_up\"; of sensors \
      \"stuck\", \"drift\"; of buses \"drop\", \"delay\", \"duplicate\", \"corrupt\", \"reorder\", \"babble\"";
 
-/// The faults, in the order of time.
+/// Checks the faults and sorts them by time.
 pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &Names<'_>) -> Checked<Vec<Fault>> {
     let mut faults = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
@@ -23,7 +23,7 @@ pub(super) fn faults(raw: &[raw::Fault], end: EndS, names: &Names<'_>) -> Checke
     Ok(faults)
 }
 
-/// One `[[fault]]`.
+/// One entry of `[[fault]]`.
 struct Entry<'a> {
     at: Place,
     raw: &'a raw::Fault,
@@ -83,7 +83,7 @@ impl Entry<'_> {
         Ok(FaultKind::Wire { link_down, from, to, both_ways: !self.raw.one_way.unwrap_or(false) })
     }
 
-    /// A link that is down for some time comes up again.
+    /// Returns the repair of a wire that is down for a limited time.
     fn end_of(&self, fault: &Fault) -> Checked<Option<Fault>> {
         let FaultKind::Wire { link_down: true, from, to, both_ways } = fault.kind else { return Ok(None) };
         if self.raw.for_s.is_none() {
@@ -120,7 +120,7 @@ impl Entry<'_> {
         Given { at, bus: raw.bus.as_deref(), cells: raw.cells.as_deref(), all: raw.all }
     }
 
-    /// How long it lasts; without `for_s` it stays.
+    /// Returns the duration of the fault; without `for_s` it lasts to the end.
     fn length(&self) -> Checked<Span> {
         self.raw.for_s.map_or(Ok(Span(u64::MAX)), |seconds| length(&self.at.key("for_s"), seconds))
     }
@@ -134,7 +134,7 @@ impl Entry<'_> {
         delay.map(Span).ok_or_else(|| wrong(got.to_string()))
     }
 
-    /// A number that this kind of fault needs.
+    /// Returns a number that this kind of fault requires.
     fn given(&self, key: &'static str, value: Option<f64>, min: f64, max: f64) -> Checked<f64> {
         let why = || match (min, max) {
             (f64::NEG_INFINITY, _) => format!("a finite number is needed with kind = {:?}", self.raw.kind),
@@ -145,7 +145,7 @@ impl Entry<'_> {
             .ok_or_else(|| self.at.key(key).fault(value.map_or_else(String::new, |it| it.to_string()), why()))
     }
 
-    /// Refuses the keys that mean nothing for this kind of fault.
+    /// Refuses keys without a meaning for this kind of fault.
     fn only(&self, keys: &[&str]) -> Checked<()> {
         let raw = self.raw;
         let given = [
@@ -159,7 +159,7 @@ impl Entry<'_> {
         ];
         let senseless = given.into_iter().find(|(key, given)| *given && !keys.contains(key));
         senseless.map_or(Ok(()), |(key, _)| {
-            Err(self.at.key(key).fault("", format_args!("means nothing with kind = {:?}", raw.kind)))
+            Err(self.at.key(key).fault("", format_args!("is not allowed with kind = {:?}", raw.kind)))
         })
     }
 }

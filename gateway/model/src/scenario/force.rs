@@ -1,4 +1,4 @@
-//! The force of a touch over time, and the contact words that hold it.
+//! The force of a touch over time, and the contact words that represent it.
 
 use core::f64::consts::PI;
 
@@ -8,11 +8,11 @@ use protocol::time::{Micros, Span};
 use super::curve::{linear, seconds};
 use super::{Profile, Touch};
 
-/// The maximum force of three contact words together, in N.
+/// The maximum total force of three contact words, in N.
 pub const MAX_FORCE_N: f64 = 3.0 * 32_767.0 / 1_024.0;
 
-/// The three contact words of a force in N, as equal as they can be: they add up exactly to the force
-/// rounded to a word's step. Outside of their range they saturate.
+/// Splits a force in N into three contact words, as equal as possible; their sum is exactly the force rounded to a
+/// word's step. Forces out of range saturate.
 #[must_use]
 #[expect(clippy::cast_possible_truncation, reason = "rounded; the cast saturates, and NaN becomes 0")]
 pub fn contact_words(force_n: f64) -> [Q5_10; 3] {
@@ -25,12 +25,12 @@ pub fn contact_words(force_n: f64) -> [Q5_10; 3] {
 }
 
 impl Touch {
-    /// Whether it touches at a time.
+    /// Returns true if the touch is active at a time.
     pub(super) fn holds_at(&self, time: Micros) -> bool {
         self.at <= time && time.since(self.at) < self.length
     }
 
-    /// The force in N at a time; `None` when it does not touch then.
+    /// Returns the force in N at a time; `None` if the touch is not active.
     pub(super) fn level(&self, time: Micros) -> Option<f64> {
         if !self.holds_at(time) {
             return None;

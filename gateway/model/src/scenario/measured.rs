@@ -1,5 +1,5 @@
-//! What sensors read that are not perfect: a function of the scenario, its seed and the epoch, computed epoch by epoch,
-//! because hysteresis, creep and drift have a past.
+//! The readings of imperfect sensors. They are a function of the scenario, its seed and the epoch, and are computed
+//! epoch by epoch, because hysteresis, creep and drift depend on the past.
 //!
 //! ```text
 //!   force, neighbours ─> hysteresis ─> + creep ─> * gain(T) ─> + zero(T) + random walk + noise ─> contact words
@@ -16,39 +16,39 @@ use super::force::contact_words;
 use super::sensors::{ForceErrors, REFERENCE_C, Sensors};
 use crate::accelerometer::sensor::normal;
 
-/// Time constants of creep in s: together they are nearly a logarithm of time.
+/// Time constants of creep in s; their sum approximates a logarithm of time.
 const CREEP_S: [f64; 4] = [1.0, 10.0, 100.0, 1_000.0];
 
-/// What is there for a cell to measure.
+/// The true input of a cell's sensors.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct True {
     /// The force of touches in N.
     pub(super) force_n: f64,
-    /// Proximity, and the temperature that a touch brings.
+    /// Proximity, and the temperature set by a touch.
     pub(super) sensors: SkinSensors,
     pub(super) is_warmed: bool,
-    /// What a fault adds to the reading in N.
+    /// Offset in N that a fault adds to the reading.
     pub(super) added_n: f64,
     pub(super) is_stuck: bool,
 }
 
-/// The sensors of all cells.
+/// The imperfect sensors of all cells.
 #[derive(Clone, Debug)]
 pub(super) struct Measured {
     sensors: Sensors,
     seed: u64,
     period_s: f64,
     cells: Vec<CellSensors>,
-    /// What the cells of the epoch before the next one measured.
+    /// The readings of the epoch before `next`.
     words: Vec<SkinSensors>,
     next: u64,
 }
 
-/// One cell's errors, and the past of its force sensor.
+/// The errors of one cell, and the state of its force sensor.
 #[derive(Clone, Debug)]
 struct CellSensors {
     neighbours: Vec<usize>,
-    /// As parts of the largest, -1 to 1.
+    /// As fractions of the largest error, -1 to 1.
     offset: f64,
     gain: f64,
     temperature_n: f64,
@@ -60,7 +60,7 @@ struct CellSensors {
 }
 
 impl Measured {
-    /// That of a skin, before the first epoch.
+    /// Creates the sensors of a skin, before the first epoch.
     pub(super) fn new(sensors: &Sensors, seed: u64, skin: &Skin) -> Self {
         let find = |cell: &protocol::skin::Cell, node| {
             skin.cells.iter().position(|other| other.bus == cell.bus && other.node == node)
@@ -79,17 +79,17 @@ impl Measured {
         Self { sensors: sensors.clone(), seed, period_s, cells: cells.collect(), words, next: 0 }
     }
 
-    /// What each cell measures in the epoch before [`Self::next`]; the default before the first.
+    /// Returns the reading of each cell in the epoch before [`Self::next`]; the default before the first.
     pub(super) fn words(&self) -> &[SkinSensors] {
         &self.words
     }
 
-    /// The epoch that comes next.
+    /// Returns the next epoch.
     pub(super) const fn next(&self) -> u64 {
         self.next
     }
 
-    /// Begins again before the first epoch.
+    /// Resets to the state before the first epoch.
     pub(super) fn restart(&mut self) {
         for (cell, index) in self.cells.iter_mut().zip(0..) {
             *cell = CellSensors::new(core::mem::take(&mut cell.neighbours), self.seed, index);
@@ -98,7 +98,7 @@ impl Measured {
         self.next = 0;
     }
 
-    /// The next epoch, which is at `time`, with what is there for each cell.
+    /// Computes the next epoch, at `time`, from the true inputs of the cells.
     pub(super) fn step(&mut self, time: Micros, there: &[True]) {
         let ambient = self.sensors.temperature_at(time).unwrap_or(REFERENCE_C);
         for ((cell, there_is), words) in self.cells.iter_mut().zip(there).zip(&mut self.words) {
@@ -138,9 +138,9 @@ impl CellSensors {
         }
     }
 
-    /// What it reads in N, `period_s` after the last time, so many degrees above the reference.
+    /// Returns the reading in N, `period_s` after the previous one, at this number of °C above the reference.
     fn read(&mut self, force_n: f64, degrees: f64, errors: &ForceErrors, period_s: f64) -> f64 {
-        // A play between the curve of a rising force and that of a falling one.
+        // Hysteresis as a play between the curves of a rising and of a falling force.
         let falling = force_n * (1.0 + errors.hysteresis);
         self.read_n = self.read_n.clamp(force_n.min(falling), force_n.max(falling));
         for (creep, time_s) in self.creep_n.iter_mut().zip(CREEP_S) {

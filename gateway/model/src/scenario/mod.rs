@@ -1,8 +1,8 @@
 //! The description of a run: the robot's motion, touches, and faults.
 //!
-//! A [`Scenario`] exists only when everything in its file has been checked against the skin. Every
-//! error names the line, the key, the value and what is allowed, in one line. Cells are named by their
-//! index in [`Skin::cells`], buses by theirs in [`Skin::buses`].
+//! A [`Scenario`] has been checked completely against its skin. Every error names the line, the key, the value and the
+//! allowed values, in one line. Cells are given by their index in [`Skin::cells`], buses by their index in
+//! [`Skin::buses`].
 
 mod check;
 mod curve;
@@ -32,59 +32,60 @@ pub use force::{MAX_FORCE_N, contact_words};
 pub use sensors::{ForceErrors, REFERENCE_C, Sensors};
 pub use touches::{Stimulus, Touches};
 
-/// How long a run takes in which nothing happens, unless it is told.
+/// The default duration of a run without events.
 pub const IDLE: Span = Span::from_millis(10_000);
 
-/// A checked description.
+/// A checked description of a run.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Scenario {
-    /// How long it takes.
+    /// The duration of the run.
     pub duration: Span,
-    /// What random faults are drawn from.
+    /// The seed of random faults and sensor errors.
     pub seed: u64,
     /// The motion of the robot.
     pub motion: Motion,
-    /// What the gateway computes, in the order of time; before the first it compares.
+    /// The gateway's modes, in order of time; before the first, the mode is [`Mode::Compare`].
     pub modes: Vec<ModeChange>,
     /// The touches, in the file's order.
     pub touches: Vec<Touch>,
-    /// The period after which all touches begin again; each of them ends before. The motion and the faults go on.
+    /// The period after which all touches begin again; each touch ends before that. The motion and the faults do not
+    /// repeat.
     pub touches_repeat: Option<Span>,
-    /// The faults, in the order of time.
+    /// The faults, in order of time.
     pub faults: Vec<Fault>,
-    /// How the sensors differ from perfect ones.
+    /// The errors of the sensors.
     pub sensors: Sensors,
 }
 
 /// The motion of the robot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Motion {
-    /// Where it begins, in rad.
+    /// The start position, in rad or m.
     pub start: [f64; MAX_ROBOT_JOINTS],
-    /// How it moves from there.
+    /// The motion from there.
     pub kind: MotionKind,
 }
 
-/// How the robot moves.
+/// The kind of a robot's motion.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[expect(clippy::large_enum_variant, reason = "a run has one")]
 pub enum MotionKind {
-    /// `hold`: it stays where it is.
+    /// `hold`: the robot stays at its start position.
     Hold,
-    /// `sine`: every joint swings about its start.
+    /// `sine`: every joint swings around its start.
     Sine {
-        /// How far, in rad.
+        /// The amplitude of each joint, in rad or m.
         amplitude: [f64; MAX_ROBOT_JOINTS],
-        /// How slowly, in s.
+        /// The period, in s.
         period_s: f64,
     },
-    /// `kinesthetic`: the skin's controller moves it, whichever that is.
+    /// `kinesthetic`: the skin's controller moves the robot.
     Kinesthetic,
 }
 
 impl Motion {
-    /// Where the joints are `seconds` after the run's start, and how they move; `None` of a motion that is not known
-    /// beforehand.
+    /// Returns the state of the joints `seconds` after the start of the run; `None` if the motion is not known in
+    /// advance.
     #[must_use]
     pub fn state_at(&self, seconds: f64) -> Option<RobotState> {
         let mut state = RobotState { position: self.start, ..RobotState::default() };
@@ -107,7 +108,7 @@ impl Motion {
 }
 
 impl MotionKind {
-    /// The word in the file.
+    /// Returns the word in the file.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -118,27 +119,27 @@ impl MotionKind {
     }
 }
 
-/// From when on the gateway computes what.
+/// A change of the gateway's mode.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub struct ModeChange {
-    /// From when on.
+    /// The time of the change.
     pub at: Micros,
-    /// What.
+    /// The new mode.
     pub mode: Mode,
 }
 
-/// What the gateway computes.
+/// The source of the torques that the gateway uses.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub enum Mode {
-    /// `compare`: it takes the cells' torques, and computes all of them centrally as well.
+    /// `compare`: the gateway uses the cells' torques, and computes all of them centrally as well.
     #[default]
     Compare,
-    /// `distributed`: it takes the cells' torques.
+    /// `distributed`: the gateway uses the cells' torques.
     Distributed,
 }
 
 impl Mode {
-    /// The word in the file.
+    /// Returns the word in the file.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -148,41 +149,41 @@ impl Mode {
     }
 }
 
-/// Something touches some cells.
+/// A touch of some cells.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Touch {
-    /// When it begins.
+    /// The start time.
     pub at: Micros,
-    /// How long it lasts; the longest there is when it does not end.
+    /// The duration; the maximum value if the touch does not end.
     pub length: Span,
-    /// What it touches, in the skin's order.
+    /// The touched cells, in the skin's order.
     pub cells: Vec<usize>,
     /// The peak force on each of the cells, in N.
     pub force_n: f64,
-    /// How the force comes and goes.
+    /// The course of the force.
     pub profile: Profile,
-    /// How near it is, 0 to 1, all the time.
+    /// The proximity during the touch, 0 to 1.
     pub proximity: Q1_14,
-    /// How warm it makes the cells, in degrees Celsius.
+    /// The temperatures of the touched cells, in °C.
     pub temperature: Option<[Q9_6; 2]>,
 }
 
-/// How a touch's force comes and goes.
+/// The course of a touch's force over time.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Profile {
-    /// `half-sine`: it grows and falls like half a swing.
+    /// `half-sine`: the force follows half a period of a sine.
     HalfSine,
-    /// `step`: all of it, all the time.
+    /// `step`: the full force during the whole touch.
     Step,
-    /// `ramp`: it grows evenly to all of it, and then is gone.
+    /// `ramp`: the force grows linearly to its peak and then drops to zero.
     Ramp,
-    /// Points of a curve, linear between them: the time since the begin of the touch, the first 0, and the force in N. The touch
-    /// ends at the last point.
+    /// Points of a curve, linear between them: the time since the start of the touch, beginning with 0, and the force
+    /// in N. The touch ends at the last point.
     Points(Vec<(Span, f64)>),
 }
 
 impl Profile {
-    /// The word in the file; `points` for a list of them.
+    /// Returns the word in the file; `points` for a list of points.
     #[must_use]
     pub const fn name(&self) -> &'static str {
         match self {
@@ -197,49 +198,49 @@ impl Profile {
 /// A fault, or its repair.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fault {
-    /// When.
+    /// The time.
     pub at: Micros,
-    /// What.
+    /// The action.
     pub kind: FaultKind,
 }
 
-/// What happens.
+/// The kind of a fault or repair.
 #[derive(Clone, Debug, PartialEq)]
 pub enum FaultKind {
-    /// Something is done to the processes of cells.
+    /// An action on the processes of cells.
     Process {
-        /// What.
+        /// The action.
         action: ProcessAction,
-        /// To which cells.
+        /// The cells.
         cells: Vec<usize>,
     },
-    /// Cells measure wrongly; [`Touches`] does it.
+    /// Wrong readings of cells, applied by [`Touches`].
     Sensor {
-        /// How.
+        /// The kind of error.
         fault: SensorFault,
-        /// For how long.
+        /// The duration.
         length: Span,
-        /// Which.
+        /// The cells.
         cells: Vec<usize>,
     },
-    /// Something is done to the wires between two cells.
+    /// A change of the wires between two cells.
     Wire {
-        /// Whether they stop working; else they work again.
+        /// True to take the link down, false to bring it up.
         link_down: bool,
         /// The sender.
         from: usize,
         /// The receiver.
         to: usize,
-        /// Whether it applies to the other direction too.
+        /// True if it applies to the other direction, too.
         both_ways: bool,
     },
-    /// A bus carries frames wrongly.
+    /// A disturbance of the frames of a bus.
     Bus {
-        /// How.
+        /// The disturbance.
         fault: BusFault,
-        /// For how long.
+        /// The duration.
         length: Span,
-        /// Which bus.
+        /// The bus.
         bus: usize,
         /// Only frames of these cells; empty means all frames.
         cells: Vec<usize>,
@@ -247,7 +248,7 @@ pub enum FaultKind {
 }
 
 impl FaultKind {
-    /// The word in the file.
+    /// Returns the word in the file.
     #[must_use]
     pub const fn name(&self) -> &'static str {
         match self {
@@ -269,22 +270,22 @@ impl FaultKind {
     }
 }
 
-/// What is done to a process.
+/// An action on a process.
 #[derive(Clone, Copy, Debug, Deserialize, Eq, PartialEq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ProcessAction {
-    /// `kill`: it ends at once.
+    /// `kill`: ends it at once.
     Kill,
-    /// `stop`: it hangs, as if its firmware did.
+    /// `stop`: suspends it, as if its firmware hung.
     Stop,
-    /// `continue`: it goes on after a stop.
+    /// `continue`: resumes it after a stop.
     Continue,
-    /// `restart`: it is restarted, or started if it has ended.
+    /// `restart`: restarts it, or starts it if it has ended.
     Restart,
 }
 
 impl ProcessAction {
-    /// Its name in a scenario's file.
+    /// Returns its name in a scenario's file.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -296,19 +297,19 @@ impl ProcessAction {
     }
 }
 
-/// How a cell measures wrongly.
+/// The error of a cell's sensor.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum SensorFault {
-    /// `stuck`: it keeps the value from when the fault began.
+    /// `stuck`: the reading keeps its value from the start of the fault.
     Stuck,
-    /// `drift`: its contact force moves away from the true one.
+    /// `drift`: the contact force drifts away from the true one.
     Drift {
-        /// How quickly, in N/s; may be negative.
+        /// The drift in N/s; may be negative.
         n_per_s: f64,
     },
 }
 
-/// How a bus carries frames wrongly; a probability is that of a frame to be hit.
+/// A disturbance of the frames of a bus. The probability applies to each frame.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum BusFault {
     /// `drop`: the frame is lost.
@@ -316,33 +317,33 @@ pub enum BusFault {
         /// 0 to 1.
         probability: f64,
     },
-    /// `delay`: the frame comes later.
+    /// `delay`: the frame arrives later.
     Delay {
         /// 0 to 1.
         probability: f64,
-        /// By how much.
+        /// The delay.
         delay: Span,
     },
-    /// `duplicate`: the frame comes twice.
+    /// `duplicate`: the frame arrives twice.
     Duplicate {
         /// 0 to 1.
         probability: f64,
     },
-    /// `corrupt`: bits of the frame are turned.
+    /// `corrupt`: bits of the frame are flipped.
     Corrupt {
         /// 0 to 1.
         probability: f64,
     },
-    /// `reorder`: the frame comes after the next one.
+    /// `reorder`: the frame arrives after the next one.
     Reorder {
         /// 0 to 1.
         probability: f64,
     },
-    /// `babble`: an unknown sender sends frames all the time.
+    /// `babble`: an unknown sender sends frames continuously.
     Babble {
-        /// How many.
+        /// Frames per second.
         frames_per_s: f64,
-        /// Under this identifier.
+        /// The identifier of these frames.
         id: u16,
     },
 }
@@ -351,22 +352,22 @@ impl Scenario {
     /// Reads and checks a file.
     ///
     /// # Errors
-    /// When it cannot be read, or the first thing that is wrong with it.
+    /// Returns [`DocumentError`] if the file cannot be read, with the first fault otherwise.
     pub fn read(path: &Path, skin: &Skin) -> Result<Self, DocumentError> {
         Self::parse(&path.display().to_string(), &document::text(path)?, skin)
     }
 
-    /// Checks a text; `path` is what errors call it.
+    /// Checks a text; errors show `path` as its name.
     ///
     /// # Errors
-    /// The first thing that is wrong with it.
+    /// Returns [`DocumentError`] with the first fault.
     pub fn parse(path: &str, text: &str, skin: &Skin) -> Result<Self, DocumentError> {
         let what = "this is a skin, not a scenario: `skinbus run SKIN --scenario SCENARIO` takes both";
         document::parse(path, text, |raw| check::scenario(raw, skin))
             .map_err(|error: DocumentError| error.or_mistaken(text, KEYS, &[], what))
     }
 
-    /// No touches, no faults, and the skin's controller moves the robot from zero.
+    /// Returns a scenario without touches and faults, in which the skin's controller moves the robot from zero.
     #[must_use]
     pub const fn idle(duration: Span) -> Self {
         let motion = Motion { start: [0.0; MAX_ROBOT_JOINTS], kind: MotionKind::Kinesthetic };
@@ -382,7 +383,7 @@ impl Scenario {
         }
     }
 
-    /// What the gateway computes at a time.
+    /// Returns the gateway's mode at a time.
     #[must_use]
     pub fn mode_at(&self, time: Micros) -> Mode {
         self.modes.iter().rev().find(|change| change.at <= time).map_or_else(Mode::default, |it| it.mode)

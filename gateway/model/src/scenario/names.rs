@@ -1,4 +1,4 @@
-//! How a scenario's file names buses and cells.
+//! The names of buses and cells in a scenario's file.
 
 use std::collections::HashMap;
 
@@ -9,7 +9,7 @@ use protocol::skin::{CellName, Reply, Skin};
 use super::raw;
 use crate::listing::ranges;
 
-/// Ranges of node ids that an error lists.
+/// Maximum number of node id ranges in an error.
 const LISTED: usize = 8;
 
 /// The buses and cells of a skin, by their names.
@@ -18,16 +18,16 @@ pub(super) struct Names<'a> {
     index: HashMap<(usize, i64), usize>,
 }
 
-/// The keys of a table that name cells.
+/// The keys of a table that select cells.
 #[derive(Clone, Copy)]
 pub(super) struct Given<'a> {
     /// The table.
     pub(super) at: &'a Place,
-    /// The bus of cells that are node ids alone.
+    /// The bus of cells that are given by node id alone.
     pub(super) bus: Option<&'a str>,
-    /// Node ids, and cells with their buses.
+    /// Node ids, or cells with their buses.
     pub(super) cells: Option<&'a [raw::Named]>,
-    /// Every cell, of the bus if that is given.
+    /// True for every cell (of the bus, if that is given).
     pub(super) all: bool,
 }
 
@@ -47,7 +47,7 @@ impl<'a> Names<'a> {
         self.skin.buses.get(bus).map_or("", |bus| &bus.name)
     }
 
-    /// A bus by its name; `at` is where the name stands, and `value` what stands there.
+    /// Returns the bus with this name; `at` and `value` are the key and the value for errors.
     fn named(&self, at: &Place, value: &dyn core::fmt::Display, name: &str) -> Checked<usize> {
         let wrong = || at.fault(value, format_args!("no such bus; there is {}", self.buses()));
         self.skin.bus_named(name).ok_or_else(wrong)
@@ -58,7 +58,7 @@ impl<'a> Names<'a> {
         names.collect::<Vec<_>>().join(", ")
     }
 
-    /// The bus that the key `bus` names; it need not be named when there is only one.
+    /// Returns the bus that the key `bus` names. The key is optional if the skin has one bus only.
     fn key(&self, given: Given<'_>) -> Checked<usize> {
         let at = given.at.key("bus");
         match given.bus {
@@ -73,7 +73,7 @@ impl<'a> Names<'a> {
         }
     }
 
-    /// The bus that a table is about: that of its key, else that of its first cell.
+    /// Returns the bus of a table: that of its key, else that of its first cell.
     pub(super) fn bus(&self, given: Given<'_>) -> Checked<usize> {
         match given.cells {
             Some([first, ..]) if given.bus.is_none() => {
@@ -84,7 +84,7 @@ impl<'a> Names<'a> {
         }
     }
 
-    /// The cell that stands at `at`.
+    /// Returns the cell that is named at `at`.
     fn cell(&self, at: &Place, named: &raw::Named, given: Given<'_>) -> Checked<usize> {
         let (bus, node) = match named {
             raw::Named::Node(node) => (self.key(given)?, *node),
@@ -103,7 +103,7 @@ impl<'a> Names<'a> {
         })
     }
 
-    /// The node ids of a bus in words.
+    /// Formats the node ids of a bus for an error.
     fn nodes(&self, bus: usize) -> String {
         let mut nodes: Vec<_> = self.skin.cells_of(bus).map(|cell| cell.node.get()).collect();
         nodes.sort_unstable();
@@ -115,7 +115,7 @@ impl<'a> Names<'a> {
         }
     }
 
-    /// The cells that a table names one by one, in the file's order, each once.
+    /// Returns the cells that a table lists, in the file's order. A cell must not occur twice.
     fn each(&self, given: Given<'_>, named: &[raw::Named]) -> Checked<Vec<usize>> {
         if given.bus.is_some() {
             self.key(given)?;
@@ -133,12 +133,12 @@ impl<'a> Names<'a> {
         Ok(cells)
     }
 
-    /// The cells that a table names, or all of them; sorted.
+    /// Returns the cells that a table lists, or all of them; sorted.
     pub(super) fn cells(&self, given: Given<'_>) -> Checked<Vec<usize>> {
         let path = given.at.key("cells");
         match given.cells {
             Some(_) if given.all => Err(path.fault("", "either some cells, or all = true")),
-            None if !given.all => Err(path.fault("", "which cells? give their nodes, or all = true")),
+            None if !given.all => Err(path.fault("", "which cells? give their node ids, or all = true")),
             None => {
                 let bus = given.bus.map(|_| self.key(given)).transpose()?;
                 let cells = self.skin.cells.iter().enumerate();
@@ -154,7 +154,7 @@ impl<'a> Names<'a> {
         }
     }
 
-    /// The cells that a table names, all of them on one bus; sorted.
+    /// Returns the cells that a table lists, all of which must be on one bus; sorted.
     pub(super) fn cells_on(&self, given: Given<'_>, bus: usize) -> Checked<Vec<usize>> {
         let cells = self.cells(given)?;
         let is_here = |cell: usize| self.skin.cells.get(cell).is_some_and(|cell| cell.bus == bus);
@@ -163,7 +163,7 @@ impl<'a> Names<'a> {
             let at = path.nth(index);
             if !is_here(self.cell(&at, named, given)?) {
                 let why = format_args!(
-                    "it is about one bus, {:?}: give another table for this cell",
+                    "this fault is on one bus, {:?}: use another table for this cell",
                     self.bus_name(bus)
                 );
                 return Err(at.fault(named, why));
@@ -172,13 +172,13 @@ impl<'a> Names<'a> {
         Ok(cells)
     }
 
-    /// The two cells of one bus that a table names, in the file's order; wires lead from one to the other.
+    /// Returns the two cells of one bus that a table lists, in the file's order. A wire must connect them.
     pub(super) fn wired(&self, given: Given<'_>) -> Checked<(usize, usize)> {
         let path = given.at.key("cells");
         self.cells(given)?;
         let named = given.cells.unwrap_or_default();
         let [one, other] = named else {
-            return Err(path.fault(format_args!("{} cells", named.len()), "a wire is between two"));
+            return Err(path.fault(format_args!("{} cells", named.len()), "a wire connects two cells"));
         };
         let bus = self.bus(given)?;
         self.cells_on(given, bus)?;
@@ -193,7 +193,7 @@ impl<'a> Names<'a> {
             (0..PORTS).any(|port| wires.other_end(from, port).is_some_and(|(other, _)| other == to))
         };
         let pair = (self.cell(&path.nth(0), one, given)?, self.cell(&path.nth(1), other, given)?);
-        let wrong = || path.fault(format_args!("[{one}, {other}]"), "no wire is between them");
+        let wrong = || path.fault(format_args!("[{one}, {other}]"), "no wire connects them");
         Some(pair).filter(leads).ok_or_else(wrong)
     }
 }
@@ -204,7 +204,7 @@ mod tests {
     use crate::testing::SKIN;
     use protocol::skin::Skin;
 
-    /// Cells 1 to 3 of `vcan0`, and 1 and 5 of `vcan1`: places 0 to 4.
+    /// Cells 1 to 3 of `vcan0`, and 1 and 5 of `vcan1`: indices 0 to 4.
     fn two_buses() -> Skin {
         let second = "[[bus]]\nname = \"vcan1\"\nreply = \"torque\"\nformat = \"fd\"\n\n[controller]";
         let (head, cell) = SKIN.split_at(SKIN.find("[[cell]]").unwrap());
@@ -280,9 +280,9 @@ mod tests {
             assert!(got.contains(said), "{keys}\n{got}");
         }
         let two = "kind = \"drop\"\nprobability = 0.5\ncells = [\"vcan0:1\", \"vcan1:5\"]";
-        let said = "fault[0].cells[1] = \"vcan1:5\": it is about one bus, \"vcan0\": give another table for this cell";
+        let said = "fault[0].cells[1] = \"vcan1:5\": this fault is on one bus, \"vcan0\": use another table for this cell";
         assert!(fault(two).unwrap_err().contains(said));
         let wire = fault("kind = \"link_down\"\ncells = [\"vcan0:1\", \"vcan1:5\"]").unwrap_err();
-        assert!(wire.contains("it is about one bus, \"vcan0\""), "{wire}");
+        assert!(wire.contains("this fault is on one bus, \"vcan0\""), "{wire}");
     }
 }

@@ -9,7 +9,7 @@ use super::names::{Given, Names};
 use super::times::{EndS, LONGEST_S, length};
 use super::{Profile, Touch, raw};
 
-/// The touches, in the file's order.
+/// Checks the touches; returns them in the file's order.
 pub(super) fn touches(raw: &[raw::Touch], end: EndS, names: &Names<'_>) -> Checked<Vec<Touch>> {
     let mut touches = Vec::with_capacity(raw.len());
     for (index, raw) in raw.iter().enumerate() {
@@ -45,7 +45,7 @@ fn touch(at: &Place, raw: &raw::Touch, end: EndS, names: &Names<'_>) -> Checked<
     })
 }
 
-/// A profile that a word names, the touch's length, and its peak force in N.
+/// Returns a profile that is given by a word, the touch's duration, and its peak force in N.
 fn named(at: &Place, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, f64)> {
     let profiles = [Profile::HalfSine, Profile::Step, Profile::Ramp].map(|profile| (profile.name(), profile));
     let Some((_, profile)) = profiles.iter().find(|(name, _)| *name == word).cloned() else {
@@ -68,7 +68,7 @@ fn named(at: &Place, raw: &raw::Touch, word: &str) -> Checked<(Profile, Span, f6
     Ok((profile, length, force_n))
 }
 
-/// A profile of points, with the length and the peak force that these have.
+/// Returns a profile that is given by points, with their duration and peak force.
 fn drawn(at: &Place, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile, Span, f64)> {
     let path = at.key("profile");
     let mut points: Vec<(Span, f64)> = Vec::with_capacity(given.len() + 1);
@@ -80,7 +80,7 @@ fn drawn(at: &Place, raw: &raw::Touch, given: &[Vec<f64>]) -> Checked<(Profile, 
             return Err(point.fault("", why));
         };
         if !(0.0..=LONGEST_S).contains(&seconds) {
-            let why = format!("0 to {LONGEST_S:e} s after the begin of the touch are possible");
+            let why = format!("0 to {LONGEST_S:e} s after the start of the touch are possible");
             return Err(point.nth(0).fault(seconds, why));
         }
         let moment = span(seconds);
@@ -122,8 +122,9 @@ fn newtons(at: &Place, force_n: f64) -> Checked<()> {
     Err(at.fault(force_n, why))
 }
 
-/// Checks that the last of these touches, with those before it in the file, presses no cell with more than
-/// its words can hold. Peaks are added, wherever they are in the touches: the sum is largest when one of them begins.
+/// Checks that the last of these touches, together with those before it in the file, stays within the contact words of
+/// every cell. The check adds peak forces at the start of each touch, where the number of simultaneous touches is
+/// largest.
 fn together(at: &Place, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
     let Some((last, before)) = touches.split_last() else { return Ok(()) };
     for start in touches.iter().map(|touch| touch.at).filter(|&at| last.holds_at(at)) {
@@ -136,7 +137,7 @@ fn together(at: &Place, touches: &[Touch], names: &Names<'_>) -> Checked<()> {
             let force = last.force_n + others.map(|touch| touch.force_n).sum::<f64>();
             if force > MAX_FORCE_N {
                 let why = format!(
-                    "with the touches before it that makes {force} N on {}, more than the \
+                    "together with earlier touches this makes {force} N on {}, more than the \
                      {MAX_FORCE_N:.3} N of three contact words",
                     names.name(*cell)
                 );
@@ -242,7 +243,7 @@ mod tests {
             ("force_n = 3.0\nprofile = \"poke\"", "\"ramp\" or points [[t_s, force_n], ...]"),
             (
                 "profile = [[1.0, 90.0]]\n[[touch]]\nall = true\nprofile = [[2.0, 7.0]]",
-                "7:11: touch[1].profile = up to 7 N: with the touches before it that makes 97 N on cell 1",
+                "7:11: touch[1].profile = up to 7 N: together with earlier touches this makes 97 N on cell 1",
             ),
         ] {
             let got = read(touch).unwrap_err();
@@ -257,7 +258,7 @@ mod tests {
         assert!(remarks[0].starts_with(said), "{remarks:?}");
     }
 
-    /// Points in the order of time, at least 1 ms apart.
+    /// Generates points in order of time, at least 1 ms apart.
     fn points() -> impl Strategy<Value = Vec<(u64, f64)>> {
         let steps = proptest::collection::vec((1_000_u64..2_000_000, 0.0..MAX_FORCE_N), 1..12);
         (any::<bool>(), steps).prop_map(|(from_zero, steps)| {

@@ -1,4 +1,4 @@
-//! A scenario's file as it is read, before it is checked.
+//! A scenario's file as parsed, before it is checked.
 
 use core::fmt;
 
@@ -34,11 +34,11 @@ const fn one() -> i64 {
     1
 }
 
-/// How a touch's force comes and goes, as the file has it.
+/// The course of a touch's force, as given in the file.
 #[derive(Debug)]
 pub(super) enum Profile {
     Word(String),
-    /// Times in s after the touch's begin, and forces in N: two numbers each, if they are right.
+    /// Times in s after the start of the touch, and forces in N; each point must have two numbers.
     Points(Vec<Vec<f64>>),
 }
 
@@ -74,7 +74,7 @@ impl<'de> Deserialize<'de> for Profile {
     }
 }
 
-/// A cell as the file names it.
+/// A cell as named in the file.
 #[derive(Debug)]
 pub(super) enum Named {
     Node(i64),
@@ -83,7 +83,7 @@ pub(super) enum Named {
 }
 
 impl fmt::Display for Named {
-    /// As it stands in the file.
+    /// Formats the name as in the file.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Node(node) => node.fmt(f),
@@ -115,8 +115,8 @@ impl<'de> Deserialize<'de> for Named {
 }
 
 impl Scenario {
-    /// What is said of the duration, or else [`IDLE`], or a second after the last thing that begins or ends if that is
-    /// later.
+    /// Returns the given duration. The default is [`IDLE`], or one second after the last start or end of an event if
+    /// that is later.
     pub(super) fn duration_s(&self) -> f64 {
         let end = |at_s: f64, for_s: Option<f64>| at_s + for_s.unwrap_or(0.0);
         let touches = self.touch.iter().map(|touch| end(touch.at_s, touch.for_s()));
@@ -177,7 +177,7 @@ pub(super) struct Touch {
 }
 
 impl Touch {
-    /// The duration, if the file has one: also the time of a profile's last point.
+    /// Returns the duration, if the file has one; for points, the time of the last one.
     fn for_s(&self) -> Option<f64> {
         match &self.profile {
             Profile::Points(points) => points.last()?.first().copied(),

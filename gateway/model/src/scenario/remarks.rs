@@ -1,4 +1,4 @@
-//! What is allowed in a scenario and probably not meant.
+//! Warnings about scenarios that are valid but probably not intended.
 
 use protocol::message::SkinSensors;
 use protocol::skin::{ControllerKind, Skin};
@@ -8,7 +8,7 @@ use super::{MotionKind, Profile, Scenario, Touch, contact_words};
 use crate::central::force;
 
 impl Scenario {
-    /// What will have no effect, one line each.
+    /// Returns one line for each part of the scenario that will have no effect.
     #[must_use]
     pub fn remarks(&self, skin: &Skin) -> Vec<String> {
         let controller = unused_controller(self.motion.kind, skin);
@@ -22,14 +22,14 @@ fn unused_controller(motion: MotionKind, skin: &Skin) -> Option<String> {
     let unused = !matches!(motion, MotionKind::Kinesthetic);
     unused.then(|| {
         format!(
-            "motion.kind = {:?}: the scenario moves the robot, and the external controller at {socket} is not asked; \
-             with \"kinesthetic\" it moves it",
+            "motion.kind = {:?}: the scenario moves the robot, and the external controller at {socket} is not used; \
+             with \"kinesthetic\" the controller moves it",
             motion.name()
         )
     })
 }
 
-/// A touch that presses, and of whose cells none computes a force.
+/// Returns a warning if a touch is below the thresholds of all its cells.
 fn weak(touch: &Touch, skin: &Skin) -> Option<String> {
     let sensors = SkinSensors {
         contact: contact_words(touch.force_n),

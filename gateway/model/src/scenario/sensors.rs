@@ -1,4 +1,4 @@
-//! How the sensors of a run differ from perfect ones: the table `[sensors]`.
+//! The errors of the sensors in a run: the table `[sensors]`.
 
 use protocol::document::{Checked, Place};
 use protocol::fixed::Q9_6;
@@ -9,57 +9,57 @@ use super::raw;
 use super::times::EndS;
 use crate::accelerometer::sensor::DataSheet;
 
-/// Data sheets state errors at this temperature, in °C.
+/// The reference temperature of data sheet errors, in °C.
 pub const REFERENCE_C: f64 = 25.0;
 
-/// How sensors differ from perfect ones; the default is perfect sensors. Which cell errs how is drawn from the scenario's
+/// The errors of all sensors; the default is perfect sensors. The errors of each cell are drawn with the scenario's
 /// seed.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Sensors {
-    /// The temperature of all cells in °C at some times, in the order of time: linear between them, constant before the
-    /// first and after the last one. Without any it is not simulated.
+    /// The temperature of all cells in °C at some times, in order of time: linear between them, constant before the
+    /// first and after the last one. If empty, temperature is not simulated.
     pub temperature: Vec<(Micros, f64)>,
     /// The errors of force sensors.
     pub force: ForceErrors,
-    /// What kind of accelerometers the cells have. Without one they measure nothing.
+    /// The data sheet of the cells' accelerometers; `None` for cells without one.
     pub acceleration: Option<DataSheet>,
 }
 
-/// The errors of force sensors; all are zero of perfect ones.
+/// The errors of force sensors; zero for perfect ones.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ForceErrors {
     /// The largest zero error in N, of either sign.
     pub offset_n: f64,
-    /// The largest error of the gain, a part of it, of either sign.
+    /// The largest relative error of the gain, of either sign.
     pub gain: f64,
-    /// How much more it reads while the force falls than while it rises, a part of the force.
+    /// The excess of the reading with a falling force over that with a rising one, relative to the force.
     pub hysteresis: f64,
-    /// How much more it reads under a constant force with each tenfold of time, a part of the force.
+    /// The growth of the reading under a constant force per decade of time, relative to the force.
     pub creep: f64,
     /// The standard deviation of the zero's random walk after an hour, in N.
     pub drift_n: f64,
     /// The largest shift of the zero in N/°C, of either sign.
     pub temperature_n_per_c: f64,
-    /// The largest change of the gain for each °C, a part of it, of either sign.
+    /// The largest relative change of the gain per °C, of either sign.
     pub temperature_gain_per_c: f64,
-    /// Which part of the force on a wired neighbour it reads.
+    /// The share of the force on a wired neighbour that it reads.
     pub crosstalk: f64,
     /// The standard deviation of the noise in N.
     pub noise_n: f64,
 }
 
 impl Sensors {
-    /// Sensors that read what is there.
+    /// Sensors without errors.
     pub const PERFECT: Self =
         Self { temperature: Vec::new(), force: ForceErrors::PERFECT, acceleration: None };
 
-    /// Whether force sensors read what is there, and there is no temperature.
+    /// Returns true if force sensors have no errors and temperature is not simulated.
     #[must_use]
     pub fn is_force_perfect(&self) -> bool {
         self.force == ForceErrors::PERFECT && self.temperature.is_empty()
     }
 
-    /// The temperature of all cells at a time, if it is simulated.
+    /// Returns the temperature of all cells at a time, if it is simulated.
     #[must_use]
     pub fn temperature_at(&self, time: Micros) -> Option<f64> {
         linear(&self.temperature, time.0, |Micros(micros)| micros)
@@ -67,7 +67,7 @@ impl Sensors {
 }
 
 impl ForceErrors {
-    /// None.
+    /// No errors.
     pub const PERFECT: Self = Self {
         offset_n: 0.0,
         gain: 0.0,
@@ -80,9 +80,9 @@ impl ForceErrors {
         noise_n: 0.0,
     };
 
-    /// Honeywell FSS1500, a piezoresistive bridge of 15 N. Its data sheet has, at 5 V and 0.12 mV/g: null offset up to
-    /// 15 mV, 125 g; sensitivity 0.10 to 0.14 mV/g; null shift 0.5 mV from 25 to 40 °C, 4.2 g; sensitivity shift 5.5 %
-    /// from 25 to 50 °C.
+    /// Honeywell FSS1500, a piezoresistive bridge of 15 N. Its data sheet gives, at 5 V and 0.12 mV/g: null offset up
+    /// to 15 mV, 125 g; sensitivity 0.10 to 0.14 mV/g; null shift 0.5 mV from 25 to 40 °C, 4.2 g; sensitivity shift 5.5
+    /// % from 25 to 50 °C.
     pub const PIEZORESISTIVE: Self = Self {
         offset_n: 1.2,
         gain: 0.17,
@@ -91,8 +91,8 @@ impl ForceErrors {
         ..Self::PERFECT
     };
 
-    /// Interlink FSR 400, a force sensing resistor. Its data sheet has: 6 % from part to part; hysteresis 10 %; long term
-    /// drift 5 % per log10(time); 15 % less resistance after an hour at 85 °C.
+    /// Interlink FSR 400, a force sensing resistor. Its data sheet gives: 6 % from part to part; hysteresis 10 %; long
+    /// term drift 5 % per log10(time); 15 % less resistance after an hour at 85 °C.
     pub const RESISTIVE: Self =
         Self { gain: 0.06, hysteresis: 0.1, creep: 0.05, temperature_gain_per_c: 0.0025, ..Self::PERFECT };
 }
@@ -112,7 +112,7 @@ fn temperature(at: &Place, points: &[[f64; 2]], end: EndS) -> Checked<Vec<(Micro
         let at = at.nth(index);
         let moment = end.moment_or_end(&at.nth(0), seconds)?;
         if temperature.last().is_some_and(|(last, _)| *last >= moment) {
-            return Err(at.nth(0).fault(seconds, "times come in their order, each once"));
+            return Err(at.nth(0).fault(seconds, "times must increase"));
         }
         at.nth(1).fit(degrees, Q9_6::try_nearest)?;
         temperature.push((moment, degrees));
@@ -195,7 +195,7 @@ mod tests {
         let cases = [
             (
                 "[sensors]\ntemperature_c = [[0.0, 25.0], [0.0, 26.0]]\n",
-                "sensors.temperature_c[1][0] = 0: times come in their order, each once",
+                "sensors.temperature_c[1][0] = 0: times must increase",
             ),
             ("[sensors]\ntemperature_c = [[601.0, 25.0]]\n", "the scenario goes from 0 to duration_s = 600"),
             ("[sensors.force]\nkind = \"good\"\n", "\"perfect\", \"piezoresistive\" or \"resistive\""),

@@ -53,7 +53,7 @@ kind = "kill"
 cells = [1]
 "#;
 
-/// Three cells on one bus.
+/// Returns a skin with three cells on one bus.
 fn three() -> Skin {
     let cell = SKIN.get(SKIN.find("[[cell]]").unwrap()..).unwrap();
     let text = [2, 3].map(|node| cell.replace("node = 1", &format!("node = {node}")));
@@ -64,7 +64,7 @@ fn good() -> Scenario {
     Scenario::parse("scenario.toml", GOOD, &three()).unwrap()
 }
 
-/// What is wrong, by its line; columns have a test of their own.
+/// Formats an error with its line only; columns have their own test.
 fn by_line(error: DocumentError) -> String {
     let DocumentError::Wrong { path, line, what, .. } = error else { return error.to_string() };
     format!("{path}:{line}: {what}")
@@ -123,7 +123,7 @@ fn most_keys_have_defaults() {
     assert_eq!(scenario.mode_at(Micros(0)), Mode::Compare);
     let parse = |text: &str| Scenario::parse("s.toml", text, &skin()).unwrap();
     assert_eq!(parse(""), Scenario::idle(IDLE));
-    // The shortest that does something: a constant force on one cell, until the end.
+    // The shortest file with an effect: a constant force on one cell, until the end.
     let short = parse("[[touch]]\ncells = [1]\nforce_n = 3.0\n");
     let touch = &short.touches[0];
     assert_eq!((short.duration, touch.at, touch.length), (IDLE, Micros(0), Span(u64::MAX)));
@@ -222,15 +222,15 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("start_rad = [0.0", "start_rad = [6.0"),
-        "s.toml:7: motion.start_rad[0] = 6 rad: joint1 may go from -6.2832 to 6.2832 rad, and it swings by 0.5 rad"
+        "s.toml:7: motion.start_rad[0] = 6 rad: joint1 is limited to -6.2832 to 6.2832 rad, and it swings by 0.5 rad"
     );
     assert_eq!(
         says("[0.5, 0.1", "[1.5, 0.1"),
-        "s.toml:8: motion.amplitude_rad[0] = 1.5: in 4 s this takes 2.356 rad/s, and joint 1 may make 2"
+        "s.toml:8: motion.amplitude_rad[0] = 1.5: in 4 s this takes 2.356 rad/s, but the limit of joint 1 is 2"
     );
     assert_eq!(
         says("at_s = 5.7", "at_s = 0.0"),
-        "s.toml:15: mode[1].at_s = 0: modes come in the order of time"
+        "s.toml:15: mode[1].at_s = 0: modes must be in order of time"
     );
     assert_eq!(
         says("\"distributed\"", "\"central\""),
@@ -252,7 +252,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     assert_eq!(says("[1, 3]", "[]"), "s.toml:22: touch[0].cells = []: at least one cell is needed");
     assert_eq!(
         says("cells = [1, 3]\n", ""),
-        "s.toml:18: touch[0].cells: which cells? give their nodes, or all = true"
+        "s.toml:18: touch[0].cells: which cells? give their node ids, or all = true"
     );
     assert_eq!(
         says("force_n = 3.0", "force_n = 96.0"),
@@ -268,7 +268,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("cells = [2]\nforce_n = 1.0", "all = true\nforce_n = 94.0"),
-        "s.toml:30: touch[1].force_n = 94: with the touches before it that makes 97 N on cell 1 of \
+        "s.toml:30: touch[1].force_n = 94: together with earlier touches this makes 97 N on cell 1 of \
          \"vcan0\", more than the 95.997 N of three contact words"
     );
     assert_eq!(
@@ -281,7 +281,7 @@ fn every_error_names_line_key_value_and_what_is_allowed() {
     );
     assert_eq!(
         says("kind = \"kill\"", "kind = \"kill\"\nprobability = 0.5"),
-        "s.toml:46: fault[1].probability: means nothing with kind = \"kill\""
+        "s.toml:46: fault[1].probability: is not allowed with kind = \"kill\""
     );
     assert!(
         says("\"kill\"", "\"kil\"").starts_with("s.toml:45: fault[1].kind = \"kil\": of processes \"kill\"")
@@ -313,7 +313,7 @@ fn with_several_buses_the_bus_must_be_named() {
     );
 }
 
-/// The force in N of a cell's words in an epoch.
+/// Returns the force in N of a cell's words in an epoch.
 fn force(touches: &Touches, cell: usize, epoch: u64) -> f64 {
     touches.sensors(cell, epoch).contact.iter().map(|word| word.to_f64()).sum()
 }
@@ -321,7 +321,7 @@ fn force(touches: &Touches, cell: usize, epoch: u64) -> f64 {
 #[test]
 fn touches_come_and_go_by_their_profile() {
     let touches = Touches::new(&good(), &three());
-    // 62.5 epochs a second: the half-sine goes from epoch 125 to 225, the step from 187.5 to 218.75.
+    // At 62.5 epochs per second, the half-sine covers epochs 125 to 225, the step 187.5 to 218.75.
     assert_eq!(force(&touches, 0, 125), 0.0);
     assert_eq!(force(&touches, 0, 175), 3.0, "the middle");
     assert!((force(&touches, 0, 150) - 3.0 * 0.5_f64.sqrt()).abs() < 1e-3);
@@ -399,7 +399,7 @@ proptest! {
         let _ = contact_words(force_n);
     }
 
-    /// All changes together give the words of every cell, also when epochs were skipped.
+    /// All changes together give the words of every cell, even with skipped epochs.
     #[test]
     fn changes_add_up_to_the_words_of_every_cell(steps in proptest::collection::vec(1_u64..40, 1..60)) {
         let faults = "[[fault]]\nat_s = 2.5\nkind = \"stuck\"\nfor_s = 0.3\ncells = [1]\n\
@@ -469,15 +469,15 @@ fn a_link_between_two_wired_cells_goes_down_and_comes_up_in_time() {
     let wrong = |skin, text| fault(skin, text).unwrap_err();
     assert_eq!(
         wrong(&sums, "kind = \"link_down\"\ncells = [3, 1]"),
-        "s.toml:6: fault[0].cells = [3, 1]: no wire is between them"
+        "s.toml:6: fault[0].cells = [3, 1]: no wire connects them"
     );
     assert_eq!(
         wrong(&sums, "kind = \"link_down\"\ncells = [1]"),
-        "s.toml:6: fault[0].cells = 1 cells: a wire is between two"
+        "s.toml:6: fault[0].cells = 1 cells: a wire connects two cells"
     );
     assert_eq!(
         wrong(&sums, "kind = \"link_up\"\nfor_s = 1.0\ncells = [1, 2]"),
-        "s.toml:6: fault[0].for_s: means nothing with kind = \"link_up\""
+        "s.toml:6: fault[0].for_s: is not allowed with kind = \"link_up\""
     );
     let torques = described("reply = \"torque\"", line);
     assert_eq!(

@@ -1,4 +1,4 @@
-//! Moments and lengths of time in a scenario's file.
+//! Times and durations in a scenario's file.
 
 use protocol::document::{Checked, Place, span};
 use protocol::time::{Micros, Span};
@@ -8,7 +8,7 @@ use protocol::time::{Micros, Span};
 pub(super) struct EndS(pub(super) f64);
 
 impl EndS {
-    /// A moment within the scenario.
+    /// Checks a time within the scenario.
     pub(super) fn moment(self, at: &Place, seconds: f64) -> Checked<Micros> {
         if (0.0..self.0).contains(&seconds) {
             return Ok(Micros(span(seconds).0));
@@ -16,7 +16,7 @@ impl EndS {
         self.outside(at, seconds)
     }
 
-    /// A moment within the scenario, or its end.
+    /// Checks a time within the scenario, or its end.
     pub(super) fn moment_or_end(self, at: &Place, seconds: f64) -> Checked<Micros> {
         if (0.0..=self.0).contains(&seconds) {
             return Ok(Micros(span(seconds).0));
@@ -30,10 +30,10 @@ impl EndS {
     }
 }
 
-/// A year.
+/// The longest duration in s: one year.
 pub(super) const LONGEST_S: f64 = 3.2e7;
 
-/// A length of time.
+/// Checks a duration.
 pub(super) fn length(at: &Place, seconds: f64) -> Checked<Span> {
     if (1e-6..=LONGEST_S).contains(&seconds) {
         return Ok(span(seconds));

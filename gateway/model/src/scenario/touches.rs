@@ -1,8 +1,8 @@
 //! The sensor words of every cell in every epoch, from touches and sensor faults.
 //!
-//! A pure function of the scenario and the epoch: epoch 0 is the scenario's beginning, epoch k comes k
-//! broadcast periods later. The words at that moment are those with which the cell answers these joints. Sensors that
-//! are not perfect are computed epoch by epoch ([`Measured`]).
+//! They are a pure function of the scenario and the epoch: epoch 0 is the start of the scenario, epoch k follows k
+//! broadcast periods later. The cell answers the joints of an epoch with these words. Imperfect sensors are computed
+//! epoch by epoch ([`Measured`]).
 
 use protocol::id::CellId;
 use protocol::message::SkinSensors;
@@ -21,33 +21,33 @@ pub struct Stimulus {
     pub cell: usize,
     /// Its bus, as an index into [`Skin::buses`].
     pub bus: usize,
-    /// Its node id there.
+    /// Its node id on that bus.
     pub node: CellId,
     /// Its sensor words.
     pub sensors: SkinSensors,
 }
 
-/// The touches of a scenario, cell by cell. A cell without a touch has [`SkinSensors::default`], as every cell has
-/// before the first epoch.
+/// The touches of a scenario, by cell. A cell without a touch has [`SkinSensors::default`], as every cell has before
+/// the first epoch.
 #[derive(Clone, Debug)]
 pub struct Touches {
-    /// From one epoch to the next, in µs.
+    /// Broadcast period, in µs.
     period_us: f64,
     touches: Vec<Touch>,
     /// The period after which they repeat.
     repeat: Option<Span>,
-    /// The touches' forces in N before and now: scratch of [`Touches::changes`].
+    /// The touches' forces in N before and now: scratch memory of [`Touches::changes`].
     levels: Vec<[Option<f64>; 2]>,
     cells: Vec<Touched>,
-    /// What sensors measure that are not perfect; then all cells are touched.
+    /// The imperfect sensors, if any; `cells` then has every cell.
     measured: Option<Measured>,
-    /// Scratch of [`Touches::changes`], as are the next two.
+    /// Scratch memory of [`Touches::changes`], as are the next two.
     changed: Vec<Stimulus>,
     there: Vec<True>,
     before: Vec<SkinSensors>,
 }
 
-/// Something that happens to a cell at some time.
+/// A cell with touches or faults.
 #[derive(Clone, Debug)]
 struct Touched {
     cell: usize,
@@ -66,7 +66,7 @@ struct Wrong {
 }
 
 impl Touches {
-    /// What happens to which cell.
+    /// Collects the touches and sensor faults of each cell.
     #[must_use]
     pub fn new(scenario: &Scenario, skin: &Skin) -> Self {
         let of_cell = |(index, cell): (usize, &protocol::skin::Cell)| Touched {
@@ -110,15 +110,15 @@ impl Touches {
         }
     }
 
-    /// The cells whose words differ from those of the epoch before.
+    /// Returns the cells whose words differ from those of the previous epoch.
     pub fn stimuli_for(&mut self, epoch: u64) -> impl Iterator<Item = Stimulus> {
         self.changes(epoch.checked_sub(1), epoch)
     }
 
-    /// The cells whose words in `epoch` differ from those in `before`, `None` being the time before the
-    /// first epoch: for a loop that has skipped some. Each cell at most once, in the skin's order.
+    /// Returns the cells whose words in `epoch` differ from those in `before`, for a loop that may skip epochs; `None`
+    /// is the time before the first epoch. Each cell occurs at most once, in the skin's order.
     ///
-    /// Work grows with the cells that something ever touches; no allocation.
+    /// Work grows with the number of cells that are ever touched. No allocation.
     pub fn changes(&mut self, before: Option<u64>, epoch: u64) -> impl Iterator<Item = Stimulus> {
         let mut changed = core::mem::take(&mut self.changed);
         changed.clear();
@@ -148,7 +148,7 @@ impl Touches {
         self.measured = Some(measured);
     }
 
-    /// Computes what is measured up to an epoch, from the beginning if that has passed.
+    /// Computes the readings up to an epoch, from the start if that epoch has passed.
     fn measure(&mut self, measured: &mut Measured, epoch: u64) {
         if measured.next() > epoch + 1 {
             measured.restart();
@@ -163,7 +163,7 @@ impl Touches {
         self.there = there;
     }
 
-    /// What is there for a cell to measure.
+    /// Returns the true input of a cell's sensors.
     fn there(&self, touched: &Touched, time: Micros) -> True {
         let mut there = True::default();
         for touch in touched.touches.iter().filter_map(|&index| self.touches.get(index)) {
@@ -202,12 +202,12 @@ impl Touches {
         })
     }
 
-    /// The cells that are ever touched, by their places in the skin.
+    /// Returns the cells that are ever touched, by index in the skin.
     pub fn cells(&self) -> impl Iterator<Item = usize> + '_ {
         self.cells.iter().map(|touched| touched.cell)
     }
 
-    /// The words of a cell in an epoch: for one that has restarted.
+    /// Returns the words of a cell in an epoch, for a cell that has restarted.
     #[must_use]
     pub fn sensors(&self, cell: usize, epoch: u64) -> SkinSensors {
         if let Some(measured) = &self.measured {
@@ -227,7 +227,7 @@ impl Touches {
         }
     }
 
-    /// When an epoch is.
+    /// Returns the time of an epoch.
     #[must_use]
     #[expect(
         clippy::cast_possible_truncation,
@@ -239,7 +239,7 @@ impl Touches {
         Micros((epoch as f64 * self.period_us).round() as u64)
     }
 
-    /// Returns the time since the touches began last.
+    /// Returns the time since the last start of the touches.
     fn phase(&self, time: Micros) -> Micros {
         match self.repeat {
             Some(Span(repeat @ 1..)) => Micros(time.0 % repeat),
@@ -252,7 +252,7 @@ impl Touches {
         touch.level(self.phase(time))
     }
 
-    /// Before and now, from the scratch; `None` when no touch of this cell changed.
+    /// Returns the words before and now, from the scratch memory; `None` if no touch of this cell changed.
     fn words_of_levels(&self, touched: &Touched) -> Option<[SkinSensors; 2]> {
         let levels = || touched.touches.iter().filter_map(|&index| Some((index, self.levels.get(index)?)));
         if levels().all(|(_, [before, now])| before == now) {
@@ -263,10 +263,10 @@ impl Touches {
         Some([before, now])
     }
 
-    /// The words of a cell at a time, with its faults.
+    /// Returns the words of a cell at a time, with its faults.
     fn words_at(&self, touched: &Touched, time: Micros) -> SkinSensors {
         let faults = || touched.faults.iter().filter(|wrong| wrong.holds_at(time));
-        // A stuck sensor keeps the value from when it got stuck.
+        // A stuck sensor keeps its value from the start of the fault.
         let stuck = faults().filter(|wrong| wrong.fault == SensorFault::Stuck).map(|wrong| wrong.at).min();
         let time = stuck.unwrap_or(time);
         let drift = touched.faults.iter().map(|wrong| match wrong.fault {
@@ -280,7 +280,8 @@ impl Touches {
         self.words(levels, drift.sum())
     }
 
-    /// Forces add up; the nearest thing gives the proximity; the last touch in the file gives the temperature.
+    /// Combines touches: forces add up, the nearest touch gives the proximity, and the last touch in the file gives the
+    /// temperature.
     fn words(&self, levels: impl Iterator<Item = (usize, Option<f64>)>, mut force_n: f64) -> SkinSensors {
         let mut sensors = SkinSensors::default();
         for (index, level) in levels {

@@ -1,4 +1,4 @@
-//! The errors of distributed torques against central ones.
+//! The errors of distributed torques compared with central ones.
 
 use protocol::fixed::{TorqueFormat, is_saturated};
 use protocol::packet::Words;
@@ -7,12 +7,12 @@ use protocol::parameters::MAX_JOINTS;
 use super::errors::Errors;
 use super::replies::Expected;
 
-/// Exact torques in a torque format: what rounding to it alone makes of them.
+/// The effect of rounding exact torques to a torque format.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Rounded {
-    /// Of the torques within its range.
+    /// Errors of the torques within its range.
     pub errors: Errors,
-    /// Torques beyond its range, whose words are saturated.
+    /// Number of torques beyond its range, whose words are saturated.
     pub beyond: u64,
 }
 
@@ -31,36 +31,36 @@ impl Rounded {
     }
 }
 
-/// Distributed against central torques, over the joints that a contact loads (l <= k).
+/// Errors of distributed torques, over the joints that a contact loads (l <= k).
 #[derive(Clone, Copy, Debug, Default, PartialEq, serde::Serialize)]
 pub struct Accuracy {
-    /// Single cells, against the central computation on the same words.
+    /// Single cells, compared with the central computation on the same words.
     pub single: Errors,
-    /// Single cells, against the central computation on unrounded angles, lengths and poses.
+    /// Single cells, compared with the central computation on unrounded angles, lengths and poses.
     pub unquantised: Errors,
-    /// The whole skin's torque in epochs that all cells answered in time, all joints.
+    /// The torque of the whole skin, in epochs that all cells answered in time; all joints.
     pub whole: Errors,
-    /// The whole bus' torque as sums along a tree brought it, in epochs whose sums were complete in time, over
-    /// the joints that some cell in them loads.
+    /// The torque of the whole bus as the sum along a tree, in epochs with complete sums in time, over the joints that
+    /// some cell in them loads.
     pub sums: Errors,
-    /// The same, each error averaged over 32 such epochs in a row with the same contact state of every cell.
+    /// As `sums`, with each error averaged over 32 such consecutive epochs in which no contact changed.
     pub sums_averaged: Errors,
-    /// Words that were left out because they were saturated.
+    /// Number of words that were skipped because they were saturated.
     pub saturated: u64,
-    /// The central torques of `single`, saturated ones too, in each of [`TorqueFormat::ALL`].
+    /// The central torques of `single`, including saturated ones, in each of [`TorqueFormat::ALL`].
     #[serde(skip)]
     pub formats: [Rounded; TorqueFormat::ALL.len()],
-    /// `single` joint by joint.
+    /// `single` by joint.
     #[serde(skip)]
     pub single_by_joint: [Errors; MAX_JOINTS],
-    /// `whole` joint by joint.
+    /// `whole` by joint.
     #[serde(skip)]
     pub whole_by_joint: [Errors; MAX_JOINTS],
 }
 
 impl Accuracy {
-    /// Compares one cell's torque, also in the cell's own account; returns distributed less central, zero where
-    /// saturated.
+    /// Compares one cell's torque, and adds the errors to the cell's own, too. Returns distributed minus central
+    /// torques, zero where saturated.
     pub(super) fn compare(
         &mut self,
         joint: usize,
@@ -99,7 +99,7 @@ impl Accuracy {
         }
     }
 
-    /// The accuracy of several buses together.
+    /// Merges the figures of two buses.
     #[must_use]
     pub fn with(self, other: Self) -> Self {
         let joint_by_joint = |mut sum: [Errors; MAX_JOINTS], other: [Errors; MAX_JOINTS]| {

@@ -18,51 +18,51 @@ use super::status::Status;
 use super::switched::{SWITCHES, Switch, Switched};
 use crate::tracker::{Contact, Pages, Tracked, Update, Uplink, Word};
 
-/// What a cell has sent since it was requested.
+/// The requested packets that a cell has sent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Said {
-    /// A heartbeat since the last sync.
+    /// True if it sent a heartbeat since the last sync.
     pub heartbeat: bool,
-    /// Its counters since the last report.
+    /// True if it sent its counters since the last report command.
     pub counters: bool,
 }
 
-/// Whether a cell is halted.
+/// The halt state of a cell.
 #[derive(Clone, Copy, Debug, Default)]
 struct Halt {
-    /// By its last heartbeat, or a later command on the bus.
+    /// True if halted, by its last heartbeat or a later command on the bus.
     halted: bool,
-    /// Whether the bus carried a halt or a resume since its last heartbeat.
+    /// True if the bus carried a halt or a resume since its last heartbeat.
     commanded: bool,
 }
 
-/// One cell.
+/// The gateway's state of one cell.
 #[derive(Clone, Debug)]
 pub struct Cell {
     /// Its node id.
     pub node: CellId,
-    /// Its serial number, as described.
+    /// Its described serial number.
     pub serial: u32,
-    /// Whether it is wired to the gateway.
+    /// True if it is wired to the gateway.
     pub root: bool,
     /// The joint that moves it, from 1.
     pub(super) joint: usize,
-    /// The hash that its configuration must have.
+    /// The expected hash of its configuration.
     pub configuration: u16,
     /// The epoch of its last heartbeat.
     pub last_joints: Epoch,
-    /// What it answers joints with, as it confirmed last since it started.
+    /// Its reply parameter, as last confirmed since it started.
     pub reply: Option<[i16; WORDS]>,
-    /// Ports whose links are down by its parameter, a bit each.
+    /// Ports that its parameter takes down, one bit each.
     pub deaf: u8,
     /// Replies due and received.
     pub replies: Replies,
     /// Its sensors frames.
     pub sensed: Sensed,
     pub(super) tracked: Tracked,
-    /// Whether it has sent a heartbeat since the last sync, and its counters since the last report.
+    /// The requested packets that it has sent.
     pub(super) said: Said,
-    /// Its contact state, as far as it is known from the bus.
+    /// Its contact state, as far as known from the bus.
     contact: Contact<()>,
     /// The switches that it should have, and those that it has confirmed.
     switched: Switched,
@@ -72,7 +72,7 @@ pub struct Cell {
     /// The number of the last broadcast that it answered.
     pub(super) answered: Option<u64>,
     held: Held,
-    /// Its sums as a root, where torques come in sums.
+    /// The sums that it sends as a root, on a bus with sums.
     pub(super) sums: Option<RootSums>,
 }
 
@@ -107,49 +107,49 @@ impl Cell {
         }
     }
 
-    /// Its last heartbeat.
+    /// Returns its last heartbeat.
     #[must_use]
     pub fn heartbeat(&self) -> Option<Heartbeat> {
         self.tracked.claim().heartbeat()
     }
 
-    /// The last page of each kind since it started.
+    /// Returns the last page of each kind since it started.
     #[must_use]
     pub const fn pages(&self) -> &Pages {
         self.tracked.pages()
     }
 
-    /// How far its torques were from the central ones, in the joints that move it.
+    /// Returns the errors of its torques compared with the central ones, in the joints that move it.
     #[must_use]
     pub const fn errors(&self) -> Errors {
         self.outstanding.errors
     }
 
-    /// The kinds of words (`torque`, `skin`, `acceleration`) that stayed equal while what it should have sent changed, each
-    /// with the most in a row.
+    /// Returns the kinds of words (`torque`, `skin`, `acceleration`) that stayed constant while the expected words
+    /// changed, each with the longest run.
     pub fn stuck(&self) -> impl Iterator<Item = (&'static str, u64)> {
         self.outstanding.stuck.longest()
     }
 
-    /// Returns whether it sends such words now.
+    /// Returns true if it sends such words now.
     #[must_use]
     pub fn is_stuck(&self) -> bool {
         self.outstanding.stuck.is_now()
     }
 
-    /// Whether it measures, so that stimuli do not touch it; none before its first heartbeat.
+    /// Returns true if it measures, so that stimuli have no effect; `None` before its first heartbeat.
     #[must_use]
     pub fn measures(&self) -> Option<bool> {
         self.heartbeat().map(|heartbeat| !heartbeat.state.has(State::TEST_MODE))
     }
 
-    /// Packets sent and arrived.
+    /// Returns the packets that it sent and those that arrived.
     #[must_use]
     pub const fn uplink(&self) -> Uplink {
         self.tracked.account.uplink()
     }
 
-    /// Begins new accounts: what has come so far does not count.
+    /// Starts new accounts: earlier packets do not count.
     pub(super) fn begin_accounts(&mut self) {
         self.tracked.account = Default::default();
         (self.replies, self.sensed) = Default::default();
@@ -157,7 +157,7 @@ impl Cell {
         self.sent.begin();
     }
 
-    /// Its receive counters came, and so many joints passed the page on its way; later pages are compared with the
+    /// Records its receive counters; `passed` joints crossed the page on the bus. Later pages are compared with the
     /// first one since a start.
     pub(super) fn report(&mut self, passed: u64) {
         let heard = self.pages().heard;
@@ -165,15 +165,15 @@ impl Cell {
         heard.iter().for_each(|heard| self.contact.count(heard.stimuli, ()));
     }
 
-    /// Takes its heartbeat, with what that means.
+    /// Applies its heartbeat.
     pub(super) fn take_heartbeat(&mut self, update: &Update, heartbeat: &Heartbeat, epoch: Epoch) -> Change {
-        // Of a claimant or an outsider: it does not have the node id, and may never have it.
+        // Ignores heartbeats of a cell that does not own the node id.
         let of_owner = |word: &Word| !matches!(word, Word::Claimant | Word::Outsider);
         let Some(word) = update.word.filter(of_owner) else { return Change::default() };
         let started = matches!(word, Word::Started { .. } | Word::Shared);
         (self.said.heartbeat, self.last_joints) = (true, epoch);
         if word != Word::Overtaken {
-            // The first one after a halt or a resume may have been sent before it.
+            // The first heartbeat after a halt or a resume may have been sent before it.
             let old = core::mem::take(&mut self.halt.commanded) && !started;
             if !old {
                 self.halt.halted = heartbeat.state.has(State::HALTED);
@@ -199,32 +199,32 @@ impl Cell {
         } else if !self.tracked.account.is_in_question() {
             self.sent.confirm();
         }
-        // It does not release a sum, which may hold torques of other cells.
+        // A heartbeat does not release a sum, which may hold torques of other cells.
         if self.sums.is_some() || !started && heartbeat.state.has(State::ACTIVE) {
             return Change::default();
         }
         self.release()
     }
 
-    /// What it has sent since it was requested.
+    /// Returns which requested packets it has sent.
     #[must_use]
     pub const fn said(&self) -> Said {
         self.said
     }
 
-    /// Whether it can be expected to answer: configured, awake, and not halted.
+    /// Returns true if it can be expected to answer: configured, awake, and not halted.
     #[must_use]
     pub fn is_ready(&self) -> bool {
         let claim = self.tracked.claim();
         !self.tracked.is_dead() && !self.halt.halted && claim.is_settled() && claim.says(State::CONFIGURED)
     }
 
-    /// A stimulus was sent; `last` is the epoch of the last joints.
+    /// Records a stimulus on the bus; `last` is the epoch of the last joints.
     pub(super) fn stimulate(&mut self, from: From, page: SensorPage, last: Option<Epoch>) {
         self.contact.push(from, page, (), last);
     }
 
-    /// A sensors frame of the cell came, after it took the newest joints or not.
+    /// Records a sensors frame of the cell; `is_newest` if the cell had the newest joints.
     pub(super) fn take_sensors(&mut self, at: Micros, page: &SensorPage, is_newest: bool, events: &Events) {
         self.sensed.hear(at, page, events);
         self.switched.subtracts |= matches!(page, SensorPage::Baseline(_));
@@ -236,7 +236,7 @@ impl Cell {
         }
     }
 
-    /// It answered a request.
+    /// Records its answer to a request.
     pub(super) fn answers(&mut self, answer: &Answer) {
         self.switched.answered(answer);
         let Answer::Value { number, written: true, words } = *answer else { return };
@@ -249,45 +249,47 @@ impl Cell {
         }
     }
 
-    /// The switches that it should have and has not confirmed.
+    /// Returns the switches that it should have but has not confirmed.
     #[must_use]
     pub fn lacks(&self) -> [Option<Switch>; SWITCHES] {
         self.switched.lacks()
     }
 
-    /// What it computes with; `None` where that is unknown: it measures, subtracts a zero of its own, may not be on the bus,
-    /// or may have taken stimuli that did not come here.
+    /// Returns the sensor words that it computes with; `None` if unknown: it measures, subtracts its own zero, may be
+    /// off the bus, or may have received stimuli that did not arrive here.
     pub(super) fn sensors(&self) -> Option<SkinSensors> {
         self.contact.known().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
     }
 
-    /// Its sensors for people, as far as stimuli and pages that came tell; older stimuli may have changed them.
+    /// Returns its sensor words for display, from the stimuli and pages that arrived; older stimuli may have changed
+    /// them.
     #[must_use]
     pub fn presumed_sensors(&self) -> Option<SkinSensors> {
         self.contact.skin().filter(|_| self.computes_with_stimuli()).map(|(skin, ())| *skin)
     }
 
-    /// Whether its torques follow from stimuli alone.
+    /// Returns true if its torques follow from stimuli alone.
     fn computes_with_stimuli(&self) -> bool {
         self.tracked.claim().says(State::TEST_MODE)
             && !self.switched.subtracts
             && !self.tracked.account.is_interrupted()
     }
 
-    /// Whether its torques follow from stimuli alone, of which some may not have come here. A write of its mode clears them.
+    /// Returns true if its torques follow from stimuli alone, some of which may not have arrived here. A write of its
+    /// mode clears them.
     #[must_use]
     pub fn has_unseen_stimuli(&self) -> bool {
         self.is_ready() && self.computes_with_stimuli() && self.contact.known().is_none()
     }
 
-    /// Its sensors from the joints of this epoch on; `None` where they are unknown.
+    /// Returns its sensor words from the joints of this epoch on; `None` if unknown.
     pub(super) fn latch(&mut self, epoch: Epoch) -> Option<SkinSensors> {
         self.contact.latch(epoch, |()| {});
         self.sensors()
     }
 
-    /// A new broadcast: a reply that did not come in three epochs is missing, and the held torque decays.
-    /// Returns the change of the sum and for how many epochs the held torque was not renewed.
+    /// Starts a broadcast: a reply that did not arrive in three epochs is missing, and the held torque decays. Returns
+    /// the change of the sum, and the number of epochs without a new torque.
     pub(super) fn open_epoch(&mut self, number: u64, in_contact: bool, safety: &Safety) -> (Change, u32) {
         self.sent.count();
         let due = in_contact && self.is_ready();
@@ -309,23 +311,23 @@ impl Cell {
         (self.held.decay(unanswered, safety, self.sums.is_some()), unanswered)
     }
 
-    /// The last broadcast came again: the cell receives and drops it, and no reply is due.
+    /// Records a repeated broadcast, which the cell receives and drops; no reply is due.
     pub(super) const fn hear_again(&mut self) {
         self.sent.count();
     }
 
-    /// Whether something of its torque is in the running sum.
+    /// Returns true if the running sum contains its torque.
     pub(super) const fn contributes(&self) -> bool {
         self.held.contributes()
     }
 
-    /// Whether it is in contact, by its own report where its sensors are unknown.
+    /// Returns true if it is in contact, by its own report if its sensors are unknown.
     fn is_in_contact(&self) -> bool {
         self.outstanding.is_due() || self.sensors().is_none() && self.tracked.claim().says(State::ACTIVE)
     }
 
-    /// A torque answers the broadcast `number`, `lag` before the newest; `is_zero` if it only ends a contact. Returns
-    /// whether it was due.
+    /// Records a torque that answers the broadcast `number`, `lag` before the newest; `is_zero` if it only ends a
+    /// contact. Returns whether it was due.
     pub(super) fn answer(&mut self, number: u64, lag: usize, is_zero: bool) -> Requested {
         self.answered = Some(number);
         let asked = self.outstanding.answer(lag);
@@ -340,8 +342,8 @@ impl Cell {
         asked
     }
 
-    /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next one. One of an older broadcast
-    /// than what is held changes nothing.
+    /// Holds a root's sum for the broadcast `number`, in steps of Q3.12, until the next one. A sum for an older
+    /// broadcast than the held one changes nothing.
     pub(super) fn hold_sum(&mut self, number: u64, count: u8, words: [i32; MAX_JOINTS]) -> Change {
         if self.answered.is_some_and(|last| number < last) {
             return Change::default();
@@ -350,12 +352,12 @@ impl Cell {
         self.held.hold_sum(words, count)
     }
 
-    /// Whether its held torque is older than the broadcast before `number`.
+    /// Returns true if its held torque is older than the broadcast before `number`.
     pub(super) fn is_behind(&self, number: u64) -> bool {
         self.held.is_some() && self.answered.is_some_and(|last| last + 1 < number)
     }
 
-    /// Cells in the held torque.
+    /// Returns the number of cells in the held torque.
     pub(super) fn held_cells(&self) -> u32 {
         self.held.cells()
     }
@@ -370,37 +372,37 @@ impl Cell {
         self.held.release()
     }
 
-    /// The bus carried a halt: it stops answering.
+    /// Records a halt on the bus: the cell stops answering.
     pub(super) fn halt(&mut self) -> Change {
         self.halt = Halt { halted: true, commanded: true };
         self.release()
     }
 
-    /// The bus carried a resume: it answers the next broadcast.
+    /// Records a resume on the bus: the cell answers the next broadcast.
     pub(super) const fn resume(&mut self) {
         self.halt = Halt { halted: false, commanded: true };
     }
 
-    /// Joints that the cell reports as skipped because they were old, and joints that were sent to it and that it
-    /// does not report as received; of a cell that has reported.
+    /// Returns the joints that the cell reports as skipped because they were old, and the joints sent to it that it
+    /// does not report as received; `None` before its first report.
     #[must_use]
     pub fn unanswered(&self) -> Option<(u64, u64)> {
         self.sent.unanswered(self.pages().heard)
     }
 
-    /// The bus is lost: due replies may have been sent and lost.
+    /// Records a lost bus: due replies may have been sent and lost.
     pub(super) fn interrupt(&mut self) {
         self.forget_contact();
         self.tracked.account.interrupt();
     }
 
-    /// Its contact state is no longer known: what is due is in doubt.
+    /// Forgets the contact state: due replies are in doubt.
     fn forget_contact(&mut self) {
         self.doubt_outstanding();
         self.contact.reset();
     }
 
-    /// A write of this parameter decides about its answers from now on.
+    /// Records a write of a parameter that decides about its answers from now on.
     pub(super) fn write(&mut self, number: u8) {
         self.doubt_outstanding();
         if number == Parameter::Mode.number() {
@@ -412,11 +414,11 @@ impl Cell {
 
     fn doubt_outstanding(&mut self) {
         let due = self.outstanding.clear();
-        // A due contribution to a sum is missing there.
+        // On a bus with sums, the sum counts a missing contribution.
         self.replies.miss(if self.sums.is_some() { 0 } else { due }, true);
     }
 
-    /// Nothing more will come: outstanding replies are missing.
+    /// Ends the accounts: outstanding replies are missing.
     pub(super) fn settle(&mut self) {
         self.tracked.account.finish();
         if self.sums.is_none() {
@@ -425,8 +427,8 @@ impl Cell {
         }
     }
 
-    /// It restarted: outstanding replies will never come, and its counters can no longer explain missing ones. Or what seemed
-    /// a restart was none: they go on, and explain all but what was outstanding.
+    /// Records a restart: outstanding replies will never arrive, and the counters can no longer explain missing ones.
+    /// If an apparent restart is taken back, the counters continue and explain all but the outstanding replies.
     fn restart(&mut self, word: Word, taken_back: bool, sent: u16) {
         let due = self.outstanding.clear();
         let outstanding = if self.sums.is_some() { 0 } else { due };

@@ -1,9 +1,9 @@
-//! Frames by kind, and why frames could not be used.
+//! Counts of frames by kind, and of unusable frames by cause.
 
 use protocol::id::Kind;
 use protocol::packet::PacketError;
 
-/// What can be unusual about a frame; each has a counter and a name.
+/// The unusual properties of a frame; each has a counter and a name.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 #[repr(usize)]
 pub enum Event {
@@ -13,25 +13,25 @@ pub enum Event {
     Crc,
     /// A kind, page, command or count that does not exist.
     Meaning,
-    /// The first segment of a classic packet without its second.
+    /// The first segment of a classic packet without the second.
     Incomplete,
-    /// A remote frame, a 29-bit identifier, or no packet with an unused identifier.
+    /// A remote frame, a 29-bit identifier, or a frame with an unused identifier that is not a packet.
     Foreign,
-    /// The driver's report of an error on the bus.
+    /// The driver's report of a bus error.
     ErrorFrame,
-    /// From a node that the skin does not have, or of a kind that this bus does not use.
+    /// A frame from a node that the skin does not have, or of a kind that this bus does not use.
     UnknownNode,
-    /// A torque of an epoch that has passed.
+    /// A torque for an epoch that has passed.
     StaleTorque,
     /// A second torque of one cell for one epoch.
     RepeatedTorque,
     /// A torque with a saturated word; it is used.
     Saturated,
-    /// A cell received a packet of another one with its node id.
+    /// A cell reports another cell with its node id.
     Duplicate,
-    /// Another gateway.
+    /// A frame of another gateway.
     OtherGateway,
-    /// Another sender wrote what a cell answers, or whether it obeys stimuli.
+    /// A write by another sender of a cell's replies or mode.
     Switched,
 }
 
@@ -64,7 +64,7 @@ impl Event {
         Self::Switched,
     ];
 
-    /// The name that tables and summaries use.
+    /// Returns the name in tables and summaries.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -85,17 +85,17 @@ impl Event {
     }
 }
 
-/// Everything that is counted on a bus.
+/// All counters of a bus.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Counters {
     received: [u64; Kind::ALL.len()],
     sent: [u64; Kind::ALL.len()],
     events: [u64; Event::ALL.len()],
-    /// Epochs that were closed.
+    /// Number of closed epochs.
     pub epochs: u64,
-    /// Of these, epochs that somebody had to answer.
+    /// Epochs among them in which some reply was due.
     pub epochs_due: u64,
-    /// Of these, epochs that everybody answered in time.
+    /// Epochs among these in which all due replies arrived in time.
     pub epochs_complete: u64,
 }
 
@@ -119,19 +119,19 @@ impl Counters {
         self.epochs_complete += (due && complete) as u64;
     }
 
-    /// Packets of a kind that others sent.
+    /// Returns the number of packets of a kind that others sent.
     #[must_use]
     pub fn received(&self, kind: Kind) -> u64 {
         self.received.get(kind as usize).copied().unwrap_or(0)
     }
 
-    /// Packets of a kind that this gateway sent, as read back from the bus.
+    /// Returns the number of packets of a kind that this gateway sent, as read back from the bus.
     #[must_use]
     pub fn sent(&self, kind: Kind) -> u64 {
         self.sent.get(kind as usize).copied().unwrap_or(0)
     }
 
-    /// How often something happened.
+    /// Returns the number of occurrences of an event.
     #[must_use]
     pub fn events(&self, event: Event) -> u64 {
         self.events.get(event as usize).copied().unwrap_or(0)

@@ -1,5 +1,4 @@
-//! How long cells take, by the kernel's time stamps: a machine that is too slow shows here, and a bus that loses frames does
-//! not.
+//! The delays of cells, by the kernel's time stamps: large delays show a busy machine, not a bus that loses frames.
 
 use hdrhistogram::Histogram;
 use protocol::time::Span;
@@ -20,7 +19,7 @@ impl Default for Delays {
     }
 }
 
-// The histograms grow by themselves; they cannot refuse.
+// Recording cannot fail: the histograms resize themselves.
 impl Delays {
     pub(super) fn last_reply(&mut self, span: Span) {
         let _ = self.last_reply.record(span.0);
@@ -40,19 +39,20 @@ impl Delays {
         }
     }
 
-    /// From a broadcast to its last reply in time, for each epoch with a reply.
+    /// Returns the delays from a broadcast to its last reply in time, one per epoch with a reply.
     #[must_use]
     pub const fn of_last_replies(&self) -> &Histogram<u64> {
         &self.last_reply
     }
 
-    /// From a broadcast to each reply, late ones included; of sums none.
+    /// Returns the delays from a broadcast to each reply, including late ones; empty on a bus with sums.
     #[must_use]
     pub const fn of_replies(&self) -> &Histogram<u64> {
         &self.reply
     }
 
-    /// At each heartbeat, for how long joints had stood on the bus that its cell had not taken; 0 if there were none.
+    /// Returns, for each heartbeat, the age of the oldest joints on the bus that its cell had not received; 0 if it had
+    /// received all.
     #[must_use]
     pub const fn of_joints_not_taken(&self) -> &Histogram<u64> {
         &self.not_taken

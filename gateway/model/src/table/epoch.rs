@@ -1,4 +1,4 @@
-//! The epoch that cells are answering: which replies are due, and how it ends when the next one begins.
+//! The epoch that cells are answering: its due replies, and its end when the next one begins.
 
 use protocol::id::CellId;
 use protocol::message::Joints;
@@ -12,48 +12,49 @@ use super::replies::Expected as Reply;
 use super::root_totals::Expected;
 use crate::tracker::LATEST;
 
-/// The positions in rad that the words of a broadcast were rounded from.
+/// Looks up the positions in rad or m from which a broadcast's words were rounded.
 pub type Positions<'a> = dyn FnMut(Epoch) -> Option<[f64; MAX_JOINTS]> + 'a;
 
 /// The broadcast that cells are answering.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Broadcast {
     pub(super) epoch: Epoch,
-    /// The epochs that may still be answered and when they stood on the bus, in that order, newest first.
+    /// The epochs that may still be answered, with the times of their broadcasts, newest first.
     recent: [Option<(Epoch, Micros)>; LATEST + 1],
-    /// Broadcasts before this one.
+    /// Number of broadcasts before this one.
     pub(super) number: u64,
     at: Micros,
     due: u32,
     pub(super) in_time: u32,
-    /// Only torques came that were due, and ends of contacts.
+    /// True if only due torques, and ends of contacts, arrived.
     pub(super) is_whole: bool,
     pub(super) last_reply: Option<Micros>,
     pub(super) error: [f64; MAX_JOINTS],
 }
 
 impl Broadcast {
-    /// Broadcasts after the last one that a cell had received when it sent a page; only a few are searched.
+    /// Returns the number of broadcasts after `heard`, the last one that a cell had received when it sent a page; only
+    /// the most recent ones are searched.
     pub(super) fn since(&self, heard: Epoch) -> u64 {
-        // It has received none, if these are all.
+        // If these are all broadcasts, the cell has received none.
         let recent = || self.recent.iter().flatten().count();
         let all = || usize::try_from(self.number + 1).ok().filter(|&all| all == recent());
         self.lag(heard).or_else(all).map_or(0, |passed| passed as u64)
     }
 
-    /// How many broadcasts before the newest one that of an epoch was, if it may still be answered. Not by the epochs'
-    /// difference: broadcasts may be lost on the way back, or change places.
+    /// Returns the position of an epoch's broadcast before the newest one, if it may still be answered. The difference
+    /// of epochs would be wrong: broadcasts may be lost on the way back, or change order.
     pub(super) fn lag(&self, epoch: Epoch) -> Option<usize> {
         self.recent.iter().flatten().position(|&(recent, _)| recent == epoch)
     }
 
-    /// When the broadcast `lag` before the newest stood on the bus.
+    /// Returns the time of the broadcast `lag` before the newest.
     pub(super) fn stood_at(&self, lag: usize) -> Micros {
         self.recent.get(lag).copied().flatten().map_or(self.at, |(_, at)| at)
     }
 
-    /// For how long, at `now`, joints had stood on the bus that a cell had not taken which took `taken` last. Of more than a
-    /// few, since the oldest of these.
+    /// Returns the age, at `now`, of the oldest joints that a cell had not received whose last joints were `taken`.
+    /// Only the most recent broadcasts are searched.
     pub(super) fn not_taken_for(&self, taken: Epoch, now: Micros) -> Span {
         let recent = self.recent.iter().flatten().count();
         self.lag(taken)
@@ -62,19 +63,19 @@ impl Broadcast {
             .map_or(Span(0), |first| now.since(self.stood_at(first)))
     }
 
-    /// Its number, its epoch, and when it stood on the bus.
+    /// Returns its number, its epoch, and its time on the bus.
     pub(super) const fn joints(&self) -> (u64, Epoch, Micros) {
         (self.number, self.epoch, self.at)
     }
 
-    /// What was due and came so far does not count.
+    /// Resets the counts of due and received replies.
     pub(super) const fn begin_accounts(&mut self) {
         (self.due, self.in_time, self.is_whole, self.last_reply) = (0, 0, true, None);
     }
 }
 
 impl Table {
-    /// New joints are on the bus: closes the epoch before, and computes which cells have to answer this one.
+    /// Records new joints on the bus: closes the previous epoch, and computes which cells must answer this one.
     pub(super) fn open_epoch(
         &mut self,
         at: Micros,
@@ -83,7 +84,7 @@ impl Table {
         q: Option<[f64; MAX_JOINTS]>,
     ) {
         if self.broadcast.is_some_and(|newest| newest.epoch == epoch) {
-            // Repeated on the way: cells drop it.
+            // A repeated broadcast: cells drop it.
             return self.cells.iter_mut().for_each(Cell::hear_again);
         }
         let number = self.broadcast.map_or(0, |before| before.number + 1);
@@ -161,27 +162,28 @@ impl Table {
         }
     }
 
-    /// Of the epoch that was closed last: the distributed torque of the whole bus less the central one, in Nm or N by joint
-    /// of the chain, without saturated words; `None` where it was not compared, or not all that was due came in time.
+    /// Returns the distributed torque of the whole bus minus the central one, for the last closed epoch, in Nm or N by
+    /// joint of the chain, without saturated words. Returns `None` if it was not compared, or if not all due replies
+    /// arrived in time.
     #[must_use]
     pub fn difference(&self) -> Option<[f64; MAX_JOINTS]> {
         self.root_totals.as_ref().map_or(self.difference, |root_totals| root_totals.error.last)
     }
 
-    /// The bus is lost: packets on their way are in doubt. The torques stay as they are, and decay in the loop.
+    /// Records a lost bus: packets in transit are in doubt. The torques stay as they are, and decay in the loop.
     pub fn interrupt(&mut self) {
         self.interrupted = true;
         self.interrupt_cells(|_| true);
     }
 
-    /// These cells were not reached, or are not any more, while the bus works: packets of theirs, and to them, may be lost.
+    /// Records cells that were or are unreachable while the bus works: packets from and to them may be lost.
     pub fn interrupt_cells(&mut self, is_in_doubt: impl Fn(CellId) -> bool) {
         self.cells.iter_mut().filter(|cell| is_in_doubt(cell.node)).for_each(Cell::interrupt);
     }
 
-    /// Releases torques that have decayed in the loop while no joints were on the bus, so that they do not come back.
+    /// Releases torques that have decayed in the loop while the bus carried no joints, so that they do not come back.
     fn release_decayed(&mut self, epoch: Epoch) {
-        // Broadcasts may change places on the way back: the newest is not always the last that came.
+        // Broadcasts may change order on the way back: the last one to arrive is not always the newest.
         let recent = self.broadcast.iter().flat_map(|broadcast| broadcast.recent.into_iter().flatten());
         let gap = recent.map(|(before, _)| epoch.since(before)).min().unwrap_or(0);
         let over = i64::from(gap) > i64::from(self.safety.hold_epochs + self.safety.decay_epochs) + 1;

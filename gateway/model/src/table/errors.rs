@@ -2,7 +2,7 @@
 
 use serde::ser::{Serialize, SerializeStruct, Serializer};
 
-/// Mean and maximum of some absolute errors, in Nm; serialised as `mean_nm`, `max_nm` and `count`.
+/// Mean and maximum of absolute errors, in Nm; serialised as `mean_nm`, `max_nm` and `count`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Errors {
     sum: f64,
@@ -36,26 +36,26 @@ impl Errors {
         self.count += 1;
     }
 
-    /// How many torques were compared.
+    /// Returns the number of compared torques.
     #[must_use]
     pub const fn count(&self) -> u64 {
         self.count
     }
 
-    /// The mean absolute error in Nm; `None` without anything compared.
+    /// Returns the mean absolute error in Nm; `None` without a comparison.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "a count of comparisons")]
     pub fn mean(&self) -> Option<f64> {
         (self.count > 0).then(|| self.sum / self.count as f64)
     }
 
-    /// The maximum absolute error in Nm.
+    /// Returns the maximum absolute error in Nm.
     #[must_use]
     pub const fn max(&self) -> f64 {
         self.max
     }
 
-    /// Both together.
+    /// Merges two sets of errors.
     #[must_use]
     pub fn with(self, other: Self) -> Self {
         Self { sum: self.sum + other.sum, max: self.max.max(other.max), count: self.count + other.count }

@@ -1,4 +1,4 @@
-//! Frames on the bus, and their effects on the table.
+//! The effects of frames on the table.
 
 use protocol::id::{Id, Node};
 use protocol::message::{From, Heartbeat, Message, NetworkPage, Request, SensorPage, State};
@@ -13,11 +13,11 @@ use super::root_totals::{RootTotals, Sum, Taken};
 use super::{Event, Notice, Positions, Table};
 use crate::tracker::{Update, Word};
 
-/// What decides about a cell's answers and takes effect at once.
+/// Parameters that decide about a cell's answers and take effect at once.
 const SWITCHED: [Parameter; 3] = [Parameter::Mode, Parameter::Reply, Parameter::Commit];
 
 impl Table {
-    /// A frame of this gateway, read back from the bus.
+    /// Handles a frame of this gateway, read back from the bus.
     pub(super) fn hear_own(&mut self, at: Micros, message: &Message, positions: &mut Positions<'_>) {
         if let Message::Joints { epoch, joints } = *message {
             self.open_epoch(at, epoch, &joints, positions(epoch));
@@ -36,13 +36,13 @@ impl Table {
         }
     }
 
-    /// A frame of another sender.
+    /// Handles a frame of another sender.
     pub(super) fn hear(&mut self, at: Micros, id: Id, message: &Message) {
-        // Messages of a gateway may also come from a command line.
+        // A command-line tool may also send a gateway's messages.
         match *message {
             Message::Joints { .. } => {
                 self.counters.count(Event::OtherGateway);
-                // A gateway goes on; a frame of its kind may come from anybody.
+                // A gateway sends joints continuously; a single frame may come from any sender.
                 if self.outsiders.joints_at(at) {
                     self.snapshot.sums.other_gateways += 1;
                     self.notices.push_back(Notice::OtherGateway);
@@ -237,13 +237,13 @@ impl Table {
         if sum.is_saturated() {
             self.counters.count(Event::Saturated);
         }
-        // In the steps of which the running sum is made.
+        // In the steps of the running sum.
         let change = cell.hold_sum(number, sum.count, sum.in_steps());
         self.apply(change);
         self.release_moved(number);
     }
 
-    /// Releases the held sum of a silent root when its cells are in another root's sum.
+    /// Releases the held sum of a silent root once its cells are in another root's sum.
     fn release_moved(&mut self, number: u64) {
         let Some(due) = self.root_totals.as_ref().and_then(RootTotals::due) else { return };
         if self.snapshot.sums.contributing > due {

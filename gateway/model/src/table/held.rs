@@ -1,23 +1,24 @@
-//! A cell's last torque, which holds until its next one, decays when that does not come, and is summed.
+//! The last torque of a cell or root. It is held until the next one, decays without one, and is part of the running
+//! sum.
 
 use protocol::parameters::MAX_JOINTS;
 use protocol::skin::Safety;
 
-/// What changed in the running sum.
+/// A change of the running sum.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) struct Change {
     pub(super) torque: [i32; MAX_JOINTS],
     pub(super) contributing: i32,
 }
 
-/// What is held of a cell.
+/// The held torque of a cell.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Held {
-    /// The last torque, in steps of Q3.12, and its number of cells: of a root, those in its sum.
+    /// The last torque in steps of Q3.12, and its number of cells (for a root, those in its sum).
     torque: Option<([i32; MAX_JOINTS], u8)>,
-    /// What of it is in the running sum.
+    /// Its share of the running sum.
     contribution: [i32; MAX_JOINTS],
-    /// Of its cells, those that are counted there.
+    /// Number of its cells that the running sum counts.
     contributing: u8,
 }
 
@@ -28,25 +29,25 @@ impl Held {
         self.contribute(words, u8::from(self.torque.is_some()))
     }
 
-    /// The same of a sum of so many cells; one of no cell ends all contacts.
+    /// Holds a sum of this number of cells; a sum of zero cells ends all contacts.
     pub(super) fn hold_sum(&mut self, words: [i32; MAX_JOINTS], count: u8) -> Change {
-        // Even with cells in contact all words may be rounded to 0.
+        // Even with cells in contact, all words may round to 0.
         self.torque = (count > 0).then_some((words, count));
         self.contribute(words, count)
     }
 
-    /// Releases it.
+    /// Releases the torque.
     pub(super) fn release(&mut self) -> Change {
         self.torque = None;
         self.contribute([0; MAX_JOINTS], 0)
     }
 
-    /// Holds or decays it after so many unanswered epochs.
+    /// Holds or decays the torque after this number of unanswered epochs.
     pub(super) fn decay(&mut self, unanswered: u32, safety: &Safety, is_sum: bool) -> Change {
         let Some((held, cells)) = self.torque else { return Change::default() };
         let left = (safety.hold_epochs + safety.decay_epochs).saturating_sub(unanswered);
         if left == 0 && unanswered > 0 {
-            // Its contribution has decayed to zero; yet the cell has not reported the end of its contact.
+            // The contribution has decayed to zero, although the cell has not reported the end of its contact.
             return self.contribute([0; MAX_JOINTS], 0);
         }
         let decay = safety.decay_epochs.max(1);
@@ -67,23 +68,23 @@ impl Held {
         Change { torque, contributing: i32::from(cells) - i32::from(counted) }
     }
 
-    /// Cells in the held torque; none when nothing is held.
+    /// Returns the number of cells in the held torque; 0 if nothing is held.
     pub(super) fn cells(&self) -> u32 {
         self.torque.map_or(0, |(_, cells)| cells.into())
     }
 
-    /// Whether anything is held.
+    /// Returns true if a torque is held.
     pub(super) const fn is_some(&self) -> bool {
         self.torque.is_some()
     }
 
-    /// Whether something of it is in the running sum.
+    /// Returns true if the running sum contains a share of it.
     pub(super) const fn contributes(&self) -> bool {
         self.contributing > 0
     }
 }
 
-/// A sum of words of Q3.12 in Nm.
+/// Converts a sum of Q3.12 words to Nm.
 #[expect(clippy::cast_precision_loss, reason = "sums of 254 words of 16 bits are exact")]
 pub(super) fn to_nm(steps: i64) -> f64 {
     steps as f64 / 4_096.0

@@ -1,13 +1,13 @@
-//! A gateway's state of one bus: the latest of every cell, and the running sum of their torques.
+//! A gateway's state of one bus: the newest data of every cell, and the running sum of their torques.
 //!
 //! ```text
 //!   frame, time, own ─> handle_frame ─┐           ┌─> Snapshot (for a tick; of constant size)
 //!               time ─> handle_time ──┴─ [Table] ─┴─> counters, accounts, accuracy (for the table at the end)
 //! ```
 //!
-//! Own frames are read back from the bus: joints open an epoch at their place among the other frames, with the
-//! kernel's time stamp. Every frame costs bounded work; a new epoch and the
-//! passing of time cost work for each cell, but in the thread that receives, not in the tick.
+//! The gateway's own frames are read back from the bus, so that joints open an epoch in order with the other frames and
+//! with the kernel's time stamp. Every frame costs bounded work. A new epoch and a timeout cost work per cell, in the
+//! receiving thread and not in the tick.
 
 mod accuracy;
 mod cell;
@@ -60,18 +60,18 @@ pub use sensed::Sensed;
 pub use status::Status;
 pub use switched::{SWITCHES, Switch};
 
-/// What a tick needs to know of a bus: of the same size for any number of cells.
+/// The totals of a bus that a tick needs; their size does not depend on the number of cells.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Sums {
     /// The sum of all held torques in Nm.
     pub torque: [f64; MAX_JOINTS],
-    /// Cells in it.
+    /// Number of cells in it.
     pub contributing: u32,
-    /// Unanswered epochs of the oldest of them.
+    /// Number of unanswered epochs of the oldest of them.
     pub age: u32,
-    /// Cells in contact that did not answer the last epoch.
+    /// Number of cells in contact that did not answer the last epoch.
     pub stale: u32,
-    /// Silent cells.
+    /// Number of silent cells.
     pub dead: u32,
     /// The last broadcast of this gateway that was read back from the bus.
     pub read_back: Option<Epoch>,
@@ -79,21 +79,21 @@ pub struct Sums {
     pub halts: u32,
     /// Resumes on the bus that this gateway did not send.
     pub resumes: u32,
-    /// Joints of another gateway that goes on.
+    /// Joints from another gateway that sends continuously.
     pub other_gateways: u32,
 }
 
-/// What a receiver provides for the loop: the sums, and the input of a central computation.
+/// The data from a receiver for the loop: the totals, and the input of a central computation.
 #[derive(Clone, Debug)]
 pub struct Snapshot {
-    /// What a tick needs.
+    /// The totals for a tick.
     pub sums: Sums,
-    /// The sensors of each cell, in the order of the bus' cells; only kept up to date while comparing.
+    /// The sensor words of each cell, in the order of the bus' cells; only updated while comparing.
     pub sensors: Vec<SkinSensors>,
 }
 
 impl Snapshot {
-    /// Takes over another one without allocating; the sensors only if `sensors`.
+    /// Copies another snapshot without allocating; copies the sensors only if `sensors` is true.
     pub fn take(&mut self, other: &Self, sensors: bool) {
         self.sums = other.sums;
         if sensors {
@@ -111,9 +111,9 @@ pub enum Notice {
     Back(CellId),
     /// A cell restarted: it is not in contact until its stimuli are sent again.
     Restarted(CellId),
-    /// A cell received a packet of another one with its node id.
+    /// A cell reports another cell with its node id.
     Duplicate(CellId),
-    /// The first heartbeat of a cell since its bus was lost: it is not known which frames it has lost.
+    /// The first heartbeat of a cell after its bus was lost: it may have missed frames.
     Returned(CellId),
     /// Another gateway sends on this bus.
     OtherGateway,
@@ -129,36 +129,36 @@ pub struct Table {
     unquantised: Central,
     comparing: bool,
     cells: Vec<Cell>,
-    /// Where a node stands in `cells`.
+    /// The index of each node in `cells`.
     places: [Option<usize>; CellId::COUNT],
     packets: PacketReader,
     broadcast: Option<Broadcast>,
-    /// Sums along the tree, where cells answer with them.
+    /// The sums along the tree, if the cells answer with sums.
     root_totals: Option<RootTotals>,
     outsiders: Outsiders,
-    /// The bus was lost since the last broadcast.
+    /// True if the bus was lost since the last broadcast.
     interrupted: bool,
-    /// In whole steps, so that the sum never drifts.
+    /// The running sum in integer steps, so that it never drifts.
     sum: [i64; MAX_JOINTS],
     snapshot: Snapshot,
     counters: Counters,
     accuracy: Accuracy,
-    /// Of the epoch that was closed last, see [`Table::difference`].
+    /// The difference of the last closed epoch, see [`Table::difference`].
     difference: Option<[f64; MAX_JOINTS]>,
     delays: Delays,
     notices: VecDeque<Notice>,
 }
 
-/// What the bus carries.
+/// The torque format and the chain length of the bus.
 #[derive(Clone, Debug)]
 struct Carried {
     torque_format: TorqueFormat,
-    /// Joints of the chain.
+    /// Number of joints of the chain.
     joints: usize,
 }
 
 impl Table {
-    /// The table of one of a skin's buses, before any frame.
+    /// Creates the table of a skin's bus, before any frame.
     #[must_use]
     pub fn new(skin: &Skin, bus: usize) -> Self {
         let part = skin.part_on(bus);
@@ -201,12 +201,12 @@ impl Table {
         }
     }
 
-    /// Only the sums of roots are received: sums of other cells then cannot be counted one by one.
+    /// Declares that only the sums of roots are received: sums of other cells then cannot be counted.
     pub fn hear_sums_of_roots_only(&mut self) {
         self.cells.iter_mut().filter(|cell| !cell.root).for_each(|cell| cell.tracked.account.without_sums());
     }
 
-    /// Whether the sums of a root are for the gateway. If not, they are in another root's sum, and the held one is
+    /// Sets whether a root sends its sums to the gateway. If not, another root's sum contains them, and the held sum is
     /// released so that it does not count twice.
     pub fn set_feeds(&mut self, root: CellId, feeds: bool) {
         let Some(cell) = self.cell_mut(root) else { return };
@@ -218,42 +218,42 @@ impl Table {
         }
     }
 
-    /// Whether distributed torques are compared with central ones from the next epoch on.
+    /// Sets whether distributed torques are compared with central ones from the next epoch on.
     pub const fn set_comparing(&mut self, comparing: bool) {
         self.comparing = comparing;
     }
 
-    /// What a tick needs.
+    /// Returns the data for a tick.
     #[must_use]
     pub const fn snapshot(&self) -> &Snapshot {
         &self.snapshot
     }
 
-    /// Packets of all cells, sent and arrived.
+    /// Returns the packets that all cells sent and those that arrived.
     #[must_use]
     pub fn uplink(&self) -> Uplink {
         self.cells.iter().map(Cell::uplink).sum()
     }
 
-    /// The bus' cells, in the skin's order.
+    /// Returns the bus' cells, in the skin's order.
     #[must_use]
     pub fn cells(&self) -> &[Cell] {
         &self.cells
     }
 
-    /// Where a cell is in [`cells`](Self::cells); none of a node that the skin does not have on this bus.
+    /// Returns the index of a cell in [`cells`](Self::cells); `None` if the skin does not have it on this bus.
     #[must_use]
     pub fn place(&self, cell: CellId) -> Option<usize> {
         self.places.get(cell.index()).copied().flatten()
     }
 
-    /// Frames by kind and event.
+    /// Returns the counts of frames and events.
     #[must_use]
     pub const fn counters(&self) -> &Counters {
         &self.counters
     }
 
-    /// Distributed against central torques.
+    /// Returns the errors of distributed torques compared with central ones.
     #[must_use]
     pub fn accuracy(&self) -> Accuracy {
         let Some(root_totals) = &self.root_totals else { return self.accuracy };
@@ -266,13 +266,13 @@ impl Table {
         }
     }
 
-    /// Counts of sums, and of the cells due in them; `None` where cells answer with torques.
+    /// Returns the counts of sums and of the cells due in them; `None` if cells answer with torques.
     #[must_use]
     pub fn sums(&self) -> Option<(SumCounts, Contributions)> {
         self.root_totals.as_ref().map(|root_totals| (root_totals.counts, root_totals.contributions))
     }
 
-    /// The account of what was due and what has come, of all cells together: of replies, or of cells in sums.
+    /// Returns the account of due and received replies of all cells, or of the cells in sums.
     #[must_use]
     pub fn replies(&self) -> Replies {
         let Some(root_totals) = &self.root_totals else {
@@ -282,41 +282,41 @@ impl Table {
         Replies { due, in_time, late, missing, ..Replies::default() }
     }
 
-    /// How often parents of cells changed, by the cells' own counters.
+    /// Returns the number of parent changes in the tree, by the cells' own counters.
     #[must_use]
     pub fn parent_changes(&self) -> u64 {
         self.cells.iter().filter_map(|cell| cell.pages().ports).map(|ports| u64::from(ports.changes)).sum()
     }
 
-    /// Nodes that send and that the skin does not have, each with its last heartbeat.
+    /// Returns the nodes that send but are not in the skin, each with its last heartbeat.
     pub fn unknown_nodes(&self) -> impl Iterator<Item = (CellId, &Heartbeat)> {
         self.outsiders.nodes.iter().map(|(node, heartbeat)| (*node, heartbeat))
     }
 
-    /// How long cells take.
+    /// Returns the delays of the cells.
     #[must_use]
     pub const fn delays(&self) -> &Delays {
         &self.delays
     }
 
-    /// The notices, oldest first, each once.
+    /// Removes and returns the notices, oldest first.
     pub fn notices(&mut self) -> impl Iterator<Item = Notice> {
         self.notices.drain(..)
     }
 
-    /// Reassembles and decodes a frame of this bus, to be handed to [`receive`](Self::receive) and to others.
+    /// Reassembles and decodes a frame of this bus, for [`receive`](Self::receive) and other consumers.
     pub fn read<'f>(&mut self, at: Micros, frame: &'f Frame) -> Received<'f> {
         self.packets.read(at, frame)
     }
 
-    /// Takes a frame that was on the bus at `at`; `own` if this gateway sent it. `positions` is asked for
-    /// the positions in rad that an own broadcast's words were rounded from, if they are known.
+    /// Handles a frame that was on the bus at `at`; `own` if this gateway sent it. `positions` looks up the positions
+    /// in rad or m from which the words of an own broadcast were rounded, if known.
     pub fn handle_frame(&mut self, at: Micros, own: bool, frame: &Frame, positions: &mut Positions<'_>) {
         let received = self.read(at, frame);
         self.receive(at, own, &received, positions);
     }
 
-    /// [`handle_frame`](Self::handle_frame), of a frame that has been [`read`](Self::read).
+    /// Does [`handle_frame`](Self::handle_frame) for a frame that has been [`read`](Self::read).
     pub fn receive(&mut self, at: Micros, own: bool, received: &Received<'_>, positions: &mut Positions<'_>) {
         let (id, event) = match received.content {
             Content::Message(id, _, ref message) => {
@@ -328,7 +328,7 @@ impl Table {
                 return self.counters.count(if is_error { Event::ErrorFrame } else { Event::Foreign });
             }
             Content::Segment(id) if received.waited == 0 || self.is_used(id) => return,
-            // Foreign frames are counted each, and not as incomplete packets.
+            // Each foreign frame counts as such, not as an incomplete packet.
             Content::Segment(id) => (id, Event::Foreign),
             Content::AfterLost(id) => (id, Event::Incomplete),
             Content::Meaningless(id, ..) => {
@@ -355,7 +355,7 @@ impl Table {
         }
     }
 
-    /// Counts a frame that cannot be used, also with the cell whose identifier it bears.
+    /// Counts an unusable frame, also for the cell with its identifier.
     fn reject(&mut self, id: Id, own: bool, event: Event) {
         self.counters.count(event);
         if let (false, Some(cell)) = (own, self.sender(id)) {
@@ -363,7 +363,7 @@ impl Table {
         }
     }
 
-    /// The cell that frames of this identifier come from.
+    /// Returns the cell that sends frames with this identifier.
     fn sender(&mut self, id: Id) -> Option<&mut Cell> {
         self.cell_mut(id.sender()?)
     }
@@ -373,7 +373,7 @@ impl Table {
         self.cells.get_mut(place)
     }
 
-    /// Begins new accounts: what came so far gives the state, and does not count.
+    /// Starts new accounts: earlier frames set the state but do not count.
     pub fn begin_accounts(&mut self) {
         self.cells.iter_mut().for_each(Cell::begin_accounts);
         if let Some(broadcast) = &mut self.broadcast {
@@ -387,7 +387,7 @@ impl Table {
         self.notices.clear();
     }
 
-    /// Handles timeouts: cells that were silent for too long are dead.
+    /// Handles timeouts: cells that were silent for too long become dead.
     pub fn handle_time(&mut self, now: Micros) {
         for place in 0..self.cells.len() {
             let Some(cell) = self.cells.get_mut(place) else { break };
@@ -400,7 +400,7 @@ impl Table {
         }
     }
 
-    /// No more broadcasts follow: closes the last epoch and the accounts.
+    /// Ends the run: closes the last epoch and the accounts.
     pub fn finish(&mut self) {
         self.close_epoch();
         self.broadcast = None;
@@ -420,7 +420,7 @@ impl Table {
         }
     }
 
-    /// Adds what a cell's contribution changed by to the running sum.
+    /// Adds the change of a cell's contribution to the running sum.
     fn apply(&mut self, change: Change) {
         for ((sum, torque), difference) in
             self.sum.iter_mut().zip(&mut self.snapshot.sums.torque).zip(change.torque)
@@ -432,7 +432,7 @@ impl Table {
             self.snapshot.sums.contributing.saturating_add_signed(change.contributing);
     }
 
-    /// The network's cells, in the skin's order, and those that it does not describe.
+    /// Returns the network's cells, in the skin's order, then those that it does not describe.
     pub fn network(&self, now: Micros) -> impl Iterator<Item = Seen> {
         let described = self.statuses(now).map(|(cell, status)| Seen {
             node: cell.node,
@@ -455,20 +455,21 @@ impl Table {
         described.chain(unknown_nodes)
     }
 
-    /// The joints that cells are answering: their number, their epoch, and when they stood on the bus.
+    /// Returns the number, the epoch and the time of the joints that cells are answering.
     #[must_use]
     pub fn newest(&self) -> Option<(u64, Epoch, Micros)> {
         self.broadcast.as_ref().map(Broadcast::joints)
     }
 
-    /// The sensors of each cell since those joints, as far as stimuli and pages that came tell, and its status now.
+    /// Returns the sensor words of each cell since those joints, from the stimuli and pages that arrived, and its
+    /// status now.
     ///
-    /// They are for people: what is compared needs the sensors that are known ([`Snapshot::sensors`]).
+    /// They are for display. Comparisons need the certain values ([`Snapshot::sensors`]).
     pub fn sensors(&self, now: Micros) -> impl Iterator<Item = (Option<SkinSensors>, Status)> {
         self.statuses(now).map(|(cell, status)| (cell.presumed_sensors(), status))
     }
 
-    /// The cells' statuses now.
+    /// Returns the cells with their statuses now.
     pub fn statuses(&self, now: Micros) -> impl Iterator<Item = (&Cell, Status)> {
         let newest = self.broadcast.map(|broadcast| broadcast.number);
         self.cells.iter().map(move |cell| (cell, cell.status(now, newest)))

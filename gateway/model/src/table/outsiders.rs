@@ -1,4 +1,4 @@
-//! Senders that are not of this bench.
+//! Senders outside this bench.
 
 use std::collections::BTreeMap;
 
@@ -6,22 +6,22 @@ use protocol::id::CellId;
 use protocol::message::Heartbeat;
 use protocol::time::{Micros, Span};
 
-/// So many joints of another sender within [`WITHIN`] are a gateway's.
+/// Number of joints from another sender within [`WITHIN`] that prove a gateway.
 const JOINTS: usize = 4;
-/// The slowest gateway sends fifteen in it.
+/// The time window for these joints; the slowest gateway sends fifteen in it.
 const WITHIN: Span = Span::from_millis(1_000);
 
-/// What others send.
+/// The frames of other senders.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Outsiders {
-    /// Nodes that the skin does not have, each with its last heartbeat.
+    /// Nodes that are not in the skin, each with its last heartbeat.
     pub(super) nodes: BTreeMap<CellId, Heartbeat>,
-    /// When the last joints came, newest first.
+    /// Arrival times of the last joints, newest first.
     joints: [Option<Micros>; JOINTS],
 }
 
 impl Outsiders {
-    /// Takes joints of another sender; whether a gateway sends them.
+    /// Records joints of another sender; returns true if a gateway sends them.
     pub(super) fn joints_at(&mut self, at: Micros) -> bool {
         self.joints.rotate_right(1);
         if let Some(newest) = self.joints.first_mut() {

@@ -1,4 +1,4 @@
-//! Replies due, compared with replies that came.
+//! Due replies compared with received ones.
 
 use derive_more::{Add, Sum};
 use protocol::parameters::MAX_JOINTS;
@@ -12,29 +12,29 @@ use crate::tracker::LATEST;
 /// A reply is due when the cell is configured, awake, and in contact by Algorithm 1.
 #[derive(Add, Clone, Copy, Debug, Default, Eq, PartialEq, Sum)]
 pub struct Replies {
-    /// Epochs with a due reply.
+    /// Number of epochs with a due reply.
     pub due: u64,
-    /// Answered before the next broadcast.
+    /// Replies before the next broadcast.
     pub in_time: u64,
-    /// Answered after it.
+    /// Replies after it.
     pub late: u64,
-    /// Not answered.
+    /// Epochs without a reply.
     pub missing: u64,
-    /// Of the missing ones, those of a cell that was dead or restarted, or whose bus was lost.
+    /// Missing replies of a cell that was dead or restarted, or whose bus was lost.
     pub in_doubt: u64,
-    /// Torques that were not due: ends of contacts, and the next two.
+    /// Torques that were not due: ends of contacts, and the next two counts.
     pub unasked: u64,
-    /// Of these, torques of cells whose contact was not known.
+    /// Torques among these from cells with an unknown contact state.
     pub contact_unknown: u64,
-    /// Of these, torques other than zero of cells whose contact was known: nothing touched them, or they could not be
+    /// Non-zero torques among these from cells with a known contact state: they were not touched, or could not be
     /// expected to answer.
     pub unexpected: u64,
-    /// Torques that came when their epoch, or a later one of the same cell, was over, and were dropped.
+    /// Torques that arrived after their epoch, or after a torque of the same cell for a later epoch, and were dropped.
     pub too_late: u64,
 }
 
 impl Replies {
-    /// The account of several cells together.
+    /// Sums the accounts of several cells.
     #[must_use]
     pub fn total(all: impl Iterator<Item = Self>) -> Self {
         all.sum()
@@ -46,14 +46,14 @@ impl Replies {
     }
 }
 
-/// Whether a torque that came was to come.
+/// The expectation of a received torque.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Requested {
     /// It was due.
     Due,
-    /// It was not due, by what is known of the cell's contact.
+    /// It was not due, by the known contact state of the cell.
     NotDue,
-    /// The contact of its cell was not known.
+    /// The contact state of its cell was unknown.
     Unknown,
 }
 
@@ -68,20 +68,20 @@ pub(super) struct Expected {
 /// The outstanding replies of a cell for the newest epochs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Outstanding {
-    /// Bit n: the n-th broadcast before the newest one was to be answered and is not yet.
+    /// Bit n: the n-th broadcast before the newest one is due and not answered yet.
     due: u8,
-    /// Bit n: at the n-th broadcast before the newest one the cell's contact was known.
+    /// Bit n: the cell's contact was known at the n-th broadcast before the newest one.
     known: u8,
     expected: [Option<Expected>; LATEST + 1],
-    /// How far its answers were from that.
+    /// Errors of its answers.
     pub(super) errors: Errors,
-    /// Its words beside those that it should have sent.
+    /// Its words compared with the expected ones.
     pub(super) stuck: Stuck,
 }
 
 impl Outstanding {
-    /// A new broadcast, to be answered if `due`; `is_known` if the cell's contact is. Returns whether the oldest one was
-    /// not answered and no longer can be.
+    /// Starts a broadcast, to be answered if `due`; `is_known` if the cell's contact is known. Returns true if the
+    /// oldest broadcast is unanswered and can no longer be answered.
     pub(super) fn open(&mut self, due: bool, is_known: bool) -> bool {
         let oldest = 1 << LATEST;
         let unanswered = self.due & oldest != 0;
@@ -90,22 +90,22 @@ impl Outstanding {
         unanswered
     }
 
-    /// What was due so far does not count.
+    /// Resets the due replies.
     pub(super) fn begin_accounts(&mut self) {
         *self = Self { known: self.known, ..Self::default() };
     }
 
-    /// A new broadcast; those before it do not count.
+    /// Starts a broadcast and drops all earlier ones.
     pub(super) fn open_only(&mut self, due: bool, is_known: bool) {
         (self.due, self.known) = (u8::from(due), u8::from(is_known));
     }
 
-    /// Whether the newest broadcast is to be answered.
+    /// Returns true if the newest broadcast must be answered.
     pub(super) const fn is_due(&self) -> bool {
         self.due & 1 != 0
     }
 
-    /// The broadcast `lag` before the newest is answered; whether that was due.
+    /// Records the answer to the broadcast `lag` before the newest; returns whether it was due.
     pub(super) const fn answer(&mut self, lag: usize) -> Requested {
         let bit = 1 << lag;
         let was_due = self.due & bit != 0;
@@ -119,14 +119,15 @@ impl Outstanding {
         }
     }
 
-    /// Clears the outstanding replies, and what is known of the contact at their broadcasts; how many there were.
+    /// Clears the outstanding replies, and the knowledge of the contact at their broadcasts. Returns the number of
+    /// outstanding replies.
     pub(super) const fn clear(&mut self) -> u32 {
         let due = self.due.count_ones();
         (self.due, self.known) = (0, 0);
         due
     }
 
-    /// What the newest answer should be.
+    /// Records the expected newest answer.
     pub(super) fn expect(&mut self, expected: Expected) {
         self.expected.rotate_right(1);
         if let Some(newest) = self.expected.first_mut() {
@@ -134,7 +135,7 @@ impl Outstanding {
         }
     }
 
-    /// What the answer to a broadcast should be.
+    /// Returns the expected answer to a broadcast.
     pub(super) fn expected(&self, number: u64) -> Option<Expected> {
         self.expected.iter().flatten().find(|expected| expected.number == number).copied()
     }

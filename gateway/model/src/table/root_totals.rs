@@ -1,4 +1,4 @@
-//! Sums along the cells' tree: the roots' sums of each epoch, compared with what is expected.
+//! Sums along the cells' tree: the roots' sums of each epoch, compared with the expected ones.
 
 use protocol::fixed::TorqueFormat;
 use protocol::parameters::MAX_JOINTS;
@@ -7,55 +7,55 @@ use serde::Serialize;
 use super::errors::Errors;
 use crate::tracker::LATEST;
 
-/// Epochs over which errors of sums are averaged.
+/// Number of epochs over which errors of sums are averaged.
 const AVERAGED: u32 = 32;
 
 /// Counts of sums.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct SumCounts {
-    /// Sums that came, of all cells.
+    /// Received sums, from all cells.
     pub received: u64,
-    /// Of these, a root's first one for an epoch.
+    /// The first sum of a root for an epoch.
     pub first: u64,
-    /// A root's further ones for an epoch: the one with the most cells in it is used.
+    /// Further sums of a root for an epoch; the one with the most cells is used.
     pub resent: u64,
-    /// Of cells that are no roots: they are in their parents' sums.
+    /// Sums of cells that are not roots: their parents' sums contain them.
     pub overheard: u64,
-    /// Of an epoch that has passed.
+    /// Sums for an epoch that has passed.
     pub stale: u64,
 }
 
-/// Cells that are to be in an epoch's sums: due = in time + late + missing.
+/// Cells in the sums of epochs: due = in time + late + missing.
 ///
-/// Due are the cells that are in contact by Algorithm 1 and can be expected to answer, but no cell that only forwards
-/// the sums of others.
+/// A cell is due if it is in contact by Algorithm 1 and can be expected to answer. Cells that only forward the sums of
+/// others are not due.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq, Serialize)]
 pub struct Contributions {
-    /// Cells that were to be in it, all epochs together.
+    /// Cells due in sums, over all epochs.
     pub due: u64,
-    /// Of these, in it before the next joints.
+    /// Due cells in a sum before the next joints.
     pub in_time: u64,
-    /// In it after them.
+    /// Due cells in a sum after them.
     pub late: u64,
-    /// Never in it.
+    /// Due cells in no sum.
     pub missing: u64,
-    /// In it and not due.
+    /// Cells in a sum that were not due.
     pub unasked: u64,
-    /// Of these, cells in sums of epochs in which the contact of some cell was not known.
+    /// Cells among these in epochs in which the contact of some cell was unknown.
     pub contact_unknown: u64,
 }
 
 /// A root's sum for one epoch.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) struct Sum {
-    /// Cells in it.
+    /// Number of cells in it.
     pub(super) count: u8,
-    /// In steps of Q7.8.
+    /// Words in steps of Q7.8.
     pub(super) words: [i32; MAX_JOINTS],
 }
 
 impl Sum {
-    /// In steps of 2^-12 Nm.
+    /// Returns the words in steps of 2^-12 Nm.
     pub(super) fn in_steps(&self) -> [i32; MAX_JOINTS] {
         self.words.map(|word| word << (TorqueFormat::Q3_12.fraction() - TorqueFormat::Q7_8.fraction()))
     }
@@ -68,9 +68,9 @@ impl Sum {
 /// The sums of a root.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct RootSums {
-    /// Whether its sums are for the gateway; else another cell takes them.
+    /// True if its sums are for the gateway; otherwise another cell receives them.
     pub(super) feeds: bool,
-    /// The best one of each of the newest epochs.
+    /// The best sum of each of the newest epochs.
     pub(super) epochs: [Option<Sum>; LATEST + 1],
 }
 
@@ -79,7 +79,7 @@ impl RootSums {
         Self { feeds, epochs: [None; LATEST + 1] }
     }
 
-    /// A new epoch.
+    /// Starts an epoch.
     pub(super) fn open(&mut self) {
         self.epochs.rotate_right(1);
         if let Some(newest) = self.epochs.first_mut() {
@@ -92,25 +92,25 @@ impl RootSums {
 #[derive(Clone, Copy, Debug)]
 struct Open {
     due: u32,
-    /// No other cell can be in it.
+    /// True if no other cell can be in it.
     known: bool,
     came: u32,
-    /// What had come before the next joints.
+    /// Number of cells before the next joints.
     in_time: Option<u32>,
-    /// Steps of Q7.8.
+    /// Words in steps of Q7.8.
     sum: [i32; MAX_JOINTS],
     saturated: bool,
     expected: Option<Expected>,
 }
 
-/// What is expected, in Nm, by the central computation.
+/// The expected sum by the central computation, in Nm.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Expected {
-    /// The whole bus' torque.
+    /// The torque of the whole bus.
     pub(super) torque: [f64; MAX_JOINTS],
-    /// Joints that some cell of it loads, from the first.
+    /// Number of joints that some cell in it loads, from the first.
     pub(super) joints: usize,
-    /// Every cell has the same sensors as in the epoch before.
+    /// True if every cell has the same sensor words as in the previous epoch.
     pub(super) constant: bool,
 }
 
@@ -124,17 +124,17 @@ impl Expected {
     }
 }
 
-/// Errors of sums, epoch after epoch.
+/// Errors of sums over consecutive epochs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct SumError {
     pub(super) each: Errors,
     pub(super) averaged: Errors,
-    /// Words that were left out because they were saturated.
+    /// Number of words that were skipped because they were saturated.
     pub(super) saturated: u64,
-    /// Epochs in a row, and their errors together.
+    /// Number of consecutive epochs, and the sum of their errors.
     epochs: u32,
     sum: [f64; MAX_JOINTS],
-    /// The errors of the epoch that was compared last.
+    /// The errors of the last compared epoch.
     pub(super) last: Option<[f64; MAX_JOINTS]>,
 }
 
@@ -166,7 +166,7 @@ impl SumError {
         }
     }
 
-    /// The next epoch begins a new average.
+    /// Restarts the average with the next epoch.
     pub(super) const fn interrupt(&mut self) {
         (self.epochs, self.sum) = (0, [0.0; MAX_JOINTS]);
     }
@@ -182,17 +182,17 @@ pub(super) struct RootTotals {
     pub(super) error: SumError,
 }
 
-/// How one sum was taken.
+/// The use of a received sum.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Taken {
     /// It is the root's best for its epoch.
     Best,
-    /// One with as many cells came before.
+    /// A sum with at least as many cells arrived earlier.
     Resent,
 }
 
 impl RootTotals {
-    /// Takes a root's sum for the epoch `lag` before the newest; `best` is its best one for that epoch so far.
+    /// Records a root's sum for the epoch `lag` before the newest; `best` is its best sum for that epoch so far.
     pub(super) fn take(&mut self, lag: usize, best: &mut Option<Sum>, sum: Sum) -> Taken {
         let before = *best;
         match before {
@@ -214,12 +214,12 @@ impl RootTotals {
         Taken::Best
     }
 
-    /// Cells due in the newest epoch's sum; `None` where the sensors of some are unknown.
+    /// Returns the number of cells due in the newest epoch's sum; `None` if the sensors of some are unknown.
     pub(super) fn due(&self) -> Option<u32> {
         self.epochs.first().copied().flatten().filter(|open| open.known).map(|open| open.due)
     }
 
-    /// New joints: `due` cells should be in their sum, and no others if `known`. Settles the oldest epoch.
+    /// Starts an epoch: `due` cells should be in its sum, and no others if `known`. Settles the oldest epoch.
     pub(super) fn open(&mut self, due: u32, known: bool, expected: Option<Expected>) {
         self.epochs.rotate_right(1);
         if let Some(oldest) = self.epochs.first_mut() {
@@ -236,8 +236,7 @@ impl RootTotals {
         }
     }
 
-    /// The next joints are on the bus, or none follow: how many were due in the newest epoch, and whether all
-    /// of them came in time.
+    /// Closes the newest epoch. Returns whether cells were due in it, and whether all of them arrived in time.
     pub(super) fn close(&mut self) -> (bool, bool) {
         self.error.last = None;
         let Some(Some(open)) = self.epochs.first_mut() else { return (false, false) };
@@ -255,7 +254,7 @@ impl RootTotals {
         (open.due > 0, complete)
     }
 
-    /// No more sums follow.
+    /// Ends the run: settles all epochs.
     pub(super) fn finish(&mut self) {
         for open in &mut self.epochs {
             self.contributions.settle(open.take());

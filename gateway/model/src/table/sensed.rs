@@ -1,6 +1,6 @@
 //! Sensors frames of a cell: their rate, and the touches and releases in them.
 //!
-//! Nothing here affects the torques that the table expects: those follow from stimuli.
+//! They do not affect the torques that the table expects, which follow from stimuli.
 
 use protocol::message::SensorPage;
 use protocol::parameters::Events;
@@ -10,29 +10,29 @@ use protocol::touch::{Touch, contact};
 /// The sensors frames of one cell.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Sensed {
-    /// How many came.
+    /// Number of frames.
     pub frames: u64,
-    /// Touches: contact rose to its threshold.
+    /// Number of touches: contact rose to its threshold.
     pub touches: u64,
-    /// Releases: contact fell below the threshold less hysteresis.
+    /// Number of releases: contact fell below the threshold minus the hysteresis.
     pub releases: u64,
     contact: Touch,
-    /// Frames that no report asked for.
+    /// Number of frames that do not answer a report command.
     unasked: u64,
-    /// When the first and the last of them came.
+    /// Arrival times of the first and the last of them.
     span: Option<(Micros, Micros)>,
-    /// The pages of each kind that are still to come in answer to a report.
+    /// The kinds of pages that are still expected in answer to a report command.
     requested: [bool; KINDS],
 }
 
-/// Kinds of sensors pages.
+/// Number of kinds of sensors pages.
 const KINDS: usize = 3;
-/// The fewest frames that make a rate.
+/// Minimum number of frames for a rate.
 const FEWEST: u64 = 3;
-/// The shortest time over which frames make a rate.
+/// Minimum time for a rate.
 const SHORTEST: Span = Span::from_millis(1_000);
 
-/// The place of a page's kind in [`Sensed`].
+/// Returns the index of a page's kind in [`Sensed`].
 const fn kind(page: &SensorPage) -> usize {
     match page {
         SensorPage::Skin(_) => 0,
@@ -42,17 +42,17 @@ const fn kind(page: &SensorPage) -> usize {
 }
 
 impl Sensed {
-    /// The cell answers a report: one page of each kind follows at once.
+    /// Expects the answer to a report command: one page of each kind follows at once.
     pub(super) const fn answer_report(&mut self) {
         self.requested = [true; KINDS];
     }
 
-    /// The answer to a report is complete, or its pages were lost.
+    /// Ends the answer to a report command: it is complete, or its pages were lost.
     pub(super) const fn end_report(&mut self) {
         self.requested = [false; KINDS];
     }
 
-    /// A sensors frame came.
+    /// Records a sensors frame.
     pub(super) fn hear(&mut self, at: Micros, page: &SensorPage, events: &Events) {
         self.frames += 1;
         let requested = self.requested.get_mut(kind(page)).is_some_and(core::mem::take);
@@ -68,13 +68,13 @@ impl Sensed {
         self.releases += u64::from(before == Touch::Touched && self.contact != Touch::Touched);
     }
 
-    /// The cell restarted: it is not in contact, and no release is counted.
+    /// Records a restart: the cell is not in contact, and no release is counted.
     pub(super) const fn restart(&mut self) {
         self.contact = Touch::Free;
     }
 
-    /// Frames a second that no report asked for, from the first to the last of them; `None` of fewer than three, or of
-    /// less than a second.
+    /// Returns the rate in Hz of frames that do not answer a report command, from the first to the last; `None` for
+    /// fewer than three frames or less than a second.
     #[must_use]
     #[expect(clippy::cast_precision_loss, reason = "counts far below 2^53")]
     pub fn rate_hz(&self) -> Option<f64> {
@@ -135,7 +135,7 @@ mod tests {
             sensed.hear(Micros(at.0 + 1), &ACCELERATION, &Events::default());
         }
         assert_eq!((sensed.rate_hz(), sensed.frames), (None, 20));
-        // Its acceleration was lost, and the next one is none of the answer.
+        // The acceleration of the answer was lost, and the next one does not belong to it.
         sensed.answer_report();
         sensed.hear(Micros(0), &skin(), &Events::default());
         sensed.end_report();

@@ -1,50 +1,51 @@
-//! Joints that were sent to a cell, compared with those that it reports as received.
+//! Joints sent to a cell, compared with those that it reports as received.
 
 use protocol::message::Heard;
 
 use crate::tracker::Word;
 
-/// What is known of one cell.
+/// The counts of one cell.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Sent {
     since: Since,
-    /// The same before its last start and replies then in doubt, as long as that start may be taken back.
+    /// The counts before its last start, with the replies then in doubt, while that start may still be taken back.
     before: Option<(Since, u64)>,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
 struct Since {
-    /// Its first page of receive counters since it started or we did.
+    /// Its first page of receive counters since it started or the gateway did.
     first: Option<Heard>,
-    /// Broadcasts since that page.
+    /// Number of broadcasts since that page.
     joints: u64,
 }
 
 impl Sent {
-    /// Joints were sent.
+    /// Counts a broadcast.
     pub(super) const fn count(&mut self) {
         self.since.joints += 1;
     }
 
-    /// What was sent so far does not count.
+    /// Resets the count.
     pub(super) const fn begin(&mut self) {
         self.since.joints = 0;
     }
 
-    /// A page came, and so many joints passed it on its way; later pages are compared with the first one.
+    /// Records a page of counters that crossed `passed` joints on the bus. Later pages are compared with the first one.
     pub(super) fn report(&mut self, heard: Option<Heard>, passed: u64) {
         if self.since.first.is_none() {
             self.since = Since { first: heard, joints: passed };
         }
     }
 
-    /// The last start is not taken back any more.
+    /// Confirms the last start, which can no longer be taken back.
     pub(super) const fn confirm(&mut self) {
         self.before = None;
     }
 
-    /// The cell started, with a counter of `sent` packets, while so many replies were outstanding and in doubt. Or what
-    /// seemed a start was none: its counters go on, and as many replies are in doubt as it returns.
+    /// Records a start of the cell, with a counter of `sent` packets, and with this number of replies outstanding and
+    /// in doubt. If an apparent start is taken back, the earlier counts continue, and the returned number of replies is
+    /// in doubt.
     pub(super) fn restart(&mut self, word: Word, taken_back: bool, sent: u16, of: (u32, u64)) -> Option<u64> {
         let (outstanding, in_doubt) = of;
         if let Some((before, _)) = &mut self.before {
@@ -56,21 +57,22 @@ impl Sent {
             *in_doubt += u64::from(outstanding);
         }
         let before = self.before.take_if(|_| taken_back);
-        // It counts from zero; without its first heartbeat, we compare from the next page on.
+        // The cell counts from zero; without its first heartbeat, compare from the next page on.
         let restarted = Since { first: (sent == 0).then(Heard::default), joints: 0 };
         self.since = before.map_or(restarted, |(since, _)| since);
         before.map(|(_, in_doubt)| in_doubt)
     }
 
-    /// Joints that it reports as skipped because they were old, and joints that it does not report as received.
+    /// Returns the joints that it reports as skipped because they were old, and the joints that it does not report as
+    /// received.
     pub(super) fn unanswered(&self, last: Option<Heard>) -> Option<(u64, u64)> {
         let first = self.since.first?;
         let last = last.unwrap_or(first);
         let since = |count: fn(&Heard) -> u16| count(&last).wrapping_sub(count(&first));
         let skipped = since(|heard| heard.joints_late);
         let heard = since(|heard| heard.joints).wrapping_add(since(|heard| heard.joints_repeated));
-        // The cell counts modulo 2^16, so only the difference modulo 2^16 is known. A page may have passed some joints
-        // on the way.
+        // The cell counts modulo 2^16, so only the difference modulo 2^16 is known. A page may have crossed some joints
+        // on the bus.
         let [low, high, ..] = self.since.joints.to_le_bytes();
         let unheard = u16::from_le_bytes([low, high]).wrapping_sub(heard.wrapping_add(skipped));
         Some((skipped.into(), if unheard > u16::MAX - 64 { 0 } else { unheard.into() }))

@@ -1,13 +1,13 @@
-//! The status of a cell, as tables and recordings name it.
+//! The status of a cell, as named in tables and recordings.
 
 /// The status of a cell.
 #[derive(Clone, Copy, Debug, Eq, Hash, PartialEq)]
 pub enum Status {
-    /// Nothing came from it yet.
+    /// No packet has arrived from it yet.
     Unknown,
     /// Alive and not in contact.
     Quiet,
-    /// In contact, and answered the last epoch that had time for it.
+    /// In contact, and answered the last epoch that left time for it.
     Active,
     /// In contact, and did not answer an epoch.
     Stale,
@@ -16,7 +16,7 @@ pub enum Status {
 }
 
 impl Status {
-    /// The name that tables and summaries use.
+    /// Returns the name in tables and summaries.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
@@ -28,7 +28,7 @@ impl Status {
         }
     }
 
-    /// The number that recordings and snapshots use.
+    /// Returns the number in recordings and snapshots.
     #[must_use]
     pub const fn number(self) -> u8 {
         self as u8

@@ -1,46 +1,47 @@
-//! Cells that send the same words for ever while they should send others.
+//! Detects cells that keep sending the same words while the expected words change.
 //!
 //! ```text
-//!   torque that was due, and the central one ──────────┐
-//!                                                      ├─> Words ─> equal words in a row
-//!   sensors page, and what stimuli set it to ──────────┘
+//!   due torque, and the central one ───────────────────┐
+//!                                                      ├─> Words ─> runs of equal words
+//!   sensors page, and the page that stimuli set ───────┘
 //! ```
 //!
-//! Equal words are right where nothing changes: a force may be constant, an arm may stand, and a small torque is rounded to
-//! zero. So they count only against words that are known: of a cell whose contact is known, which neither measures nor
-//! subtracts a zero. These must have changed several times, each time by far more than a cell's rounding, so that neither
-//! a lost stimulus nor an epoch's delay explains it. Nothing is known of cells in sums, nor of what a cell measures.
+//! Equal words are correct while nothing changes: a force may be constant, an arm may stand still, and a small torque
+//! is rounded to zero. So they count only if the expected words are known, for a cell with a known contact state that
+//! neither measures nor subtracts a zero. The expected words must have changed several times, each time by far more
+//! than a cell's rounding, so that neither a lost stimulus nor a delay of an epoch explains it. Cells in sums, and
+//! measured words, cannot be judged.
 
 use protocol::message::SensorPage;
 use protocol::packet::padded;
 use protocol::parameters::MAX_JOINTS;
 
-/// Equal words in a row from which on a cell is stuck.
+/// Length of a run of equal words from which a cell counts as stuck.
 const EQUAL: u64 = 32;
-/// Changes of the right words meanwhile.
+/// Minimum number of changes of the expected words in the run.
 const CHANGES: u32 = 4;
-/// The smallest change that counts in one of the words, in steps.
+/// Smallest change of a word that counts, in steps.
 const STEPS: u16 = 16;
 
-/// Kinds of words that may be stuck, as [`Stuck::longest`] names them.
+/// Kinds of words that may be stuck, with the names of [`Stuck::longest`].
 const NAMES: [&str; 3] = ["torque", "skin", "acceleration"];
 
-/// The words of a cell's torques and sensors.
+/// The sent words of a cell's torques and sensors.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Stuck {
     kinds: [Words; NAMES.len()],
 }
 
-/// The words of one kind.
+/// The sent words of one kind.
 #[derive(Clone, Copy, Debug, Default)]
 struct Words {
     sent: Option<[i16; MAX_JOINTS]>,
-    /// Words in a row that were equal to `sent`.
+    /// Number of consecutive words equal to `sent`.
     equal: u64,
-    /// Words that it should have sent, as they changed last.
+    /// The expected words at their last change.
     right: [i16; MAX_JOINTS],
     changes: u32,
-    /// The most equal words in a row that were too many.
+    /// The longest run that counted as stuck.
     longest: u64,
 }
 
@@ -67,13 +68,13 @@ impl Words {
 }
 
 impl Stuck {
-    /// Takes a torque that was due, beside the central one.
+    /// Compares a due torque with the central one.
     pub(super) fn take_torque(&mut self, sent: [i16; MAX_JOINTS], right: [i16; MAX_JOINTS]) {
         let [torque, ..] = &mut self.kinds;
         torque.take(sent, right);
     }
 
-    /// Takes a sensors page of the cell, beside the one that stimuli set; pages of different kinds tell nothing.
+    /// Compares a sensors page of the cell with the one that stimuli set; pages of different kinds are skipped.
     pub(super) fn take_page(&mut self, sent: &SensorPage, right: &SensorPage) {
         let [_, skin, acceleration] = &mut self.kinds;
         let words = match (sent, right) {
@@ -84,18 +85,18 @@ impl Stuck {
         words.take(bits(sent), bits(right));
     }
 
-    /// Returns whether it sends the same words for too long now.
+    /// Returns true if the cell counts as stuck now.
     pub(super) fn is_now(&self) -> bool {
         self.kinds.iter().any(Words::is_stuck)
     }
 
-    /// The kinds of words that stayed equal for too long, each with the most in a row.
+    /// Returns the kinds of words that were stuck, each with its longest run.
     pub(super) fn longest(&self) -> impl Iterator<Item = (&'static str, u64)> {
         NAMES.into_iter().zip(self.kinds.map(|words| words.longest)).filter(|(_, longest)| *longest > 0)
     }
 }
 
-/// The words of a page.
+/// Returns the words of a page.
 fn bits(page: &SensorPage) -> [i16; MAX_JOINTS] {
     match page {
         SensorPage::Skin(skin) => {
@@ -117,7 +118,7 @@ mod tests {
     const FEW: i16 = 15;
     const MANY: i16 = 16;
 
-    /// The most equal words in a row that were too many, of what was sent and what was right.
+    /// Returns the longest stuck run for pairs of sent and expected words.
     fn longest(words: impl Iterator<Item = (i16, i16)>) -> u64 {
         let mut all = Words::default();
         words.for_each(|(sent, right)| all.take(padded(&[0, sent]), padded(&[0, right])));

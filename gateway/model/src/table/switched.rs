@@ -1,7 +1,7 @@
-//! Switches of a cell, which a restart resets: events, sensing and baseline, parameters 8, 7 and 11.
+//! Switches of a cell, which a restart resets: events, sensing and baseline (parameters 8, 7 and 11).
 //!
-//! Their target is the skin's, until the cell confirms another value, which was written from a command line. They
-//! are written to the cell until it confirms them.
+//! The skin gives their targets, until the cell confirms another value that a command-line tool has written. They are
+//! written to the cell until it confirms them.
 
 use protocol::message::Answer;
 use protocol::packet::WORDS;
@@ -10,20 +10,20 @@ use protocol::parameters::{Baseline, Events, Parameter, Sensing};
 /// A parameter's number and its target words.
 pub type Switch = (u8, [i16; WORDS]);
 
-/// How many there are.
+/// Number of switches.
 pub const SWITCHES: usize = 3;
 
-/// The switches of one cell, in the order in which they are written: thresholds before the mode that needs them.
+/// The switches of one cell, in the order of writing: thresholds before the mode that needs them.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Switched {
     target: [Switch; SWITCHES],
     confirmed: [bool; SWITCHES],
-    /// It has a baseline: it subtracts a zero from what it is given to measure.
+    /// True if the cell has a baseline, and so subtracts a zero from its input.
     pub(super) subtracts: bool,
 }
 
 impl Switched {
-    /// A cell that has just started, with the skin's targets.
+    /// Creates the switches of a cell that has just started, with the skin's targets.
     pub(super) fn new(events: Events, sensing: Sensing, baseline: Baseline) -> Self {
         let target = [
             (Parameter::Events.number(), events.words()),
@@ -35,7 +35,7 @@ impl Switched {
         switched
     }
 
-    /// The cell restarted: its switches are as at every start.
+    /// Resets the switches to their state at a start.
     pub(super) fn restart(&mut self) {
         let start = [Events::default().words(), Sensing::default().words(), Baseline::default().words()];
         for ((confirmed, (_, target)), start) in self.confirmed.iter_mut().zip(self.target).zip(start) {
@@ -44,11 +44,11 @@ impl Switched {
         self.subtracts = false;
     }
 
-    /// The cell answered a write. A refused one is not repeated.
+    /// Records the answer to a write. A refused write is not repeated.
     pub(super) fn answered(&mut self, answer: &Answer) {
         let (of, words) = match *answer {
             Answer::Value { number, written: true, words } => (number, Some(words)),
-            // A cell without the option can have no other words than zeros.
+            // A cell without the option can only have zeros.
             Answer::Refused { number, reason: Answer::UNKNOWN | Answer::CANNOT_BE } => (number, None),
             Answer::Value { .. } | Answer::Refused { .. } => return,
         };
@@ -62,7 +62,7 @@ impl Switched {
         }
     }
 
-    /// What is to be written to it.
+    /// Returns the switches that must still be written.
     pub(super) fn lacks(&self) -> [Option<Switch>; SWITCHES] {
         let mut lacks = self.target.map(Some);
         for (lacks, confirmed) in lacks.iter_mut().zip(self.confirmed) {

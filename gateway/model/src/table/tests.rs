@@ -1,4 +1,4 @@
-//! A table of a bus whose cells answer with torques.
+//! Tests of the table of a bus whose cells answer with torques.
 
 use super::*;
 use protocol::can::Format;
@@ -6,7 +6,7 @@ use protocol::message::{Answer, Heard, Joints, Message, NetworkPage, Request, Se
 use protocol::packet::{self, Packet};
 use protocol::parameters::Parameter;
 
-/// A table that received these, in the frames of the bus, the gateway's own or a cell's.
+/// Returns a table that received these messages in the frames of the bus, from the gateway itself or from a cell.
 fn table(heard: &[(bool, Message)]) -> Table {
     let mut table = Table::new(&crate::testing::skin(), 0);
     for (own, message) in heard {
@@ -30,7 +30,7 @@ fn what_is_no_packet_is_rejected_with_a_cells_identifier_and_foreign_with_an_unu
             let frame = Frame::with_data(id, format, flags, &data[..length]).unwrap();
             table.handle_frame(Micros(at), false, &frame, &mut |_| None);
         };
-        // Of the only cell; of one that is not there; a command that does not exist; joints.
+        // Frames of the only cell; of a cell that does not exist; a command that does not exist; joints.
         for at in 0..9_u8 {
             for id in [0x201, 0x263, 0x077, 0x001] {
                 hear(id, at, 1_000 * u64::from(at));
@@ -38,7 +38,7 @@ fn what_is_no_packet_is_rejected_with_a_cells_identifier_and_foreign_with_an_unu
         }
         let of = |event| table.counters().events(event);
         let events = [Event::Foreign, Event::Crc, Event::Incomplete].map(of);
-        // Segments: eight of nine were dropped of each; an incomplete packet is counted once.
+        // Segments: eight of nine were dropped of each; an incomplete packet counts once.
         assert_eq!(events, if format == Format::Fd { [18, 18, 0] } else { [16, 0, 8] }, "{format:?}");
     }
 }
@@ -102,7 +102,7 @@ fn after_an_outage_no_reply_is_due_before_a_heartbeat_and_a_clear_contact() {
     );
     assert_eq!(hear(&mut table, &[heartbeat(1), untouched, press, joints(1), joints(2)]), (2, 0, 0));
     table.interrupt();
-    // It may come back later than the bus, and so may not have received this.
+    // The cell may return later than the bus, and so may have missed this stimulus.
     assert_eq!(hear(&mut table, &[joints(3), press, joints(4)]), (2, 2, 2));
     assert_eq!(table.notices().count(), 0);
     assert_eq!(hear(&mut table, &[heartbeat(9), joints(5)]), (2, 2, 2), "its sensors are unknown");
@@ -150,7 +150,7 @@ fn a_start_that_was_none_takes_no_counters_that_explain_missing_replies() {
         let cell = table.cells().first().unwrap();
         (cell.replies.missing, cell.replies.in_doubt, cell.unanswered())
     };
-    // It takes two of six joints, and answers none of them.
+    // It receives two of six joints, and answers none of them.
     let before = [
         heartbeat(900),
         heard(100, 7),
@@ -163,7 +163,7 @@ fn a_start_that_was_none_takes_no_counters_that_explain_missing_replies() {
         joints(6),
     ];
     assert_eq!(hear(&mut table, &before), (2, 0, Some((0, 6))));
-    // An old heartbeat seems a start; two more joints, and its own heartbeat shows that it was none.
+    // An old heartbeat looks like a start; after two more joints, the cell's own heartbeat disproves it.
     assert_eq!(hear(&mut table, &[heartbeat(100), press, joints(7)]), (6, 6, None));
     let taken_back = hear(&mut table, &[heartbeat(902)]);
     assert_eq!(taken_back, (7, 5, Some((0, 7))), "only what was outstanding is in doubt");
@@ -180,12 +180,12 @@ fn lost_joints_that_passed_a_report_on_its_way_are_counted() {
         (false, Message::Network { from: Node::Cell(CellId::new(1).unwrap()), epoch: Epoch(epoch), page })
     };
     let unanswered = |heard: &[_]| table(heard).cells().first().unwrap().unanswered();
-    // It did not receive the first; nor, when it began, one that came before its report.
+    // The cell did not receive the first joints, or joints before its first report.
     assert_eq!(unanswered(&[report(0, 0), joints(1), joints(2), report(2, 1)]), Some((0, 1)));
     assert_eq!(unanswered(&[joints(1), report(0, 0), joints(2), report(2, 1)]), Some((0, 1)));
     assert_eq!(unanswered(&[joints(1), report(0, 0), joints(2), report(2, 2)]), Some((0, 0)));
     assert_eq!(unanswered(&[joints(1), report(1, 1), joints(2), report(2, 2)]), Some((0, 0)));
-    // A cell that was there before this gateway has larger counters.
+    // A cell that started before this gateway has larger counters.
     assert_eq!(unanswered(&[joints(8), joints(9), report(8, 70), joints(10), report(10, 72)]), Some((0, 0)));
 }
 
@@ -240,7 +240,7 @@ fn heartbeats_say_for_how_long_joints_were_not_taken() {
             table.handle_frame(Micros(at_ms * 1_000), own, &frame, &mut |_| None);
         }
         let delays = table.delays().of_joints_not_taken();
-        // A histogram has three digits.
+        // A histogram has three significant digits.
         (delays.len(), delays.max() / 1_000)
     };
     let beat = |epoch, sent, state| {
@@ -281,7 +281,7 @@ fn a_cell_is_active_stale_or_quiet_by_the_torque_that_is_held() {
     assert_eq!(said.map(&mut hear), [active, quiet, quiet, quiet]);
 }
 
-/// A cell that was there before, and has a stimulus of another sender of which nothing came here.
+/// A cell that started before the gateway, with a stimulus from another sender that did not arrive here.
 struct There {
     table: Table,
     epoch: u8,
@@ -328,7 +328,7 @@ impl There {
         self.hear(true, &Message::Stimulus { to: Node::Cell(Self::cell()), from, page });
     }
 
-    /// So many joints, each of which the cell answers with 1 Nm.
+    /// Sends this number of joints; the cell answers each with 1 Nm.
     fn answered(&mut self, joints: usize) -> Replies {
         for _ in 0..joints {
             self.epoch = self.epoch.wrapping_add(1);
@@ -352,10 +352,10 @@ fn a_cell_that_was_pressed_before_is_neither_due_nor_compared() {
     let replies = there.answered(125);
     assert_eq!((replies.due, replies.unasked, replies.contact_unknown, replies.unexpected), (0, 125, 125, 0));
     assert_eq!(there.compared(), (0, 0));
-    // Not even with a stimulus of our own: one that came before may hold from a later epoch on.
+    // A stimulus of the gateway does not help: an earlier one may be latched at a later epoch.
     there.stimulate(2.0);
     assert_eq!(there.answered(3).due, 0);
-    // By now all that waited in it is latched; the next stimulus is the last one.
+    // By now all earlier stimuli are latched; the next stimulus is the last one.
     there.answered(1);
     there.stimulate(2.0);
     assert_eq!((there.answered(5).due, there.compared().0 > 0), (5, true));
@@ -392,7 +392,7 @@ fn epochs_with_a_torque_that_was_not_due_are_not_the_whole_skin() {
     there.answered(5);
     let whole = there.compared().1;
     assert!(whole > 0);
-    // Another gateway's write: until the next stimulus the contact is not known.
+    // After another gateway's write, the contact is unknown until the next stimulus.
     let request = Request::Write { number: Parameter::Reply.number(), words: packet::words([0]) };
     there.hear(false, &Message::Configure { to: Node::Everyone, tag: 0, request });
     let replies = there.answered(5);

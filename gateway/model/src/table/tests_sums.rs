@@ -1,4 +1,4 @@
-//! A table of a bus whose cells answer with sums.
+//! Tests of the table of a bus whose cells answer with sums.
 
 use protocol::can::Format;
 use protocol::fixed::{Q1_14, Q5_10};
@@ -9,7 +9,7 @@ use protocol::time::Span;
 use super::*;
 use crate::tracker::DEAD_AFTER;
 
-/// Four cells on one bus, 1 and 2 of them roots.
+/// Returns a skin with four cells on one bus, of which 1 and 2 are roots.
 fn skin() -> Skin {
     let head = crate::testing::SKIN.replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 1500");
     let (head, cell) = head.split_at(head.find("[[cell]]").unwrap());
@@ -20,7 +20,7 @@ fn skin() -> Skin {
     Skin::parse("skin.toml", &format!("{head}{}", cells.collect::<String>())).unwrap()
 }
 
-/// 1 - 3 - 4, and 2 alone.
+/// Wiring: 1 - 3 - 4, and 2 alone.
 const NEIGHBORS: [&str; 4] = ["[3, 0, 0, 0]", "[0, 0, 0, 0]", "[1, 4, 0, 0]", "[3, 0, 0, 0]"];
 
 struct Bench {
@@ -33,7 +33,7 @@ fn cell(node: i64) -> CellId {
 }
 
 impl Bench {
-    /// All cells ready, some of them pressed with 1 N in each contact word.
+    /// All cells are ready, some of them pressed with 1 N in each contact word.
     fn new(pressed: &[i64]) -> Self {
         let mut bench = Self { table: Table::new(&skin(), 0), at: 0 };
         bench.table.set_comparing(true);
@@ -41,7 +41,7 @@ impl Bench {
             bench.heartbeat(node, 0, State::default());
         }
         for node in (1..=4).filter(|_| !pressed.is_empty()) {
-            // It has taken no stimulus before.
+            // The cell has received no stimulus before.
             let page = NetworkPage::Heard(Heard::default());
             bench.say(false, Message::Network { from: Node::Cell(cell(node)), epoch: Epoch(0), page });
         }
@@ -77,7 +77,7 @@ impl Bench {
         self.table.snapshot().sums
     }
 
-    /// A sum of `count` cells with so many steps in its first word.
+    /// Sends a sum of `count` cells with this number of steps in its first word.
     fn sum(&mut self, node: i64, epoch: u8, count: u8, steps: i16) -> Sums {
         let torque = packet::words([steps]).into();
         self.say(false, Message::Sum { from: cell(node), epoch: Epoch(epoch), torque, count });
@@ -93,7 +93,7 @@ impl Bench {
     }
 }
 
-/// The first joint's torque in steps of Q7.8, and how many cells are in it.
+/// Returns the first joint's torque in steps of Q7.8, and the number of cells in it.
 fn first(sums: &Sums) -> (f64, u32) {
     (sums.torque[0] * 256.0, sums.contributing)
 }
@@ -155,7 +155,7 @@ fn a_roots_sum_is_held_and_decays_as_a_torque_does_and_no_heartbeat_releases_it(
     bench.joints(1);
     assert_eq!(first(&bench.sum(2, 1, 0, 0)), (64.0, 2), "a sum of no cell ends the contacts");
     for epoch in 2..=1 + hold_epochs {
-        // It is not in contact itself; its children may be.
+        // The root is not in contact itself; its children may be.
         bench.heartbeat(1, u16::try_from(epoch).unwrap(), State::default());
         let sums = bench.joints(u8::try_from(epoch).unwrap());
         assert_eq!((first(&sums), sums.age, sums.stale), ((64.0, 2), epoch - 1, 2));
@@ -245,7 +245,7 @@ fn the_error_of_whole_sums_is_taken_of_complete_epochs_only_and_averaged_over_32
     let page = SkinSensors { contact: [Q5_10::nearest(1.0); 3], ..SkinSensors::default() };
     let frames = central.frames(&[Q1_14::ZERO; 6]);
     let one = central.torque(0, &frames, central.force(0, &page));
-    // Alternately half a step too high and too low: the average is nearer than any of them.
+    // Errors alternate between half a step too high and too low, so that the average is smaller than each.
     let off = |up| {
         let word = |nm: f64| ((nm * 2.0 * 256.0) + if up { 0.6 } else { -0.4 }).floor() as i16;
         Words::new(Length::Six, one.map(word))
@@ -270,7 +270,7 @@ fn sums_that_may_contain_a_cell_of_unknown_contact_are_not_compared() {
     let of = |pressed: &[i64], unknown: bool| {
         let mut bench = Bench::new(pressed);
         if unknown {
-            // Cell 4 returns from an outage: it may have taken stimuli of others.
+            // Cell 4 returns from an outage: it may have received stimuli from other senders.
             bench.table.interrupt_cells(|it| it == cell(4));
             bench.heartbeat(4, 0, State::default());
         }
@@ -299,7 +299,7 @@ fn packets_that_the_gateway_does_not_receive_are_counted_by_their_sender() {
     page(&mut bench, 0);
     bench.joints(0);
     page(&mut bench, 5);
-    // Two pages, five sums, and one packet that is lost.
+    // Two pages, five sums, and one lost packet.
     bench.heartbeat(3, 9, State::default());
     bench.table.finish();
     let uplink = bench.table.cells()[2].uplink();

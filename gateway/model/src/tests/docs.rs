@@ -1,5 +1,5 @@
-//! The documents on files that users write match the program: their examples are
-//! read here, and their tables name every key that there is, and no other.
+//! Checks that the documents on user files match the program: their examples parse, and their tables list exactly the
+//! supported keys.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test may stop")]
 
 use std::collections::BTreeSet;
@@ -12,7 +12,7 @@ const SKIN_MD: &str = include_str!("../../../../docs/reference/skin.md");
 const SCENARIO_MD: &str = include_str!("../../../../docs/reference/scenario.md");
 const CONTROLLER_MD: &str = include_str!("../../../../docs/how-to/external-controller.md");
 
-/// The fenced block of TOML that has this text.
+/// Returns the fenced TOML block that contains this text.
 fn block<'a>(document: &'a str, with: &str) -> &'a str {
     let blocks = document.split("```toml\n").skip(1).filter_map(|rest| rest.split("\n```").next());
     let mut found = blocks.filter(|block| block.contains(with));
@@ -29,7 +29,8 @@ fn scenario_text() -> &'static str {
     block(SCENARIO_MD, "# scenario.toml:")
 }
 
-/// The keys under a heading: of the table's first column, or of the list before what is in parentheses and the colon.
+/// Returns the keys under a heading: from the table's first column, or from the list before the parentheses and the
+/// colon.
 fn documented(page: &str, heading: &str) -> BTreeSet<String> {
     let start = page.find(&format!("\n{heading}\n")).unwrap_or_else(|| panic!("no heading {heading:?}"));
     let section = &page[start + heading.len() + 2..];
@@ -42,7 +43,7 @@ fn documented(page: &str, heading: &str) -> BTreeSet<String> {
     keys.flat_map(|keys| keys.split('`').skip(1).step_by(2)).map(str::to_owned).collect()
 }
 
-/// The keys that a table may have, from the error of the program on an unknown one.
+/// Returns the keys that a table accepts, from the program's error for an unknown key.
 fn allowed(text: &str, read: impl Fn(&str) -> String) -> BTreeSet<String> {
     let said = read(text);
     let (_, keys) = said.split_once("unknown field `zzz`, expected ").unwrap_or_else(|| panic!("{said}"));
@@ -58,7 +59,7 @@ fn read_scenario(text: &str) -> String {
     Scenario::parse("scenario.toml", text, &skin).unwrap_err().to_string()
 }
 
-/// A text with an unknown key after the first `line`.
+/// Returns a text with an unknown key inserted after the first `line`.
 fn spoilt(text: &str, line: &str) -> String {
     let with = format!("\n{line}\n");
     assert!(text.contains(&with), "the example has {line}");

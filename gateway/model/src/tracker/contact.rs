@@ -1,56 +1,56 @@
-//! The contact state of a cell in test mode, by the protocol's rules: stimuli that wait for their epochs, and latched
-//! ones. It is independent of the cells' code, so that each is an oracle of the other.
+//! The contact state of a cell in test mode, by the protocol's rules: pending and latched stimuli. It is independent of
+//! the cells' code, so that each can serve as the oracle of the other.
 //!
-//! A stimulus that was sent before a reader listens may still wait in the cell, and no page of the cell reports it. So
-//! the contact state is *known* only where every stimulus that can count was received here:
+//! A stimulus from before the start of the reader may still be pending in the cell, and no page of the cell reports it.
+//! So the contact state is *known* only if every stimulus that can matter was received here:
 //!
 //! ```text
-//!   a start; a confirmed write of the mode ───────────> nothing touches the cell, and nothing waits in it
-//!   as many stimuli counted by the cell as came here ─> those that came here are all
-//!   129 joints; then a stimulus, or the cell's page ──> what waited before them is latched, and replaced
+//!   a start; a confirmed write of the mode ───────────> the cell is free, with nothing pending
+//!   as many stimuli counted by the cell as came here ─> those received here are all
+//!   129 joints; then a stimulus, or the cell's page ──> earlier stimuli are latched and replaced
 //! ```
 
 use protocol::fixed::Q3_12;
 use protocol::message::{From, SensorPage, SkinSensors};
 use protocol::packet::Epoch;
 
-/// How many stimuli may wait in a cell.
+/// Maximum number of pending stimuli in a cell.
 pub const PENDING: usize = 8;
 
-/// The contact state of one cell. With each stimulus the reader keeps a `T`: when it came, or in which frames.
+/// The contact state of one cell. The reader attaches a `T` to each stimulus, such as its time or its frames.
 #[derive(Clone, Debug)]
 pub struct Contact<T> {
     waiting: Vec<(From, SensorPage, T)>,
     skin: Option<(SkinSensors, T)>,
     acceleration: Option<([Q3_12; 3], T)>,
     obeys: Option<bool>,
-    /// `skin` follows from all stimuli that the cell has taken.
+    /// True if `skin` includes all stimuli that the cell has received.
     is_known: bool,
     unseen: Unseen,
-    /// Stimuli since the reader began; `None` once it has lost count of what they led to.
+    /// Number of stimuli since the reader began; `None` once their effect is uncertain.
     came: Option<u16>,
-    /// The cell has counted stimuli that did not come here.
+    /// True if the cell has counted stimuli that did not arrive here.
     is_short: bool,
-    /// The mode was written, and the cell has not confirmed it.
+    /// True if the mode was written, and the cell has not confirmed it.
     clears: bool,
 }
 
-/// Stimuli that were not received here and may wait in the cell.
+/// Stimuli that were not received here and may be pending in the cell.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Unseen {
-    /// No joints came yet.
+    /// Any, before the first joints.
     Any,
-    /// Those for one of the next `ahead` epochs after the last joints.
+    /// Stimuli for one of the next `ahead` epochs after the last joints.
     Ahead { last: Epoch, ahead: u8 },
-    /// None can wait.
+    /// No stimulus can be pending.
     None,
 }
 
-/// A stimulus waits for at most half of all epochs.
+/// A stimulus is pending for at most half of all epochs.
 const HALF: u8 = 1 << 7;
 
 impl Unseen {
-    /// The joints of an epoch latch all stimuli for it and for half of all epochs before it.
+    /// Latches all stimuli for an epoch and for the half of all epochs before it.
     fn latch(&mut self, epoch: Epoch) {
         *self = match *self {
             Self::None => Self::None,
@@ -82,7 +82,7 @@ impl<T> Default for Contact<T> {
 }
 
 impl<T> Contact<T> {
-    /// Takes a stimulus, unless the cell measures or too many wait; `last` is the epoch of the last joints.
+    /// Adds a stimulus, unless the cell measures or has too many pending; `last` is the epoch of the last joints.
     pub fn push(&mut self, from: From, page: SensorPage, tag: T, last: Option<Epoch>) {
         self.came = self.came.map(|came| came.wrapping_add(1));
         if self.obeys != Some(false) && self.waiting.len() < PENDING {
@@ -90,7 +90,7 @@ impl<T> Contact<T> {
         }
     }
 
-    /// Latches the stimuli for the joints of this epoch; the newest of each page counts. Each is passed to `latched`.
+    /// Latches the stimuli for the joints of this epoch, calling `latched` for each; the newest of each page counts.
     pub fn latch(&mut self, epoch: Epoch, mut latched: impl FnMut(&mut T)) {
         self.unseen.latch(epoch);
         self.is_short &= self.unseen != Unseen::None;
@@ -111,8 +111,9 @@ impl<T> Contact<T> {
         }
     }
 
-    /// Takes the cell's own sensors page. It counts only while nothing else is known, because it may be older than the
-    /// joints at which the cell latched the next stimulus; and not while a stimulus that did not come here may wait.
+    /// Applies the cell's own sensors page. It counts only if the state is not known otherwise, because it may be older
+    /// than the joints at which the cell latched the next stimulus. It does not count while a stimulus that was not
+    /// received here may be pending.
     pub fn learn(&mut self, page: SensorPage, tag: T) {
         match page {
             SensorPage::Skin(skin) if !self.is_known && self.unseen == Unseen::None => {
@@ -123,12 +124,13 @@ impl<T> Contact<T> {
             SensorPage::Acceleration(acceleration) => {
                 _ = self.acceleration.get_or_insert((acceleration, tag))
             }
-            // What the cell computes with, and no reading.
+            // A baseline belongs to the computation and is not a reading.
             SensorPage::Baseline(_) => {}
         }
     }
 
-    /// Takes how many stimuli the cell has counted since its start. If as many came here, there are no others.
+    /// Compares the number of stimuli that the cell has counted since its start with those received here. If they are
+    /// equal, there are no others.
     pub fn count(&mut self, stimuli: u16, tag: T) {
         if self.came == Some(stimuli) {
             self.settle(tag);
@@ -137,56 +139,56 @@ impl<T> Contact<T> {
         }
     }
 
-    /// The cell has started: nothing touches it, and no stimulus waits.
+    /// Records a start of the cell: no contact, and no pending stimulus.
     pub fn start(&mut self, tag: T) {
         self.reset();
         self.settle(tag);
     }
 
-    /// The mode was written, which clears the contact state as soon as the cell has taken it.
+    /// Records a write of the mode, which clears the contact state once the cell has received it.
     pub fn write_mode(&mut self) {
         self.reset();
         self.clears = true;
     }
 
-    /// The cell has confirmed a write of its mode: since then all stimuli came here.
+    /// Records the confirmed write of the mode: all stimuli since then were received here.
     pub fn confirm_mode(&mut self, tag: T) {
         if self.clears {
             self.settle(tag);
         }
     }
 
-    /// All stimuli that count came here.
+    /// Marks the state as known: all stimuli that matter were received here.
     fn settle(&mut self, tag: T) {
         self.skin.get_or_insert_with(|| (SkinSensors::default(), tag));
         (self.is_known, self.unseen, self.is_short, self.clears) = (true, Unseen::None, false, false);
     }
 
-    /// Its skin sensors if no stimulus that was not received here can have changed them.
+    /// Returns the skin sensors if they are known.
     #[must_use]
     pub fn known(&self) -> Option<&(SkinSensors, T)> {
         self.skin.as_ref().filter(|_| self.is_known)
     }
 
-    /// Its skin sensors as far as stimuli and pages that came tell; older stimuli may have changed them.
+    /// Returns the skin sensors by the stimuli and pages received here; older stimuli may have changed them.
     #[must_use]
     pub const fn skin(&self) -> Option<&(SkinSensors, T)> {
         self.skin.as_ref()
     }
 
-    /// All pages that are latched or known.
+    /// Returns all latched or reported pages.
     pub fn latched(&self) -> impl Iterator<Item = (SensorPage, &T)> {
         let skin = self.skin.iter().map(|(skin, tag)| (SensorPage::Skin(*skin), tag));
         skin.chain(self.acceleration.iter().map(|(xyz, tag)| (SensorPage::Acceleration(*xyz), tag)))
     }
 
-    /// The waiting stimuli in their order, each with the joints from which on it applies.
+    /// Returns the pending stimuli in order, each with the joints from which it applies.
     #[must_use]
     pub fn waiting(&self) -> &[(From, SensorPage, T)] {
         &self.waiting
     }
 
-    /// Forgets the contact state and what waits: stimuli may have been lost on their way, or came from others.
+    /// Forgets the contact state and the pending stimuli: stimuli may have been lost, or sent by others.
     pub fn reset(&mut self) {
         self.waiting.clear();
         (self.skin, self.acceleration) = (None, None);
@@ -194,25 +196,25 @@ impl<T> Contact<T> {
         (self.is_short, self.clears) = (false, false);
     }
 
-    /// Forgets the contact state until the next stimulus; what waits in the cell goes on waiting.
+    /// Forgets the contact state until the next stimulus; stimuli stay pending in the cell.
     pub fn forget(&mut self) {
         (self.skin, self.acceleration, self.is_known, self.came) = (None, None, false, None);
     }
 
-    /// Whether the cell obeys stimuli; `None` while that is not known, and then it is assumed.
+    /// Returns true if the cell obeys stimuli; `None` if unknown, in which case callers assume that it does.
     #[must_use]
     pub const fn obeys(&self) -> Option<bool> {
         self.obeys
     }
 
-    /// The cell obeys stimuli, or measures, from now on.
+    /// Sets whether the cell obeys stimuli or measures from now on.
     pub const fn set_obeys(&mut self, obeys: bool) {
         self.obeys = Some(obeys);
     }
 }
 
-/// Whether the joints from which a stimulus should apply have passed: then it applies from the next ones on. `last` is
-/// the epoch of the last joints.
+/// Returns true if the joints from which a stimulus should apply have passed, so that it applies from the next ones.
+/// `last` is the epoch of the last joints.
 #[must_use]
 pub fn is_late(from: From, last: Option<Epoch>) -> bool {
     matches!((from, last), (From::Epoch(first), Some(last)) if last.since(first) >= 0)
@@ -302,7 +304,8 @@ mod tests {
         assert_eq!(known(&contact), None);
     }
 
-    /// A cell with one stimulus from before for any epoch: none is left when the reader takes its word.
+    /// For a cell with one earlier stimulus for any epoch: it is no longer pending when the reader trusts the cell's
+    /// page.
     #[test]
     fn no_stimulus_from_before_waits_when_a_page_is_believed_whatever_epochs_come() {
         for steps in [&[1_u8][..], &[127], &[3, 1, 255, 1], &[200, 100], &[1, 1, 100], &[254, 7]] {

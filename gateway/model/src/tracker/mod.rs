@@ -1,15 +1,16 @@
-//! The state of cells, derived from the traffic on the bus: in this one place, for all that follow cells.
+//! The state of cells, derived from the traffic on the bus. All other parts of the program that follow cells use this
+//! module.
 //!
 //! ```text
-//!                                ┌─ Claim    which cell has the node id, and its restarts
+//!                                ┌─ Claim    the owner of the node id, and its restarts
 //!   a cell's packets ─> Tracked ─┼─ Account  packets sent and lost
 //!                                ├─ Pages    its last pages since it started
 //!                                └─          alive or silent
-//!   stimuli, joints ──> Contact ────────────> contact state, and waiting stimuli
+//!   stimuli, joints ──> Contact ────────────> contact state, and pending stimuli
 //! ```
 //!
-//! Live tables, statistics, explanations, replays, the recorder and listings read these; each adds what is its own.
-//! The work for a packet is bounded, and nothing is allocated for it.
+//! Live tables, statistics, explanations, replays, the recorder and listings build on these types. The work per packet
+//! is bounded, without allocation.
 
 mod claim;
 mod contact;
@@ -24,11 +25,11 @@ pub use contact::{Contact, PENDING, is_late};
 pub use per_cell::PerCell;
 pub use uplink::{Account, Uplink};
 
-/// A cell that is silent for so long is dead: two heartbeats, and the jitter of a busy machine, so that one lost frame
-/// is tolerated.
+/// The time of silence after which a cell counts as dead: two heartbeats plus the jitter of a busy machine, so that one
+/// lost frame is tolerated.
 pub const DEAD_AFTER: Span = Span::from_millis(600);
 
-/// An answer may be to the newest joints, or to those up to so many before them; later ones are dropped.
+/// Maximum age of an answer, in broadcasts before the newest one; older answers are dropped.
 pub const LATEST: usize = 3;
 
 /// The last page of each kind since a cell started.
@@ -36,16 +37,16 @@ pub const LATEST: usize = 3;
 pub struct Pages {
     /// Counters of what it received.
     pub heard: Option<Heard>,
-    /// Counters of what it refused.
+    /// Counters of what the cell refused.
     pub refused: Option<Refused>,
     /// Its place in the tree.
     pub tree: Option<Tree>,
-    /// What its ports lead to.
+    /// The neighbours at its ports.
     pub ports: Option<Ports>,
 }
 
 impl Pages {
-    /// Takes a page.
+    /// Records a page.
     const fn take(&mut self, page: &NetworkPage) {
         match *page {
             NetworkPage::Heartbeat(_) => {}
@@ -57,20 +58,20 @@ impl Pages {
     }
 }
 
-/// What a packet of a cell changes in its state.
+/// The effect of a packet on a cell's state.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Update {
-    /// What it means as a heartbeat, if it is one.
+    /// Its meaning as a heartbeat, if it is one.
     pub word: Option<Word>,
-    /// The cell was dead before.
+    /// True if the cell was dead before.
     pub revived: bool,
-    /// It is the cell's first heartbeat since the bus was lost, and it has not started since.
+    /// True for the cell's first heartbeat after the bus was lost, if it has not restarted since.
     pub returned: bool,
-    /// What seemed a start was none, and its account goes on from before that.
+    /// True if an apparent start was taken back, so that the earlier account continues.
     pub taken_back: bool,
 }
 
-/// One cell, by the packets of its node id.
+/// One cell, followed by the packets of its node id.
 #[derive(Clone, Debug, Default)]
 pub struct Tracked {
     /// Packets sent and arrived.
@@ -82,7 +83,7 @@ pub struct Tracked {
 }
 
 impl Tracked {
-    /// Takes a packet that came at `at`; `joints` is the number of the newest joints.
+    /// Records a packet that arrived at `at`; `joints` is the number of the newest joints.
     pub fn hear(&mut self, at: Micros, message: &Message, joints: Option<u64>) -> Update {
         let is_first = self.last_packet.replace(at).is_none();
         let revived = core::mem::take(&mut self.dead);
@@ -109,7 +110,7 @@ impl Tracked {
             Word::First => self.account.begin(heartbeat.sent, false),
             Word::Shared => {
                 taken_back = self.account.take_back(heartbeat.sent);
-                // Some may be the other sender's.
+                // Some pages may be from the other sender.
                 self.pages = Pages::default();
             }
             Word::Started { again } => {
@@ -124,25 +125,25 @@ impl Tracked {
         Update { word: Some(word), revived, returned, taken_back }
     }
 
-    /// The owner of the node id, and its last heartbeat.
+    /// Returns the claim: the owner of the node id, and its last heartbeat.
     #[must_use]
     pub const fn claim(&self) -> &Claim {
         &self.claim
     }
 
-    /// Its last pages since it started.
+    /// Returns its last pages since it started.
     #[must_use]
     pub const fn pages(&self) -> &Pages {
         &self.pages
     }
 
-    /// When its last packet came.
+    /// Returns the arrival time of its last packet.
     #[must_use]
     pub const fn last_packet(&self) -> Option<Micros> {
         self.last_packet
     }
 
-    /// Handles the timeout of a silent cell; whether it has just passed.
+    /// Handles the timeout of a silent cell; returns true if it has just expired.
     pub fn falls_silent(&mut self, now: Micros) -> bool {
         let silent = self.is_silent(now);
         let falls = silent && !self.dead;
@@ -150,13 +151,13 @@ impl Tracked {
         falls
     }
 
-    /// Whether it was found dead, and has sent nothing since.
+    /// Returns true if it is dead: it was found silent, and has sent nothing since.
     #[must_use]
     pub const fn is_dead(&self) -> bool {
         self.dead
     }
 
-    /// Whether it has sent something, and then been silent for too long.
+    /// Returns true if it has sent packets, and then was silent for too long.
     #[must_use]
     pub fn is_silent(&self, now: Micros) -> bool {
         self.last_packet.is_some_and(|last| now.since(last) > DEAD_AFTER)

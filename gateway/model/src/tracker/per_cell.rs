@@ -1,8 +1,8 @@
-//! Something for each node id.
+//! A table with one entry per node id.
 
 use protocol::id::{CellId, Node};
 
-/// Something for each node id of a bus.
+/// One value for each node id of a bus.
 #[derive(Clone, Debug)]
 pub struct PerCell<T>(Box<[T]>);
 
@@ -13,18 +13,18 @@ impl<T: Default> Default for PerCell<T> {
 }
 
 impl<T> PerCell<T> {
-    /// That of one cell.
+    /// Returns the value of one cell.
     #[must_use]
     pub fn get(&self, cell: CellId) -> Option<&T> {
         self.0.get(cell.index())
     }
 
-    /// That of one cell, to be changed.
+    /// Returns the mutable value of one cell.
     pub fn get_mut(&mut self, cell: CellId) -> Option<&mut T> {
         self.0.get_mut(cell.index())
     }
 
-    /// Those of the cells that an addressee names, by node id.
+    /// Returns the values of the cells that an addressee names, by node id.
     pub fn named(&mut self, to: Node) -> &mut [T] {
         let places = match to {
             Node::Gateway => 0..0,
@@ -34,12 +34,12 @@ impl<T> PerCell<T> {
         self.0.get_mut(places).unwrap_or_default()
     }
 
-    /// All of them, by node id.
+    /// Iterates over all values, by node id.
     pub fn iter(&self) -> impl Iterator<Item = (CellId, &T)> {
         CellId::all().zip(&self.0)
     }
 
-    /// All of them, by node id, to be changed.
+    /// Iterates over all mutable values, by node id.
     pub fn iter_mut(&mut self) -> impl Iterator<Item = (CellId, &mut T)> {
         CellId::all().zip(&mut self.0)
     }

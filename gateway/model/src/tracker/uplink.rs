@@ -1,98 +1,99 @@
-//! Packets that a cell sent, by its own counter, compared with packets that arrived.
+//! Packets sent by a cell's own counter, compared with received packets.
 
 use derive_more::{Add, Sum};
 
-/// Packets of one cell: sent by its own count = delivered + rejected + unheard + lost - surplus, as of its last heartbeat.
+/// Packets of one cell, as of its last heartbeat: sent = delivered + rejected + unheard + lost - surplus.
 #[derive(Add, Clone, Copy, Debug, Default, Eq, PartialEq, Sum)]
 pub struct Uplink {
-    /// Sent, by the cell's own count.
+    /// Packets sent, by the cell's own count.
     pub sent: u64,
-    /// Arrived and understood.
+    /// Packets that arrived and were understood.
     pub delivered: u64,
-    /// Arrived and refused.
+    /// Packets that arrived and were refused.
     pub rejected: u64,
-    /// Sent and never arrived.
+    /// Packets that were sent and never arrived.
     pub lost: u64,
-    /// Of the lost ones, those of a time in which the bus was lost.
+    /// Lost packets while the bus was lost.
     pub outage: u64,
-    /// Arrived more often than sent: repeated on the way, or sent by another cell with this node id.
+    /// Packets that arrived more often than sent: repeated on the way, or sent by another cell with this node id.
     pub surplus: u64,
-    /// Of the surplus, heartbeats of other senders under this node id: of a cell that claims it, or older ones again.
+    /// Heartbeats of other senders among the surplus: of a cell that claims this node id, or repeated old ones.
     pub outsiders: u64,
-    /// Arrived with nothing to compare it with: before a cell's first heartbeat, and between its last one
-    /// and a restart. How many more it sent then is not known.
+    /// Packets that cannot be compared with a count: before a cell's first heartbeat, and between its last one and a
+    /// restart. The cell may have sent more then.
     pub in_doubt: u64,
     /// Restarts of the cell.
     pub restarts: u32,
-    /// Of those that never arrived, sums for another cell, which the gateway did not receive.
+    /// Packets that never arrived because they were sums for another cell, which the gateway does not receive.
     pub unheard: u64,
-    /// Arrived since the last heartbeat: of a dead cell, all that is known of its end.
+    /// Packets since the last heartbeat; for a dead cell, its last known packets.
     pub unsettled: u64,
 }
 
-/// Works out a cell's [`Uplink`].
+/// Computes a cell's [`Uplink`].
 ///
-/// A heartbeat has the number of packets that the cell sent before it. A bus keeps each sender's order, so what
-/// has not arrived by then never will.
+/// A heartbeat contains the number of packets that the cell sent before it. A bus keeps the order of each sender, so
+/// packets that are missing by then are lost.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Account {
     now: Counts,
-    /// As if the last start had been none; for [`Account::take_back`].
+    /// The counts without the last start; for [`Account::take_back`].
     before: Option<Counts>,
 }
 
-/// An account, and what its next heartbeat is compared with.
+/// An account, and the state that its next heartbeat is compared with.
 #[derive(Clone, Copy, Debug, Default)]
 struct Counts {
     total: Uplink,
-    /// What the cell had sent with its last heartbeat, modulo 2^16.
+    /// Number of packets sent up to the last heartbeat, modulo 2^16.
     reported: Option<u16>,
-    /// Arrived since then, and of these refused.
+    /// Number of packets since then, and of those refused among them.
     arrived: u64,
     rejected: u64,
     sums: Option<Sums>,
-    /// The bus was lost since the last heartbeat.
+    /// True if the bus was lost since the last heartbeat.
     interrupted: bool,
 }
 
-/// Sums that a cell sends to another one and the gateway does not take, by the cell's own count.
+/// Sums that a cell sends to another cell, by its own count; the gateway does not receive them.
 #[derive(Clone, Copy, Debug, Default)]
 struct Sums {
-    /// By its last page, modulo 2^16.
+    /// The count in its last page, modulo 2^16.
     reported: Option<u16>,
-    /// Since the account began.
+    /// Number of sums since the account began.
     count: u64,
-    /// Of these, found missing.
+    /// Number of sums among them that account for missing packets.
     found: u64,
-    /// The joints of its last page, and of its last heartbeat: sums in between are not counted yet.
+    /// The numbers of the newest joints at its last page and at its last heartbeat. Sums in between are not counted
+    /// yet.
     page_at: Option<u64>,
     heartbeat_at: Option<u64>,
 }
 
 impl Account {
-    /// What it comes to so far.
+    /// Returns the figures so far.
     #[must_use]
     pub const fn uplink(&self) -> Uplink {
         Uplink { unsettled: self.now.arrived, ..self.now.total }
     }
 
-    /// The bus is lost: packets of the cell do not arrive until its next heartbeat.
+    /// Records a lost bus: packets of the cell do not arrive until its next heartbeat.
     pub fn interrupt(&mut self) {
         self.each(|counts| counts.interrupted = true);
     }
 
-    /// Whether the bus was lost since the cell's last heartbeat: it is not known whether the cell is back on it.
+    /// Returns true if the bus was lost since the cell's last heartbeat, so that the cell may still be off it.
     #[must_use]
     pub const fn is_interrupted(&self) -> bool {
         self.now.interrupted
     }
 
-    /// A packet arrived.
+    /// Counts a packet.
     pub(super) fn arrive(&mut self) {
         self.each(|counts| counts.arrived += 1);
     }
 
-    /// A frame with this cell's identifier arrived that cannot be used.
+    /// Counts an unusable frame with this cell's identifier.
     pub fn reject(&mut self) {
         self.each(|counts| {
             counts.arrived += 1;
@@ -100,30 +101,31 @@ impl Account {
         });
     }
 
-    /// The gateway does not take this cell's sums.
+    /// Declares that the gateway does not receive this cell's sums.
     pub fn without_sums(&mut self) {
         self.each(|counts| _ = counts.sums.get_or_insert_default());
     }
 
-    /// The cell reports how many sums it has sent, modulo 2^16; `joints` is the number of the newest.
+    /// Records the number of sums that the cell reports as sent, modulo 2^16; `joints` is the number of the newest
+    /// joints.
     pub(super) fn sums_sent(&mut self, reported: u16, joints: Option<u64>) {
         self.now.sums_sent(reported, joints);
     }
 
-    /// Its heartbeat came after the joints of this number; the account is settled already.
+    /// Records the number of the newest joints at its heartbeat, after the account is settled.
     pub(super) const fn heartbeat_at(&mut self, joints: Option<u64>) {
         if let Some(sums) = &mut self.now.sums {
             sums.heartbeat_at = joints;
         }
     }
 
-    /// No more comes: accounts for missing packets that were sums which the gateway does not take.
+    /// Ends the account: attributes missing packets to sums that the gateway does not receive.
     pub fn finish(&mut self) {
         self.now.finish();
     }
 
-    /// The first heartbeat of a cell since it started has arrived; the cell had sent `sent` packets before it, modulo
-    /// 2^16. `again` if the cell was there before.
+    /// Records the first heartbeat since a start; the cell had sent `sent` packets before it, modulo 2^16. `again` if
+    /// the cell was present before.
     pub(super) fn begin(&mut self, sent: u16, again: bool) {
         if again {
             self.before.get_or_insert(self.now);
@@ -132,24 +134,24 @@ impl Account {
         self.now.begin(sent, again);
     }
 
-    /// A further heartbeat has arrived; the cell had sent `sent` packets before it, modulo 2^16.
+    /// Records a further heartbeat; the cell had sent `sent` packets before it, modulo 2^16.
     pub(super) fn settle(&mut self, sent: u16) {
         self.before.iter_mut().for_each(Counts::intrude);
         self.now.settle(sent);
     }
 
-    /// An old heartbeat of the cell since its last start has arrived.
+    /// Records an old heartbeat of the cell since its last start.
     pub(super) fn pass_over(&mut self) {
         self.before.iter_mut().for_each(Counts::intrude);
     }
 
-    /// The last start was one, and is not taken back.
+    /// Confirms the last start, which can no longer be taken back.
     pub(super) const fn confirm(&mut self) {
         self.before = None;
     }
 
-    /// A heartbeat has arrived that goes on where the account was before the last start: that was none. Whether it is known
-    /// what there was before.
+    /// Records a heartbeat that continues the account before the last start, and so disproves that start. Returns true
+    /// if the earlier account is known.
     pub(super) fn take_back(&mut self, sent: u16) -> bool {
         let before = self.before.take();
         match before {
@@ -162,13 +164,13 @@ impl Account {
         before.is_some()
     }
 
-    /// Whether the last start may still be taken back.
+    /// Returns true if the last start may still be taken back.
     #[must_use]
     pub const fn is_in_question(&self) -> bool {
         self.before.is_some()
     }
 
-    /// The heartbeat that has just arrived is of another sender under this node id.
+    /// Records that the last heartbeat is from another sender with this node id.
     pub(super) fn intrude(&mut self) {
         self.each(Counts::intrude);
     }
@@ -203,7 +205,7 @@ impl Counts {
             self.total.restarts += 1;
             self.finish();
             if let Some(sums) = &mut self.sums {
-                // It counts from zero.
+                // The cell counts from zero.
                 *sums = Sums { reported: Some(0), ..Sums::default() };
             }
         }

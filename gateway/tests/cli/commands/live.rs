@@ -188,7 +188,7 @@ fn a_cell_that_cannot_compute_its_part_is_named_and_not_written() {
         std::fs::write(&skin, &skin_text).unwrap();
         let mut command = bench.gateway(&format!("commission {}", skin.display()));
         let Output { status, stdout, stderr } = bench.beside(Format::Fd, || command.output().unwrap());
-        let said = format!("12             cannot have {expected}: give it newer firmware");
+        let said = format!("12             does not support {expected}: install newer firmware");
         assert_eq!(status.code(), Some(1), "{}", text(&stderr));
         let all = format!("{}{}", text(&stdout), text(&stderr));
         assert!(all.contains(&said) && all.contains("requests         1 "), "{all}");
@@ -345,7 +345,7 @@ fn what_the_options_of_a_dump_leave_out_is_said() {
         ("vcan0 --cell vcan1:3", "skinbus: vcan1 is not shown: name it beside vcan0\n"),
         (
             "vcan0 --bus vcan0 --cell vcan1:3",
-            "skinbus: vcan1:3 is on no bus that is picked: vcan0 are; leave one of the two out\n",
+            "skinbus: vcan1:3 is not on a selected bus (vcan0): leave out one of the two filters\n",
         ),
     ] {
         let Output { status, stderr, .. } = bench.gateway(&format!("dump {arguments}")).output().unwrap();

@@ -1,4 +1,4 @@
-//! Whatever is lost, changed or cut off of a run, the counts are those of its numbers.
+//! Property test: for any loss, change or cut of a run, the counts are those of its numbers.
 
 use std::collections::BTreeSet;
 
@@ -6,13 +6,13 @@ use proptest::prelude::*;
 
 use super::*;
 
-/// What happens to the second capture.
+/// The damage to the second capture.
 #[derive(Clone, Debug)]
 struct Harm {
-    /// The numbers of its first joints and of those behind its last.
+    /// The number of its first joints, and the number after its last ones.
     first: u64,
     end: u64,
-    /// Joints that are lost in a row.
+    /// Consecutive lost joints: first number and count.
     gap: (u64, u64),
     lost_joints: BTreeSet<u64>,
     lost_torques: BTreeSet<u64>,
@@ -81,7 +81,7 @@ proptest! {
             changed_torques: none(),
         };
         let there: Vec<_> = (0..1_500).filter(|number| harm.has_joints(*number)).collect();
-        // The epochs tell where it begins, and how long it is silent if that is no whole number of rounds.
+        // The epochs identify the start, and the length of a silence unless it is a multiple of 256 epochs.
         prop_assume!(there.first().is_some_and(|first| *first < 256));
         prop_assume!(there.windows(2).all(|pair| pair[1] - pair[0] != 256));
         let (first, last) = (there[0], *there.last().unwrap());

@@ -1,4 +1,4 @@
-//! A packet's values, by the protocol's own types and the names of a DBC.
+//! Computes a packet's values from the protocol's own types, with the names of a DBC.
 
 use std::collections::BTreeMap;
 
@@ -143,7 +143,7 @@ impl Said {
     }
 }
 
-/// The name of a message and its values; `None` for values that no encoding has.
+/// Returns the name of a message and its values; `None` for values that cannot be encoded.
 pub(super) fn by_protocol(message: &Message, packet: &Packet) -> (String, BTreeMap<String, f64>) {
     let mut said = Said::default();
     let crc = u16::from_le_bytes(*packet.encode().last_chunk().unwrap());

@@ -1,4 +1,4 @@
-//! Buses in virtual time, with exact stuffing, against what is computed for them.
+//! Simulates buses in virtual time, with exact stuffing, and compares them with the computed bounds.
 
 use std::collections::BTreeMap;
 
@@ -12,45 +12,45 @@ use rand_pcg::Pcg64Mcg;
 use super::{Answers, COMPUTATION_NS, Case};
 use bus_model::{BusModel, Priority, Request};
 
-/// How long the cells of an epoch compute.
+/// The computation times of the cells in an epoch.
 #[derive(Clone, Copy, Debug)]
 enum Computation {
-    /// All as long as they may.
+    /// The longest time for all cells.
     Longest,
-    /// Each time anything up to that.
+    /// A random time up to the longest.
     Any,
-    /// All but one at once.
+    /// Zero for all cells but one.
     Straggler,
 }
 
-/// When the cells' heartbeats fall due.
+/// The due times of the cells' heartbeats.
 #[derive(Clone, Copy, Debug)]
 enum Heartbeats {
-    /// Spread over their period by node number, cells started together.
+    /// Spread over their period by node id, with cells started together.
     Spread,
-    /// Each cell as it was started.
+    /// Random, as if each cell started on its own.
     Any,
-    /// All within the time that cells compute after some joints.
+    /// All while cells compute after the same joints.
     Together,
 }
 
-/// What words hold.
+/// The content of words.
 #[derive(Clone, Copy, Debug)]
 enum Data {
-    /// Anything.
+    /// Random.
     Any,
-    /// Anything, and zeros as in torques of joints beyond the cell.
+    /// Random, with zeros as in torques of joints beyond the cell.
     Zeros,
-    /// Whatever makes the longest frames there can be.
+    /// The content of the longest frames.
     Longest,
 }
 
-/// One simulation: the longest times in it.
+/// The longest times in one simulation.
 #[derive(Clone, Copy, Debug, Default)]
 struct Longest {
-    /// From the broadcast's turn to the end of the last answer in ns.
+    /// From the due time of the broadcast to the end of the last answer in ns.
     last_ns: u64,
-    /// From when a heartbeat is due to its end in ns; nothing when it was early enough.
+    /// From the due time of a heartbeat to its end in ns; zero if it ended before.
     heartbeat_ns: u64,
 }
 
@@ -78,14 +78,14 @@ impl Sent {
 struct Bench<'a> {
     case: &'a Case,
     data: Data,
-    /// The bits of the longest frame.
+    /// The content of the longest frame.
     longest: Bits,
     dice: Pcg64Mcg,
     bus: BusModel,
-    /// What will be sent, by time; of what is due, since when.
+    /// The frames to send, by time, each with its due time.
     agenda: BTreeMap<(u64, u32), (Sent, u64)>,
     entered: u32,
-    /// By tag: what it is, since when it is due, and whether it is the packet's last frame.
+    /// By tag: the frame, its due time, and whether it is the packet's last frame.
     on_the_way: Vec<(Sent, u64, bool)>,
 }
 
@@ -125,7 +125,7 @@ impl Bench<'_> {
     }
 }
 
-/// Runs so many epochs of a bus whose cells are all in contact.
+/// Runs a number of epochs of a bus whose cells are all in contact.
 fn simulate(case: &Case, epochs: u64, seed: u64, how: (Computation, Heartbeats, Data)) -> Longest {
     let (computation, heartbeats, data) = how;
     let (cells, period) = (case.answers.cells(), case.period_ns);
@@ -154,7 +154,7 @@ fn simulate(case: &Case, epochs: u64, seed: u64, how: (Computation, Heartbeats, 
             Heartbeats::Together => period + bench.dice.random_range(0..2 * case.frame_ns()),
         };
         for due in (0..).map(|it| phase + it * 250_000_000).take_while(|&due| due < end) {
-            // As long as early as the rules allow: up to a period.
+            // Send a heartbeat as early as the rules allow: up to a period.
             let early = if bench.dice.random() { bench.dice.random_range(0..period) } else { 0 };
             bench.enter(due.saturating_sub(early), Sent::Heartbeat(node), due);
         }
@@ -229,8 +229,8 @@ fn case(rates: &str, cells: u32) -> Case {
     }
 }
 
-/// What part of the smaller bound the slowest of many seeds reached, each with another way to be slow; and that none is
-/// above either bound.
+/// Returns the share of the smaller bound that the slowest of many seeds reached, with varied scenarios, and asserts
+/// that none exceeds a bound.
 fn reached(case: &Case, data: &[Data], seeds: u64) -> f64 {
     let times = case.times();
     let mut slowest_ns = 0;
@@ -241,7 +241,7 @@ fn reached(case: &Case, data: &[Data], seeds: u64) -> f64 {
             [Heartbeats::Together, Heartbeats::Spread, Heartbeats::Any][pick(3, 3)],
             data[pick(9, data.len())],
         );
-        // One more than there are between two heartbeats of a cell.
+        // One epoch more than there are between two heartbeats of a cell.
         let longest = simulate(case, 17, seed, how);
         for computed_ns in [times.chain_ns, times.response_ns.map(|it| it.worst_ns)].into_iter().flatten() {
             assert!(longest.last_ns <= computed_ns, "{} of {computed_ns}, {seed}, {how:?}", longest.last_ns);
@@ -281,7 +281,7 @@ fn so_are_other_numbers_of_cells_rates_and_classic_can() {
         let reached = reached(&case(rates, cells), REAL, 18);
         assert!(reached >= 0.85, "{rates} {cells}: {reached}");
     }
-    // With few cells there are no heartbeats that could block twice.
+    // With few cells there are not enough heartbeats to block twice.
     for cells in [1, 2, 5] {
         assert!(reached(&case("1M/5M", cells), REAL, 90) >= 0.6);
     }

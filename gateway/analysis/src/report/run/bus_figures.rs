@@ -1,4 +1,4 @@
-//! Figures from the frames of one bus: the same accounts that the gateway kept, epoch by epoch.
+//! Figures from the frames of one bus: the same accounts as the gateway kept, epoch by epoch.
 
 use protocol::can::Frame;
 use protocol::candump::{Direction, Record};
@@ -18,9 +18,9 @@ use model::central::Central;
 use model::table::{Replies, Sums, Table};
 use trace::capture::Latched;
 
-/// Time is let pass for the cells as often as a receiver does it.
+/// Interval of timeout handling for the cells in µs, as in a receiver.
 const LOOK_US: u64 = 20_000;
-/// How long a cell took to answer, in µs.
+/// The reply times of a cell, in µs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Latency {
     pub(super) max: u64,
@@ -28,98 +28,98 @@ pub(super) struct Latency {
     pub(super) count: u64,
 }
 
-/// The epoch that is open.
+/// The open epoch.
 #[derive(Clone, Copy, Debug, Default)]
 struct Open {
     number: u64,
     at: f64,
-    /// What was due in it.
+    /// Number of due replies.
     due: u64,
-    /// What there was when it was opened.
+    /// The account when it was opened.
     before: Replies,
-    /// Errors compared before it, and their sum.
+    /// Number and sum of errors before it.
     errors: (u64, f64),
-    /// Packets of cells that were lost before it.
+    /// Number of lost packets of cells before it.
     lost: u64,
     /// Its slowest reply, in µs.
     slowest: Option<u64>,
 }
 
-/// Lines over time with a point an epoch.
+/// Lines over time with one point per epoch.
 #[derive(Debug, Default)]
 pub(super) struct Lines {
     pub(super) due: Thinned,
     pub(super) in_time: Thinned,
     pub(super) late: Thinned,
     pub(super) missing: Thinned,
-    /// In ms.
+    /// The slowest reply, in ms.
     pub(super) slowest: Thinned,
-    /// Mean absolute error of the whole bus' torque in an epoch that all answered, in Nm.
+    /// Mean absolute error of the whole bus' torque in an epoch that all cells answered, in Nm.
     pub(super) error: Thinned,
-    /// By joint of the chain: distributed less central torque of an epoch that all answered, in Nm or N.
+    /// By joint of the chain: distributed minus central torque of an epoch that all cells answered, in Nm or N.
     pub(super) difference: Vec<Thinned>,
 }
 
-/// The effect of a frame that the lines of a capture without a loop need.
+/// The effect of a frame on the lines of a capture without a loop.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Effect {
-    /// New joints, by joint of the chain in rad or m.
+    /// New joints, by joint of the chain, in rad or m.
     Joints([f64; MAX_JOINTS]),
-    /// Cells are halted, or go on.
+    /// A halt (true) or a resume of cells.
     Halted(bool),
 }
 
-/// Returns true for frames that cells receive and that change a table as the gateway's own do. Whoever took the capture
-/// does not tell who sent a frame; its identifier tells for whom it is.
+/// Returns true for frames that cells receive and that change a table like the gateway's own. The capture does not
+/// contain the sender of a frame, but its identifier shows its receiver.
 fn is_for_cells(frame: &Frame) -> bool {
     let Ok(id) = data_id(frame) else { return false };
-    // A table learns of a resume from others' frames only: the gateway knows of its own.
+    // A table counts a resume only in frames of others: the gateway knows its own.
     let is_resume = id.kind == Kind::Command && Command::from_byte(id.node) == Some(Command::Resume);
     id.sender().is_none() && !is_resume
 }
 
-/// The state of a bus' frames so far.
+/// The state of a bus after the frames so far.
 #[derive(Debug)]
 pub(super) struct Received {
     looked: Micros,
-    /// Whether frames have no direction that tells the gateway's own.
+    /// True if frames have no direction that identifies the gateway's own.
     is_of_frames_only: bool,
-    /// What had come before the newest joints.
+    /// The totals before the newest joints.
     pub(super) before: Sums,
-    /// Cells in contact since the newest joints; `None` while that is not known of all.
+    /// Number of cells in contact since the newest joints; `None` if unknown for some cell.
     pub(super) in_contact: Option<u32>,
 }
 
-/// One bus.
+/// The figures of one bus.
 #[derive(Debug)]
 pub(super) struct LinkId {
     pub(super) name: String,
     pub(super) table: Table,
-    /// What its cells make of their sensors.
+    /// The central computation of its cells' forces.
     central: Central,
-    /// By place among the bus' cells: the force in N that a cell reported last, for those that measure.
+    /// By index of the cell on the bus: the last reported force in N, for cells that measure.
     measured: Vec<Option<f64>>,
     pub(super) touched: Touched,
     pub(super) moments: Moments,
-    /// When the whole bus' torque was farthest from the central one, and by how much.
+    /// Time and size of the largest error of the whole bus' torque.
     pub(super) farthest: Option<(f64, f64)>,
-    /// Whether cells answer with sums.
+    /// True if cells answer with sums.
     pub(super) sums: bool,
     pub(super) received: Received,
     open: Option<Open>,
     pub(super) lines: Lines,
-    /// By place among the bus' cells.
+    /// By index of the cell on the bus.
     pub(super) latency: Vec<Latency>,
     pub(super) frames: u64,
-    /// When the first and the last joints stood on the bus, in s, and how many there were.
+    /// Times of the first and the last joints on the bus, in s, and the number of joints.
     pub(super) joints: Option<(f64, f64, u64)>,
-    /// The bit rates of a real bus in its place.
+    /// The bit rates of the corresponding real bus.
     pub(super) rates: Chosen,
-    /// Where they come from; none where they are common ones.
+    /// The source of the rates; `None` for defaults.
     pub(super) rates_from: Option<&'static str>,
-    /// Seconds that it would carry what it has to.
+    /// Seconds of transmission on the real bus.
     pub(super) load: Binned,
-    /// The same with what only a bench sends.
+    /// Seconds of transmission, including frames that only a bench sends.
     pub(super) load_of_all: Binned,
     /// Frames that the recorder lost, by its own notes.
     pub(super) dropped: u64,
@@ -166,18 +166,18 @@ impl LinkId {
         }
     }
 
-    /// A frame from before the recording that is latched when it begins.
+    /// Handles a frame that was latched before the start of the recording.
     pub(super) fn latched(&mut self, before: &Latched) {
         self.table.handle_frame(Micros(before.nanos / 1_000), before.own, &before.frame, &mut |_| None);
     }
 
-    /// The recording begins.
+    /// Starts the recording.
     pub(super) fn begin(&mut self) {
         self.table.begin_accounts();
         self.open = self.table.newest().map(|(number, _, _)| Open { number, ..Open::default() });
     }
 
-    /// The next frame, `at` seconds after the recording's beginning.
+    /// Handles the next frame, `at` seconds after the start of the recording.
     pub(super) fn frame(&mut self, at: f64, record: &Record<'_>) -> Option<Effect> {
         let now = Micros(record.time.nanos / 1_000);
         self.frames += 1;
@@ -218,12 +218,12 @@ impl LinkId {
         }
     }
 
-    /// What a real bus would have carried of a frame; nothing of one that only a bench sends.
+    /// Adds the load of a frame on a real bus; zero for a frame that only a bench sends.
     pub(super) fn carried(&mut self, at: f64, bits: Option<Bits>) {
         self.load.add(at, bits.map_or(0.0, |bits| bits.seconds(self.rates.rates)));
     }
 
-    /// How long a cell took, if this is its answer to the newest joints.
+    /// Records the reply time of a cell, if this is its answer to the newest joints.
     fn answer(&mut self, now: Micros, message: &Message) {
         let (Message::Torque { from, epoch, .. } | Message::Sum { from, epoch, .. }) = message else {
             return;
@@ -243,7 +243,7 @@ impl LinkId {
         }
     }
 
-    /// What a cell measures, if this is its sensors page.
+    /// Records the force that a cell measures, if this is its sensors page.
     fn measure(&mut self, message: &Message) {
         let Message::Sensors { from, page: SensorPage::Skin(skin), .. } = message else { return };
         let Some(place) = self.table.cells().iter().position(|cell| cell.node == *from) else { return };
@@ -252,7 +252,7 @@ impl LinkId {
         }
     }
 
-    /// The force on each cell since the newest joints: by its stimuli, or as it measures it.
+    /// Updates the force on each cell since the newest joints, from its stimuli or from its measurement.
     fn forces(&mut self, at: f64) {
         let (table, central, measured) = (&self.table, &self.central, &self.measured);
         let sensors = table.sensors(self.received.looked).zip(table.cells()).zip(measured).enumerate();
@@ -269,19 +269,19 @@ impl LinkId {
         self.received.in_contact = in_contact;
     }
 
-    /// What is due and what has come of it, all epochs together.
+    /// Returns the account of due and received replies over all epochs.
     pub(super) fn account(&self) -> Replies {
         self.table.replies()
     }
 
-    /// Errors compared so far, and their sum.
+    /// Returns the number and the sum of errors so far.
     fn errors(&self) -> (u64, f64) {
         let accuracy = self.table.accuracy();
         let errors = if self.sums { accuracy.sums } else { accuracy.whole };
         (errors.count(), errors.mean().unwrap_or(0.0) * errors.count() as f64)
     }
 
-    /// New joints stand on the bus.
+    /// Handles new joints on the bus.
     fn next(&mut self, number: u64, at: f64) {
         let (first, _, count) = self.joints.unwrap_or((at, at, 0));
         self.joints = Some((first, at, count + 1));
@@ -291,7 +291,7 @@ impl LinkId {
         self.forces(at);
     }
 
-    /// Ends the epoch that is open: what has become due since, and what there is now.
+    /// Closes the open epoch. Returns the number of newly due replies, the account and the errors now.
     fn close(&mut self) -> (u64, Replies, (u64, f64)) {
         let (account, errors) = (self.account(), self.errors());
         let Some(Open { at, due, before, errors: errors_before, lost, slowest, .. }) = self.open.take()
@@ -322,7 +322,7 @@ impl LinkId {
         (account.due.saturating_sub(before.due), account, errors)
     }
 
-    /// No more frames follow.
+    /// Ends the figures.
     pub(super) fn finish(&mut self) {
         self.table.finish();
         self.close();

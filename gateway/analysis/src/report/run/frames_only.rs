@@ -1,24 +1,24 @@
-//! A capture that holds frames only, as a candump log does: series from joints and torques on the buses in place of the loop's
-//! topics, and the parts of a report that are missing.
+//! Captures with frames only, such as a candump log: series from joints and torques on the buses instead of the loop's
+//! topics, and the missing parts of the report.
 
 use protocol::skin::Skin;
 
 use super::bus_figures::{Effect, LinkId};
 use super::motion::Motion;
 
-/// What a capture without a loop is, and what of it has been read.
+/// The kind of a capture without a loop, and the state of reading it.
 #[derive(Debug)]
 pub(super) struct FramesOnly {
-    /// What it is in a sentence, without its article: `candump log`.
+    /// Its description in a sentence, without article: `candump log`.
     pub(super) format: &'static str,
-    /// What lacks the loop's parts: `a log`.
+    /// Its description as the subject of missing parts: `a log`.
     pub(super) noun: &'static str,
     /// The file of its skin.
     pub(super) skin_file: String,
-    /// The bus whose joints are the times of the series.
+    /// The bus whose joints give the times of the series.
     clock: Option<usize>,
     is_halted: bool,
-    /// When the last frame was, in s after the first.
+    /// Time of the last frame, in s after the first.
     end: f64,
     /// Time of the first frame in ns since 1970.
     pub(super) began: Option<u64>,
@@ -32,7 +32,7 @@ impl FramesOnly {
         Self { format, noun, skin_file, clock: None, is_halted: false, end: 0.0, began: None }
     }
 
-    /// Takes a frame of one of the skin's buses, which had this effect there.
+    /// Handles a frame of one of the skin's buses with its effect there.
     pub(super) fn take(
         &mut self,
         (at, bus, effect): (f64, usize, Option<Effect>),
@@ -47,7 +47,7 @@ impl FramesOnly {
                     sums(at, skin, bus_figures, motion);
                 }
                 for ((joint, _), position) in skin.joints_of(bus).zip(positions) {
-                    // A joint of several chains is broadcast on the buses of all of them.
+                    // The buses of all its chains broadcast a joint of several chains.
                     let owner = (0..bus_figures.len()).find(|bus| {
                         let has_joints = bus_figures.get(*bus).is_some_and(|it| it.joints.is_some());
                         has_joints && skin.joints_of(*bus).any(|(it, _)| it == joint)
@@ -66,13 +66,13 @@ impl FramesOnly {
         }
     }
 
-    /// No more frames follow: sets the time that the capture covers, from the first joints to the last frame.
+    /// Ends the capture: sets the covered time, from the first joints to the last frame.
     pub(super) fn finish(&self, motion: &mut Motion) {
         motion.first.get_or_insert(0.0);
         motion.last = self.end;
     }
 
-    /// The parts of a report that are not here, as items of a list.
+    /// Returns the missing parts of the report, as list items.
     pub(super) fn missing(&self, bus_figures: &[LinkId], motion: &Motion) -> Vec<&'static str> {
         let has_joints = bus_figures.iter().any(|it| it.joints.is_some());
         let compared = bus_figures.iter().any(|it| {
@@ -92,7 +92,7 @@ impl FramesOnly {
     }
 }
 
-/// Adds the sums of all buses before joints.
+/// Adds the sums of all buses before the joints.
 fn sums(at: f64, skin: &Skin, bus_figures: &[LinkId], motion: &mut Motion) {
     let mut torque = vec![0.0; motion.distributed.len()];
     let (mut contributing, mut active) = (0, Some(0));

@@ -7,9 +7,9 @@
 //!   metadata, /can/notes ────────────────┘
 //! ```
 //!
-//! Replies, losses and errors are not in a recording as numbers; the frames are. They go through the same
-//! [`Table`](model::table::Table) that the gateway had, and so come to the same accounts. The load of a
-//! real bus is that of `skinbus fit` for the same recording.
+//! A recording contains the frames, but no counts of replies, losses and errors. The frames pass through the same
+//! [`Table`](model::table::Table) as in the gateway, and so give the same accounts. The load of a real bus is that of
+//! `skinbus fit` for the same recording.
 
 mod bus_figures;
 mod frames_only;
@@ -36,17 +36,17 @@ use trace::capture::{
 use trace::recording::layout::Layout;
 use trace::ros2::read;
 
-/// Why there is no report.
+/// The error of a report.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ReportError {
-    /// It cannot be opened, or is something else.
+    /// The recording cannot be opened, or is something else.
     #[error(transparent)]
     Open(CaptureError),
-    /// It cannot be read.
+    /// The recording cannot be read.
     #[error(transparent)]
     Capture(#[from] CaptureError),
-    /// Frames alone, and no skin for them.
+    /// The capture has frames only, and no skin was given.
     #[error(
         "{name} is a log, and frames alone are not enough: name their skin with --skin; a recording, `skinbus run SKIN \
          --record run.mcap`, has it"
@@ -55,15 +55,15 @@ pub enum ReportError {
         /// Its name.
         name: String,
     },
-    /// Frames of which none can be reported.
+    /// The capture has only frames that cannot be reported.
     #[error("{name} {what}")]
     Frames {
         /// Its name.
         name: String,
-        /// What is wrong with it, as the rest of a sentence, and what to do.
+        /// The fault, as the rest of a sentence, with the remedy.
         what: String,
     },
-    /// The skin of the options is another than the recording's.
+    /// The skin in the options differs from the recording's.
     #[error("{name} was recorded with another skin")]
     OtherSkin {
         /// Its name.
@@ -71,7 +71,7 @@ pub enum ReportError {
         /// The skin that is attached to it.
         recorded: Box<Skin>,
     },
-    /// Of another program, or of nothing.
+    /// The recording is from another program, or is empty.
     #[error(
         "{name} holds no run: {what}; `skinbus run SKIN --record run.mcap` makes what a report needs{}",
         if *.has_skin { "" } else { ", and frames alone need their --skin" }
@@ -79,59 +79,59 @@ pub enum ReportError {
     Foreign {
         /// Its name.
         name: String,
-        /// What is missing.
+        /// The missing part.
         what: String,
         /// True if a skin was named.
         has_skin: bool,
     },
-    /// It ends before there is anything to report.
+    /// The recording ends before there is anything to report.
     #[error("{name} holds no run that can be shown: {what}")]
     Unfinished {
         /// Its name.
         name: String,
-        /// What is missing.
+        /// The missing part.
         what: String,
     },
-    /// Bit rates that CAN does not have.
+    /// The bit rates are not valid for CAN.
     #[error("{bus}: {source}; correct --nominal or --data")]
     Rates {
         /// The bus.
         bus: String,
-        /// Why.
+        /// The reason.
         source: BitRatesError,
     },
 }
 
-/// A report, and what of the recording is missing.
+/// A report, and the missing parts of its recording.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Report {
     /// Its contents.
     pub page: Page,
-    /// A sentence, when the recording is cut off or damaged.
+    /// A sentence, if the recording is cut off or damaged.
     pub missing: Option<String>,
-    /// Whether it is damaged, and the report of what stands before that.
+    /// True if the recording is damaged, so that the report covers only the part before the damage.
     pub is_damaged: bool,
-    /// What the recording is called.
+    /// Name of the recording.
     pub name: String,
-    /// What a capture of frames only lacks, and remarks on it: lines for standard error.
+    /// Missing parts of a capture with frames only, and remarks on it: lines for standard error.
     pub remarks: Vec<String>,
 }
 
-/// How a report is asked for.
+/// Options of a report.
 #[derive(Clone, Debug, Default)]
 pub struct Options {
-    /// The command, as the page has it.
+    /// The command, as shown on the page.
     pub command: String,
-    /// Bits in a second of all buses, in place of the skin's.
+    /// Nominal bit rate of all buses in bit/s, replacing the skin's.
     pub nominal: Option<u32>,
-    /// Bits in a second of FD frames' data, in place of the skin's.
+    /// Data bit rate of FD frames in bit/s, replacing the skin's.
     pub data: Option<u32>,
-    /// The skin of a capture of frames only, behind the name of its file.
+    /// The skin of a capture with frames only, and the name of its file.
     pub skin: Option<(String, Skin)>,
 }
 
 impl Options {
-    /// Where a bus' rates come from: the options' names, or the skin's key; none where they are common ones.
+    /// Returns the source of a bus' rates: the options' names, or the skin's key; `None` for defaults.
     fn origin(&self, bus: &Bus) -> Option<&'static str> {
         match (self.nominal, self.data, bus.bitrate) {
             (Some(_), Some(_), _) => Some("--nominal, --data"),
@@ -142,17 +142,18 @@ impl Options {
         }
     }
 
-    /// The bit rates that a bus' load is reckoned with.
+    /// Returns the bit rates for a bus' load.
     fn rates(&self, bus: &Bus) -> Result<Chosen, ReportError> {
         let rates = Requested { nominal: self.nominal, data: self.data }.of_bus(bus);
         rates.map_err(|source| ReportError::Rates { bus: bus.name.clone(), source })
     }
 }
 
-/// Reads a recording, or the parts of one, and makes a report.
+/// Reads a recording, or the parts of one, and creates its report.
 ///
 /// # Errors
-/// When it is no recording of a run, or has nothing in it; bit rates that CAN does not have.
+/// Returns [`ReportError`] if it is not a recording of a run, if it is empty, or if the bit rates are not valid for
+/// CAN.
 pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportError> {
     let (run, broken, is_damaged) = read(paths, options)?;
     let missing = broken.map(|why| run.missing(&why));
@@ -162,15 +163,15 @@ pub fn report(paths: &[PathBuf], options: &Options) -> Result<Report, ReportErro
     Ok(Report { page, missing, is_damaged, name: run.name, remarks })
 }
 
-/// Sees that these are recordings, without reading them.
+/// Checks that these files are recordings, without reading them.
 ///
 /// # Errors
-/// When they are not, or cannot be opened.
+/// Returns [`ReportError`] if they are not, or cannot be opened.
 pub fn check(paths: &[PathBuf], options: &Options) -> Result<(), ReportError> {
     open(paths, options).map(drop)
 }
 
-/// Opens a recording; also how long its files are, if that is known.
+/// Opens a recording; also returns the size of its files, if known.
 fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), ReportError> {
     let mut items = Reader::open_with_others(paths).map_err(ReportError::Open)?;
     let name = items.name().to_owned();
@@ -179,7 +180,7 @@ fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), R
     let bytes = paths.iter().map(bytes).sum::<Option<u64>>();
     if items.format() == Format::Candump && (options.skin.is_none() || bytes == Some(0)) {
         let empty = bytes == Some(0);
-        // A text of another kind would be refused with a skin too.
+        // A text of another kind would be refused with a skin, too.
         if bytes.is_some()
             && !items.has_frame()?
             && let Some((kind, hint)) = items.text_kind()
@@ -196,11 +197,11 @@ fn open(paths: &[PathBuf], options: &Options) -> Result<(Reader, Option<u64>), R
     Ok((items, bytes))
 }
 
-/// Reads it all; also why it has no proper end, if it has none, and whether that is damage.
+/// Reads the whole recording; also returns why it has no proper end, if so, and whether that is damage.
 fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bool), ReportError> {
     let (mut items, bytes) = open(paths, options)?;
     let name = items.name().to_owned();
-    // What stands before the first message is known when it is open, unless the file is damaged: that is the reason then.
+    // The header is known once the file is open, unless the file is damaged; then the damage is the reason.
     let begun = Run::begin(&name, bytes.unwrap_or(0), (items.format(), items.extras()), options);
     while begun.is_err() && items.extras().skin().is_none() && items.next_item()?.is_some() {}
     let mut run = begun?;
@@ -234,46 +235,46 @@ fn read(paths: &[PathBuf], options: &Options) -> Result<(Run, Option<String>, bo
     Ok((run, damaged.map(|error| error.to_string()).or(unfinished), is_damaged))
 }
 
-/// What a real bus would make of these buses.
+/// Creates the computation of real buses for these buses.
 fn shadow(skin: &Skin, bus_figures: &[LinkId]) -> Shadow {
-    let rates = Requested::default().rates().expect("common rates are possible");
+    let rates = Requested::default().rates().expect("the default rates are valid");
     let of_bus =
         bus_figures.iter().map(|bus_figures| (bus_figures.name.clone(), bus_figures.rates.rates)).collect();
     let options =
         shadow::Options { of_bus, each_frame: true, skin: Some(skin.clone()), ..shadow::Options::new(rates) };
-    Shadow::new(options).expect("no bit is damaged")
+    Shadow::new(options).expect("a bit-error rate of 0 is valid")
 }
 
-/// What a recording says, as far as it has been read.
+/// The content of a recording, as far as it has been read.
 #[derive(Debug)]
 struct Run {
     skin: Skin,
-    /// Its path, and of how many bytes.
+    /// Its path, and its size in bytes.
     name: String,
     bytes: u64,
-    /// By name, as the recording has them.
+    /// Metadata records by name.
     metadata: Vec<(String, Vec<(String, String)>)>,
     /// The topics of joints and of torques.
     topics: [String; 2],
-    /// Its files, in the order in which they were named.
+    /// Its files, in the given order.
     files: Vec<String>,
-    /// When the first message was, in ns since 1970.
+    /// Time of the first message, in ns since 1970.
     began: Option<u64>,
-    /// The time that seconds of commands count from, in s after the first message: the run's first tick, or the first frame.
+    /// The origin of seconds in commands, in s after the first message: the run's first tick, or the first frame.
     zero: Option<f64>,
-    /// When the loop began, in ns since 1970, if the recording says so.
+    /// Start of the loop, in ns since 1970, if the recording has it.
     run_began: Option<u64>,
     motion: Motion,
     bus_figures: Vec<LinkId>,
     shadow: Shadow,
-    /// Packets of any network that the kernel dropped on their way to sockets.
+    /// Packets of any network that the kernel dropped before they reached their sockets.
     backlog: u64,
-    /// Frames of buses that the skin does not have, and the name of the first of them.
+    /// Number of frames on buses that are not in the skin, and the name of the first such bus.
     others: u64,
     other_bus: Option<String>,
-    /// Messages that do not match the type of their topic.
+    /// Number of messages that do not match the type of their topic.
     unreadable: u64,
-    /// Of a capture without a loop.
+    /// The state of a capture without a loop.
     frames_only: Option<FramesOnly>,
     /// Remarks on a capture without a loop.
     remarks: Vec<String>,
@@ -367,7 +368,7 @@ impl Run {
                 }
             }
             Item::Entry(Entry::Note(note)) => self.note(note),
-            // Of a recording without its skin they are not read: what is said to be missing is.
+            // Without its skin, these are not read, and are reported as missing.
             Item::Other(other) if self.frames_only.is_none() => self.message(other),
             Item::Other(_) => {}
         }
@@ -401,12 +402,12 @@ impl Run {
         self.unreadable += u64::from(taken.is_err());
     }
 
-    /// Seconds since the first message.
+    /// Returns the seconds since the first message.
     fn seconds(&mut self, nanos: u64) -> f64 {
         seconds_since(*self.began.get_or_insert(nanos), nanos)
     }
 
-    /// Takes what it is now known of that a real bus would have carried it.
+    /// Adds the frames for which the load on a real bus is known now.
     fn carried(&mut self) {
         while let Some(frame) = self.shadow.poll() {
             let at = self.seconds(frame.nanos);
@@ -425,18 +426,18 @@ impl Run {
         }
     }
 
-    /// Whether joints were on a bus of a capture of frames only.
+    /// Returns true if a capture with frames only has joints.
     fn has_joints(&self) -> bool {
         self.frames_only.is_some() && self.bus_figures.iter().any(|bus_figures| bus_figures.joints.is_some())
     }
 
-    /// The parts that a capture of frames only lacks, as a list in words.
+    /// Returns the missing parts of a capture with frames only, as a list.
     fn lacking(&self) -> String {
         let missing = self.frames_only.as_ref().map(|it| it.missing(&self.bus_figures, &self.motion));
         missing.unwrap_or_default().join("; ")
     }
 
-    /// Why a capture of frames only cannot be reported, as the rest of a sentence.
+    /// Returns why a capture with frames only cannot be reported, as the rest of a sentence.
     fn unusable(&self, items: &Reader) -> Option<String> {
         if !items.has_times() {
             return Some(
@@ -463,19 +464,19 @@ impl Run {
         self.motion.counts.ticks == 0 && self.bus_figures.iter().all(|bus_figures| bus_figures.frames == 0)
     }
 
-    /// A value of the recording's metadata.
+    /// Returns a value of the recording's metadata.
     fn fact(&self, record: &str, key: &str) -> Option<&str> {
         let (_, facts) = self.metadata.iter().find(|(name, _)| name == record)?;
         facts.iter().find(|(name, _)| name == key).map(|(_, value)| value.as_str())
     }
 
-    /// What of a recording without its end is missing, in a sentence.
+    /// Returns a sentence about the missing part of a recording without its end.
     fn missing(&self, why: &str) -> String {
         let here = self.motion.seconds();
         let planned = self.fact("configuration", "duration_s").and_then(|text| text.parse::<f64>().ok());
         let lacks = planned.filter(|planned| *planned > here).map_or_else(String::new, |planned| {
             format!(" of the {planned} s that the run was to last: {:.2} s are missing", planned - here)
         });
-        format!("{why}. What is here holds {here:.2} s{lacks}")
+        format!("{why}. It covers {here:.2} s{lacks}")
     }
 }

@@ -1,23 +1,23 @@
-//! When something went wrong on a bus: replies late or missing, packets lost, cells that fell silent or restarted.
+//! The times of problems on a bus: late or missing replies, lost packets, cells that fell silent or restarted.
 
 use std::collections::VecDeque;
 
 use model::table::{Notice, Replies};
 use model::tracker::LATEST;
 
-/// Losses that follow each other within this time are one, in s.
+/// Maximum distance of losses that are joined into one, in s.
 const TOGETHER_S: f64 = 0.5;
-/// The most that are kept of each kind.
+/// Maximum number of entries of each kind that are kept.
 const KEPT: usize = 500;
 
-/// Losses that follow each other.
+/// Losses shortly after each other.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Loss {
-    /// From the first to the last epoch that lacked something, in s after the recording's first message.
+    /// The first and the last epoch with a loss, in s after the recording's first message.
     pub(super) seconds: (f64, f64),
     pub(super) late: u64,
     pub(super) missing: u64,
-    /// Packets of cells, by their own counts; found at the next heartbeat.
+    /// Lost packets of cells, by their own counts; found at the next heartbeat.
     pub(super) packets: u64,
 }
 
@@ -30,16 +30,17 @@ impl Loss {
 /// The losses and notices of one bus.
 #[derive(Debug, Default)]
 pub(super) struct Moments {
-    /// When the newest epochs were opened, newest first.
+    /// Start times of the newest epochs, newest first.
     opened: VecDeque<f64>,
     pub(super) losses: Vec<Loss>,
     pub(super) notices: Vec<(f64, Notice)>,
-    /// What is not kept.
+    /// Number of entries that were not kept.
     pub(super) further: u64,
 }
 
 impl Moments {
-    /// An epoch ends that was opened at this time; what has become late or missing in it, and packets found lost.
+    /// Records the end of an epoch that was opened at `at`: newly late and missing replies in it, and packets found
+    /// lost.
     pub(super) fn epoch(&mut self, at: f64, before: &Replies, now: &Replies, packets: u64) {
         self.opened.push_front(at);
         self.opened.truncate(LATEST + 1);
@@ -48,7 +49,7 @@ impl Moments {
         if late + missing + packets == 0 {
             return;
         }
-        // A reply is late for one of the epochs before, and missing when it can no longer come.
+        // A reply is late for one of the previous epochs, and missing once it can no longer arrive.
         let behind = if missing > 0 { LATEST } else { usize::from(late > 0) };
         let from = self.opened.get(behind).or_else(|| self.opened.back()).copied().unwrap_or(at);
         let is_full = self.losses.len() >= KEPT;
@@ -64,7 +65,7 @@ impl Moments {
         }
     }
 
-    /// What a table has to say.
+    /// Records a notice of a table.
     pub(super) fn notice(&mut self, at: f64, notice: Notice) {
         if self.notices.len() < KEPT {
             self.notices.push((at, notice));
@@ -73,7 +74,7 @@ impl Moments {
         }
     }
 
-    /// The loss with most of what a count names.
+    /// Returns the loss with the highest count.
     pub(super) fn worst(&self, of: impl Fn(&Loss) -> u64) -> Option<&Loss> {
         self.losses.iter().filter(|loss| of(loss) > 0).max_by_key(|loss| of(loss))
     }

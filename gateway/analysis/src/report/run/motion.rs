@@ -5,10 +5,10 @@ use model::quantiles::Times;
 use trace::ros2::read::{Joints, Torques};
 use trace::ros2::skin::LoopTiming;
 
-/// Changes of the loop that are named.
+/// Maximum number of changes of the loop that are listed.
 const TURNS: usize = 12;
 
-/// What the ticks said.
+/// The series and counts of all ticks.
 #[derive(Debug, Default)]
 pub(super) struct Motion {
     pub(super) position: Vec<Thinned>,
@@ -20,36 +20,36 @@ pub(super) struct Motion {
     pub(super) late: Timed,
     pub(super) took: Timed,
     pub(super) central_took: Timed,
-    /// Of ticks without a central computation.
+    /// Durations of ticks without a central computation.
     pub(super) plain: Times,
     pub(super) counts: Counts,
-    /// Active cells of all ticks with a central computation together, and these ticks.
+    /// Sum of active cells over all ticks with a central computation, and the number of these ticks.
     pub(super) active_sum: (u64, u64),
-    /// The first and the last tick, in s; of frames only, the first joints and the last frame.
+    /// The first and the last tick in s; for frames only, the first joints and the last frame.
     pub(super) first: Option<f64>,
     pub(super) last: f64,
-    /// When most ticks were skipped at once, and how many.
+    /// Time and size of the largest number of skipped ticks.
     pub(super) skip: Option<(f64, u64)>,
-    /// When what changed.
+    /// Changes of the loop, with their times.
     pub(super) turns: Vec<(f64, &'static str)>,
     number: Option<u64>,
     comparing: Option<bool>,
     halt: u8,
 }
 
-/// How many ticks were what.
+/// Counts of ticks.
 #[derive(Debug, Default)]
 pub(super) struct Counts {
     pub(super) ticks: u64,
     pub(super) skipped: u64,
-    /// Ticks that happened, by their numbers, and are not in the recording.
+    /// Ticks that happened, by their numbers, but are not in the recording.
     pub(super) unrecorded: u64,
     pub(super) bad: u64,
     pub(super) halted: u64,
     pub(super) refused: u64,
 }
 
-/// A length of time in each tick: a line in µs, and all of them.
+/// A duration in each tick: a line in µs, and a histogram.
 #[derive(Debug, Default)]
 pub(super) struct Timed {
     pub(super) line: Thinned,
@@ -76,7 +76,7 @@ impl Motion {
 
     pub(super) fn torques(&mut self, at: f64, torques: &Torques) {
         push(&mut self.distributed, at, torques.distributed.iter().copied());
-        // Without a central computation the line has a gap.
+        // Without a central computation, the line has a gap.
         push(&mut self.central, at, torques.central.iter().copied().chain(std::iter::repeat(f64::NAN)));
         let compared = !torques.central.is_empty();
         self.active.push(at, if compared { torques.active.into() } else { f64::NAN });
@@ -117,14 +117,14 @@ impl Motion {
         }
     }
 
-    /// From the first tick to the last, in s.
+    /// Returns the time from the first tick to the last, in s.
     pub(super) fn seconds(&self) -> f64 {
         self.first.map_or(0.0, |first| self.last - first)
     }
 }
 
 impl Counts {
-    /// Takes the next tick, behind one of this number.
+    /// Counts the next tick, after the tick with number `before`.
     fn take(&mut self, timing: &LoopTiming, before: Option<u64>) {
         self.ticks += 1;
         self.skipped = self.skipped.saturating_add(timing.skipped);

@@ -1,4 +1,4 @@
-//! What a run's report says, and in which order.
+//! The contents of a run's report, in order.
 
 mod arm;
 mod bus;
@@ -16,20 +16,20 @@ use crate::report::figure::{Axis, Figure, Finding, Mark, Page, Section, Series, 
 use crate::report::thin::Thinned;
 use model::table::{Accuracy, Cell, Uplink};
 
-/// The paper's cells, control loop and broadcasts.
+/// The paper's number of cells, control loop rate and broadcast rate.
 const PAPER_CELLS: f64 = 253.0;
 const PAPER_CONTROL_HZ: f64 = 500.0;
 const PAPER_BROADCAST_HZ: f64 = 62.5;
-/// The paper's law of the central computation (Eq. 29 and 30), in µs: of each active cell, of each cell, of none.
+/// The paper's law of the central computation (Eq. 29 and 30), in µs: per active cell, per cell, and fixed.
 const PAPER_CENTRAL_US: [f64; 3] = [0.798, 0.827, 10.7];
 
-/// Stuck cells that are named.
+/// Maximum number of stuck cells that are listed.
 const NAMED: usize = 10;
 
-/// What a page is made of.
+/// The inputs of a page.
 struct Draft<'a> {
     run: &'a Run,
-    /// When the loop began, or joints did where only frames are, in s after the recording's first message.
+    /// Start of the loop, or of the joints in a capture with frames only, in s after the recording's first message.
     zero: f64,
 }
 
@@ -40,7 +40,7 @@ pub(super) fn page(run: &Run, command: &str, missing: Option<&str>) -> Page {
         None => intro_of_run(run),
     };
     if let Some(missing) = missing {
-        intro = format!("Not all of the run is here: {missing}. {intro}");
+        intro = format!("The run is incomplete: {missing}. {intro}");
     }
     let mut sections = vec![draft.summary(), draft.skin()];
     if run.motion.counts.ticks > 0 || run.has_joints() {
@@ -94,7 +94,7 @@ impl Draft<'_> {
         Series::new(caption, Shape::Line, self.points(thinned))
     }
 
-    /// A figure of the page's width over the time of the run.
+    /// Creates a figure of full width over the time of the run.
     fn figure(&self, name: impl Into<String>, title: impl Into<String>, y: Axis) -> Figure {
         Figure::new(name, title, self.time(), y)
     }
@@ -113,7 +113,7 @@ impl Draft<'_> {
         if self.run.bus_figures.len() > 1 { bus_figures.name.clone() } else { String::new() }
     }
 
-    /// All numbers that the paper has too, and what must hold.
+    /// Creates the section with all numbers that the paper has, too, and with the requirements.
     fn summary(&self) -> Section {
         let (skin, motion) = (&self.run.skin, &self.run.motion);
         let mut findings = Vec::new();
@@ -174,7 +174,7 @@ impl Draft<'_> {
         let accounts = self.run.bus_figures.iter().map(LinkId::account);
         let (due, in_time) = accounts.fold((0, 0), |sum, one| (sum.0 + one.due, sum.1 + one.in_time));
         if due > 0 {
-            let what = format!("replies not there before the next joints, of {due} that were due");
+            let what = format!("replies not received before the next joints, of {due} due");
             let period = 1.0 / skin.timing.broadcast_hz();
             let bar = format!("none after {}", quantity(period, "s"));
             let late = due - in_time;
@@ -189,12 +189,12 @@ impl Draft<'_> {
         findings.push(lost.look(self.worst_loss(|loss| loss.packets)));
         findings.extend(self.stuck());
         Section::new("summary", "In numbers").findings(findings).text(
-            "Beside the paper's numbers (Efficient Distributed Torque Computation for Large Scale Robot Skin). Within \
-             5 % of the paper's, a number is the same. A command shows the recording where the number is worst.",
+            "Compared with the paper (Efficient Distributed Torque Computation for Large Scale Robot Skin). Numbers within \
+             5 % of the paper's count as the same. The commands show the recording where a number is worst.",
         )
     }
 
-    /// Cells that sent the same words while they should have sent others; `None` without any.
+    /// Returns the finding of cells that sent constant words while the expected words changed; `None` without any.
     fn stuck(&self) -> Option<Finding> {
         let cells = self.run.bus_figures.iter().flat_map(|bus_figures| {
             let name = |cell: &Cell| {
@@ -208,30 +208,33 @@ impl Draft<'_> {
         let cells: Vec<_> = cells.collect();
         let more = if cells.len() > NAMED { ", and others" } else { "" };
         let named: Vec<_> = cells.iter().take(NAMED).map(String::as_str).collect();
-        let what = format!("stuck cells, which should have sent other words ({}{more})", named.join("; "));
+        let what = format!(
+            "stuck cells, which sent constant words while others were due ({}{more})",
+            named.join("; ")
+        );
         (!cells.is_empty()).then(|| none(what, cells.len() as u64))
     }
 
-    /// A sentence that names a part which only a recording of a run has; `None` in one.
+    /// Returns a sentence about a part that only a recording of a run has; `None` for such a recording.
     fn lacks(&self, what: &str) -> Option<String> {
         let frames_only = self.run.frames_only.as_ref()?;
         Some(format!("Not in {}: {what}.", frames_only.noun))
     }
 
-    /// The command for the loss with most of what a count names.
+    /// Returns the command that shows the loss with the highest count.
     fn worst_loss(&self, of: impl Fn(&Loss) -> u64) -> Option<String> {
         let all = self.run.bus_figures.iter().filter_map(|bus_figures| bus_figures.moments.worst(&of));
         all.max_by_key(|loss| of(loss)).map(|loss| self.look(loss.seconds.0))
     }
 }
 
-/// A figure without series that have no point; none where there is nothing to show.
+/// Removes series without points; returns `None` if nothing is left.
 fn shown(mut figure: Figure) -> Option<Figure> {
     figure.series.retain(|series| series.points.iter().any(|(x, y)| x.is_finite() && y.is_finite()));
     (!figure.series.is_empty()).then_some(figure)
 }
 
-/// What must not be there at all.
+/// Creates a finding whose count must be zero.
 fn none(what: String, count: u64) -> Finding {
     Finding::stated(what, count as f64).must("none", count == 0).from("default")
 }

@@ -1,46 +1,46 @@
-//! Which cell of a bus was touched when, and with how much, in bounded memory: times in equal bins, which become twice as
-//! wide when there are too many, with the largest force in each.
+//! The touches of the cells of a bus, with time and force, in bounded memory: the largest force in equal bins of time,
+//! which double in width when there are too many.
 
 use std::collections::BTreeMap;
 
 use protocol::skin::Skin;
 
-/// The most bins, and how wide one is at first, in s.
+/// Maximum number of bins, and their initial width in s.
 const BINS: usize = 600;
 const BIN_S: f64 = 0.016;
-/// Touches of which the details are kept.
+/// Maximum number of touches with details.
 const TOUCHES: usize = 2_000;
 
-/// A time in which some cell of a link was in contact.
+/// A time span with contact on some cell of a link.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Touch {
     /// The row that carries the cells, from 1.
     pub(super) row: u8,
-    /// From and to, in s after the recording's first message.
+    /// Start and end, in s after the recording's first message.
     pub(super) seconds: (f64, f64),
-    /// Cells in it, by their places on the bus.
+    /// The cells in contact, by index on the bus.
     pub(super) cells: Vec<usize>,
-    /// The cell with the largest force, and that force in N.
+    /// The cell with the largest force, and this force in N.
     pub(super) strongest: (usize, f64),
 }
 
-/// The cells of one bus.
+/// The touches of the cells of one bus.
 #[derive(Debug)]
 pub(super) struct Touched {
-    /// By place on the bus: the row that carries it.
+    /// By index of the cell on the bus: the row that carries it.
     rows: Vec<u8>,
     width: f64,
-    /// Largest forces in N by bin, of cells that were touched.
+    /// Largest forces in N by bin, for touched cells.
     bins: BTreeMap<usize, Vec<f64>>,
-    /// The largest force of each cell, in N; `None` while it is not known.
+    /// The largest force of each cell, in N; `None` while unknown.
     pub(super) max: Vec<Option<f64>>,
-    /// Forces since the last joints, and when those were.
+    /// Forces since the last joints, and the time of those joints.
     now: Vec<f64>,
     at: Option<f64>,
-    /// By row.
+    /// Open touches by row.
     open: BTreeMap<u8, Touch>,
     pub(super) touches: Vec<Touch>,
-    /// Touches beyond those.
+    /// Number of touches beyond those with details.
     pub(super) further: u64,
 }
 
@@ -60,7 +60,7 @@ impl Touched {
         }
     }
 
-    /// New joints stand on the bus, and these are the forces on its cells since then, in N, where they are known.
+    /// Records new joints on the bus with the forces on its cells since then, in N, where known.
     pub(super) fn joints(&mut self, at: f64, forces: impl Iterator<Item = Option<f64>>) {
         self.until(at);
         self.at = Some(at);
@@ -111,7 +111,7 @@ impl Touched {
         }
     }
 
-    /// The forces that were there last have been there until now.
+    /// Extends the last forces to the time `at`.
     #[expect(
         clippy::cast_possible_truncation,
         clippy::cast_sign_loss,
@@ -137,14 +137,14 @@ impl Touched {
         }
     }
 
-    /// No more joints follow.
+    /// Ends all open touches.
     pub(super) fn finish(&mut self) {
         let Some(at) = self.at else { return };
         let rows: Vec<_> = self.open.keys().copied().collect();
         rows.into_iter().for_each(|row| self.end(row, at));
     }
 
-    /// Cells that were touched, by place: where from and to in s, and the largest force there in N.
+    /// Returns the touched cells by index: start and end of each bin in s, and the largest force in it in N.
     pub(super) fn cells(&self) -> impl Iterator<Item = (usize, Vec<(f64, f64, f64)>)> + '_ {
         self.bins.iter().map(|(place, bins)| {
             let place_of = |at: usize| at as f64 * self.width;
@@ -165,7 +165,7 @@ mod tests {
         Touched::new(&skin, 0)
     }
 
-    /// Forces by place; all others are 0.
+    /// Records joints with forces by index of the cell; all others are 0.
     fn joints(touched: &mut Touched, at: f64, forces: &[(usize, f64)]) {
         let cells = touched.rows.len();
         let force = |place| forces.iter().find(|(of, _)| *of == place).map_or(0.0, |(_, force)| *force);

@@ -1,4 +1,4 @@
-//! Draws cells: over time, and where they are.
+//! Draws strips and maps of cells.
 
 use std::fmt::Write as _;
 
@@ -9,22 +9,22 @@ use super::super::scale::Span;
 use super::colour::{LEVELS, TRACK, colours, level};
 use super::{FAINT, INK, LETTERS, dark, natural};
 
-/// A letter's mean width.
+/// Mean width of a letter.
 const LETTER: f64 = 0.56 * LETTERS;
-/// From a drawing's edge to what is in it.
+/// Margin of a drawing.
 const EDGE: f64 = 12.0;
-/// The height of the legend with the space below it.
+/// Height of the legend, with the space below it.
 const LEGEND: f64 = 52.0;
-/// The height of a panel's or a group's heading.
+/// Height of the heading of a panel or group.
 const HEADING: f64 = 24.0;
-/// From one cell's middle to the next one's, at most.
+/// Maximum distance between the centres of adjacent cells.
 const PITCH: f64 = 18.0;
-/// By how much neighbouring areas cover each other, so that no seam is seen.
+/// Overlap of adjacent areas, which hides seams.
 const SEAM: f64 = 0.3;
-/// Of a link with one cell, in m.
+/// Distance of cells for a link with one cell, in m.
 const ALONE_M: f64 = 0.028;
 
-/// A file of its own.
+/// Draws a standalone SVG file.
 #[must_use]
 pub fn draw(drawing: &Drawing) -> String {
     let style = format!("<style>{}</style>\n", dark());
@@ -34,7 +34,7 @@ pub fn draw(drawing: &Drawing) -> String {
     document(drawing, (width.into(), height), &attributes, &format!("{style}{body}"))
 }
 
-/// A part of a page that has the rules of [`dark()`], `width` pixels wide when the page shows it as it is.
+/// Draws a part of a page that contains the rules of [`dark()`]; `width` is the natural width in pixels.
 #[must_use]
 pub fn inline(drawing: &Drawing, width: u32, class: &str) -> String {
     let (height, body) = body(drawing, width.into());
@@ -49,7 +49,7 @@ fn document(drawing: &Drawing, (width, height): (f64, f64), attributes: &str, bo
     )
 }
 
-/// The drawing's height and its elements.
+/// Returns the drawing's height and its elements.
 fn body(drawing: &Drawing, width: f64) -> (f64, String) {
     let mut out = String::new();
     let height = match drawing {
@@ -59,7 +59,7 @@ fn body(drawing: &Drawing, width: f64) -> (f64, String) {
     (height.ceil(), out)
 }
 
-/// Where a text stands at its place.
+/// The alignment of a text.
 #[derive(Clone, Copy)]
 enum Anchor {
     Start,
@@ -95,7 +95,7 @@ fn track(out: &mut String, path: &str) {
     let _ = writeln!(out, "<path class=\"track\" fill=\"{paper}\" d=\"{path}\"/>");
 }
 
-/// Areas by their level, each level in one element.
+/// Areas by their level; each level becomes one element.
 #[derive(Default)]
 struct Levels([String; LEVELS]);
 
@@ -116,7 +116,7 @@ fn rectangle(path: &mut String, (x, y): (f64, f64), (width, height): (f64, f64))
     let _ = write!(path, "M{x:.1} {y:.1}h{width:.1}v{height:.1}h-{width:.1}z");
 }
 
-/// The colours with what they stand for, at the top.
+/// Draws the legend of the colours at the top.
 fn legend(out: &mut String, legend: &Legend, width: f64) {
     let bar = (width * 0.4).min(260.0);
     let left = EDGE + LETTER * legend.caption.chars().count() as f64 + 14.0;
@@ -178,12 +178,12 @@ fn strip_of(out: &mut String, strip: &Strip, width: f64) -> f64 {
 /// A panel's cells and its size, in m.
 struct Sheet<'a> {
     panel: &'a Panel,
-    /// The smallest place, and from it to the largest one.
+    /// The smallest coordinates, and the extent.
     from: [f64; 2],
     size: [f64; 2],
-    /// From a cell to the nearest one, half of them nearer.
+    /// Median distance from a cell to its nearest neighbour.
     pitch: f64,
-    /// Which way the nearest ones lie, modulo 60 degrees.
+    /// Mean direction of the nearest neighbours, modulo 60 degrees.
     turn: f64,
 }
 
@@ -208,7 +208,7 @@ impl<'a> Sheet<'a> {
         };
         let (mut x, y) = (ends(|[x, _]| x), ends(|[_, y]| y));
         if let Some(radius) = panel.radius {
-            // All the way round.
+            // A cylinder covers the full circumference.
             x = (-core::f64::consts::PI * radius, core::f64::consts::PI * radius);
         }
         let (from, size) = ([x.0, y.0].map(|at| at - pitch * 0.6), [x.1 - x.0, y.1 - y.0]);
@@ -221,7 +221,7 @@ fn map_of(out: &mut String, map: &Map, width: f64) -> f64 {
     let sheets: Vec<_> = map.panels.iter().filter(|panel| !panel.cells.is_empty()).map(Sheet::new).collect();
     let max = |of: &dyn Fn(&Sheet<'_>) -> f64| sheets.iter().map(of).fold(f64::MIN_POSITIVE, f64::max);
     let pitch = sheets.iter().map(|sheet| sheet.pitch).fold(f64::INFINITY, f64::min);
-    // Pixels for a metre, the same for all links.
+    // Scale in pixels per metre, the same for all links.
     let scale = (PITCH / pitch).min((width - 2.0 * EDGE - 50.0) / max(&|sheet| sheet.size[0]));
     let (mut x, mut y, mut height) = (EDGE, LEGEND, 0.0_f64);
     for sheet in &sheets {
@@ -236,7 +236,7 @@ fn map_of(out: &mut String, map: &Map, width: f64) -> f64 {
     y + height
 }
 
-/// One link; how high it is with its heading and its axis.
+/// Draws one link; returns its height including heading and axis.
 fn panel_of(out: &mut String, sheet: &Sheet<'_>, legend: &Legend, (x, y): (f64, f64), scale: f64) -> f64 {
     words(out, (x, y + 14.0), Anchor::Start, false, &sheet.panel.title);
     let (left, top) = (x + 44.0, y + HEADING);
@@ -258,7 +258,7 @@ fn panel_of(out: &mut String, sheet: &Sheet<'_>, legend: &Legend, (x, y): (f64, 
         path.push('z');
         hexagon(out, cell.value, legend, &cell.caption, &path);
     }
-    // Along the link in cm, about it in degrees.
+    // The axes show cm along the link, and degrees around it.
     let step = if high > 120.0 { 0.1 } else { 0.05 };
     let length = sheet.size[1] - sheet.pitch * 1.2;
     let first = sheet.from[1] + sheet.pitch * 0.6;

@@ -1,10 +1,10 @@
-//! The colours of values: cividis (Nuñez, Anderton and Renslow, *Optimizing colormaps with consideration for color vision
-//! deficiency*, 2018), which readers see in one order whatever colours they can tell apart. High values are far from the
-//! ground: dark on paper, light on a dark screen.
+//! The colours of values: cividis (Nuñez, Anderton and Renslow, *Optimizing colormaps with consideration for color
+//! vision deficiency*, 2018), whose order all readers can see, with any kind of colour vision. High values contrast
+//! with the background: dark on paper, light on a dark screen.
 
 use std::fmt::Write as _;
 
-/// How many colours there are.
+/// Number of colours.
 pub(super) const LEVELS: usize = 16;
 
 /// Cividis at equal distances.
@@ -21,10 +21,10 @@ const CIVIDIS: [[f64; 3]; 10] = [
     [254.0, 232.0, 56.0],
 ];
 
-/// What lies below cells and rows on paper, and on a dark screen.
+/// The background of cells and rows, on paper and on a dark screen.
 pub(super) const TRACK: [&str; 2] = ["#EBEDEF", "#26292E"];
 
-/// A colour from 0 to 1.
+/// Returns a colour for a position from 0 to 1.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 9, and 0 to 255")]
 fn cividis(place: f64) -> String {
     let at = place.clamp(0.0, 1.0) * (CIVIDIS.len() - 1) as f64;
@@ -38,20 +38,20 @@ fn cividis(place: f64) -> String {
     text
 }
 
-/// Of a level from 0: its colour on paper, and on a dark screen.
+/// Returns the colours of a level, from 0, on paper and on a dark screen.
 pub(super) fn colours(level: usize) -> [String; 2] {
     let part = level as f64 / (LEVELS - 1) as f64;
     [cividis(1.0 - part), cividis(0.2 + 0.8 * part)]
 }
 
-/// The level of a value above 0, of which `max` is the largest.
+/// Returns the level of a value above 0 that is at most `max`.
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "0 to 15")]
 pub(super) fn level(value: f64, max: f64) -> usize {
     let part = (value / max).clamp(0.0, 1.0) * LEVELS as f64;
     (part.ceil() as usize).clamp(1, LEVELS) - 1
 }
 
-/// The rules of a dark screen.
+/// Adds the CSS rules for a dark screen.
 pub(super) fn dark(rules: &mut String) {
     let [_, track] = TRACK;
     let _ = write!(rules, ".track{{fill:{track}}}");
@@ -65,7 +65,7 @@ pub(super) fn dark(rules: &mut String) {
 mod tests {
     use super::*;
 
-    /// Of a colour, as in the sRGB standard.
+    /// Returns the relative luminance of a colour, by the sRGB standard.
     fn luminance(colour: &str) -> f64 {
         let part = |at: usize| f64::from(u8::from_str_radix(&colour[at..at + 2], 16).unwrap()) / 255.0;
         let [r, g, b] = [1, 3, 5].map(|at| part(at).powf(2.2));

@@ -18,7 +18,7 @@ fn line(points: &[(f64, f64)]) -> Series {
     Series::new("a \"line\" & more", Shape::Line, points.to_vec())
 }
 
-/// The lines of a class, as places in units.
+/// Returns the lines of a class, as positions in units.
 fn lines<'a>(document: &'a Document<'_>, class: &'a str) -> Vec<Vec<(f64, f64)>> {
     let of_class =
         |node: &Node<'_, '_>| node.has_tag_name((SVG, "polyline")) && node.attribute("class") == Some(class);
@@ -44,7 +44,7 @@ fn values_stand_where_the_axes_say() {
     let (width, height) = natural(Size::Wide);
     assert!(left > 0.0 && right < f64::from(width) * f64::from(UNIT));
     assert!(top > 0.0 && bottom < f64::from(height) * f64::from(UNIT));
-    // A tick's words stand at its value.
+    // The label of a tick is at its value.
     let words: Vec<_> = document.descendants().filter(|node| node.has_tag_name((SVG, "text"))).collect();
     let at = |word: &str, axis: &str| {
         let node = words.iter().find(|node| node.text().unwrap().trim() == word).unwrap();
@@ -72,7 +72,7 @@ fn what_lies_outside_is_truncated_at_the_edge_and_a_gap_is_a_gap() {
     for (x, y) in beyond[..2].concat() {
         assert!((left..=right).contains(&x) && (top - 1.0..=bottom + 1.0).contains(&y), "{x} {y}");
     }
-    // From -3 to 3 in 5 s, it comes in at -1 after 5/3 s.
+    // From -3 to 3 in 5 s, it crosses -1 after 5/3 s.
     let into = left + (right - left) / 6.0;
     assert!((beyond[0][0].0 - into).abs() <= 2.0, "{beyond:?} {into}");
     assert_eq!(gap.len(), 2 + 1, "{gap:?}");

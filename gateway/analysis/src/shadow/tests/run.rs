@@ -1,4 +1,4 @@
-//! A shadow of a run: start-up and operation, what only a bench sends, which cells answered, and what fits.
+//! Tests of a whole run: start-up and operation, bench-only frames, answering cells, and the fit.
 
 use super::super::*;
 use crate::fit::traffic::BenchFrames;
@@ -13,10 +13,10 @@ use protocol::message::{
 use protocol::packet::{Epoch, WORDS};
 
 const MS: u64 = 1_000_000;
-/// When runs begin.
+/// The start time of runs.
 const BEGIN: u64 = 1_700_000_000_000_000_000;
 
-/// A run that is made up, frame by frame, of buses of a format.
+/// A constructed run, frame by frame, on buses of a format.
 struct Run {
     format: Format,
     frames: Vec<(u64, Frame)>,
@@ -60,7 +60,7 @@ impl Run {
         self.frames.extend(frames.map(|frame| (self.now, frame)));
     }
 
-    /// Address claims and configuration of all cells at once: more than a bus can carry for a while.
+    /// Sends address claims and configuration of all cells at once: more than a bus can carry for a while.
     fn start(&mut self, cells: i64) {
         for node in 1..=cells {
             self.say(&heartbeat(node, State::CLAIMING));
@@ -76,7 +76,7 @@ impl Run {
         self.now += 2 * MS;
     }
 
-    /// The answers to a report.
+    /// Sends a report command and its answers.
     fn report(&mut self, cells: i64) {
         for node in 1..=cells {
             self.say(&page(node, NetworkPage::Heard(Heard::default())));
@@ -86,7 +86,7 @@ impl Run {
         }
     }
 
-    /// Joints and what answers them.
+    /// Sends joints and their answers.
     fn epoch(&mut self, answering: i64) {
         let joints = Joints { in_use: 6, ..Joints::default() };
         self.say(&Message::Joints { epoch: self.epoch, joints });
@@ -103,7 +103,7 @@ impl Run {
         (0..epochs).for_each(|_| self.epoch(answering));
     }
 
-    /// Stimuli of every epoch, and the end of a bench.
+    /// Sends the stimuli of every epoch, and the end of a bench.
     fn bench(&mut self, epochs: u32, cells: i64) {
         for _ in 0..epochs {
             (1..=cells).for_each(|node| self.say(&stimulus(node)));
@@ -180,7 +180,7 @@ fn start_up_stands_apart_and_what_follows_is_as_in_a_capture_that_begins_in_the_
         assert_eq!(shadow.stretches.count, 0);
         let answering = shadow.answering.unwrap();
         assert_eq!((answering.epochs, answering.most, answering.cells), (130, 20, 100));
-        // From the middle on: with an answer before the first joints, with joints at once, with joints soon.
+        // Captures from the middle on: with an answer before the first joints, with joints at once, with joints soon.
         for from in [joints + 5, joints, joints + 21] {
             let middle = Run { frames: whole.frames[from..].to_vec(), ..Run::new(format) };
             let shadow = middle.shadow(options());
@@ -216,7 +216,7 @@ fn a_second_run_in_one_capture_starts_up_again_and_time_without_joints_is_not_op
     run.operate(100, 10);
     let shadow = run.shadow(options());
     let start_up = shadow.start_up.unwrap();
-    // A second after the last joints counts as operation still.
+    // The second after the last joints still counts as operation.
     assert!((start_up.duration_s - (0.402 * 2.0 + 59.016)).abs() < 1e-6, "{start_up:?}");
     let operation = 100.0 * 0.016 + 99.0 * 0.016 + 0.001 + 1.0 - 0.016;
     assert!((shadow.operation_s - operation).abs() < 0.002, "{}", shadow.operation_s);
@@ -273,7 +273,7 @@ fn an_answer_that_was_ready_too_late_for_any_bus_does_not_count_for_the_verdict(
     let verdict = |after: u64| {
         let mut run = Run::new(Format::Fd);
         run.operate(20, 4);
-        // One cell answers later than the others, just before the next joints or a little earlier.
+        // One cell answers later than the others, just before the next joints or slightly earlier.
         run.epoch(0);
         let (next, epoch) = (run.now, Epoch(run.epoch.0 - 1));
         run.now = next - 16 * MS + after;
@@ -293,7 +293,7 @@ fn an_answer_that_was_ready_too_late_for_any_bus_does_not_count_for_the_verdict(
 
 #[test]
 fn another_protocol_is_counted_in_full_whatever_it_looks_like() {
-    // Identifiers of stimuli, sync and report; among many that are none, some that are sound packets.
+    // Identifiers of stimuli, sync and report: many random frames, and some valid packets.
     let mut run = Run::new(Format::Fd);
     for step in 0..3_000_u64 {
         let id = [0x701, 0x002, 0x004, 0x4FF][usize::try_from(step % 4).unwrap()];
@@ -312,7 +312,7 @@ fn another_protocol_is_counted_in_full_whatever_it_looks_like() {
         (3_012, 0, true)
     );
     assert_eq!(shadow.this_run.unwrap().case(), "this capture");
-    // Classic frames of some car.
+    // Classic frames as in a car.
     let mut run = Run::new(Format::Classic);
     for step in 0..3_000_u32 {
         let frame =

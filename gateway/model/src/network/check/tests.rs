@@ -1,4 +1,4 @@
-//! Networks are damaged at random; each damage is named, and nothing else.
+//! Random damage to networks: each damage is reported, and nothing else.
 
 use std::collections::VecDeque;
 
@@ -20,7 +20,7 @@ fn serial(node: CellId) -> u32 {
 /// The hash of every cell's configuration.
 const HASH: u16 = 0x1234;
 
-/// A skin whose cells' ports name these, the first a root.
+/// Returns a skin whose cells have these neighbours at their ports; the first cell is a root.
 fn skin(neighbors: &[[usize; PORTS]]) -> Skin {
     let head = crate::testing::SKIN.replace("reply = \"torque\"", "reply = \"sum\"\nslot_us = 100");
     let (head, one) = head.split_at(head.find("[[cell]]").unwrap());
@@ -38,12 +38,12 @@ fn skin(neighbors: &[[usize; PORTS]]) -> Skin {
 struct Truth {
     wires: Wires,
     cells: usize,
-    /// From which end to which end messages pass.
+    /// From each end, the end at which its messages arrive.
     leads: BTreeMap<End, End>,
     dead: BTreeSet<CellId>,
     beats: BTreeMap<CellId, Heartbeat>,
     versions: BTreeMap<CellId, u16>,
-    /// Cells at which nothing else may be damaged.
+    /// Cells that must not be damaged again.
     touched: BTreeSet<CellId>,
     expected: BTreeSet<Difference>,
 }
@@ -138,7 +138,7 @@ impl Truth {
                 }
             }
             5 => {
-                // A plug in the wrong port of the right cell.
+                // Move a plug to a wrong port of the right cell.
                 let Some((a, b)) = wire(at) else { return };
                 let Some(wrong) = self.free_port(b.cell) else { return };
                 if self.touch(&[a.cell, b.cell]) {
@@ -205,7 +205,7 @@ impl Truth {
         (self.leads.get(&other) == Some(&end) && ours(end.cell) && ours(other.cell)).then_some(other)
     }
 
-    /// The tree as cells would make it, breadth first.
+    /// Returns the tree that cells would build, breadth first.
     fn trees(&self) -> BTreeMap<CellId, Tree> {
         let mut trees = BTreeMap::new();
         let mut next = VecDeque::from([(cell(1), Tree { parent: Some(0), up: 4, ..Tree::default() })]);
@@ -229,7 +229,7 @@ impl Truth {
             let mut ports = [PortState::default(); PORTS];
             for (port, state) in ports.iter_mut().enumerate() {
                 let end = End { cell, port };
-                // A port receives where a cell sends towards it.
+                // A port receives if a cell sends towards it.
                 let from = self.leads.iter().find(|(from, to)| **to == end && self.sends(from.cell));
                 let Some((from, _)) = from else { continue };
                 *state = PortState {
@@ -271,7 +271,7 @@ impl Truth {
     }
 }
 
-/// Wirings in which every cell has a route to the first.
+/// Generates wirings in which every cell has a route to the first.
 fn wiring() -> impl Strategy<Value = Vec<[usize; PORTS]>> {
     let parents = proptest::collection::vec(any::<Index>(), 1..14);
     let more = proptest::collection::vec((any::<Index>(), any::<Index>()), 0..10);

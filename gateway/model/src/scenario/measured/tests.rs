@@ -7,7 +7,7 @@ use crate::testing::SKIN;
 
 const EPOCHS_PER_S: u64 = 62;
 
-/// Three cells in a row, wired one to the next.
+/// Returns a skin with three cells in a row, wired one to the next.
 fn three() -> Skin {
     let cell = SKIN.get(SKIN.find("[[cell]]").unwrap()..).unwrap();
     let at = |node: u8, neighbors: &str| {
@@ -26,7 +26,7 @@ fn touches(text: &str) -> Touches {
     Touches::new(&Scenario::parse("s.toml", text, &skin).unwrap(), &skin)
 }
 
-/// What cells read in N, at a time.
+/// Returns the forces that cells read at a time, in N.
 fn read(touches: &Touches, seconds: f64) -> [f64; 3] {
     #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "a few seconds")]
     let epoch = (seconds * 62.5) as u64;

@@ -1,9 +1,9 @@
-//! Touches that begin again after a period.
+//! Touches that repeat with a period.
 
 use super::*;
 use protocol::message::SkinSensors;
 
-/// Epochs of the shortest period that holds all touches of the good scenario, at 62.5 epochs a second.
+/// Number of epochs of the shortest period that holds all touches of the good scenario, at 62.5 epochs per second.
 const SHORTEST: u64 = 225;
 
 fn repeating(seconds: f64, more: &str) -> Scenario {
@@ -11,7 +11,7 @@ fn repeating(seconds: f64, more: &str) -> Scenario {
     Scenario::parse("s.toml", &format!("{text}{more}"), &three()).unwrap()
 }
 
-/// A period of so many epochs, in s.
+/// Returns the length of this number of epochs, in s.
 fn seconds(epochs: u64) -> f64 {
     Span(epochs * 16_000).seconds()
 }
@@ -55,7 +55,7 @@ fn motion_modes_and_faults_do_not_begin_again() {
     let drift = "[[fault]]\nat_s = 0.0\nkind = \"drift\"\ncells = [3]\nn_per_s = 0.01\n";
     let (repeating, once) =
         (repeating(5.0, drift), Scenario { touches_repeat: None, ..repeating(5.0, drift) });
-    // At the seam the joints are as fast as everywhere else.
+    // The joints move continuously across the end of a period.
     for at_s in [4.999, 5.0, 5.001, 9.999, 10.0] {
         let [state, before] = [at_s, at_s - 1e-3].map(|at_s| repeating.motion.state_at(at_s).unwrap());
         assert_eq!(Some(state), once.motion.state_at(at_s));
@@ -81,7 +81,7 @@ proptest! {
         prop_assert_eq!(again.sensors(cell, epoch), again.sensors(cell, epoch + period));
     }
 
-    /// All changes together give the words of every cell in every period, also when epochs were skipped.
+    /// All changes together give the words of every cell in every period, even with skipped epochs.
     #[test]
     fn changes_add_up_over_periods(steps in proptest::collection::vec(1_u64..300, 1..40)) {
         let endless = "[[touch]]\nat_s = 2.9\ncells = [2]\nforce_n = 1.0\n";

@@ -1,26 +1,27 @@
-//! An outsider that may own a node id when the owner is silent.
+//! An outsider that may own a node id if the owner is silent.
 //!
 //! | before | heartbeat of an outsider | next |
 //! |---|---|---|
 //! | none | any | first of its counter |
-//! | so many of a counter | goes on with it, 100 ms later or more | one more of it |
-//! | so many of a counter | sooner, or with another counter | first of its counter |
+//! | n of a counter | continues the counter, at least 100 ms later | n + 1 of it |
+//! | n of a counter | sooner, or with another counter | first of its counter |
 //!
-//! A heartbeat of the owner, or of a start that is believed, ends the candidacy. The candidate succeeds an owner that is
-//! silent if it has just started, or with the third heartbeat of its counter.
+//! A heartbeat of the owner, or an accepted start, ends the candidacy. The candidate succeeds a silent owner if it has
+//! just started, or with the third heartbeat of its counter.
 
 use protocol::time::Span;
 
 use super::life::Life;
 
-/// Heartbeats whose counter goes on that show a start without its claim, on an id that two senders used.
+/// Number of heartbeats with a continuous counter that prove a start without its claim, on an id that two senders have
+/// used.
 const SHOWN_BY: u8 = 3;
 
-/// A cell's heartbeats are a quarter of a second apart. Old ones that are sent again in the order of their counters, by
-/// chance, come much sooner.
+/// Minimum interval of a cell's heartbeats, which are 250 ms apart. Old heartbeats that happen to be repeated in order
+/// arrive much faster.
 const PACE: Span = Span::from_millis(100);
 
-/// An outsider: its last heartbeat, and how many there were whose counter goes on.
+/// An outsider: its last heartbeat, and the number of heartbeats with a continuous counter.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) struct Candidate {
     last: Life,
@@ -35,7 +36,7 @@ impl Candidate {
         Self { last: new, shown }
     }
 
-    /// Returns whether it owns the id from its last heartbeat on.
+    /// Returns true if it owns the id from its last heartbeat on.
     pub(super) fn succeeds(&self, owner: Option<&Life>) -> bool {
         let is_silent = owner.is_none_or(|owner| !owner.is_alive(self.last.at));
         is_silent && (self.last.has_just_started() || self.shown >= SHOWN_BY)

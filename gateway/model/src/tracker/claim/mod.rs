@@ -1,4 +1,4 @@
-//! The address claim of one node id: the cell that owns it, and whether a heartbeat is of a cell that has restarted.
+//! The address claim of one node id: its owner, and the detection of restarts from heartbeats.
 //!
 //! ```text
 //!   heartbeat ──> [Ownership] ── Outsider ──> [Candidate]
@@ -7,8 +7,8 @@
 //!                   └─> Word
 //! ```
 //!
-//! [`ownership`] has the states, what a heartbeat can show, and the table of both; [`candidate`] has the same of an
-//! outsider that may own the id when its owner is silent; [`life`] compares a heartbeat with one start of a cell.
+//! [`ownership`] has the states, the evidence of heartbeats, and their transition table; [`candidate`] has those of an
+//! outsider that may own the id if its owner is silent; [`life`] compares a heartbeat with one life of a cell.
 
 mod candidate;
 mod life;
@@ -23,47 +23,48 @@ use candidate::Candidate;
 use life::Life;
 use ownership::{Evidence, Ownership};
 
-/// What a heartbeat of a node id means.
+/// The meaning of a heartbeat for its node id.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub enum Word {
-    /// The first one of the cell that has the id; when it started is not known.
+    /// The first heartbeat of the owner, whose start was not observed.
     First,
-    /// A further one of the cell that has the id.
+    /// A further heartbeat of the owner.
     Known,
-    /// An old one of that cell, or its last one again: it tells nothing new.
+    /// An old heartbeat of the owner, or its last one again, without new information.
     Overtaken,
-    /// The first one since the cell started.
+    /// The first heartbeat since the cell started.
     Started {
-        /// Whether the cell, or another one that had the id before, sent something before that.
+        /// True if the cell, or an earlier owner of the id, sent packets before.
         again: bool,
     },
-    /// Of the sender that had the id before, which goes on: two use it in turn, and what seemed a start was none.
+    /// A heartbeat of the previous owner, which continues: two senders use the id in turn, and the apparent start was
+    /// none.
     Shared,
-    /// Of another sender, while the cell that has the id is alive: after two used it in turn, or when no cell can have
-    /// sent so much since that one was heard.
+    /// A heartbeat of another sender while the owner is alive: after two senders used the id in turn, or with a counter
+    /// that no cell can have reached since the owner's last heartbeat.
     Outsider,
-    /// Another cell claims the id, and will give up the claim.
+    /// A claim by another cell, which will give it up.
     Claimant,
 }
 
-/// The address claim of one node id: which cell has it.
+/// The address claim of one node id.
 ///
-/// A cell is identified by its serial number. While it claims the id it yields to a cell that has it already, so a
-/// claim of a settled cell's id does not change that cell's state.
+/// A cell is identified by its serial number. A claiming cell yields to a cell that owns the id already, so a claim of
+/// a settled cell's id does not change that cell's state.
 ///
-/// A heartbeat is not signed, and old ones may be sent again. So a start is believed at once, and taken back when the
-/// counter before it goes on; from then on a start is believed only of an id whose cell is silent.
+/// Heartbeats are not authenticated, and old ones may be repeated. So a start is accepted at once, and taken back if
+/// the counter before it continues; after that, a start is accepted only if the owner is silent.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub struct Claim {
     ownership: Ownership,
-    /// The outsider that sent the last heartbeat, unless one of the owner's came since.
+    /// The outsider that sent the last heartbeat, unless the owner has sent one since.
     candidate: Option<Candidate>,
-    /// Serial number of the last owner before this one that was another cell.
+    /// Serial number of the last owner that was another cell than the current one.
     previous: Option<u32>,
 }
 
 impl Claim {
-    /// Takes a heartbeat of this node id, which came at `at`. This is the one place that detects a restart.
+    /// Records a heartbeat of this node id that arrived at `at`. Only this function detects restarts.
     pub fn hear(&mut self, at: Micros, heartbeat: &Heartbeat) -> Word {
         let new = Life::new(at, heartbeat);
         let (mut next, mut word) = self.ownership.next(self.ownership.evidence(&new), new);
@@ -86,36 +87,36 @@ impl Claim {
         word
     }
 
-    /// Whether a start that was heard may still be taken back.
+    /// Returns true if an accepted start may still be taken back.
     pub(super) fn is_in_question(&self, at: Micros) -> bool {
         self.ownership.former().is_some_and(|former| former.may_go_on(at))
     }
 
-    /// The last heartbeat of the cell that has the id, or is the first one to claim it.
+    /// Returns the last heartbeat of the cell that owns the id, or of the first one to claim it.
     #[must_use]
     pub fn heartbeat(&self) -> Option<Heartbeat> {
         self.ownership.owner().map(|owner| owner.heartbeat)
     }
 
-    /// The serial number of that cell.
+    /// Returns the serial number of that cell.
     #[must_use]
     pub fn serial(&self) -> Option<u32> {
         self.ownership.owner().map(|owner| owner.heartbeat.serial)
     }
 
-    /// The serial number of the cell that had the id before that one, or claimed it.
+    /// Returns the serial number of the previous owner or claimant.
     #[must_use]
     pub const fn previous(&self) -> Option<u32> {
         self.previous
     }
 
-    /// Whether that cell reports this state.
+    /// Returns true if that cell reports this state.
     #[must_use]
     pub fn says(&self, state: State) -> bool {
         self.ownership.owner().is_some_and(|owner| owner.heartbeat.state.has(state))
     }
 
-    /// Whether a cell has the id, and so answers.
+    /// Returns true if a cell owns the id, and so answers.
     #[must_use]
     pub fn is_settled(&self) -> bool {
         self.ownership.owner().is_some_and(Life::is_settled)

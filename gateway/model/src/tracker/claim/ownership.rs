@@ -1,4 +1,4 @@
-//! The owner of a node id as a state machine: states, what a heartbeat shows, and the table of both.
+//! The owner of a node id as a state machine: states, evidence of heartbeats, and the transition table.
 //!
 //! ```text
 //!            Claims,               Intrudes, Starts,
@@ -12,82 +12,83 @@
 //!                          └───────── FormerContinues ───────┘
 //! ```
 //!
-//! Each row is a row of the tests beside this file, which go through all states and all evidence. *Former* is the life
-//! before a start that may be taken back; it *may go on* for 10 s after its last heartbeat.
+//! Each row is a row of the tests, which go through all states and all evidence. *Former* is the life before a start
+//! that may be taken back; it *may go on* for 10 s after its last heartbeat.
 //!
 //! | row | state | evidence | next | word | why |
 //! |---|---|---|---|---|---|
 //! | `first_claim` | `Free` | `Claims` | `Sole` | `Started`, not again | a cell claims its id for half a second after a start, and at no other time |
-//! | `found` | `Free` | `Settles` | `Sole` | `First` | it started before anybody listened |
-//! | `other_claim` | all others | `Claims` | the same | `Claimant` | a claimant yields to the cell that has the id, or that claimed it first |
-//! | `claimant_lost` | all others | `Settles` | the same, new owner | `First` | the owner only claimed the id, and did not get it |
-//! | `old` | all others | `Repeats` | the same | `Overtaken` | it shows nothing that its successor did not |
-//! | `next` | all others | `Continues` | the same, newer owner | `Known` | the counter fits the owner, and no better the former |
-//! | `away` | `Sole`, `Doubted` | `Returns` | the same, newer owner | `Known` | after 10 s nothing is known of how much it sent; its serial number is the owner's |
-//! | `start` | `Sole` | `Intrudes`, `Starts`, `Jumps`, `Succeeds` | `Doubted`, former: the owner | `Started` again | a start is believed at once |
-//! | `further_start` | `Doubted`, former may go on | `Intrudes`, `Starts`, `Jumps`, `Succeeds` | `Doubted`, former: as before | `Started` again | two old heartbeats in turn hide no cell that goes on |
-//! | `start_after_former` | `Doubted`, former may not | `Intrudes`, `Starts`, `Jumps`, `Succeeds` | `Doubted`, former: the owner | `Started` again | of what may be taken back only the owner is left |
+//! | `found` | `Free` | `Settles` | `Sole` | `First` | it started before the reader |
+//! | `other_claim` | all others | `Claims` | the same | `Claimant` | a claimant yields to the owner, or to an earlier claimant |
+//! | `claimant_lost` | all others | `Settles` | the same, new owner | `First` | the owner only claimed the id, and lost the claim |
+//! | `old` | all others | `Repeats` | the same | `Overtaken` | it adds nothing to its successor |
+//! | `next` | all others | `Continues` | the same, newer owner | `Known` | the counter fits the owner at least as well as the former |
+//! | `away` | `Sole`, `Doubted` | `Returns` | the same, newer owner | `Known` | after 10 s its counter cannot be predicted; its serial number is the owner's |
+//! | `start` | `Sole` | `Intrudes`, `Starts`, `Jumps`, `Succeeds` | `Doubted`, former: the owner | `Started` again | a start is accepted at once |
+//! | `further_start` | `Doubted`, former may go on | `Intrudes`, `Starts`, `Jumps`, `Succeeds` | `Doubted`, former: as before | `Started` again | two old heartbeats in turn must not hide a cell that goes on |
+//! | `start_after_former` | `Doubted`, former may not | `Intrudes`, `Starts`, `Jumps`, `Succeeds` | `Doubted`, former: the owner | `Started` again | only the owner can still go on |
 //! | `impossible` | `Sole`, `Doubted` | `Exceeds` | the same | `Outsider` | neither the owner nor a cell that started since can have sent so much |
-//! | `taken_back` | `Doubted`, `Inherited` | `FormerContinues` | `Shared` | `Shared` | what seemed a start was an old heartbeat, or another cell's with this id |
-//! | `outsider` | `Shared`, `Inherited` | `Intrudes`, `Starts`, `Jumps`, `Returns`, `Exceeds` | the same | `Outsider` | a start is not believed while the owner is alive: once is enough |
-//! | `successor` | `Shared` | `Succeeds` | `Inherited`, former: the owner | `Started` again | the owner is silent, and the candidate shows that it is alive |
+//! | `taken_back` | `Doubted`, `Inherited` | `FormerContinues` | `Shared` | `Shared` | the apparent start was an old heartbeat, or that of another cell with this id |
+//! | `outsider` | `Shared`, `Inherited` | `Intrudes`, `Starts`, `Jumps`, `Returns`, `Exceeds` | the same | `Outsider` | after one false start, no start is accepted while the owner is alive |
+//! | `successor` | `Shared` | `Succeeds` | `Inherited`, former: the owner | `Started` again | the owner is silent, and the candidate is alive |
 //! | `further_successor` | `Inherited`, former may go on | `Succeeds` | `Inherited`, former: as before | `Started` again | as `further_start` |
 //! | `successor_after_former` | `Inherited`, former may not | `Succeeds` | `Inherited`, former: the owner | `Started` again | as `start_after_former` |
-//! | `incomparable` | `Free`; `Sole`, `Shared` | all but `Claims`, `Settles`; `FormerContinues` | the same | `Overtaken` | cannot come: there is no owner, no former to compare with |
+//! | `incomparable` | `Free`; `Sole`, `Shared` | all but `Claims`, `Settles`; `FormerContinues` | the same | `Overtaken` | impossible: the state has no owner or former to compare with |
 //!
-//! An id that was shared stays so: `Shared` and `Inherited` never become `Sole` again. Whether the owner has settled is
-//! no state: its last heartbeat says it.
+//! A shared id stays shared: `Shared` and `Inherited` never become `Sole` again. The owner's last heartbeat shows
+//! whether it has settled; this needs no state.
 
 use super::Word;
 use super::life::{LEAP, Life};
 
-/// The owner of a node id, and how sure it is.
+/// The owner of a node id, and its certainty.
 #[derive(Clone, Copy, Debug, Default, Eq, PartialEq)]
 pub(super) enum Ownership {
-    /// No heartbeat has come.
+    /// No heartbeat has arrived.
     #[default]
     Free,
-    /// One cell has the id, or is the first one to claim it.
+    /// One cell owns the id, or is the first one to claim it.
     Sole { owner: Life },
-    /// The owner seemed to start; the life before it may go on, and then that was no start.
+    /// The owner seems to have started; if the life before it goes on, that was not a start.
     Doubted { owner: Life, former: Life },
-    /// Two senders have used the id in turn: only a successor of a silent owner is believed.
+    /// Two senders have used the id in turn: only a successor of a silent owner is accepted.
     Shared { owner: Life },
     /// The owner succeeded a silent one of a shared id; the life before it may go on.
     Inherited { owner: Life, former: Life },
 }
 
-/// A fact that a heartbeat shows. [`Ownership::evidence`] returns the first that holds.
+/// A fact that a heartbeat proves. [`Ownership::evidence`] returns the first that holds.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 pub(super) enum Evidence {
-    /// It has CLAIMING, and another serial number than the owner's or no owner to compare with.
+    /// It has CLAIMING, and another serial number than the owner, if there is one.
     Claims,
-    /// It has no CLAIMING, and another serial number than an owner that only claims the id, or no owner to compare with.
+    /// It does not have CLAIMING, and has another serial number than an owner that only claims the id, if there is one.
     Settles,
-    /// It is of another serial number than a settled owner's, or its counter is not the owner's; the former's goes on to
-    /// it. If both counters go on to it: the owner's claim was heard and cannot be over; or it was not heard, and the
-    /// former's counter is nearer.
+    /// The former's counter continues with it, and either its serial number differs from a settled owner's, or its
+    /// counter does not fit the owner. If both counters continue with it: the owner's claim was received and cannot be
+    /// over; or it was not received, and the former's counter is nearer.
     FormerContinues,
-    /// It is of another cell that has settled, as the owner has.
+    /// It is from another settled cell, while the owner is settled.
     Intrudes,
     /// It is the owner's first packet after a start.
     Starts,
-    /// It is the owner's last one again, or an older one. Of an owner whose claim was not heard: or the former's.
+    /// It is the owner's last one again, or an older one. If the owner's claim was not received, it may also be the
+    /// former's.
     Repeats,
-    /// The owner's counter goes on to it.
+    /// The owner's counter continues with it.
     Continues,
-    /// The owner was away for more than 10 s, and its counter is ahead of where it was.
+    /// The owner was away for more than 10 s, and its counter is ahead of its last one.
     Returns,
-    /// It is of a life that has sent more than any cell that started since the owner's last heartbeat.
+    /// Its counter is larger than that of any cell that started since the owner's last heartbeat.
     Exceeds,
-    /// Its counter is neither the owner's nor the former's: a cell whose claim was lost, or an old heartbeat.
+    /// Its counter fits neither the owner nor the former: a cell whose claim was lost, or an old heartbeat.
     Jumps,
-    /// An outsider owns the id now, by what [`super::candidate`] knows of it. No single heartbeat shows this.
+    /// An outsider now owns the id, by the rules of [`super::candidate`]. A single heartbeat cannot prove this.
     Succeeds,
 }
 
 impl Ownership {
-    /// The cell that has the id, or claims it.
+    /// Returns the cell that owns the id, or claims it.
     pub(super) const fn owner(&self) -> Option<&Life> {
         match self {
             Self::Free => None,
@@ -98,7 +99,7 @@ impl Ownership {
         }
     }
 
-    /// The life before the owner's start, by which that may be taken back.
+    /// Returns the life before the owner's start, which may disprove that start.
     pub(super) const fn former(&self) -> Option<&Life> {
         match self {
             Self::Doubted { former, .. } | Self::Inherited { former, .. } => Some(former),
@@ -106,7 +107,7 @@ impl Ownership {
         }
     }
 
-    /// The same state with another owner.
+    /// Returns the state with another owner.
     const fn with_owner(self, owner: Life) -> Self {
         match self {
             Self::Free => Self::Free,
@@ -117,12 +118,12 @@ impl Ownership {
         }
     }
 
-    /// The same state after the owner's next heartbeat.
+    /// Returns the state after the owner's next heartbeat.
     fn with_last(self, last: Life) -> Self {
         self.owner().map_or(self, |owner| self.with_owner(owner.with_last(last)))
     }
 
-    /// Returns the fact that a heartbeat shows; `new` is the life that would begin with it.
+    /// Returns the fact that a heartbeat proves; `new` is the life that would begin with it.
     pub(super) fn evidence(&self, new: &Life) -> Evidence {
         let Some(owner) = self.owner() else {
             return if new.is_settled() { Evidence::Settles } else { Evidence::Claims };
@@ -159,15 +160,15 @@ impl Ownership {
         }
     }
 
-    /// Returns whether a counter that is `own` ahead of the owner's and `its` ahead of the former's is rather the
-    /// former's.
+    /// Returns true if a counter that is `own` ahead of the owner's and `its` ahead of the former's more likely belongs
+    /// to the former.
     fn is_formers(&self, new: &Life, own: u16, its: u16) -> bool {
         let is_alive = self.former().is_some_and(|former| former.is_alive(new.at));
         its < own && (is_alive || own > LEAP && its < own / 8)
     }
 
-    /// Returns the state after a heartbeat that shows this, and what the heartbeat means; `new` is the life that would begin
-    /// with it. The rows of the table are named beside the arms.
+    /// Returns the state after a heartbeat with this evidence, and the heartbeat's meaning; `new` is the life that
+    /// would begin with it. The arms name the rows of the table.
     pub(super) fn next(self, evidence: Evidence, new: Life) -> (Self, Word) {
         use Evidence as E;
         const AGAIN: Word = Word::Started { again: true };

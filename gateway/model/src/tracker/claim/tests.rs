@@ -2,12 +2,12 @@ use super::*;
 
 const AGAIN: Word = Word::Started { again: true };
 
-/// A heartbeat every 100 ms.
+/// Returns the meanings of heartbeats that are 100 ms apart.
 fn words(said: &[(u32, u16, State)]) -> Vec<Word> {
     words_at(said.iter().zip(0..).map(|(&(serial, sent, state), at)| (at * 100, serial, sent, state)))
 }
 
-/// At times in ms.
+/// Returns the meanings of heartbeats at times in ms.
 fn words_at(said: impl IntoIterator<Item = (u64, u32, u16, State)>) -> Vec<Word> {
     let mut claim = Claim::default();
     let hear = |(ms, serial, sent, state)| {
@@ -61,7 +61,7 @@ fn a_restart_is_a_claim_or_a_counter_that_falls_back() {
     assert_eq!(words(&[(7, 900, settled), (7, 1, settled)]), [Word::First, AGAIN], "its claim was lost");
     assert_eq!(words(&[(7, 900, settled), (7, 771, settled)]), [Word::First, AGAIN]);
     assert_eq!(words(&[(7, 900, settled), (7, 772, settled)]), [Word::First, Word::Overtaken]);
-    // A cell that wins when two claim at once sends a heartbeat, still claiming.
+    // A cell that wins against another claimant sends a heartbeat while still claiming.
     assert_eq!(words(&[(7, 0, claims), (7, 1, claims)]), [started, Word::Known]);
 }
 
@@ -92,7 +92,7 @@ fn old_heartbeats_that_are_sent_again_take_a_living_cells_id_once_at_most() {
     // Its own counter is at 900, an old one at 100.
     let said = [(0, 7, 900, settled), (50, 7, 100, settled), (250, 7, 916, settled), (300, 7, 116, settled)];
     assert_eq!(words_at(said), [Word::First, AGAIN, shared, outsider]);
-    // Two old ones before its next one, then a start.
+    // Two old heartbeats before its next one, then a start.
     let said = [
         (0, 7, 900, settled),
         (10, 7, 100, settled),
@@ -104,14 +104,14 @@ fn old_heartbeats_that_are_sent_again_take_a_living_cells_id_once_at_most() {
     ];
     let expected = [Word::First, AGAIN, known, shared, outsider, outsider, known];
     assert_eq!(words_at(said), expected);
-    // A claim of a cell that has hardly sent anything: its next heartbeat comes before the claim can end.
+    // A claim of a cell that has hardly sent anything: its next heartbeat arrives before the claim can end.
     let said = [(0, 7, 9, settled), (60, 7, 0, claims), (250, 7, 12, settled)];
     assert_eq!(words_at(said), [Word::First, AGAIN, shared]);
     // A counter that is ahead.
     let said =
         [(0, 7, 900, settled), (10, 7, 9_000, settled), (250, 7, 916, settled), (260, 7, 9_020, settled)];
     assert_eq!(words_at(said), [Word::First, outsider, known, outsider]);
-    // The cell is gone; whoever has its id then is believed.
+    // The cell is gone; the next cell with its id is accepted.
     let said = [(0, 7, 900, settled), (10, 7, 100, settled), (250, 7, 916, settled), (900, 7, 0, claims)];
     assert_eq!(words_at(said), [Word::First, AGAIN, shared, AGAIN]);
 }
@@ -120,7 +120,7 @@ fn old_heartbeats_that_are_sent_again_take_a_living_cells_id_once_at_most() {
 fn a_cell_whose_bus_was_lost_goes_on_whatever_is_sent_again_meanwhile() {
     let (claims, settled) = (State::CLAIMING, State::default());
     let (shared, outsider, known) = (Word::Shared, Word::Outsider, Word::Known);
-    // Its id was contested before the bus was lost, or was not.
+    // The id was shared before the bus was lost, or was not.
     let said = [(0, 7, 916, settled), (10, 7, 100, settled), (250, 7, 932, settled)];
     let meanwhile = [(1_200, 7, 100, settled), (1_250, 7, 116, settled), (1_300, 7, 100, settled)];
     let after = [(1_750, 7, 940, settled), (2_000, 7, 956, settled)];
@@ -128,7 +128,7 @@ fn a_cell_whose_bus_was_lost_goes_on_whatever_is_sent_again_meanwhile() {
     assert_eq!(words_at(said.into_iter().chain(meanwhile).chain(after)), expected);
     let expected = [Word::First, AGAIN, known, Word::Overtaken, shared, known];
     assert_eq!(words_at([said[0]].into_iter().chain(meanwhile).chain(after)), expected);
-    // A cell that restarts with a contested id: its claim is heard while it seems alive, or later, or never.
+    // A cell restarts with a shared id: its claim is received while the owner seems alive, or later, or never.
     let starts = [(400, 7, 0, claims), (660, 7, 1, settled), (910, 7, 4, settled), (1_160, 7, 8, settled)];
     let expected = [Word::First, AGAIN, shared, outsider, outsider, AGAIN, known];
     assert_eq!(words_at(said.into_iter().chain(starts)), expected);
@@ -144,7 +144,7 @@ fn a_quick_restart_is_not_taken_for_an_old_heartbeat() {
             [(0, 7, sent, settled), (100, 7, 0, claims), (360, 7, 1, settled), (610, 7, sent + 1, settled)];
         assert_eq!(words_at(said), [Word::First, AGAIN, Word::Known, Word::Known], "{sent}");
     }
-    // A cell that has been away for long.
+    // A cell that has been away for a long time.
     assert_eq!(words_at([(0, 7, 900, settled), (60_000, 7, 30_000, settled)]), [Word::First, Word::Known]);
 }
 

@@ -1,4 +1,4 @@
-//! What the ticks and the cells' torques come to.
+//! The sections on the arm: figures from the ticks and from the cells' torques.
 
 use hdrhistogram::Histogram;
 
@@ -13,16 +13,16 @@ use model::table::{Accuracy, Errors};
 use protocol::fixed::TorqueFormat;
 use protocol::skin::{JointKind, Reply};
 
-/// The central computation rounds by less than this, in Nm: a smaller error is none.
+/// Upper bound of the central computation's rounding error, in Nm: smaller errors count as zero.
 const ROUNDING_NM: f64 = 1e-12;
 
-/// An error without the rounding of the computation that it is compared with.
+/// Sets errors within the rounding of the reference computation to zero.
 fn without_rounding(error: f64) -> f64 {
     if error.abs() < ROUNDING_NM { 0.0 } else { error }
 }
 
 impl Draft<'_> {
-    /// The paper's Fig. 6.
+    /// Creates the section that corresponds to the paper's Fig. 6.
     pub(super) fn torque(&self) -> Section {
         let joints = 0..self.run.skin.robot.joints.len();
         let (loaded, free): (Vec<_>, Vec<_>) = joints.partition(|joint| self.is_loaded(*joint));
@@ -43,8 +43,8 @@ impl Draft<'_> {
         let mut section = Section::new("torque", "Torque, and its difference from the central one");
         if !loaded.is_empty() {
             let when = if self.run.frames_only.is_some() { "before each joints" } else { "at each tick" };
-            section = section.text(format!("The upper curve is the sum of what has come {when}. The difference below it compares like with like, once \
-             an epoch: what all cells answered to these joints, less the central computation for them; an epoch without an \
+            section = section.text(format!("The upper curve is the sum of the torques received {when}. The lower curve is the \
+             difference, once per epoch, of all cells' answers to the same joints and the central computation for them; an epoch without an \
              answer in time is a gap. Dotted: one step of the torque words."));
             let is_compared = self.run.bus_figures.iter().any(|it| it.lines.error.count() > 0);
             let lacks = self
@@ -54,7 +54,7 @@ impl Draft<'_> {
         if !free.is_empty() {
             let names: Vec<_> = free.iter().map(|joint| self.joint(*joint)).collect();
             section = section.text(format!(
-                "No torque as large as half a step of the words, distributed or central, on {}.",
+                "Torques below the resolution (half a step of the words), distributed and central: {}.",
                 names.join(", ")
             ));
         }
@@ -65,7 +65,7 @@ impl Draft<'_> {
         section.figures(figures.chain(error)).tables(self.errors()).tables(self.formats())
     }
 
-    /// The buses whose cells may load a joint, each with the joint's place in its chain.
+    /// Returns the buses with cells that may load a joint, each with the joint's index in its chain.
     fn buses_of(&self, joint: usize) -> impl Iterator<Item = (usize, usize, &LinkId)> {
         self.run.bus_figures.iter().enumerate().filter_map(move |(bus, bus_figures)| {
             let place = self.run.skin.joints_of(bus).position(|(of_chain, _)| of_chain == joint)?;
@@ -73,7 +73,7 @@ impl Draft<'_> {
         })
     }
 
-    /// One step of the torque words of a bus, in Nm or N.
+    /// Returns one step of the torque words of a bus, in Nm or N.
     fn step(&self, bus: usize) -> f64 {
         let bus = self.run.skin.buses.get(bus);
         let format = bus.map_or_else(TorqueFormat::default, |bus| match bus.reply {
@@ -83,7 +83,7 @@ impl Draft<'_> {
         format.step()
     }
 
-    /// Whether a joint had any torque, to half a step of the words.
+    /// Returns true if a joint had a torque of at least half a step of the words.
     fn is_loaded(&self, joint: usize) -> bool {
         let step = self.buses_of(joint).map(|(bus, ..)| self.step(bus)).fold(f64::INFINITY, f64::min);
         let largest = |line: Option<&Thinned>| {
@@ -97,7 +97,7 @@ impl Draft<'_> {
         ticks.into_iter().chain(epochs).any(|line| largest(line) >= step * 0.5)
     }
 
-    /// The torque on one joint, and below it what that differs by.
+    /// Creates the figure of the torque on one joint, with the difference below.
     fn torque_of(&self, joint: usize) -> Figure {
         let name = self.joint(joint);
         let name =
@@ -125,7 +125,7 @@ impl Draft<'_> {
         figure.below(Below { y: Axis::new("difference", unit), series, marks })
     }
 
-    /// A joint as the skin's file names it; with its number where that is no part of the name.
+    /// Returns a joint's name in the skin's file, with its number unless the name contains it.
     fn joint(&self, index: usize) -> String {
         let number = index + 1;
         match self.run.skin.robot.joints.get(index) {
@@ -134,13 +134,13 @@ impl Draft<'_> {
         }
     }
 
-    /// The unit of torques on all joints together.
+    /// Returns the unit of torques over all joints.
     pub(super) fn torque_unit(&self) -> &'static str {
         let slides = self.run.skin.robot.joints.iter().any(|joint| joint.kind == JointKind::Prismatic);
         if slides { "Nm or N" } else { JointKind::Revolute.torque_unit() }
     }
 
-    /// Errors joint by joint.
+    /// Creates the table of errors by joint.
     fn errors(&self) -> Option<Table> {
         let skin = &self.run.skin;
         let mut by_joint = vec![[Errors::default(); 2]; skin.robot.joints.len()];
@@ -180,7 +180,7 @@ impl Draft<'_> {
         ))
     }
 
-    /// The paper's Fig. 7, and the positions.
+    /// Creates the section that corresponds to the paper's Fig. 7, with the positions.
     pub(super) fn motion(&self) -> Section {
         let motion = &self.run.motion;
         let figures = self.groups().into_iter().enumerate().flat_map(|(group, (kind, joints))| {
@@ -200,10 +200,14 @@ impl Draft<'_> {
         let (still, figures): (Vec<_>, Vec<_>) = figures.filter(is_there).partition(is_zero);
         let mut section = Section::new("motion", "The arm").figures(figures.into_iter().filter_map(shown));
         section.text.extend(no_velocity);
-        if still.is_empty() { section } else { section.text("What is not drawn here was 0 throughout.") }
+        if still.is_empty() {
+            section
+        } else {
+            section.text("Quantities that are not drawn were 0 throughout.")
+        }
     }
 
-    /// Joints that share a figure: those of one kind that a chain adds to the chains before it.
+    /// Groups the joints that share a figure: joints of one kind that a chain adds to the previous chains.
     fn groups(&self) -> Vec<(JointKind, Vec<usize>)> {
         let robot = &self.run.skin.robot;
         let mut rest: Vec<_> = (0..robot.joints.len()).collect();
@@ -224,7 +228,7 @@ impl Draft<'_> {
         let motion = &self.run.motion;
         let is_known = motion.active.count() > 0 && !self.lacks_forces();
         let active = if is_known { self.points(&motion.active) } else { Vec::new() };
-        let title = "Active cells: those whose torque is in the sum, and those that are in contact";
+        let title = "Active cells: cells in the torque sum, and cells in contact";
         let figure = self
             .figure("active-cells", title, Axis::new("cells", ""))
             .draw("in the torque", Shape::Steps, self.points(&motion.contributing))
@@ -243,10 +247,10 @@ impl Draft<'_> {
         }
     }
 
-    /// The paper's Fig. 8.
+    /// Creates the section that corresponds to the paper's Fig. 8.
     pub(super) fn cycle(&self) -> Section {
         let motion = &self.run.motion;
-        let lacks = "how long ticks and the central computation in them took, and how late they began";
+        let lacks = "the durations of ticks and of the central computation, and the lateness of ticks";
         if let Some(lacks) = self.lacks(lacks) {
             return Section::new("cycle", "Cycle times").text(lacks);
         }
@@ -256,7 +260,7 @@ impl Draft<'_> {
         };
         let took = [("tick", &motion.took.line), ("central computation in it", &motion.central_took.line)];
         let figures = [
-            figure("cycle", "How long each tick took, and the central computation in it", &took),
+            figure("cycle", "Duration of each tick, and of the central computation in it", &took),
             figure("lateness", "How late each tick began", &[("", &motion.late.line)]),
         ];
         let rows = [
@@ -281,13 +285,15 @@ impl Draft<'_> {
         }
         let head = ["", "median", "90 %", "99 %", "max", "values"];
         Section::new("cycle", "Cycle times")
-            .text("The distributed computation has no part in a tick: the sum is kept while replies come.")
+            .text(
+                "The distributed computation takes no time in a tick: the sum is updated as replies arrive.",
+            )
             .figures(figures.into_iter().filter_map(shown))
             .tables([Table::new("The control loop", head, rows)])
     }
 }
 
-/// Whether all that is drawn is 0.
+/// Returns true if all values of a figure are 0.
 fn is_zero(figure: &Figure) -> bool {
     figure.series.iter().flat_map(|series| &series.points).all(|(_, y)| y.abs() < 1e-9 || !y.is_finite())
 }

@@ -1,4 +1,4 @@
-//! What became of the cells' replies and packets, and what a real bus would carry.
+//! The sections on the buses: replies and packets of the cells, and the load of real buses.
 
 use super::super::bus_figures::{Latency, LinkId};
 use super::{Draft, shown};
@@ -11,7 +11,7 @@ use crate::shadow::BusShadow;
 use model::quantiles::Quantiles;
 use model::table::{Cell, Event};
 
-/// Cells in the table of the worst.
+/// Maximum number of cells in the table of the worst cells.
 const WORST: usize = 12;
 
 impl Draft<'_> {
@@ -58,7 +58,7 @@ impl Draft<'_> {
             [("late", &bus_figures.lines.late), ("missing", &bus_figures.lines.missing)],
         ];
         let mut figures = vec![steps("replies", "due and in time, epoch by epoch", y.clone(), due)];
-        figures.extend((lost > 0).then(|| steps("late", "late and missing, when that was settled", y, late)));
+        figures.extend((lost > 0).then(|| steps("late", "late and missing, when settled", y, late)));
         let slowest = self.figure(format!("slowest-{name}"), slowest, Axis::new("time", "ms"));
         let slowest = slowest.series([self.line("", &bus_figures.lines.slowest)]);
         figures.push(if lost > 0 { slowest } else { slowest.half() });
@@ -99,13 +99,13 @@ impl Draft<'_> {
         Table::new("Replies by bus", head, rows)
     }
 
-    /// Cells by what went wrong with them, and then by how slow they were.
+    /// Creates the table of cells, by their problems and then by their slowness.
     fn worst(&self) -> Option<Table> {
         let cells = self.run.bus_figures.iter().enumerate().flat_map(|(bus, bus_figures)| {
             let described = self.run.skin.cells_of(bus);
             bus_figures.table.cells().iter().zip(described).zip(&bus_figures.latency).map(
                 move |((cell, described), latency)| {
-                    // As the robot numbers it.
+                    // The robot's numbering of joints.
                     let joint =
                         self.run.skin.joints_of(bus).nth(usize::from(described.joint).saturating_sub(1));
                     (bus_figures, cell, joint.map_or(0, |(joint, _)| joint + 1), latency)
@@ -157,19 +157,20 @@ impl Draft<'_> {
         Some(Table::new(title, head, rows))
     }
 
-    /// A load in % from the first tick or joints on: before it cells start, all at once.
+    /// Returns a load in % from the first tick or joints on; before that, all cells start at once.
     pub(super) fn percent(&self, binned: &Binned) -> Vec<(f64, f64)> {
         let rates = binned.rates().into_iter().map(|(x, part)| (x - self.zero, part * 100.0));
         rates.filter(|(x, _)| *x >= 0.0).collect()
     }
 
-    /// What a real bus would have made of each bus that had frames.
+    /// Returns the timing of the real bus for each bus with frames.
     fn shadows(&self) -> impl Iterator<Item = BusShadow> {
         let buses = self.run.shadow.report().buses;
         buses.into_iter().filter(|bus| self.run.skin.bus_named(&bus.bus).is_some())
     }
 
-    /// Whether real buses would carry it: in this run, and at most. Only chosen rates are rated, not defaults.
+    /// Creates the findings on the fit of real buses, in this run and in the worst case. Only chosen bit rates are
+    /// rated, not defaults.
     pub(super) fn fits(&self) -> Vec<Finding> {
         let mut findings = Vec::new();
         let limits = format!("at most 100 %, replies before the next joints, {NODES} nodes");
@@ -189,26 +190,27 @@ impl Draft<'_> {
         findings
     }
 
-    /// What a real bus would carry.
+    /// Creates the section on the load of real buses.
     pub(super) fn load(&self) -> Section {
         let figure = |bus_figures: &LinkId| {
             let LinkId { name, load, load_of_all, rates, .. } = bus_figures;
             let (rates, width) = (rates.rates, quantity(load.width(), "s"));
             let title = format!("{name}: load of a real bus at {rates}, over {width} each");
             self.figure(format!("load-{name}"), title, Axis::new("load", "%"))
-                .draw("what a real bus would carry", Shape::Steps, self.percent(load))
-                .draw("with what only a bench sends", Shape::Dashed, stairs(&self.percent(load_of_all)))
-                .marks([Mark::y(100.0, "all that it can")])
+                .draw("load of a real bus", Shape::Steps, self.percent(load))
+                .draw("including bench-only frames", Shape::Dashed, stairs(&self.percent(load_of_all)))
+                .marks([Mark::y(100.0, "full load")])
         };
-        let text = "Here a frame took no time. On a real bus it takes that of its bits: counted with the stuff bits that its \
-                    own bits make. This run is rated by its second with the highest load; in the worst case all cells \
-                    answer, with the longest frames there can be. Stimuli, sync and report with their answers and simulated \
-                    wires exist on a bench only and are left out. Start-up, before the first joints, stands apart.";
+        let text = "On this bus a frame took no time. On a real bus it takes the time of its bits, including its stuff bits. \
+                    This run is rated by its second with the highest load; the worst case assumes that all cells answer \
+                    with the longest possible frames. Frames that only a bench sends are left out: stimuli, sync and \
+                    report with their answers, and simulated wires. Start-up, before the first joints, is shown separately.";
         let assumed = self.run.bus_figures.iter().any(|bus_figures| !bus_figures.rates.is_chosen);
         let mut section = Section::new("load", "Load of the buses").text(text);
         if assumed {
-            section = section
-                .text("The skin has no bit rates for every bus, so common ones are shown, for information.");
+            section = section.text(
+                "The skin does not give bit rates for every bus; common ones are shown for information.",
+            );
         }
         section
             .figures(self.run.bus_figures.iter().map(figure).filter_map(shown))
@@ -226,7 +228,7 @@ impl Draft<'_> {
         let has_loop = run.frames_only.is_none();
         if has_loop {
             row("ticks skipped by the loop".to_owned(), ticks.skipped, true);
-            row("ticks that happened and are not in the recording".to_owned(), ticks.unrecorded, true);
+            row("ticks missing from the recording".to_owned(), ticks.unrecorded, true);
         }
         row("bad cycles".to_owned(), ticks.bad, false);
         row("ticks while the robot was halted".to_owned(), ticks.halted, false);
@@ -235,15 +237,11 @@ impl Draft<'_> {
             let name = &bus_figures.name;
             let uplink = bus_figures.table.uplink();
             row(format!("{name}: frames recorded"), bus_figures.frames, true);
-            row(
-                format!("{name}: frames that are not in the recording, by its own notes"),
-                bus_figures.dropped,
-                true,
-            );
+            row(format!("{name}: frames lost by the recorder, by its own notes"), bus_figures.dropped, true);
             row(format!("{name}: packets that cells sent, by their own count"), uplink.sent, true);
             row(format!("{name}: of these lost"), uplink.lost, true);
             row(format!("{name}: of these refused"), uplink.rejected, false);
-            row(format!("{name}: starts of cells while it ran"), u64::from(uplink.restarts), false);
+            row(format!("{name}: restarts of cells during the run"), u64::from(uplink.restarts), false);
             for event in Event::ALL {
                 row(format!("{name}: {}", event.name()), bus_figures.table.counters().events(event), false);
             }
@@ -253,12 +251,12 @@ impl Draft<'_> {
         row("messages or lines that cannot be read".to_owned(), run.unreadable, false);
         let mut section = Section::new("losses", "Losses")
             .text("Rows of possible losses are always shown; other rows only when they are not 0.");
-        section.text.extend(self.lacks("ticks that the loop skipped, and bad cycles"));
+        section.text.extend(self.lacks("skipped ticks and bad cycles"));
         section.tables(self.lost()).tables([Table::new("All counts", ["what", "count"], rows)])
     }
 }
 
-/// What a bus would carry in operation and in start-up.
+/// Creates the table of a bus's load in operation and in start-up.
 fn carried(bus: &BusShadow) -> Table {
     let share = |share: Option<f64>| share.map_or_else(|| "?".to_owned(), percent);
     let mut rows = Vec::new();
@@ -280,20 +278,13 @@ fn carried(bus: &BusShadow) -> Table {
         row(["start-up", "", &share(start.load.mean), &second, &short, &frames]);
     }
     if bus.counts.bench.total() > 0 {
-        row([
-            "left out",
-            "",
-            "",
-            "",
-            "",
-            &format!("{} frames that only a bench sends", bus.counts.bench.total()),
-        ]);
+        row(["left out", "", "", "", "", &format!("{} bench-only frames", bus.counts.bench.total())]);
     }
     let head = ["", "verdict", "load on average", "in any second", "in any 16 ms", "what"];
-    Table::new(format!("{} at {}: does it fit", bus.bus, bus.name), head, rows)
+    Table::new(format!("Fit of {} at {}", bus.bus, bus.name), head, rows)
 }
 
-/// With one decimal.
+/// Rounds to one decimal.
 fn tenths(value: f64) -> f64 {
     (value * 10.0).round() / 10.0
 }

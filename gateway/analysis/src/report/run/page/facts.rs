@@ -1,14 +1,14 @@
-//! How a capture came about, and on what machine.
+//! The origin of a capture, and its machine.
 
 use super::super::Run;
 use crate::report::figure::quantity;
 
-/// A time in µs as the recording's metadata has it.
+/// Formats a time in µs from the recording's metadata.
 pub(super) fn micros(text: &str) -> String {
     text.parse().map_or_else(|_| text.to_owned(), |micros| quantity(micros, "µs"))
 }
 
-/// What it came about with, by name.
+/// Returns the facts about the capture, by name.
 pub(super) fn facts(run: &Run, command: &str) -> Vec<(String, String)> {
     if let Some(frames_only) = &run.frames_only {
         let began = frames_only.began.map(utc).map(|began| ("first frame", began));
@@ -49,7 +49,7 @@ pub(super) fn facts(run: &Run, command: &str) -> Vec<(String, String)> {
     facts.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))).collect()
 }
 
-/// A time in ns since 1970 as people write it (Hinnant's `civil_from_days`).
+/// Formats a time in ns since 1970 as UTC (Hinnant's `civil_from_days`).
 fn utc(nanos: u64) -> String {
     let seconds = nanos / 1_000_000_000;
     let (days, second) = (seconds / 86_400 + 719_468, seconds % 86_400);

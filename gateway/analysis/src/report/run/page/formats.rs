@@ -1,4 +1,4 @@
-//! Whether another torque format would have fitted a bus better.
+//! The comparison of torque formats for the torques of a bus.
 
 use model::table::Rounded;
 use protocol::fixed::TorqueFormat;
@@ -7,7 +7,7 @@ use super::super::bus_figures::LinkId;
 use super::Draft;
 use crate::report::figure::{Finding, Table, quantity};
 
-/// What the formats would have made of the torques on a bus.
+/// The rounding of the torques on a bus in all formats.
 struct Choice<'a> {
     bus: &'a str,
     used: TorqueFormat,
@@ -19,13 +19,13 @@ impl Choice<'_> {
         self.all.iter().find(|(it, _)| *it == format).map_or_else(Rounded::default, |(_, rounded)| *rounded)
     }
 
-    /// The finest format that holds every torque; the widest where none does.
+    /// Returns the finest format that holds every torque; the widest one if none does.
     fn best(&self) -> TorqueFormat {
         let holds = |(_, rounded): &&(TorqueFormat, Rounded)| rounded.beyond == 0;
         self.all.iter().find(holds).or_else(|| self.all.last()).map_or(self.used, |(format, _)| *format)
     }
 
-    /// What another format would have brought, and what it would have cost.
+    /// Returns the benefit and the cost of a better format.
     fn advice(&self) -> Option<String> {
         let (used, best) = (self.used, self.best());
         let beyond = self.of(used).beyond;
@@ -49,7 +49,7 @@ impl Choice<'_> {
 }
 
 impl Draft<'_> {
-    /// Of each bus whose torques were compared.
+    /// Returns the comparison for each bus with compared torques.
     fn choices(&self) -> impl Iterator<Item = Choice<'_>> {
         let buses = self.run.bus_figures.iter().zip(&self.run.skin.buses);
         buses.filter_map(|(LinkId { name, table, .. }, bus)| {
@@ -61,7 +61,7 @@ impl Draft<'_> {
         })
     }
 
-    /// Torques beyond the range of the format that the bus has.
+    /// Creates the findings of torques beyond the range of the bus' format.
     pub(super) fn beyond_range(&self) -> impl Iterator<Item = Finding> {
         self.choices().map(|choice| {
             let (bus, used) = (choice.bus, choice.used);
@@ -71,7 +71,7 @@ impl Draft<'_> {
         })
     }
 
-    /// Bus by bus, the format that would have fitted better.
+    /// Returns advice on better formats, by bus.
     pub(super) fn advice(&self) -> Option<String> {
         let all: Vec<_> = self.choices().filter_map(|choice| choice.advice()).collect();
         (!all.is_empty()).then(|| all.join(" "))

@@ -1,4 +1,4 @@
-//! Moments of the recording, each with the command that shows it.
+//! Tables of moments of the recording, each with the command that shows it.
 
 use model::table::Notice;
 
@@ -6,13 +6,13 @@ use super::super::moments::Loss;
 use super::Draft;
 use crate::report::figure::{Table, quantity};
 
-/// Rows of a table of moments.
+/// Maximum number of rows of a table of moments.
 const ROWS: usize = 25;
 
 /// The heading of such a table.
-const HEAD: [&str; 3] = ["at", "what", "look at it"];
+const HEAD: [&str; 3] = ["at", "what", "command"];
 
-/// A moment, how much it counts, and what was there.
+/// A moment, its weight, and its description.
 struct Moment {
     at: f64,
     weight: f64,
@@ -20,7 +20,7 @@ struct Moment {
 }
 
 impl Draft<'_> {
-    /// The command that shows the recording at a time, in s after its first message.
+    /// Returns the command that shows the recording at a time, in s after its first message.
     pub(super) fn look(&self, at: f64) -> String {
         let seconds = (at - self.run.zero.unwrap_or(0.0)).max(0.0);
         let files: Vec<_> = self.run.files.iter().map(|file| quoted(file)).collect();
@@ -28,7 +28,7 @@ impl Draft<'_> {
         format!("skinbus view {}{} --at {seconds:.3}", files.join(" "), skin.unwrap_or_default())
     }
 
-    /// Touches, link by link.
+    /// Creates the table of touches, by link.
     pub(super) fn touches(&self) -> Option<Table> {
         let skin = &self.run.skin;
         let mut all = Vec::new();
@@ -55,7 +55,7 @@ impl Draft<'_> {
         self.table("Touches, cells of a link together", all, further)
     }
 
-    /// Losses, and cells that fell silent, came back or restarted.
+    /// Creates the table of losses, and of cells that fell silent, came back or restarted.
     pub(super) fn lost(&self) -> Option<Table> {
         let mut all = Vec::new();
         let mut further = 0;
@@ -87,7 +87,7 @@ impl Draft<'_> {
         self.table("Moments of losses", all, further)
     }
 
-    /// Those that count most, by time.
+    /// Creates a table of the moments with the highest weights, by time.
     fn table(&self, title: &str, mut all: Vec<Moment>, further: u64) -> Option<Table> {
         if all.is_empty() {
             return None;
@@ -108,7 +108,7 @@ impl Draft<'_> {
     }
 }
 
-/// What was lost.
+/// Formats the counts of a loss.
 fn counts(loss: &Loss) -> String {
     let all =
         [(loss.late, "replies late"), (loss.missing, "replies missing"), (loss.packets, "packets lost")];
@@ -116,7 +116,7 @@ fn counts(loss: &Loss) -> String {
     all.collect::<Vec<_>>().join(", ")
 }
 
-/// A word for a shell.
+/// Quotes a word for a shell.
 fn quoted(word: &str) -> String {
     let is_plain = |letter: char| letter.is_ascii_alphanumeric() || "/._-+=:,@%".contains(letter);
     if !word.is_empty() && word.chars().all(is_plain) {

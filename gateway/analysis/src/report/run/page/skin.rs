@@ -1,4 +1,4 @@
-//! What the skin was touched with, over time and by place, and where replies and packets were lost.
+//! The section on the skin: touches over time and by position, and the cells with lost replies and packets.
 
 use std::collections::BTreeMap;
 
@@ -10,14 +10,14 @@ use crate::report::figure::{
     Drawing, Legend, Map, Panel, Section, Spot, Strip, StripGroup, StripRow, quantity,
 };
 
-/// Rows of the strip.
+/// Maximum number of rows of the strip.
 const ROWS: usize = 40;
 
 /// A link: a row of a chain, from 1.
 type Link = (usize, u8);
 
 impl Draft<'_> {
-    /// Which cells were touched when and with how much.
+    /// Creates the section on touches, with their times and forces.
     pub(super) fn skin(&self) -> Section {
         let section = Section::new("skin", "The skin");
         let forces = self.by_cell(|bus, place| {
@@ -27,9 +27,10 @@ impl Draft<'_> {
             let cell = self.run.bus_figures.get(bus)?.table.cells().get(place)?;
             Some((cell.replies.late + cell.replies.missing + cell.uplink().lost) as f64)
         });
-        let title = "Where: the largest force on each cell, as seen from outside; links are unrolled, the side of the tip is below";
+        let title =
+            "Largest force on each cell, seen from outside; links are unrolled, with the tip at the bottom";
         let force = self.map("map-force", title, "force", "N", &forces);
-        let title = "Where replies were late or missing or packets lost, added up for each cell";
+        let title = "Late and missing replies and lost packets, by cell";
         let loss = self.map("map-losses", title, "losses", "", &losses);
         let section = match (self.strip(), force) {
             (Some(strip), Some(force)) => section
@@ -39,7 +40,7 @@ impl Draft<'_> {
             (..) if self.lacks_forces() => section.text(
                 self.lacks("stimuli or sensors of the cells that sent torques, and so the forces on them").unwrap_or_default(),
             ),
-            (..) => section.text("No cell was touched, as far as the frames say."),
+            (..) => section.text("The frames show no touch of a cell."),
         };
         let sums = self.run.bus_figures.iter().any(|bus_figures| bus_figures.sums);
         match (loss, sums) {
@@ -48,13 +49,13 @@ impl Draft<'_> {
                 section.text("No cell's reply was late or missing, and no packet of a cell was lost.")
             }
             (None, true) => section.text(
-                "No packet of a cell was lost. Which cells were late or missing in a sum is not on the bus, so there is no \
-                 map of it.",
+                "No packet of a cell was lost. Frames do not show which cells were late or missing in a sum, so there is no \
+                 map of them.",
             ),
         }
     }
 
-    /// Whether cells of frames without a loop sent torques, and nothing on the buses tells the forces that they are from.
+    /// Returns true for a capture without a loop in which cells sent torques but the forces are unknown.
     pub(super) fn lacks_forces(&self) -> bool {
         let lines = self.run.motion.distributed.iter();
         let is_loaded = lines.flat_map(|line| line.points()).any(|(_, torque)| torque != 0.0);
@@ -62,7 +63,7 @@ impl Draft<'_> {
         self.run.frames_only.is_some() && is_loaded && self.run.bus_figures.iter().all(is_untouched)
     }
 
-    /// Each row's cells over time, those that were touched.
+    /// Creates the strip of touched cells over time.
     fn strip(&self) -> Option<Strip> {
         let mut rows = Vec::new();
         for (bus, bus_figures) in self.run.bus_figures.iter().enumerate() {
@@ -85,12 +86,11 @@ impl Draft<'_> {
         let rest = rows.split_off(touched.min(ROWS));
         let legend = Legend::of("force", "N", rows.iter().map(|(_, max, _)| *max));
         let title = match rest.first() {
-            None => format!(
-                "When: the force on each cell that was touched, {touched} of {}",
-                self.run.skin.cells.len()
-            ),
+            None => {
+                format!("Force over time on the {touched} touched cells of {}", self.run.skin.cells.len())
+            }
             Some((_, max, _)) => format!(
-                "When: the force on the {ROWS} cells with the largest one; {} more were touched, with at most {}",
+                "Force over time on the {ROWS} cells with the largest forces; {} more were touched, with at most {}",
                 rest.len(),
                 quantity(*max, "N")
             ),
@@ -112,7 +112,7 @@ impl Draft<'_> {
         Some(Strip { name: "touches".to_owned(), title, seconds, legend, groups })
     }
 
-    /// A value of each cell in the skin's order, by bus and place on it.
+    /// Returns a value for each cell in the skin's order, given its bus and its index there.
     fn by_cell(&self, value: impl Fn(usize, usize) -> Option<f64>) -> Vec<Option<f64>> {
         let mut places = vec![0; self.run.skin.buses.len()];
         let of = |cell: &protocol::skin::Cell| {
@@ -123,7 +123,7 @@ impl Draft<'_> {
         self.run.skin.cells.iter().map(of).collect()
     }
 
-    /// The cells at their places, with their values; none where all of them are 0.
+    /// Creates a map of the cells with their values; `None` if all of them are 0.
     fn map(&self, name: &str, title: &str, caption: &str, unit: &str, values: &[Option<f64>]) -> Option<Map> {
         let skin = &self.run.skin;
         let legend = Legend::of(caption, unit, values.iter().copied().flatten());
@@ -148,7 +148,7 @@ impl Draft<'_> {
         Some(Map { name: name.to_owned(), title: title.to_owned(), legend, panels })
     }
 
-    /// From the link before it to this one, in this one's frame.
+    /// Returns the direction from the previous link to this one, in this link's frame.
     fn to_tip(&self, (chain, row): Link) -> [f64; 3] {
         let rows = self.run.skin.robot.chains.get(chain).map(|chain| &chain.rows);
         let row = rows.and_then(|rows| rows.get(usize::from(row).saturating_sub(1)));
@@ -158,7 +158,7 @@ impl Draft<'_> {
         })
     }
 
-    /// What a link is called; with its bus where there are several.
+    /// Returns the name of a link, with its bus if there are several.
     pub(super) fn link(&self, (chain, row): Link, bus: Option<usize>) -> String {
         let skin = &self.run.skin;
         let chains = &skin.robot.chains;

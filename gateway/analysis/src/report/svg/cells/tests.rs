@@ -8,7 +8,7 @@ fn newtons(max: f64) -> Legend {
     Legend { caption: "force".to_owned(), unit: "N".to_owned(), max }
 }
 
-/// The places of a path's pieces, and their sizes, as they are written.
+/// Returns the positions and sizes of the rectangles in a path, as written.
 fn rectangles(path: &str) -> Vec<[f64; 4]> {
     let pieces = path.split('z').filter(|piece| !piece.is_empty());
     let numbers = |piece: &str| {
@@ -21,7 +21,7 @@ fn rectangles(path: &str) -> Vec<[f64; 4]> {
 
 fn path<'a>(document: &'a Document<'_>, class: &str) -> Option<&'a str> {
     let node = document.descendants().filter(|node| node.has_tag_name((SVG, "path")));
-    // The legend's comes first.
+    // The legend's element comes first.
     let mut node =
         node.filter(|node| node.attribute("class") == Some(class) && node.first_element_child().is_none());
     node.next_back().and_then(|node| node.attribute("d"))

@@ -1,4 +1,4 @@
-//! The rows of the table, and heartbeats that show each evidence.
+//! Tests of the rows of the table, and of heartbeats with each kind of evidence.
 
 use protocol::message::{Heartbeat, State};
 use protocol::time::Micros;
@@ -8,7 +8,7 @@ use Sample::{Doubted, DoubtedLong, Free, Inherited, InheritedLong, Shared, Sole}
 
 const AGAIN: Word = Word::Started { again: true };
 
-/// A state, for the two with a former life twice: that may go on, or not any more.
+/// A sample of each state; the two with a former life occur twice: it may go on, or not any more.
 #[derive(Clone, Copy, Debug, Eq, PartialEq)]
 enum Sample {
     Free,
@@ -37,7 +37,7 @@ const EVIDENCE: [E; 11] = [
     E::Succeeds,
 ];
 
-/// Places in the lists above: without an arm for each variant this does not compile.
+/// Returns the indices in the lists above. A new variant without an arm does not compile.
 const fn places(ownership: &Ownership, evidence: E) -> (&[Sample], usize) {
     let samples: &[Sample] = match ownership {
         Ownership::Free => &[Free],
@@ -62,22 +62,23 @@ const fn places(ownership: &Ownership, evidence: E) -> (&[Sample], usize) {
     (samples, place)
 }
 
-/// Whose life is the next owner's, or the next former's.
+/// The origin of the next owner's or former's life.
 #[derive(Clone, Copy, Debug)]
 enum Whose {
     Nobody,
-    /// The same one's as before.
+    /// Keeps the life from before.
     Same,
-    /// The owner's before, with the heartbeat that came.
+    /// The previous owner's, with the new heartbeat.
     Longer,
-    /// That of the heartbeat that came.
+    /// The life of the new heartbeat.
     New,
-    /// The owner's before.
+    /// The previous owner's.
     Owner,
 }
 use Whose::{Longer, New, Nobody, Owner, Same};
 
-/// Name, states and evidence, next state or none if it stays, word, and whose lives the next owner's and former's are.
+/// Name, states and evidence, next state (`None` if it stays), meaning, and the origins of the next owner's and
+/// former's lives.
 type Row = (&'static str, &'static [Sample], &'static [E], Option<Sample>, Word, [Whose; 2]);
 
 const START: &[E] = &[E::Intrudes, E::Starts, E::Jumps, E::Succeeds];
@@ -113,7 +114,7 @@ fn life(ms: u64, serial: u32, sent: u16, state: State) -> Life {
 const SETTLED: State = State(0);
 
 fn sample(sample: Sample) -> Ownership {
-    // One whose claim was heard; 20 s after a first life, and 2 s after a second one.
+    // An owner whose claim was received, 20 s after a first life and 2 s after a second one.
     let owner = Life { claimed: Some(Micros(19_000_000)), ..life(20_000, 7, 50, SETTLED) };
     let [former, gone] = [18_000, 0].map(|ms| life(ms, 7, 9_000, SETTLED));
     match sample {
@@ -164,7 +165,8 @@ fn each_evidence_is_shown_by_heartbeats() {
     };
     assert_eq!(shown(sample(Free), 0, 7, 9, claims), E::Claims);
     assert_eq!(shown(sample(Free), 0, 7, 9, SETTLED), E::Settles);
-    // Milliseconds after the owner's last heartbeat, with which it had sent 50; the former's was 2 s before, at 9000.
+    // Milliseconds after the owner's last heartbeat, with which it had sent 50 packets; the former's was 2 s earlier,
+    // at 9000.
     let common = [
         (250, 8, 9, claims, E::Claims),
         (250, 8, 9, SETTLED, E::Intrudes),
@@ -204,7 +206,7 @@ fn each_evidence_is_shown_by_heartbeats() {
     }
 }
 
-/// A counter that both lives go on to.
+/// A counter that continues both lives.
 #[test]
 fn of_two_lives_the_one_whose_counter_is_nearer_continues() {
     let doubted = |claimed: Option<u64>, own: u16, its: u16, ago: u64| {
@@ -214,11 +216,11 @@ fn of_two_lives_the_one_whose_counter_is_nearer_continues() {
         Ownership::Doubted { owner, former: life(20_250 - ago, 7, 10_000 - its, SETTLED) }
     };
     let shown = |ownership: Ownership| ownership.evidence(&life(20_250, 7, 10_000, SETTLED));
-    // The owner's claim was heard: by when it is over.
+    // The owner's claim was received: the time of its end decides.
     assert_eq!(shown(doubted(Some(20_011), 9, 99, 5_000)), E::FormerContinues);
     assert_eq!(shown(doubted(Some(20_010), 9, 99, 5_000)), E::Continues);
     assert_eq!(shown(doubted(Some(20_010), 99, 9, 300)), E::Continues, "its claim was heard and is over");
-    // It was not: the nearer one, if the former is alive or the owner would have leapt.
+    // It was not received: the nearer counter wins, if the former is alive or the owner would have leapt.
     assert_eq!(shown(doubted(None, 10, 9, 600)), E::FormerContinues);
     assert_eq!(shown(doubted(None, 9, 9, 600)), E::Continues);
     assert_eq!(shown(doubted(None, 10, 9, 601)), E::Continues);
@@ -227,7 +229,7 @@ fn of_two_lives_the_one_whose_counter_is_nearer_continues() {
     assert_eq!(shown(doubted(None, 256, 9, 601)), E::Continues);
 }
 
-/// An old heartbeat of the former, as long as that is alive.
+/// An old heartbeat of the former, while the former is alive.
 #[test]
 fn an_owner_whose_claim_was_heard_has_no_old_heartbeats_of_the_former() {
     let doubted = |claimed: Option<u64>, ago: u64| Ownership::Doubted {
