@@ -7,7 +7,7 @@
 //! ```
 //!
 //! An [`Entry`] keeps all information that either format holds of a frame, so that a capture survives the round trip
-//! through\nthe other format. Entries are in the order of the file, which is not always the order of their times.
+//! through the other format. Entries are in the order of the file, which is not always the order of their times.
 
 pub mod convert;
 mod error;
