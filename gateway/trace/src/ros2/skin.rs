@@ -24,7 +24,7 @@ pub struct LoopTiming {
     pub age: u32,
     /// The number of cells in contact that missed the last epoch.
     pub stale: u32,
-    /// The number of cells that time out.
+    /// The number of cells that have timed out.
     pub dead: u32,
     /// The reason for a bad cycle, one of the definition's constants.
     pub bad: u8,
