@@ -42,7 +42,7 @@ impl Doctor {
         let mut buses = named(&self.what, Bus::of_skin, Bus::named)?;
         let present = match (query(), self.bus_kind) {
             (Ok((_, present)), _) => present,
-            // Which needs none of them.
+            // The embedded bus needs no interface.
             (Err(_), Choice::Only(BusKind::Embedded)) => Vec::new(),
             (Err(_), Choice::Auto) if !has_socketcan() => Vec::new(),
             (Err(failure), _) => return Err(failure),

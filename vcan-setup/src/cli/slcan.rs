@@ -98,7 +98,7 @@ impl Slcan {
         if !away.is_empty() {
             ready += &format!(", still away: {}", away.join(", "));
         }
-        // With JSON, standard output is that alone.
+        // With `--json`, standard output contains only the JSON.
         if self.json {
             say(&ready)
         } else {
@@ -112,7 +112,7 @@ impl Slcan {
         print(&accounts.iter().map(|account| format!("{account}\n")).collect::<String>())
     }
 
-    /// The lines, each with what holds for all.
+    /// Returns the lines, each with the options that apply to all.
     fn lines(&self) -> Result<Vec<LineOptions>, Failure> {
         let mut lines = self.lines.clone();
         if !self.cell.is_empty() && self.cell.len() != lines.len() {

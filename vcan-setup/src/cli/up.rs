@@ -116,7 +116,7 @@ impl Down {
     }
 }
 
-/// Names that the kernel takes as they are, and a shell too.
+/// Checks that a name is valid for the kernel and needs no quotes in a shell.
 fn plain(name: &str) -> Result<(), Failure> {
     super::bus_name(name).map_err(Failure::usage)?;
     if !is_plain(name) || name.starts_with(['-', '.']) {
@@ -127,7 +127,7 @@ fn plain(name: &str) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Opens a namespace; `None` when it is the one where we are.
+/// Opens a namespace; returns `None` for the current one.
 fn enter(word: &OsStr) -> Result<Option<(Namespace, File, Netlink)>, Failure> {
     let namespace = Namespace::named(word);
     let not_allowed = || not_allowed(&format!("look into the network namespace {namespace}"));
@@ -170,14 +170,14 @@ fn not_allowed(what: &str) -> Failure {
     Failure::run(format!("not allowed to {what}, which needs root: `sudo {again}`"))
 }
 
-/// Carries out plans.
+/// Executes plans.
 struct Worker<'a> {
     netlink: &'a mut Netlink,
     there: Option<(&'a File, &'a mut Netlink)>,
 }
 
 impl Worker<'_> {
-    /// Prints what is left alone, and does the rest or prints what it would do.
+    /// Prints the unchanged interfaces, and executes the plan or prints its steps.
     fn finish(mut self, plan: &Plan, dry_run: bool) -> Result<(), Failure> {
         let mut text = String::new();
         for line in &plan.unchanged {
@@ -209,12 +209,12 @@ impl Worker<'_> {
                 }
             }
         }
-        // Printed when all is done: a failure undoes the steps before it.
+        // The steps are printed at the end, because a failure undoes the earlier ones.
         print(&plan.steps.iter().map(|step| format!("{}\n", step.done())).collect::<String>())
     }
 }
 
-/// Why a step fails, and how to fix it.
+/// Explains why a step failed, and how to fix it.
 fn explain(step: &Step, error: &io::Error) -> Failure {
     let kind = match step.action {
         Action::MakeVcan => Some("vcan"),
@@ -227,7 +227,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
     let unknown = |kind: &str, kernel: &Kernel| {
         let hints = kernel.hints(kernel.module(kind));
         let nearest = hints.first().map_or("", String::as_str);
-        // A command and its comment.
+        // A hint consists of a command and a comment.
         let (command, why) = nearest.split_once("# ").unwrap_or((nearest, ""));
         let command = if command.is_empty() { String::new() } else { format!("`{}`", command.trim()) };
         let why = match (command.is_empty(), why) {
@@ -248,7 +248,7 @@ fn explain(step: &Step, error: &io::Error) -> Failure {
         )),
         (Some(Errno::OPNOTSUPP), Some(kind)) => unknown(kind, &Kernel::look()),
         (Some(Errno::PERM | Errno::ACCESS), kind) => {
-            // Root would only get this error.
+            // Even root would get this error.
             let kernel = Kernel::look();
             let missing = kind.filter(|kind| kernel.module(kind) == Module::Missing);
             missing.map_or_else(|| not_allowed(&doing), |kind| unknown(kind, &kernel))

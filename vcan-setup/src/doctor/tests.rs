@@ -12,7 +12,7 @@ fn cell(node: i64) -> CellId {
     CellId::new(node).unwrap()
 }
 
-/// A bus of a skin, with 100 cells.
+/// Returns a bus of a skin with 100 cells.
 fn bus(interface: Option<Interface>) -> Bus {
     let name = interface.as_ref().map_or("vcan0", |it| it.name.as_str()).to_owned();
     let skin = Some(SkinBus { file: "skin.toml".into(), rates: Rates::default() });
@@ -25,7 +25,7 @@ fn bus(interface: Option<Interface>) -> Bus {
     }
 }
 
-/// A machine on which all is well.
+/// Returns the facts of a machine without faults.
 fn good() -> Facts {
     Facts {
         choice: Choice::Auto,
@@ -58,7 +58,7 @@ fn no_can(choice: Choice) -> Facts {
     facts
 }
 
-/// All findings as they are printed, but for those that are ok.
+/// Returns all findings as printed, except those that are ok.
 fn complaints(facts: &Facts) -> Vec<String> {
     let bad = |finding: Finding| {
         let hints = finding.hints.iter().map(|hint| format!(" | {hint}")).collect::<String>();
@@ -67,7 +67,7 @@ fn complaints(facts: &Facts) -> Vec<String> {
     assess(facts).into_iter().filter_map(bad).collect()
 }
 
-/// The findings when the bus, its interface or the machine is changed.
+/// Returns the findings after a change of the facts.
 fn about(change: impl FnOnce(&mut Facts)) -> Vec<String> {
     let mut facts = good();
     change(&mut facts);

@@ -1,4 +1,4 @@
-//! The command line of `vcan-setup link`: read by `vcan-setup`, which then runs the program `vcan-link`, and by that.
+//! The command line of `vcan-setup link`. Both `vcan-setup` and `vcan-link`, which it runs, parse it.
 
 use std::path::PathBuf;
 
@@ -42,7 +42,7 @@ pub struct LinkOptions {
     pub json: bool,
 }
 
-/// Returns a bus' name, as the command line gives it.
+/// Parses the name of a bus.
 fn bus_name(word: &str) -> Result<String, BusError> {
     check_name(word).map(|()| word.to_owned())
 }
