@@ -86,7 +86,7 @@ impl Finding {
     }
 }
 
-/// Returns true if a bench would run: none of the findings is a fault.
+/// Returns true if a bench would run: the findings contain no fault.
 #[must_use]
 pub fn would_run(findings: &[Finding]) -> bool {
     findings.iter().all(|finding| finding.level != Level::Fault)

@@ -7,7 +7,7 @@ use std::fmt;
 pub(crate) enum Event {
     /// Another host has linked the bus.
     Joined(String),
-    /// A host has left, or is no longer reachable.
+    /// A host has left, or can no longer be reached.
     Gone(String),
     /// A connection failed or was refused.
     Transport(String),

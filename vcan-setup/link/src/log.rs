@@ -31,7 +31,7 @@ struct Log {
     said: Mutex<BTreeMap<String, Instant>>,
 }
 
-/// Forwards warnings, errors and failed connections to `tell`. Has an effect only once in a process.
+/// Forwards warnings, errors and failed connections to `tell`. Only the first call in a process has an effect.
 pub(crate) fn listen(tell: Sender<Event>) {
     let log = Log { tell: Mutex::new(tell), said: Mutex::default() };
     // If the process already has a subscriber, that one gets the entries.

@@ -110,7 +110,7 @@ pub(crate) fn plain(error: &str) -> String {
 /// # Errors
 ///
 /// Returns [`LinkError`] if the file cannot be read, if an endpoint has an unsupported form or lacks TLS beside others
-/// with TLS, or if there is no endpoint.
+/// with TLS, or if no endpoint is given.
 pub(crate) fn config(settings: &Settings) -> Result<Config, LinkError> {
     let mut config = match &settings.config {
         Some(path) => Config::from_file(path).map_err(|error| settings.blame(&error.to_string()))?,

@@ -8,8 +8,8 @@ use protocol::bus::{BusError, Choice, check_name};
 /// Join a bus here with those of the same name on other hosts, until SIGINT or SIGTERM
 ///
 /// Carries every frame over Zenoh (TCP or TLS), or counts it as lost with where and why. Nothing waits for a link: what
-/// it cannot carry is dropped, and counted. Nobody is looked for in the network: say where the others are with --connect,
-/// where they find this host with --listen, or both in a file of Zenoh's. A connection that was lost is made again.
+/// it cannot carry is dropped, and counted. The network is not searched: name the other hosts with --connect, the
+/// address of this host with --listen, or both in a configuration file of Zenoh. A lost connection is made again.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup link vcan0 --listen tcp/192.168.1.7:7447      on the host of the robot

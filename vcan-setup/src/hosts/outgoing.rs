@@ -1,4 +1,4 @@
-//! Frames from the local bus to the other hosts: numbers them, and drops those for which there is no room.
+//! Frames from the local bus to the other hosts: numbers them, and drops those that find no room.
 
 use std::collections::VecDeque;
 
@@ -42,7 +42,7 @@ impl Outgoing {
         Self { life, waiting: VecDeque::with_capacity(QUEUE), next: 0, account: Sent::default() }
     }
 
-    /// Queues a frame of the bus, or drops it if there is no room.
+    /// Queues a frame of the bus, or drops it if the queue is full.
     pub fn take(&mut self, stamped: Stamped) {
         let number = self.next;
         self.next += 1;

@@ -105,7 +105,7 @@ fn is_certain(bytes: &[u8], leftover: u64) -> bool {
     is_of_two && own_length(opcode, body) == Some(length)
 }
 
-/// Returns the length of a record according to its fields; `None` if its kind does not tell, or if the bytes end too
+/// Returns the length of a record according to its fields; `None` if its kind has no such fields, or if the bytes end too
 /// early.
 #[must_use]
 pub fn own_length(opcode: u8, body: &[u8]) -> Option<u64> {

@@ -1,4 +1,4 @@
-//! Accepts clients, and turns those away for which there is no room.
+//! Accepts clients, and turns away those that find no room.
 
 use std::io;
 use std::os::fd::OwnedFd;
@@ -43,7 +43,7 @@ impl Server {
         rustix::net::accept_with(&self.place.listener, SocketFlags::CLOEXEC | SocketFlags::NONBLOCK)
     }
 
-    /// Hangs up on a client for which there is no file descriptor, by means of the reserved one. A client that has not
+    /// Hangs up on a client that finds no free file descriptor, by means of the reserved one. A client that has not
     /// sent its hello yet keeps that descriptor until [`Server::part`].
     fn turn_away(&mut self) -> Result<(), Errno> {
         drop(self.spare.take());

@@ -92,7 +92,7 @@ fn identifier_of(digits: &[u8]) -> Option<u32> {
     let id = u32::from_str_radix(core::str::from_utf8(digits).ok()?, 16).ok()?;
     match digits.len() {
         3 => identifier(id, 0).ok(),
-        // The text after the length tells whether the frame is remote.
+        // The text after the length shows whether the frame is remote.
         _ => Some(eight_digit_identifier(id) & !REMOTE),
     }
 }
