@@ -105,8 +105,8 @@ fn is_certain(bytes: &[u8], leftover: u64) -> bool {
     is_of_two && own_length(opcode, body) == Some(length)
 }
 
-/// Returns the length of a record according to its fields; `None` if its kind has no such fields, or if the bytes end too
-/// early.
+/// Returns the length of a record according to its fields; `None` if its kind has no such fields, or if the bytes end
+/// too early.
 #[must_use]
 pub fn own_length(opcode: u8, body: &[u8]) -> Option<u64> {
     match opcode {
