@@ -196,17 +196,16 @@ impl Facts {
                 ))
             }
             (true, 0) => Some(
-                Finding::fault(format!(
-                    "no cell is heard on {on}, and with --no-spawn they have to be there"
-                ))
-                .hint(format!(
-                    "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &  # or leave out --no-spawn"
-                )),
+                Finding::fault(format!("no cell sends on {on}, and --no-spawn needs cells that run already"))
+                    .hint(format!(
+                        "cell-node --bus {name} --nodes 1-... --skin SKIN.toml &  # or leave out --no-spawn"
+                    )),
             ),
             (true, 1..) if absent().is_empty() => Some(Finding::ok(format!("{count} cells are on {on}"))),
             (true, 1..) => {
                 let absent = nodes(&absent());
-                let text = format!("{count} cells are on {on}; of the skin's these were not heard: {absent}");
+                let text =
+                    format!("{count} cells are on {on}; these cells of the skin sent nothing: {absent}");
                 Some(Finding::note(text))
             }
         };
@@ -256,7 +255,7 @@ impl Facts {
             )),
             Some(backlog) => Finding::fault(format!(
                 "the kernel's backlog of {backlog} does not hold an answer of all cells, {frames} frames: some would \
-                 be lost without a word"
+                 be lost silently"
             ))
             .hint(self.sudo(&format!("sysctl -w net.core.netdev_max_backlog={}", 2 * frames))),
         })

@@ -247,7 +247,7 @@ impl Plan {
         let wide = target.carried_by(mtu);
         let action = match (wide, interface.up, interface.ours) {
             (true, true, ours) => {
-                let whose = if ours { "" } else { ", made by somebody else" };
+                let whose = if ours { "" } else { ", made by another program" };
                 self.leave(format!("{name} is there already, and fits ({}{whose})", interface.what()));
                 return Ok(());
             }

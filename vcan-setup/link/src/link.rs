@@ -162,7 +162,7 @@ impl Link {
         let (shared, this) = (Arc::clone(&self.shared), host.clone());
         self.subscribe(HEARD, tell.clone(), move |from, bytes| {
             let heard: BTreeMap<String, Heard> = serde_json::from_slice(bytes)
-                .map_err(|error| format!("no account of what it heard: {error}"))?;
+                .map_err(|error| format!("an invalid account of received frames: {error}"))?;
             let mut ours = shared.ours();
             if let Some(heard) = heard.get(&this).filter(|_| ours.len() < SOURCES || ours.contains_key(from))
             {

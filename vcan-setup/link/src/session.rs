@@ -54,7 +54,7 @@ pub(crate) enum LinkError {
     #[error("{0} {1}: an endpoint is tcp/HOST:PORT or tls/HOST:PORT")]
     Endpoint(String, String),
     /// An endpoint without TLS is used beside one with TLS.
-    #[error("{plain} would be open to everybody beside {secure}: make all endpoints tls/, or none of them")]
+    #[error("{plain} would be open to everyone beside {secure}: make all endpoints tls/, or none of them")]
     PlainBesideTls {
         /// The endpoint without TLS.
         plain: String,

@@ -20,7 +20,7 @@ impl Facts {
         findings.extend(match self.kernel.vcan {
             Module::There => None,
             Module::Unknown => {
-                let text = "whether the kernel has vcan is not to be seen; should it have none:";
+                let text = "cannot see whether the kernel has vcan; if it has none:";
                 Some(Finding::note(text).hints(hints))
             }
             Module::Loadable => {
@@ -186,14 +186,14 @@ impl Facts {
         findings.extend(match hardware.state.filter(|_| *up) {
             Some(State::BusOff) => Some(
                 Finding::fault(format!(
-                    "{name} is BUS-OFF: after too many errors it takes no part any more; wiring, termination or bit \
+                    "{name} is BUS-OFF: it no longer takes part after too many errors; wiring, termination or bit \
                      rates are wrong"
                 ))
                 .hint(self.sudo(&format!("ip link set {name} type can restart"))),
             ),
             Some(state @ (State::ErrorPassive | State::ErrorWarning)) => Some(
                 Finding::note(format!(
-                    "{name} is {}: it sees errors; is anybody else on the bus, terminated, at the same bit rates?",
+                    "{name} is {}: it sees errors; is another node on the bus, terminated, at the same bit rates?",
                     state.name()
                 ))
                 .hint(format!("ip -details -statistics link show {name}")),

@@ -182,7 +182,7 @@ fn a_bus_of_either_kind_that_is_absent_is_made_by_a_run_that_starts_its_cells() 
             "fault: {text}, and no embedded bus of this name is served | sudo vcan-setup up skin.toml | vcan-setup serve vcan0 &"
         )]
     );
-    assert_eq!(absent(true, Some(Heard::default())).len(), 1, "no cell is heard there");
+    assert_eq!(absent(true, Some(Heard::default())).len(), 1, "no cell sends there");
 }
 
 #[test]
@@ -214,9 +214,7 @@ fn a_missing_interface_is_made_by_up_and_who_may_not_needs_sudo() {
     assert!(
         missing(admin, Module::Missing)[0].starts_with("fault: the kernel (6.1.0) has CAN and no vcan | ")
     );
-    assert!(
-        missing(admin, Module::Unknown)[0].starts_with("note: whether the kernel has vcan is not to be seen")
-    );
+    assert!(missing(admin, Module::Unknown)[0].starts_with("note: cannot see whether the kernel has vcan"));
     let contained = missing(User { root: true, admin: false }, Module::There);
     assert!(contained[0].starts_with("fault: root may not make interfaces here: it has no CAP_NET_ADMIN"));
     let named = about(|facts| {
@@ -314,9 +312,9 @@ fn another_gateway_and_cells_that_are_there_end_a_run_before_it_begins() {
     assert_eq!(listens(cells(1..=100), true), Vec::<String>::new());
     assert_eq!(
         listens(cells(2..=100), true),
-        ["note: 99 cells are on vcan0; of the skin's these were not heard: 1"]
+        ["note: 99 cells are on vcan0; these cells of the skin sent nothing: 1"]
     );
-    assert!(listens(cells([]), true)[0].starts_with("fault: no cell is heard on vcan0"));
+    assert!(listens(cells([]), true)[0].starts_with("fault: no cell sends on vcan0"));
     let embedded = |heard| {
         let mut facts = no_can(Choice::Auto);
         facts.buses[0].heard = Ok(heard);
@@ -374,7 +372,7 @@ fn the_backlog_holds_an_answer_of_every_cell_of_every_bus() {
         backlog(Some(99)),
         [
             "fault: the kernel's backlog of 99 does not hold an answer of all cells, 100 frames: some would be lost \
-          without a word | sudo sysctl -w net.core.netdev_max_backlog=200"
+          silently | sudo sysctl -w net.core.netdev_max_backlog=200"
         ]
     );
     assert!(backlog(None)[0].starts_with("note: the kernel's backlog cannot be seen"));

@@ -35,8 +35,8 @@ pub enum CaptureError {
     },
     /// The rest of the file is damaged.
     #[error(
-        "{name} is damaged: {what}; {entries} frames and notes before that were read; `skinbus recover` makes a new \
-         file of what is whole"
+        "{name} is damaged: {what}; {entries} frames and notes before that were read; `skinbus recover` copies the \
+         intact part to a new file"
     )]
     Damaged {
         /// The name of the capture.

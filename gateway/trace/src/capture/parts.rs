@@ -24,7 +24,7 @@ pub enum PartsError {
     #[error("no file is named: name a capture")]
     None,
     /// One file is a part of a recording, and another is not.
-    #[error("{} is a part of a recording, and {} is none: name the parts alone", .part.display(), .other.display())]
+    #[error("{} is a part of a recording, but {} is not: name only the parts", .part.display(), .other.display())]
     Mixed {
         /// The part.
         part: PathBuf,
@@ -32,7 +32,7 @@ pub enum PartsError {
         other: PathBuf,
     },
     /// The files are of both formats.
-    #[error("{} is a candump log, and {} an MCAP recording: make a log of it first with `skinbus convert`", .log.display(), .mcap.display())]
+    #[error("{} is a candump log, and {} an MCAP recording: convert it to a log first with `skinbus convert`", .log.display(), .mcap.display())]
     Formats {
         /// A log.
         log: PathBuf,
@@ -40,17 +40,17 @@ pub enum PartsError {
         mcap: PathBuf,
     },
     /// One file is text without frames.
-    #[error("{} has no frame in it: name captures alone", .0.display())]
+    #[error("{} contains no frames: name only captures", .0.display())]
     NoFrame(PathBuf),
     /// One file is listed twice.
     #[error("{} is named twice: name it once", .0.display())]
     Same(PathBuf),
     /// Standard input cannot be one of several files.
-    #[error("- is standard input, which cannot be one of several files: name files alone")]
+    #[error("- is standard input, which cannot be one of several files: name only files")]
     StandardInput,
     /// Two parts belong to different recordings.
     #[error(
-        "{} and {} are of different recordings, begun at {} and {} ns: name the parts of one",
+        "{} and {} belong to different recordings, begun at {} and {} ns: name the parts of one",
         .one.path.display(), .other.path.display(), .one.began, .other.began
     )]
     Different {

@@ -51,7 +51,7 @@ impl Places {
     fn add(&mut self, path: &Path) -> io::Result<()> {
         let mut file = input::open(path)?;
         if !file.metadata()?.is_file() {
-            let why = "it is no regular file, and cannot be gone back in: write it to a file first";
+            let why = "it is not a regular file, and not seekable: write it to a file first";
             return Err(io::Error::new(io::ErrorKind::NotSeekable, why));
         }
         self.parts.push(Part { path: path.to_owned(), descriptions: Vec::new() });

@@ -99,7 +99,7 @@ pub enum Damage {
         found: u64,
     },
     /// A record reaches beyond its chunk.
-    #[error("a record of {bytes} bytes in a chunk has {leftover} bytes left there")]
+    #[error("a record of {bytes} bytes does not fit into the {leftover} bytes left in its chunk")]
     Overrun {
         /// The length of the record.
         bytes: u64,
@@ -116,7 +116,7 @@ pub enum Damage {
     #[error("it does not begin and end with the magic bytes of an MCAP file")]
     Magic,
     /// A message is on an undefined channel.
-    #[error("a message belongs to channel {0}, which it has not")]
+    #[error("a message is on channel {0}, which the file does not define")]
     Channel(u16),
     /// A message does not match the type of its channel.
     #[error("a message of {topic}: {source}")]
@@ -130,7 +130,7 @@ pub enum Damage {
     #[error("no record has the operation code {0:02x}")]
     Unknown(u8),
     /// The operation code does not fit the position or the contents of the record.
-    #[error("a record has the operation code {0:02x}, and is none of that kind")]
+    #[error("a record has the operation code {0:02x}, but is not of that kind")]
     Code(u8),
     /// The length of a record is not that of its contents.
     #[error(
@@ -148,7 +148,9 @@ pub enum Damage {
     #[error("a message of {0} bytes contains the records behind it")]
     Swallowed(u64),
     /// A record reaches beyond the end of the file, but other records follow its beginning.
-    #[error("a record of {bytes} bytes leads beyond the file's end, and others follow where it begins")]
+    #[error(
+        "a record of {bytes} bytes reaches beyond the file's end, but other records follow its beginning"
+    )]
     Beyond {
         /// The length in the record's header.
         bytes: u64,
@@ -157,10 +159,10 @@ pub enum Damage {
     #[error("it ends with the magic bytes of an MCAP file, and without the footer before them")]
     Footer,
     /// The file continues after its end.
-    #[error("something follows behind its end")]
+    #[error("the file continues after its end")]
     Behind,
     /// The number of messages is not that of the statistics.
-    #[error("it has {found} messages, and {stated} by its statistics")]
+    #[error("it has {found} messages, but its statistics say {stated}")]
     Messages {
         /// The number of messages read.
         found: u64,

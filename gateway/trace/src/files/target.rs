@@ -89,7 +89,7 @@ pub fn check_regular(path: &Path, force: bool) -> io::Result<()> {
 }
 
 fn no_regular_file() -> io::Error {
-    io::Error::new(io::ErrorKind::AlreadyExists, "it is no regular file: name another one")
+    io::Error::new(io::ErrorKind::AlreadyExists, "it is not a regular file: name another one")
 }
 
 /// Returns the error for a name that is taken.
@@ -123,7 +123,10 @@ pub(super) fn open_stream(path: &Path, stopped: &AtomicBool) -> io::Result<File>
         match OpenOptions::new().append(true).custom_flags(nonblocking).open(path) {
             Err(error) if Errno::from_io_error(&error) == Some(Errno::NXIO) => {
                 if stopped.load(Ordering::Relaxed) {
-                    return Err(io::Error::new(io::ErrorKind::Interrupted, "interrupted: nobody read it"));
+                    return Err(io::Error::new(
+                        io::ErrorKind::Interrupted,
+                        "interrupted: no program read it",
+                    ));
                 }
                 std::thread::sleep(LOOK);
             }

@@ -63,7 +63,7 @@ fn what_is_there_is_not_overwritten_and_no_symlink_is_followed_to_a_file() {
         }
         let why = "is a directory; name a file in a folder that can be written";
         assert_eq!(refusals(&directory, force), [why; 2]);
-        assert_eq!(refusals(&socket, force), ["it is no regular file: name another one"; 2]);
+        assert_eq!(refusals(&socket, force), ["it is not a regular file: name another one"; 2]);
     }
     assert_eq!(names(folder.path()), before);
     assert_eq!(fs::read_to_string(&file).unwrap(), "mine");
@@ -155,7 +155,7 @@ fn a_fifo_is_waited_for_until_somebody_reads_it_or_says_stop() {
     let made = rustix::fs::mknodat(CWD, &path, rustix::fs::FileType::Fifo, Mode::RWXU, 0);
     made.unwrap();
     let stopped = LogFile::create(&path, false, &AtomicBool::new(true)).unwrap_err();
-    assert_eq!(stopped.to_string(), "interrupted: nobody read it");
+    assert_eq!(stopped.to_string(), "interrupted: no program read it");
     let fifo = path.clone();
     let reader = std::thread::spawn(move || {
         BufReader::new(File::open(fifo).unwrap()).lines().map(Result::unwrap).collect::<Vec<_>>()

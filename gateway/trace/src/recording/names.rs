@@ -168,13 +168,13 @@ fn why_taken(path: &Path) -> String {
     let name = path.display();
     // A pipe is not opened: a program that waits at its other end would take that for a reader.
     if fs::symlink_metadata(path).is_ok_and(|about| !about.is_file()) {
-        return format!("{name} is there and is no regular file: move it away, or record to another name");
+        return format!("{name} exists and is not a regular file: move it away, or record to another name");
     }
     match open_unfollowed(path) {
         Ok(file) if !is_held(&file) => format!(
-            "{name} is there, and no run that was killed has left it: move it away, or record to another name"
+            "{name} exists, but was not left by a killed run: move it away, or record to another name"
         ),
-        _ => format!("{name} is there: another run records to this name now: record to another name"),
+        _ => format!("{name} exists: another run is recording to this name: record to another name"),
     }
 }
 
@@ -219,7 +219,7 @@ pub enum Leftover {
     #[error("it is a symlink")]
     Symlink,
     /// It is a folder, a pipe or a device.
-    #[error("it is no regular file")]
+    #[error("it is not a regular file")]
     Irregular,
     /// It cannot be queried.
     #[error(transparent)]
@@ -242,7 +242,7 @@ pub enum Leftover {
     #[error("another program is writing it")]
     Held,
     /// It holds no identity, or that of another file.
-    #[error("no run of this program has begun it here")]
+    #[error("no run of this program created it here")]
     Unmarked,
 }
 
@@ -346,7 +346,7 @@ mod tests {
         assert_eq!(orphans(&goal).len(), 0, "somebody writes it");
         let error = Part::create(goal.clone()).unwrap_err().to_string();
         assert!(
-            error.ends_with("part is there: another run records to this name now: record to another name"),
+            error.ends_with("part exists: another run is recording to this name: record to another name"),
             "{error}"
         );
         drop(file);

@@ -164,7 +164,7 @@ pub fn orphans(path: &Path, mut say: impl FnMut(&str)) {
                 say(&format!("{name} {leftover}; repaired, it is {}: {recovered}{kept}", path.display()));
             }
             Ok(Repaired { new: None, .. }) => {
-                say(&format!("{name} {leftover}; nothing was recorded in it, it is gone"));
+                say(&format!("{name} {leftover}; it held no messages and was removed"));
             }
             Err(error) => say(&format!("{name} {leftover} and cannot be repaired: {error}")),
         }

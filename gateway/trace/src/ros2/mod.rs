@@ -31,7 +31,7 @@ pub trait Message: Encode {
 #[non_exhaustive]
 pub enum MessageError {
     /// The message is too long for its type.
-    #[error("it has {bytes} bytes, and may have {limit}")]
+    #[error("it has {bytes} bytes, but at most {limit} are allowed")]
     Long {
         /// Its length in bytes.
         bytes: usize,
