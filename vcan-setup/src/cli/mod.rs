@@ -24,7 +24,7 @@ use vcan_setup::link::Interface;
 use vcan_setup::netlink::Netlink;
 use vcan_setup::plan::Target;
 
-/// Gives you a bus: makes vcan interfaces, checks what a bench still needs, serves embedded buses
+/// Sets up CAN buses: makes vcan interfaces, checks what a bench still needs, serves embedded buses
 #[derive(Debug, Parser)]
 #[command(
     version,

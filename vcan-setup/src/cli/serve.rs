@@ -18,7 +18,7 @@ const URGENT: i32 = -20;
 /// Serve an embedded bus, for machines whose kernel has no SocketCAN, until SIGINT or SIGTERM
 ///
 /// Prints one line, "serving NAME at PATH", when clients can connect. The bus is private to the user; its
-/// socket lies in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
+/// socket is in $SKINBUS_DIR, else $XDG_RUNTIME_DIR/skinbus, else /tmp/skinbus-UID.
 #[derive(Args, Debug)]
 #[command(
     after_help = "Examples:\n  vcan-setup serve vcan0\n  sleep 10 | vcan-setup serve vcan0 --until-eof"

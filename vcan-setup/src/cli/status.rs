@@ -20,13 +20,13 @@ const ANSWER: Duration = Duration::from_millis(500);
 
 /// Show the CAN interfaces of this machine, and the embedded buses of this user
 ///
-/// Of hardware also the bit rates and the error state. Exit code 1 when one that was named is not there.
+/// Shows the bit rates and the error state of hardware too. Exit code 1 if a named one does not exist.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup status
   vcan-setup status skin.toml --json")]
 pub(crate) struct Status {
-    /// Only these: names, or skins, which end in .toml or hold a '/'
+    /// Show only these: names, or skin files, which end in .toml or contain a '/'
     #[arg(value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// Print JSON

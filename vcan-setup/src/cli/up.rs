@@ -19,10 +19,10 @@ use super::{Word, query, target, unreadable, word};
 
 /// Make virtual CAN interfaces, and bring them up
 ///
-/// Makes what is missing, with MTU 72 for CAN FD, and marks it with the alias "skinbus". What is there
-/// already and fits stays as it is, so it may be called again and again. Nothing is touched that it has not
-/// made: of a real interface in a skin it only checks the bit rates, unless told to set them. Needs
-/// root, unless there is nothing to do.
+/// Makes missing interfaces with MTU 72 for CAN FD, and marks them with the alias "skinbus". Interfaces that exist
+/// and fit stay as they are, so the command may be repeated. It changes only interfaces that it has made: of a real
+/// interface in a skin it only checks the bit rates, unless --set-bit-rates is given. Needs root, unless all
+/// interfaces are in place.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   vcan-setup up --dry-run skin.toml                           print what would be done
@@ -31,7 +31,7 @@ use super::{Word, query, target, unreadable, word};
   sudo vcan-setup up vcan0 --peer vcan0 --namespace blue      a pair that leads into a namespace
   sudo vcan-setup up skin.toml --set-bit-rates                and set those of real interfaces")]
 pub(crate) struct Up {
-    /// Names of interfaces, or skins: what ends in .toml or holds a '/'
+    /// Names of interfaces, or skin files, which end in .toml or contain a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// Print what would be done, and do nothing
@@ -40,24 +40,24 @@ pub(crate) struct Up {
     /// Make a vxcan pair: NAME is one end, PEER the other
     #[arg(long, value_name = "PEER")]
     peer: Option<String>,
-    /// The network namespace of the other end: a name, a path, or the number of a process
+    /// The network namespace of the other end: a name, a path, or a process id
     #[arg(long, value_name = "NAME|PATH|PID", requires = "peer")]
     namespace: Option<OsString>,
-    /// Set the bit rates of CAN hardware to those of the skin, for which it is taken down for a moment
+    /// Set the bit rates of CAN hardware to those of the skin; takes the interface down for a moment
     #[arg(long, conflicts_with = "peer")]
     set_bit_rates: bool,
 }
 
 /// Remove the virtual CAN interfaces that `up` has made
 ///
-/// Removes only what bears the mark "skinbus". Of a skin's buses it leaves alone what it has not made; a
-/// name of such an interface is an error.
+/// Removes only interfaces with the alias "skinbus". Other buses of a skin are left alone, but naming such an
+/// interface is an error.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   sudo vcan-setup down skin.toml
   vcan-setup down --dry-run vcan0")]
 pub(crate) struct Down {
-    /// Names of interfaces, or skins: what ends in .toml or holds a '/'
+    /// Names of interfaces, or skin files, which end in .toml or contain a '/'
     #[arg(required = true, value_name = "SKIN.toml|NAME")]
     what: Vec<OsString>,
     /// Print what would be done, and do nothing
